@@ -1,1 +1,1 @@
-"""What a person writes: the campaign file, its validation, and the files that it names."""
+"""The campaign file: its settings, their validation, and the ancillary files that it names."""

@@ -1,7 +1,7 @@
-"""Files that are not raw data: soundings and overlap functions, as CSV or NetCDF.
+"""Read ancillary files: soundings and overlap functions, as CSV or NetCDF.
 
-Both hold columns by name. A unit stands in brackets behind the name of a CSV column
-(``pressure [hPa]``) or in the attribute ``units`` of a NetCDF variable; SI where there is none.
+Both hold named columns. The unit is given in brackets after the name of a CSV column
+(``pressure [hPa]``) or in the attribute ``units`` of a NetCDF variable; SI where none is given.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _SCALE: Final[Mapping[str, Mapping[str, float]]] = {
     "overlap": {"1": 1.0},
 }
 _FULL: Final = 0.95
-"""Overlap that counts as full."""
+"""Smallest final overlap of a profile that counts as full."""
 _SHORTEST: Final = 30.0
-"""m, at which no overlap is complete yet."""
+"""m; a shorter overlap profile is probably in km."""
 _WIDEST: Final = 5000.0
-"""m between levels of a sounding, below 20 km: temperature is no straight line over more."""
+"""m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
 _LARGEST: Final = 100_000_000
-"""Bytes; a profile is small."""
+"""Bytes; largest file that is read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,31 +49,31 @@ class Overlap:
     range: Array
     """m, rising."""
     overlap: Array
-    """Share of the beam that the telescope sees, above 0 and at most 1."""
+    """Share of the beam in the telescope's field of view, above 0 and at most 1."""
 
     def at(self, range: Array) -> Array:  # noqa: A002 - the field's word
-        """Return the overlap at ranges (m): linear between, NaN before the first, 1 beyond."""
-        found = np.interp(range, self.range, self.overlap, left=np.nan)
-        return np.where(range > self.range[-1], 1.0, found)
+        """Return the overlap at ranges in m: linear interpolation, NaN before and 1 beyond."""
+        overlap = np.interp(range, self.range, self.overlap, left=np.nan)
+        return np.where(range > self.range[-1], 1.0, overlap)
 
 
 @dataclass(frozen=True, slots=True)
 class Ancillaries:
-    """The files besides raw data that one scene uses, read once."""
+    """The ancillary files of one scene, read once."""
 
     profiles: Mapping[str, MolecularProfile]
     overlaps: Mapping[str, Overlap]
     inputs: tuple[InputRecord, ...]
-    """By name."""
+    """In order of file names."""
 
     @classmethod
     def read(cls, folder: Path, plan: Plan) -> Self:
-        """Read what the steps of a plan name.
+        """Read the files that the steps of a plan name.
 
         Parameters
         ----------
         folder : Path
-            Of the campaign file.
+            Folder of the campaign file.
         plan : Plan
 
         Raises
@@ -100,11 +100,11 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
     Parameters
     ----------
     folder : Path
-        Of the campaign file.
+        Folder of the campaign file.
     name : str
-        Path below it, of a file with the columns ``altitude`` (m above mean sea level, rising),
-        ``pressure`` (Pa; hPa where its size or unit says so) and ``temperature`` (K). One that
-        ends in ``.nc`` is NetCDF.
+        Path of the file below `folder`. Columns: ``altitude`` (m above mean sea level, rising),
+        ``pressure`` (Pa; hPa according to its unit or size) and ``temperature`` (K). A name that
+        ends in ``.nc`` means NetCDF.
 
     Returns
     -------
@@ -115,15 +115,15 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
     Raises
     ------
     AncillaryError
-        Naming the file, where it is no such profile: columns missing, not numbers, wrong units.
+        If columns are missing, are not numbers or have wrong units; the message names the file.
     """
     content = _read(folder, name)
     names = ("altitude", "pressure", "temperature")
-    columns, told = _columns(content, folder, name, names)
+    columns, with_unit = _columns(content, folder, name, names)
     try:
         profile = MolecularProfile.from_profile(
-            *(columns[each] for each in names),
-            pressure_unit="Pa" if "pressure" in told else None,
+            *(columns[column] for column in names),
+            pressure_unit="Pa" if "pressure" in with_unit else None,
         )
     except RetrievalInputError as error:
         problem, field, remedy = error.problem, error.field, error.remedy
@@ -146,46 +146,46 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
     Parameters
     ----------
     folder : Path
-        Of the campaign file.
+        Folder of the campaign file.
     name : str
-        Path below it, of a file with the columns ``range`` (m, rising) and ``overlap`` (above
-        0, at most 1). One that ends in ``.nc`` is NetCDF.
+        Path of the file below `folder`. Columns: ``range`` (m, rising) and ``overlap`` (above 0,
+        at most 1). A name that ends in ``.nc`` means NetCDF.
 
     Raises
     ------
     AncillaryError
-        Naming the file, where it is no overlap function.
+        If the file holds no overlap function; the message names the file.
     """
     content = _read(folder, name)
     columns, _ = _columns(content, folder, name, ("range", "overlap"))
     ranges, overlap = columns["range"], columns["overlap"]
     if ranges.size != overlap.size or ranges.size < 2 or not np.all(np.diff(ranges) > 0):
         raise AncillaryError(
-            f"does not rise over {overlap.size} values of overlap",
+            f"does not rise strictly over the {overlap.size} values of overlap",
             file=name,
             field="range",
-            remedy="sort the rows",
+            remedy="sort the rows by range",
         )
     if not np.all((overlap > 0) & (overlap <= 1.0)):
         raise AncillaryError(
-            f"reaches from {overlap.min():g} to {overlap.max():g}",
+            f"has values from {overlap.min():g} to {overlap.max():g}",
             file=name,
             field="overlap",
-            remedy="give shares above 0 and at most 1; leave out ranges without overlap",
+            remedy="give values above 0 and at most 1; leave out ranges without overlap",
         )
     if ranges[-1] < _SHORTEST:
         raise AncillaryError(
             f"ends at {ranges[-1]:g} m",
             file=name,
             field="range",
-            remedy="this looks like km: give m",
+            remedy="give ranges in m, not in km",
         )
     if overlap[-1] < _FULL:
         raise AncillaryError(
-            f"ends at {overlap[-1]:g}, beyond which it is taken as 1",
+            f"ends at {overlap[-1]:g}, although overlap beyond the last range is taken as 1",
             file=name,
             field="overlap",
-            remedy="continue it to full overlap",
+            remedy="continue the profile to full overlap",
         )
     return Overlap(ranges, overlap), hashlib.sha256(content).hexdigest()
 
@@ -197,7 +197,7 @@ def _read(folder: Path, name: str) -> bytes:
         small = inside and path.stat().st_size <= _LARGEST
         if small:
             return path.read_bytes()
-    # RuntimeError: a loop of links; ValueError: a name that no file can have.
+    # RuntimeError: a loop of links; ValueError: an invalid file name.
     except (OSError, RuntimeError, ValueError) as error:
         raise AncillaryError(
             f"cannot be read: {getattr(error, 'strerror', None) or error}",
@@ -212,24 +212,27 @@ def _read(folder: Path, name: str) -> bytes:
 def _columns(
     content: bytes, folder: Path, file: str, names: tuple[str, ...]
 ) -> tuple[dict[str, Array], frozenset[str]]:
-    """Return the columns in SI units, and the names of those whose unit was told."""
-    found = _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
+    """Return the columns in SI units, and the names of those with a unit."""
+    raw = _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
     columns = {}
     for name in names:
-        if name not in found:
+        if name not in raw:
             raise AncillaryError(
-                f"has no column {name!r}, only {', '.join(found) or 'none'}", file=file
+                f"has no column {name!r}; its columns are {', '.join(raw) or 'none'}", file=file
             )
-        unit, values = found[name]
+        unit, values = raw[name]
         scale = _SCALE[name].get(unit or next(iter(_SCALE[name])))
         if scale is None:
             raise AncillaryError(
-                f"is in {unit!r}", file=file, field=name, remedy=f"use {', '.join(_SCALE[name])}"
+                f"has the unknown unit {unit!r}",
+                file=file,
+                field=name,
+                remedy=f"use {', '.join(_SCALE[name])}",
             )
         if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
             raise AncillaryError("is not a column of finite numbers", file=file, field=name)
         columns[name] = values * scale + (_ZERO_CELSIUS if unit == "degC" else 0.0)
-    return columns, frozenset(name for name in names if found[name][0])
+    return columns, frozenset(name for name in names if raw[name][0])
 
 
 def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
@@ -241,7 +244,7 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
     try:
         rows = list(csv.reader(io.StringIO("\n".join(lines)), skipinitialspace=True))
     except csv.Error as error:
-        raise AncillaryError(f"is no table: {error}", file=file) from error
+        raise AncillaryError(f"is not a CSV table: {error}", file=file) from error
     if len(rows) < 2:
         raise AncillaryError("holds no rows", file=file)
     head, *body = rows
@@ -259,7 +262,7 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
             try:
                 columns[title].append(float(cell))
             except ValueError:
-                # Columns that nobody asks for may hold anything.
+                # Columns that are not used may hold anything.
                 columns[title].append(np.nan)
     return {
         name.strip().lower(): (unit.rstrip("] ").strip(), np.array(columns[title]))
@@ -277,4 +280,4 @@ def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
                 if variable.dtype.kind in "iuf"
             }
     except (OSError, ValueError, RuntimeError, TypeError) as error:
-        raise AncillaryError("is not NetCDF that can be read", file=file) from error
+        raise AncillaryError("cannot be read as NetCDF", file=file) from error

@@ -1,7 +1,7 @@
-"""The campaign file: what a person writes, as validated models.
+"""The campaign file, a YAML file written by a person, as validated models.
 
-A campaign is one YAML file. Everything has a default that a lidar scientist would choose.
-Facts about an instrument carry validity periods, because an archive of ten years needs them.
+`load_campaign` reads it. Most settings have a default. Facts about an instrument have validity
+periods, because instruments change within an archive of years.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ _IDENTIFIERS = "letters, digits and hyphens that begin with a letter or a digit"
 
 
 class Station(SettingsModel):
-    """A place where instruments stand."""
+    """A site of instruments."""
 
     name: str
     latitude: float = Field(ge=-90, le=90, description="degrees north")
@@ -78,7 +78,7 @@ class Station(SettingsModel):
 
 
 class ChannelFacts(SettingsModel):
-    """What is known of one channel over a validity period."""
+    """Facts about one channel in a validity period."""
 
     wavelength: float | None = Field(
         default=None, gt=1e-7, lt=2e-5, description="m, where the header is wrong"
@@ -95,13 +95,13 @@ class ChannelFacts(SettingsModel):
     )
     lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = Field(
         default=None,
-        description="bins by which an analog record lies farther than the photon counting one"
-        " of the same light, besides range_offset; or 'estimate', for joined channels",
+        description="bins by which the analog record lags the photon-counting record of the same"
+        " detector, besides range_offset; or 'estimate', for glued channels",
     )
 
 
 class InstrumentFacts(SettingsModel):
-    """What is known of an instrument over a validity period."""
+    """Facts about an instrument in a validity period."""
 
     valid_from: Instant = datetime.min.replace(tzinfo=UTC)
     valid_to: Instant = datetime.max.replace(tzinfo=UTC)
@@ -125,7 +125,7 @@ class InstrumentFacts(SettingsModel):
 
 
 class Instrument(SettingsModel):
-    """A lidar, the files it wrote, what is known of it and what is wanted from it."""
+    """A lidar: its station, its files, the facts about it and its requested products."""
 
     station: Identifier
     name: str = ""
@@ -140,11 +140,11 @@ class Instrument(SettingsModel):
         periods = sorted((fact.valid_from, fact.valid_to) for fact in self.facts)
         for (_, stop), (start, _) in pairwise(periods):
             if start < stop:
-                raise ValueError(f"validity periods of facts overlap at {start:%Y-%m-%d}")
+                raise ValueError(f"the validity periods of facts overlap at {start:%Y-%m-%d}")
         return self
 
     def facts_at(self, moment: datetime) -> InstrumentFacts:
-        """Return the facts that are valid at `moment`, or empty ones."""
+        """Return the facts that are valid at `moment`, or empty facts."""
         for fact in self.facts:
             if fact.valid_from <= moment < fact.valid_to:
                 return fact
@@ -152,24 +152,24 @@ class Instrument(SettingsModel):
 
 
 class Network(SettingsModel):
-    """Instruments that look at the same air, and what is wanted from them together."""
+    """Instruments whose beams cross, and the product that is retrieved from them together."""
 
     name: str = ""
     instruments: list[Identifier] = Field(min_length=2)
     visibility: NetworkVisibilitySettings
 
     @model_validator(mode="after")
-    def _told_apart(self) -> Self:
+    def _distinct_instruments(self) -> Self:
         if len(set(self.instruments)) < len(self.instruments):
-            raise ValueError("an instrument stands twice in instruments")
-        strange = sorted(set(self.visibility.exponents) - set(self.instruments))
-        if strange:
-            raise ValueError(f"exponents of {', '.join(strange)}, not in instruments")
+            raise ValueError("instruments lists an instrument twice")
+        unknown = sorted(set(self.visibility.exponents) - set(self.instruments))
+        if unknown:
+            raise ValueError(f"exponents names {', '.join(unknown)}, not in instruments")
         return self
 
 
 class Metadata(SettingsModel):
-    """Who made the data: global attributes of every product (ACDD-1.3)."""
+    """Creator, publisher and terms of use: global attributes of every product (ACDD-1.3)."""
 
     institution: str = "unknown institution"
     project: str = "lidarops"
@@ -188,7 +188,7 @@ class Metadata(SettingsModel):
 
 
 class Scenes(SettingsModel):
-    """How granules are cut into scenes."""
+    """How granules are grouped into scenes."""
 
     window: Annotated[Literal["day"] | timedelta, BeforeValidator(as_interval)] = "day"
 
@@ -202,7 +202,7 @@ class Scenes(SettingsModel):
 
 
 class Campaign(SettingsModel):
-    """One campaign: stations, instruments, where the raw files are, which products."""
+    """One campaign: stations, instruments, networks, raw files and requested products."""
 
     name: Identifier
     title: str
@@ -217,15 +217,14 @@ class Campaign(SettingsModel):
     simulation: SimulationSettings | None = None
     catalog: str | None = Field(
         default=None,
-        description="SQLAlchemy URL of catalog and ledger; a file in the output folder else",
+        description="SQLAlchemy URL of catalog and ledger; by default a file in the output folder",
     )
     superseded: Literal["keep", "remove"] = Field(
-        default="remove", description="what becomes of products that a rerun replaces"
+        default="remove", description="whether products that a rerun replaces are kept or removed"
     )
     all_steps: bool = Field(
         default=False,
-        description="whether steps run too that by all signs give nothing, and every file is"
-        " read whole again",
+        description="run every step, even those without effect, and read files in full",
     )
     _folder: str = PrivateAttr(default=".")
 
@@ -235,8 +234,8 @@ class Campaign(SettingsModel):
             if instrument.station not in self.stations:
                 known = ", ".join(sorted(self.stations))
                 raise ValueError(
-                    f"instrument {key!r} stands at unknown station {instrument.station!r};"
-                    f" known: {known}"
+                    f"instrument {key!r} names unknown station {instrument.station!r};"
+                    f" known stations: {known}"
                 )
         return self
 
@@ -249,13 +248,14 @@ class Campaign(SettingsModel):
                 if member not in self.instruments:
                     known = ", ".join(sorted(self.instruments))
                     raise ValueError(
-                        f"network {key!r} names unknown instrument {member!r}; known: {known}"
+                        f"network {key!r} names unknown instrument {member!r};"
+                        f" known instruments: {known}"
                     )
         return self
 
     @property
     def folder(self) -> Path:
-        """Folder of the campaign file, which the paths of profiles start from."""
+        """Folder of the campaign file, to which paths of profiles are relative."""
         return Path(self._folder)
 
     @property
@@ -295,13 +295,13 @@ def load_campaign(
     path : path or str
         The YAML file.
     archive : path or str, optional
-        Root of the raw files; wins over the environment variable ``LIDAROPS_ARCHIVE``, which
-        wins over the file.
+        Root of the raw files. Overrides the environment variable ``LIDAROPS_ARCHIVE``, which
+        overrides the file.
     output : path or str, optional
-        Folder of catalog, products and reports; wins over the file.
+        Folder of catalog, products and reports. Overrides the file.
     catalog : str, optional
-        SQLAlchemy URL of catalog and ledger; wins over the environment variable
-        ``LIDAROPS_CATALOG``, which wins over the file.
+        SQLAlchemy URL of catalog and ledger. Overrides the environment variable
+        ``LIDAROPS_CATALOG``, which overrides the file.
 
     Returns
     -------
@@ -311,7 +311,7 @@ def load_campaign(
     Raises
     ------
     CampaignError
-        With file, line, key and the valid choices, where the file cannot be used.
+        If the file cannot be used, with file, line, key and valid choices.
     """
     path = Path(path)
     try:
@@ -325,37 +325,39 @@ def load_campaign(
         raw = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise CampaignError(f"is not valid YAML: {error}", file=path) from error
-    # A date that no calendar has, and nesting that no person writes.
+    # Impossible dates, and nesting that is too deep.
     except (ValueError, RecursionError) as error:
         raise CampaignError(
-            f"holds something that is not YAML: {error}",
+            f"holds a value that YAML cannot read: {error}",
             file=path,
-            remedy="look for a date such as 2024-02-30; quote what is no date",
+            remedy="look for an impossible date such as 2024-02-30, and quote texts like it",
         ) from error
-    if twice := duplicate_keys(tree):
-        raise CampaignError(_listed("is not a valid campaign:", twice), file=path)
+    if duplicates := duplicate_keys(tree):
+        raise CampaignError(_listed("is not a valid campaign:", duplicates), file=path)
     if not isinstance(raw, dict):
         raise CampaignError(
-            "is not a mapping", file=path, remedy="see catalogs/demo.yaml for an example"
+            "is not a mapping of keys to values",
+            file=path,
+            remedy="see catalogs/demo.yaml for an example",
         )
     try:
         campaign = Campaign.model_validate(raw)
     except ValidationError as error:
-        told = explain_yaml_error(error, tree, Campaign, {IDENTIFIER: _IDENTIFIERS})
-        raise CampaignError(_listed("is not a valid campaign:", told), file=path) from error
+        lines = explain_yaml_error(error, tree, Campaign, {IDENTIFIER: _IDENTIFIERS})
+        raise CampaignError(_listed("is not a valid campaign:", lines), file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):
         raise CampaignError(
-            "is a URL; catalog, products and reports are written to a folder",
+            "is a URL, but catalog, products and reports need a folder",
             file=path,
             field="output",
             remedy="give a folder, and copy the products from there",
         )
-    chosen = archive or os.environ.get(ARCHIVE_VARIABLE)
+    override = archive or os.environ.get(ARCHIVE_VARIABLE)
     loaded = campaign.model_copy(
         update={
-            "archive": _located(str(chosen), Path.cwd())
-            if chosen
+            "archive": _located(str(override), Path.cwd())
+            if override
             else _located(campaign.archive, base),
             "output": _located(str(output), Path.cwd())
             if output
@@ -367,8 +369,8 @@ def load_campaign(
     return loaded
 
 
-def _listed(problem: str, told: Sequence[str]) -> str:
-    return "\n  ".join([problem, *told])
+def _listed(problem: str, lines: Sequence[str]) -> str:
+    return "\n  ".join([problem, *lines])
 
 
 def _located(location: str, base: Path) -> str:
@@ -378,7 +380,7 @@ def _located(location: str, base: Path) -> str:
 
 
 def channel_facts(facts: InstrumentFacts, channel: str) -> ChannelFacts:
-    """Return what `facts` say of `channel`, or empty facts."""
+    """Return the facts about a channel, or empty facts."""
     return facts.channels.get(channel, ChannelFacts())
 
 

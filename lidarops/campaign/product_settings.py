@@ -1,4 +1,4 @@
-"""What a campaign file says of the products that are wanted, and the types of its values."""
+"""Settings of products in a campaign file, one model a kind, and the types of their values."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ def _utc(value: datetime) -> datetime:
 
 
 def _as_list(value: Any) -> Any:
-    """Return a single text as a list of it."""
+    """Return a single text as a list."""
     return [value] if isinstance(value, str) else value
 
 
 def _clean_pattern(value: str) -> str:
     if value.startswith(("/", "~")) or ".." in value.split("/"):
-        raise ValueError(f"{value!r} must stay inside its folder: relative, without '..'")
+        raise ValueError(f"{value!r} must be a relative path without '..'")
     return value
 
 
 def as_interval(value: Any) -> Any:
-    """Return texts such as 6h and 30min as intervals."""
-    # YAML reads 1:30 as 90 and 3600 as seconds; people write 6h or 30min.
+    """Return an interval for a text such as 6h or 30min; leave other values as they are."""
     if isinstance(value, str) and value != "day":
         units = {"s": 1, "min": 60, "h": 3600, "d": 86400}
         number = value.rstrip("abcdefghijklmnopqrstuvwxyz ")
@@ -42,7 +41,7 @@ def as_interval(value: Any) -> Any:
             try:
                 return timedelta(seconds=float(number) * units[unit])
             except OverflowError as error:
-                raise ValueError(f"{value!r} is too long") from error
+                raise ValueError(f"{value!r} is too long an interval") from error
     return value
 
 
@@ -51,14 +50,14 @@ Patterns = Annotated[
     list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(_as_list), Field()
 ]
 Inside = Annotated[str, AfterValidator(_clean_pattern)]
-"""Path relative to the campaign file, and below it."""
+"""Path below the folder of the campaign file, relative to it."""
 IDENTIFIER = r"^[A-Za-z0-9][A-Za-z0-9-]*$"
 Identifier = Annotated[str, Field(pattern=IDENTIFIER, max_length=40)]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class SettingsModel(BaseModel):
-    """Frozen, and refuses what it does not know."""
+    """Base of the models: frozen, and without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -78,7 +77,7 @@ class SignalSettings(SettingsModel):
 
     channels: list[str] | Literal["all"] = "all"
     background_range: tuple[Metres, Metres] | None = Field(
-        default=None, description="m; the last tenth of the bins where not given"
+        default=None, description="m; by default the last tenth of the bins"
     )
 
     @model_validator(mode="after")
@@ -89,7 +88,7 @@ class SignalSettings(SettingsModel):
 
 
 class VisibilitySettings(SettingsModel):
-    """How visibility follows from extinction."""
+    """Definition of visibility: contrast, and conversion of extinction to 550 nm."""
 
     contrast: Annotated[float, Field(gt=0, lt=1)] | Literal["paper"] = Field(
         default=0.05,
@@ -98,18 +97,18 @@ class VisibilitySettings(SettingsModel):
     )
     law: Literal["none", "angstrom", "kruse"] = Field(
         default="none",
-        description="how extinction is brought from the wavelength of the lidar to 550 nm; none"
-        " leaves it at the lidar's",
+        description="conversion of extinction from the wavelength of the lidar to 550 nm; none"
+        " keeps the wavelength of the lidar",
     )
     angstrom_exponent: float | None = Field(default=None, ge=-1, le=5)
     exponent_standard_error: float = Field(
-        default=0.0, ge=0, le=5, description="of the law's exponent of wavelength"
+        default=0.0, ge=0, le=5, description="standard error of the exponent of the law"
     )
 
     @model_validator(mode="after")
     def _has_its_exponent(self) -> Self:
         if (self.angstrom_exponent is not None) != (self.law == "angstrom"):
-            raise ValueError("angstrom_exponent goes with law: angstrom, which needs it")
+            raise ValueError("angstrom_exponent is required with law: angstrom, and only there")
         if self.law == "none" and self.exponent_standard_error:
             raise ValueError("exponent_standard_error needs a law: angstrom or kruse")
         return self
@@ -127,7 +126,7 @@ class HomogeneousSettings(SettingsModel):
     sections: list[tuple[Metres, Metres]] = Field(min_length=1, description="m")
     method: Literal["auto", "direct", "cubic"] = "auto"
     visibility: VisibilitySettings | None = Field(
-        default=None, description="adds visibility along the sections, where given"
+        default=None, description="if given, adds visibility along the sections"
     )
 
     @model_validator(mode="after")
@@ -139,7 +138,7 @@ class HomogeneousSettings(SettingsModel):
 
 
 class ReferenceSettings(SettingsModel):
-    """Where the air is taken as free of aerosol."""
+    """Limits of the reference window, and the scattering ratio there."""
 
     lowest: Metres = Field(default=3000.0, description="m above the station")
     highest: Metres = Field(default=12_000.0, description="m above the station")
@@ -152,7 +151,7 @@ class ReferenceSettings(SettingsModel):
     @model_validator(mode="after")
     def _holds_a_window(self) -> Self:
         if self.highest - self.lowest < self.width:
-            raise ValueError("highest must lie at least width above lowest")
+            raise ValueError("highest must be at least width above lowest")
         return self
 
 
@@ -161,7 +160,7 @@ class ElasticSettings(SettingsModel):
 
     channels: list[str] = Field(
         min_length=1,
-        description="glued_532o joins analog_532o and photon_532o, which the files must hold",
+        description="glued_532o is glued from analog_532o and photon_532o of the files",
     )
     lidar_ratio: Annotated[float, Field(ge=1, le=200)] = Field(default=50.0, description="sr")
     lidar_ratio_standard_error: float = Field(default=10.0, ge=0, le=100, description="sr")
@@ -182,27 +181,27 @@ class MultiAngleSettings(SettingsModel):
     method: Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"] = "auto"
     layers: list[tuple[float, float]] = Field(
         default=[],
-        description="m above the station: bottom and top of layers whose optical depth is wanted",
+        description="m above the station: bottom and top of layers whose optical depth is written",
     )
     largest_gradient: float = Field(
         default=5e-5,
         ge=0,
         le=1e-2,
-        description="m-1, of the logarithm of backscatter along the horizontal, to allow for",
+        description="m-1, largest horizontal gradient of ln(backscatter) included in the error",
     )
 
     @model_validator(mode="after")
     def _holds_altitudes(self) -> Self:
         if self.highest < 10 * self.step:
-            raise ValueError("highest must lie at least 10 steps up")
+            raise ValueError("highest must be at least 10 times step")
         for low, high in self.layers:
             if not 0 <= low <= high - self.step or high > self.highest:
-                raise ValueError("layers must rise by a step at least, within 0..highest")
+                raise ValueError("layers must be at least one step deep, between 0 and highest")
         return self
 
 
 class Products(SettingsModel):
-    """Which products of an instrument are wanted, with which settings."""
+    """The requested products of an instrument, with their settings."""
 
     signal: SignalSettings | None = None
     homogeneous: HomogeneousSettings | None = None
@@ -211,46 +210,47 @@ class Products(SettingsModel):
 
 
 class NetworkVisibilitySettings(SettingsModel):
-    """The ``visibility`` product: extinction and visibility where beams of lidars meet."""
+    """The ``visibility`` product: extinction and visibility where beams of lidars cross."""
 
-    channel: str = Field(description="of all instruments; glued_532o joins records")
+    channel: str = Field(description="channel of all instruments, such as photon_532o, glued_532o")
     average: PartOfDay = Field(
-        default=timedelta(minutes=10), description="over which signals are averaged"
+        default=timedelta(minutes=10), description="interval over which signals are averaged"
     )
     block: PartOfDay = Field(
-        default=timedelta(hours=6), description="of averages that share a mean field"
+        default=timedelta(hours=6), description="interval of averages that share one mean field"
     )
     method: Literal["network", "cycle", "multiplier", "unbiased", "slope", "klett"] = "network"
     prior: Literal["block", "none"] = "block"
     visibility: VisibilitySettings = VisibilitySettings()
     tolerance: float = Field(
-        default=15.0, gt=0, le=1000, description="m, within which beams that pass each other meet"
+        default=15.0, gt=0, le=1000, description="m, largest distance of beams at a crossing"
     )
     smallest_angle: float = Field(default=2.0, gt=0, lt=90, description="degree between beams")
     farthest: float | None = Field(
-        default=None, gt=0, description="m; the end of the bins where not given"
+        default=None, gt=0, description="m, largest range used; by default the last bin"
     )
     exponent: float = Field(
-        default=1.0, ge=0.1, le=10, description="m of backscatter ~ extinction^(1/m)"
+        default=1.0, ge=0.1, le=10, description="m in backscatter ~ extinction^(1/m)"
     )
     exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = Field(
-        default={}, description="of instruments whose exponent is another"
+        default={}, description="exponent of instruments that differ"
     )
     exponent_relative_error: float = Field(default=0.1, ge=0, le=0.5)
     lidar_ratio_relative_error: float = Field(
         default=0.02,
         ge=0,
         le=0.5,
-        description="of one point against the others, to allow for: mixtures and humidity",
+        description="relative error of the lidar ratio of a crossing against the others, from"
+        " aerosol mixtures and humidity",
     )
     overlap_relative_error: float = Field(
         default=0.003,
         ge=0,
         le=0.5,
-        description="of the overlap at the nearest point of a beam that is used, to allow for",
+        description="relative error of the overlap at the nearest crossing of a beam",
     )
     background_range: tuple[Metres, Metres] | None = Field(
-        default=None, description="m; the last tenth of the bins where not given"
+        default=None, description="m; by default the last tenth of the bins"
     )
 
     @model_validator(mode="after")
@@ -262,5 +262,5 @@ class NetworkVisibilitySettings(SettingsModel):
         return self
 
     def exponent_of(self, instrument: str) -> float:
-        """Return m along the beams of an instrument."""
+        """Return the exponent m of the beams of an instrument."""
         return self.exponents.get(instrument, self.exponent)

@@ -153,7 +153,7 @@ class Homogeneous(SimulationModel):
     @model_validator(mode="after")
     def _is_air(self) -> Self:
         if self.extinction.maximum > 1.0:
-            raise ValueError("extinction is in m-1: 1e-4 is 0.1 per km")
+            raise ValueError("extinction is in m-1: 1e-4 m-1 is 0.1 km-1")
         return self
 
 

@@ -200,7 +200,7 @@ class Acquisition(SimulationModel):
         if self.duration > self.interval:
             raise ValueError(
                 f"a file lasts {self.duration:g} s, longer than the interval of"
-                f" {self.interval:g} s: take fewer shots or a longer interval"
+                f" {self.interval:g} s: use fewer shots or a longer interval"
             )
         return self
 

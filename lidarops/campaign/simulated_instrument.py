@@ -70,7 +70,7 @@ class Background(SimulationModel):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.day < self.night:
-            raise ValueError("day must not be darker than night")
+            raise ValueError("day must be at least night")
         return self
 
 
@@ -80,7 +80,7 @@ class Optics(SimulationModel):
     energy: float = Field(gt=0, le=100, description="J, of one pulse")
     area: float = Field(gt=0, le=1000, description="m2, of the telescope")
     efficiency: float = Field(
-        gt=0, le=1, description="photoelectrons per photon that enters the telescope"
+        gt=0, le=1, description="photoelectrons per photon entering the telescope"
     )
 
     def signal_rate(self, wavelength: float) -> float:

@@ -89,7 +89,7 @@ class _Instrument(SimulationModel):
             raise ValueError(f"two detectors share wavelength and polarisation: {labels}")
         indices = [damage.index for damage in self.damage]
         if len(set(indices)) < len(indices):
-            raise ValueError("a file can be damaged in one way only: give each index once")
+            raise ValueError("damage lists an index twice: a file can be damaged in one way only")
         return self
 
     @model_validator(mode="after")
@@ -110,7 +110,7 @@ class _Instrument(SimulationModel):
             if recorder and max(shots) * 2**recorder.adc_bits > 2**31:
                 raise ValueError(
                     f"{max(shots)} shots of {recorder.adc_bits} bits do not fit into"
-                    " the 32 bits of a raw file: take fewer shots"
+                    " the 32 bits of a raw file: use fewer shots"
                 )
         return self
 
@@ -125,7 +125,7 @@ class _Instrument(SimulationModel):
         if self.pulse is not None and 149_896_229.0 * self.pulse.width > 0.1 * shortest:
             raise ValueError(
                 f"pulse.width of {self.pulse.width:g} s is {149_896_229.0 * self.pulse.width:.0f} m"
-                f" of range, more than a tenth of the {shortest:g} m that are recorded: give"
+                f" of range, more than a tenth of the recorded {shortest:g} m: give the width in"
                 " seconds (8e-9), or more bins"
             )
         return self
@@ -159,7 +159,7 @@ class HorizontalPath(_Instrument):
     @model_validator(mode="after")
     def _is_air(self) -> Self:
         if self.aerosol_extinction.maximum > 1.0:
-            raise ValueError("aerosol_extinction is in m-1: 1e-4 is 0.1 per km")
+            raise ValueError("aerosol_extinction is in m-1: 1e-4 m-1 is 0.1 km-1")
         return self
 
     @model_validator(mode="after")
@@ -265,8 +265,8 @@ class SimulationSettings(SimulationModel):
             for damage in instrument.damage:
                 if damage.index >= files:
                     raise ValueError(
-                        f"instruments.{key}: damage at index {damage.index}, but the files are"
-                        f" 0 to {files - 1}"
+                        f"instruments.{key}: damage at index {damage.index}, but the files have"
+                        f" indices 0 to {files - 1}"
                     )
         return self
 

@@ -14,7 +14,7 @@ def _utc(value: datetime) -> datetime:
 
 def _whole_seconds(value: datetime) -> datetime:
     if value.microsecond:
-        raise ValueError("must be a whole second: the headers of raw files hold no fractions")
+        raise ValueError("must be a whole second: headers of raw files hold no fractions")
     return value
 
 

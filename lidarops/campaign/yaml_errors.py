@@ -1,4 +1,4 @@
-"""What is wrong in a YAML file that a person wrote: where, and what would be right there."""
+"""Explain errors in a YAML file: the line, the key, and the valid choices."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from pydantic_core import ErrorDetails
 
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
-"""What pydantic puts behind a key of a mapping that is itself wrong."""
+"""Appended by pydantic to the location of an invalid key."""
 
 
 def duplicate_keys(tree: yaml.Node | None) -> list[str]:
-    """Name the keys that stand twice in a mapping: YAML's own reader takes the last one silently.
+    """Return messages on keys that a mapping holds twice; PyYAML silently keeps the last one.
 
     Parameters
     ----------
     tree : yaml.Node or None
-        As composed.
+        From `yaml.compose`.
 
     Returns
     -------
     list of str
-        A key and both its lines each, by line.
+        One message a key, with both lines; in order of lines.
     """
-    found: list[tuple[int, str]] = []
+    messages: list[tuple[int, str]] = []
     seen: set[int] = set()
-    # No recursion, as an anchor may hold itself.
-    due: list[tuple[str, yaml.Node]] = [] if tree is None else [("", tree)]
-    while due:
-        place, node = due.pop()
+    # No recursion, because an anchor may contain itself.
+    stack: list[tuple[str, yaml.Node]] = [] if tree is None else [("", tree)]
+    while stack:
+        place, node = stack.pop()
         if id(node) in seen:
             continue
         seen.add(id(node))
-        due += [(f"{place}{name}.", value) for name, _, value in _children(node)]
+        stack += [(f"{place}{name}.", value) for name, _, value in _children(node)]
         if not isinstance(node, yaml.MappingNode):
             continue
         lines: dict[str, int] = {}
@@ -46,39 +46,38 @@ def duplicate_keys(tree: yaml.Node | None) -> list[str]:
             if key.tag == _MERGE or not isinstance(key, yaml.ScalarNode):
                 continue
             if key.value in lines:
-                told = f"{place}{key.value}: stands twice, in lines {lines[key.value]} and {line}"
-                found.append((line, told))
+                message = f"{place}{key.value}: given twice, in lines {lines[key.value]} and {line}"
+                messages.append((line, message))
             lines[key.value] = line
-    return [told for _, told in sorted(found)]
+    return [message for _, message in sorted(messages)]
 
 
 def explain_yaml_error(
     error: ValidationError, tree: yaml.Node | None, model: type[BaseModel], words: Mapping[str, str]
 ) -> list[str]:
-    """Say of every mistake in what line it is, and what would be right there.
+    """Return one message for each error, with its line and the valid choices.
 
     Parameters
     ----------
     error : ValidationError
     tree : yaml.Node or None
-        Of the file.
+        Nodes of the file.
     model : type
-        What the file was validated as.
+        Model of the file.
     words : mapping of str to str
-        What texts of a pattern may be, by the pattern.
+        Pattern of a text -> description of the texts that match it.
 
     Returns
     -------
     list of str
-        A line each.
     """
     lines = []
     for problem in error.errors():
         keys = [str(key) for key in problem["loc"] if key != _KEY]
         line = _line_of(tree, keys)
         place = ".".join(keys) or "top level"
-        said = _message(problem, keys, model, words)
-        lines.append(f"{f'line {line}: ' if line else ''}{place}: {said}")
+        message = _message(problem, keys, model, words)
+        lines.append(f"{f'line {line}: ' if line else ''}{place}: {message}")
     return lines
 
 
@@ -93,18 +92,18 @@ def _message(
         if known:
             near = difflib.get_close_matches(keys[-1], known, n=3)
             others = [name for name in known if name not in near]
-            return f"is no key that is known here; known: {', '.join([*near, *others])}"
+            return f"unknown key; keys here are {', '.join([*near, *others])}"
     return problem["msg"]
 
 
 def _known_keys(model: type[BaseModel], keys: Sequence[str]) -> list[str]:
-    """Return the keys that a part of a file may have, by name."""
-    there: list[Any] = [model]
+    """Return the valid keys at a location of a file, sorted."""
+    candidates: list[Any] = [model]
     for key in keys:
-        below = [inner for kind in there for inner in _below(kind, key)]
-        # Where there is no such part, the key tells which of several kinds a part was taken for.
-        there = below or [kind for kind in there if _is_kind(kind, key)] or there
-    return sorted({name for kind in there for name in kind.model_fields if _is_model(kind)})
+        below = [inner for kind in candidates for inner in _below(kind, key)]
+        # A location key without a node names the member of a union that pydantic tried.
+        candidates = below or [kind for kind in candidates if _is_kind(kind, key)] or candidates
+    return sorted({name for kind in candidates for name in kind.model_fields if _is_model(kind)})
 
 
 def _below(kind: Any, key: str) -> list[Any]:
@@ -115,7 +114,7 @@ def _below(kind: Any, key: str) -> list[Any]:
     if origin is dict:
         return _models(held[1])
     if origin in (list, tuple) and key.isdecimal():
-        return [inner for each in held for inner in _models(each)]
+        return [inner for annotation in held for inner in _models(annotation)]
     return []
 
 
@@ -123,7 +122,7 @@ def _models(annotation: Any) -> list[Any]:
     """Return the models, lists and mappings that an annotation allows."""
     if _is_model(annotation) or get_origin(annotation) in (dict, list, tuple):
         return [annotation]
-    return [inner for each in get_args(annotation) for inner in _models(each)]
+    return [inner for argument in get_args(annotation) for inner in _models(argument)]
 
 
 def _is_model(kind: Any) -> bool:
@@ -141,7 +140,7 @@ def _is_kind(kind: Any, tag: str) -> bool:
 def _line_of(node: yaml.Node | None, keys: list[str]) -> int | None:
     line = None
     for key in keys:
-        # What a part was taken for stands among the keys, and not in the file.
+        # A key that names a member of a union is not in the file: keep the node.
         for name, mark, value in _children(node):
             if name == key:
                 line, node = mark.line + 1, value
@@ -150,7 +149,7 @@ def _line_of(node: yaml.Node | None, keys: list[str]) -> int | None:
 
 
 def _children(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Mark, yaml.Node]]:
-    """Give what a part holds: its key, where that stands, and what it is."""
+    """Yield key, position and value of the entries of a node."""
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             yield str(key.value), key.start_mark, value

@@ -1,1 +1,5 @@
-"""Product files: variables and attributes, building, writing (the only writer), reading."""
+"""NetCDF product files: describe variables, build, write and read.
+
+`variables` holds rows and layouts that all kinds share, `build` makes the encoded dataset, `write`
+is the only writer, `read` reads fast, and `provenance` records the origin of a product.
+"""

@@ -1,7 +1,7 @@
-"""Chunks of HDF5 datasets, shuffled and deflated here because the library's own deflate is slow.
+"""Shuffle and deflate chunks of HDF5 datasets, faster than the HDF5 library does.
 
-What comes out are the bytes that HDF5's filters `shuffle` and `deflate` would have to undo:
-any reader of NetCDF takes them for its own.
+The result is in the format of HDF5's filters `shuffle` and `deflate`, so any NetCDF reader can
+read it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 _LEVEL: Final = 2
-"""Of ISA-L, 0 to 3. The one below is hardly faster and larger; the one above is slow."""
+"""Compression level of ISA-L, 0 to 3. Level 1 is hardly faster and compresses less; 3 is slow."""
 
 Offset = tuple[int, ...]
 
@@ -30,11 +30,11 @@ def deflate_chunks(
     Parameters
     ----------
     values : ndarray, shape (n_0, ..., n_k)
-        In the byte order of the file; of any layout in memory.
+        In the byte order of the file, with any memory layout.
     chunk : tuple of int, length k + 1
         Elements of a chunk along each axis, each at least 1.
     fill_value : scalar
-        Fills what of a last chunk lies beyond the array, as HDF5 itself would.
+        Fills the part of a last chunk beyond the array, as HDF5 does.
 
     Yields
     ------
@@ -57,13 +57,13 @@ def _deflate(part: NDArray[Any]) -> bytes:
     compressor = isal_zlib.compressobj(_LEVEL)
     pieces: list[bytes] = []
     for plane in _planes(part):
-        # A plane has its own statistics, and nothing that is found again in another.
+        # Byte planes have different statistics and share no repeated strings.
         pieces += compressor.compress(plane), compressor.flush(isal_zlib.Z_FULL_FLUSH)
     return b"".join((*pieces, compressor.flush()))
 
 
 def inflate_chunk(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Undo what `deflate_chunks` did to a chunk.
+    """Return the values of a chunk that `deflate_chunks` compressed.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ def inflate_chunk(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> 
     """
     whole = np.empty(chunk, dtype)
     try:
-        # The size is that of its buffer at first, which grows.
+        # The initial size of the buffer, which grows if needed.
         data = isal_zlib.decompress(data, bufsize=max(whole.nbytes, 1))
-    # Its type declarations take the class of its error for an instance.
+    # The type stubs declare the error class as an instance.
     except isal_zlib.IsalError as error:  # type: ignore[misc]
         raise ValueError(f"a chunk cannot be inflated: {error}") from error
     if len(data) != whole.nbytes:
@@ -99,12 +99,12 @@ def inflate_chunk(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> 
 
 
 def _planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:
-    """Give the first byte of every element, then every second: the order of HDF5's `shuffle`.
+    """Yield the first bytes of all elements, then the second bytes: the order of HDF5's `shuffle`.
 
     Parameters
     ----------
     part : ndarray
-        Of elements of 1, 2, 4 or 8 bytes.
+        Elements have 1, 2, 4 or 8 bytes.
 
     Yields
     ------

@@ -1,7 +1,7 @@
-"""Arrays and context -> encoded CF dataset. No input, no output, no clock.
+"""Build the encoded CF dataset of a product from arrays and context, without any file or clock.
 
-Everything that a file will hold is settled here: order, types, fill values, attributes,
-extents. What the table of variables does not allow is refused.
+The result fixes everything in the file: order, types, fill values, attributes and extents. Data
+that do not match the layout of the kind are refused.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ _MANTISSA_BITS: Final = 23
 
 
 def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Dataset:
-    """Make the product of one scene, kind and channel.
+    """Return the encoded product of one scene, kind and channel.
 
     Parameters
     ----------
     data : xr.Dataset
-        In memory. Every variable of `layout`, with ``time`` and
-        ``time_bnds`` (datetime64, UTC), ``zenith_angle`` and optionally ``azimuth`` (degree;
-        scalar or over time); for ``signal`` also ``range`` (m, bin centres) and optionally
-        ``range_bnds``, for ``homogeneous`` ``section``, ``section_range`` and
-        ``section_bounds`` (m); for ``multiangle``, in place of the angles, ``altitude`` (m above
-        the geoid), ``beam``, ``beam_zenith_angle`` and optionally ``beam_azimuth`` (degree). An
-        attribute ``steps`` goes into the product. NaN is missing.
+        Every variable of `layout`, in memory, with ``time`` and ``time_bnds`` (datetime64, UTC),
+        ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over time). For ``signal``
+        also ``range`` (m, bin centres) and optionally ``range_bnds``; for ``homogeneous`` also
+        ``section``, ``section_range`` and ``section_bounds`` (m); for ``multiangle``, instead of
+        the angles, ``altitude`` (m above the geoid), ``beam``, ``beam_zenith_angle`` and optionally
+        ``beam_azimuth`` (degree). An attribute ``steps`` becomes ``lidarops_steps``. NaN is
+        missing.
     context : Context
-        What the product is of.
+        Kind, channel, station, instrument, campaign, scene and provenance of the product.
     layout : Layout
-        What the kind of product holds.
+        Layout of the kind of product.
 
     Returns
     -------
@@ -59,9 +59,9 @@ def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Data
     Raises
     ------
     ProductError
-        Where a variable is missing, unknown, lazy, or of wrong dimensions or type; where a
-        value lies out of its valid range, carries a bit that the kind does not have, or is
-        missing without a quality bit; where coordinates are not finite and rising.
+        If a variable is missing, unknown, lazy, or has wrong dimensions or type; if a value is out
+        of its valid range, carries a bit that the kind does not have, or is missing without a
+        quality bit; if coordinates are not finite or not rising.
     """
     _refuse_mismatch(context)
     source = CheckedInput(data, layout)
@@ -80,26 +80,27 @@ def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Data
 
 def _refuse_mismatch(context: Context) -> None:
     provenance = context.provenance
-    told = (provenance.kind, provenance.channel, provenance.scene)
-    if told != (context.kind, context.channel, context.scene):
+    recorded = (provenance.kind, provenance.channel, provenance.scene)
+    if recorded != (context.kind, context.channel, context.scene):
         raise ProductError(
-            f"is that of {' '.join(told)}, not of {context.kind} {context.channel} {context.scene}",
+            f"is that of {' '.join(recorded)}, not of"
+            f" {context.kind} {context.channel} {context.scene}",
             field="provenance",
         )
 
 
 def _steps(data: xr.Dataset) -> dict[str, str]:
-    """Return what the retrieval itself says that it did, where it does."""
+    """Return the attribute in which the retrieval states its steps; none where it states none."""
     return {"lidarops_steps": str(data.attrs["steps"])} if data.attrs.get("steps") else {}
 
 
 def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.Variable]:
     variables = {}
-    for found in coordinates:
-        row = found.row
-        variables[row.name] = xr.Variable(found.dims, found.values, attributes(row, mode=mode))
-        if row.bounds and found.bounds is not None:
-            variables[row.bounds] = xr.Variable((*found.dims, rows.BOUNDS_DIM), found.bounds)
+    for coordinate in coordinates:
+        row, dims = coordinate.row, coordinate.dims
+        variables[row.name] = xr.Variable(dims, coordinate.values, attributes(row, mode=mode))
+        if row.bounds and coordinate.bounds is not None:
+            variables[row.bounds] = xr.Variable((*dims, rows.BOUNDS_DIM), coordinate.bounds)
     return variables
 
 
@@ -114,14 +115,14 @@ def _measured(
         if row.optional and row.name not in source:
             continue
         stored = rows.summarize_flags(flags) if row.summary else _stored(source, row, judged, flags)
-        found_attributes = attributes(row, mode=mode, coordinates=_listed(row, coordinates))
-        variables[row.name] = xr.Variable(row.dims, stored, found_attributes)
-    _refuse_parts(layout, variables)
+        attrs = attributes(row, mode=mode, coordinates=_auxiliary_names(row, coordinates))
+        variables[row.name] = xr.Variable(row.dims, stored, attrs)
+    _refuse_without_ancillaries(layout, variables)
     return variables
 
 
-def _refuse_parts(layout: Layout, variables: dict[str, xr.Variable]) -> None:
-    """Refuse optional values without what they name: their errors, limits and judgements."""
+def _refuse_without_ancillaries(layout: Layout, variables: dict[str, xr.Variable]) -> None:
+    """Raise an error if a variable is present but one of its ancillary variables is not."""
     for row in layout.variables:
         missing = [name for name in row.ancillaries if name not in variables]
         if row.name in variables and missing:
@@ -134,35 +135,37 @@ def _stored(source: CheckedInput, row: Row, judged: Row, flags: Values) -> Value
     if row.dtype.startswith("i"):
         return whole_numbers(row, values)
     stored = _rounded(row, values)
-    # Bits judge what is retrieved; what an option derives may be missing where that stands.
+    # Bits refer to retrieved values; an optional derived value may be missing without a bit.
     if row.dims == judged.dims and not row.optional:
         check_flagged(row, stored, flags)
     stored[~np.isfinite(stored)] = rows.FILL_VALUE
     return stored
 
 
-def _listed(row: Row, coordinates: list[Coordinate]) -> tuple[str, ...]:
-    """Return the auxiliary coordinates of a variable."""
-    # CDO 2.1 cannot read a place that changes along a beam, nor a variable of three dimensions
-    # that names a place without one.
-    unread = tuple(place.name for place in rows.SOUNDED)
-    unread += ("latitude", "longitude") if len(row.dims) > 2 else ()
+def _auxiliary_names(row: Row, coordinates: list[Coordinate]) -> tuple[str, ...]:
+    """Return the names of the auxiliary coordinates of a variable."""
+    # CDO 2.1 cannot read a position that changes along a beam, nor a variable of three dimensions
+    # with a scalar position.
+    excluded = tuple(position.name for position in rows.SOUNDED)
+    excluded += ("latitude", "longitude") if len(row.dims) > 2 else ()
     return tuple(
-        found.row.name
-        for found in coordinates
-        if found.auxiliary and set(found.dims) <= set(row.dims) and found.row.name not in unread
+        coordinate.row.name
+        for coordinate in coordinates
+        if coordinate.auxiliary
+        and set(coordinate.dims) <= set(row.dims)
+        and coordinate.row.name not in excluded
     )
 
 
 def _rounded(row: Row, values: Values) -> Values:
-    # A value too large for the type becomes infinite, and is judged as a missing one.
+    # A value too large for the type becomes infinite, and counts as missing.
     with np.errstate(over="ignore"):
         stored = values.astype(row.dtype)
     return stored if row.significant_bits is None else bitround(stored, row.significant_bits)
 
 
 def bitround(values: Values, bits: int) -> Values:
-    """Round to fewer bits of the mantissa, half to even, so that the rest compresses away.
+    """Round to fewer bits of the mantissa, half to even, so that the values compress better.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a product is of, besides its numbers."""
+"""The context of a product: everything that its file states besides numbers; and its path."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a product is of: kind, channel, place, instrument, campaign, scene, provenance."""
+    """Kind, channel, station, instrument, campaign, scene and provenance of a product."""
 
     kind: ProductKind
     channel: str
@@ -50,14 +50,14 @@ def product_path(context: Context) -> str:
     str
         Relative to the product root, with forward slashes:
         ``station/instrument/kind/YYYY/station_instrument_kind_channel_YYYYMMDDTHHMMSS.nc``;
-        a scene of one of several range grids adds its key.
+        where a window holds several range grids, the key of the grid is added.
 
     Raises
     ------
     ProductError
-        If a name would lead out of its folder.
+        If a name cannot be part of a file name.
     """
-    # What the scene's name says beyond the instrument: its start, and its grid where there are two.
+    # The id of a scene without its instrument: start time, and key of the grid where there are two.
     when = context.scene.removeprefix(f"{context.instrument_key}_")
     parts = (context.station_key, context.instrument_key, context.kind.value, context.channel, when)
     for part in parts:

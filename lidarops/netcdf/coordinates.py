@@ -1,4 +1,4 @@
-"""Where and when: the coordinates of a product and what they cover."""
+"""Coordinates of a product in time and space, and their extents."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from lidarops.netcdf.sounded_air import beam_positions
 from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
 
 NEAR_VERTICAL: Final = 10.0
-"""degree. A beam within this angle of the vertical makes profiles in the sense of CF chapter 9."""
+"""degree. A beam within this angle of the vertical gives profiles in the sense of CF chapter 9."""
 
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 
 
 @dataclass(frozen=True, slots=True)
 class Coordinate:
-    """A coordinate as stored, with the limits of its cells where it has them."""
+    """A coordinate as stored, with its cell bounds if it has any."""
 
     row: Row
     dims: tuple[str, ...]
@@ -33,14 +33,14 @@ class Coordinate:
 
     @property
     def auxiliary(self) -> bool:
-        """Whether it must be listed in an attribute ``coordinates``."""
+        """Whether the attribute ``coordinates`` of variables must list it."""
         return self.dims != (self.row.name,)
 
 
 def locate_product(
     source: CheckedInput, layout: Layout, context: Context
 ) -> tuple[list[Coordinate], Extents]:
-    """Return the coordinates of a product in the order of its layout, and what they cover.
+    """Return the coordinates of a product in the order of its layout, and their extents.
 
     Parameters
     ----------
@@ -56,27 +56,27 @@ def locate_product(
     Raises
     ------
     ProductError
-        If a coordinate is missing, not finite, not rising, or out of its cell.
+        If a coordinate is missing, not finite, not rising, or outside its cell bounds.
     """
     time = _time(source, layout.row("time"))
     place = _PLACES.get(layout.sampled, _beam_place)
-    found, vertical = place(source, layout, context.station.altitude, time.values.size)
-    found["time"] = time
-    bins = {} if vertical.profiles else _air_positions(found, layout, context)
+    by_name, vertical = place(source, layout, context.station.altitude, time.values.size)
+    by_name["time"] = time
+    bins = {} if vertical.profiles else _air_positions(by_name, layout, context)
     for name, value in _fixed(context).items():
-        if name in found or not any(row.name == name for row in layout.coordinates):
+        if name in by_name or not any(row.name == name for row in layout.coordinates):
             continue
         row = layout.row(name)
         if f"bin_{name}" in bins:
             row = deployment(row)
         if np.isfinite(value):
-            found[name] = Coordinate(row, (), np.asarray(value, np.float64))
-    found |= bins
-    ordered = [found[row.name] for row in layout.coordinates if row.name in found]
+            by_name[name] = Coordinate(row, (), np.asarray(value, np.float64))
+    by_name |= bins
+    ordered = [by_name[row.name] for row in layout.coordinates if row.name in by_name]
     for coordinate in ordered:
         check_range(coordinate.row, coordinate.values)
     horizontal = [
-        bins[f"bin_{name}"].values if bins else found[name].values
+        bins[f"bin_{name}"].values if bins else by_name[name].values
         for name in ("latitude", "longitude")
     ]
     return ordered, _extents(source, vertical, horizontal)
@@ -84,14 +84,14 @@ def locate_product(
 
 @dataclass(frozen=True, slots=True)
 class _Vertical:
-    """What a product covers along the vertical."""
+    """Vertical coverage of a product."""
 
     altitude: Values
     """m, as stored."""
     exact: Values
-    """m, before it was rounded."""
+    """m, before rounding."""
     profiles: bool
-    """Whether the beam stands still and points up or down, as CF profiles do."""
+    """Whether the beam is fixed and near the vertical, as CF profiles require."""
 
 
 _Place = tuple[dict[str, Coordinate], _Vertical]
@@ -100,37 +100,37 @@ _Place = tuple[dict[str, Coordinate], _Vertical]
 def _beam_place(source: CheckedInput, layout: Layout, station: float, profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie along the beam."""
     names = _ALONG[layout.sampled]
-    found = {name: _along(source, layout.row(name)) for name in names}
+    by_name = {name: _along(source, layout.row(name)) for name in names}
     zenith = _beam(source, layout.row("zenith_angle"), profiles)
-    altitude, exact = _altitude(layout.row("altitude"), found[names[-1]], zenith, station)
-    found |= {"altitude": altitude, "zenith_angle": zenith}
+    altitude, exact = _altitude(layout.row("altitude"), by_name[names[-1]], zenith, station)
+    by_name |= {"altitude": altitude, "zenith_angle": zenith}
     if "azimuth" in source:
-        found["azimuth"] = _beam(source, layout.row("azimuth"), profiles)
+        by_name["azimuth"] = _beam(source, layout.row("azimuth"), profiles)
     tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
     vertical = zenith.dims == () and bool(tilt <= NEAR_VERTICAL)
-    return found, _Vertical(altitude.values, exact, vertical)
+    return by_name, _Vertical(altitude.values, exact, vertical)
 
 
 def _air_positions(
-    found: Mapping[str, Coordinate], layout: Layout, context: Context
+    by_name: Mapping[str, Coordinate], layout: Layout, context: Context
 ) -> dict[str, Coordinate]:
-    """Return latitude and longitude of what lies along a slanting beam of known azimuth."""
+    """Return latitude and longitude of the air along a fixed slant beam of known azimuth."""
     has_bins = any(row.name == "bin_latitude" for row in layout.coordinates)
-    if not has_bins or "azimuth" not in found:
+    if not has_bins or "azimuth" not in by_name:
         return {}
-    # Places that change over time too are what no tool reads: CDO takes garbage for them.
-    if found["zenith_angle"].dims or found["azimuth"].dims:
+    # No tool reads positions that also change over time: CDO reads garbage.
+    if by_name["zenith_angle"].dims or by_name["azimuth"].dims:
         return {}
     station = context.station
-    along = found[_ALONG[layout.sampled][-1]]
-    zenith, azimuth = (found[name].values for name in ("zenith_angle", "azimuth"))
+    along = by_name[_ALONG[layout.sampled][-1]]
+    zenith, azimuth = (by_name[name].values for name in ("zenith_angle", "azimuth"))
     angle = np.deg2rad(zenith)
     ahead, up = along.values * np.sin(angle), along.values * np.cos(angle)
-    places = beam_positions(
+    positions = beam_positions(
         station.latitude, station.longitude, station.altitude, ahead, azimuth, up
     )
     bins = {}
-    for name, values in zip(("bin_latitude", "bin_longitude"), places, strict=True):
+    for name, values in zip(("bin_latitude", "bin_longitude"), positions, strict=True):
         row = layout.row(name)
         stored = values.astype(row.dtype)
         bins[name] = Coordinate(row, row.dims, stored)
@@ -138,36 +138,36 @@ def _air_positions(
 
 
 def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles: int) -> _Place:
-    """Return the coordinates of a kind whose values lie at altitudes seen by several beams."""
+    """Return the coordinates of a kind whose values lie at altitudes of a scan."""
     names = ["beam", "beam_zenith_angle"]
     names += [name for name in ("beam_azimuth",) if name in source]
-    # Layers are an option; where one is used, its coordinate is none.
+    # Layers are optional, and so is their coordinate.
     names += ["layer_altitude"] if "layer_optical_depth" in source else []
-    found = {name: _along(source, layout.row(name)) for name in names}
+    by_name = {name: _along(source, layout.row(name)) for name in names}
     row = layout.row("altitude")
     values = _along(source, replace(row, bounds=None)).values
     if values[0] <= station:
         raise ProductError(
-            f"begins at {values[0]:g} m, the station lies at {station:g} m", field=row.name
+            f"begins at {values[0]:g} m, but the station is at {station:g} m", field=row.name
         )
     tops = np.append(station, values)
-    found["altitude"] = _celled(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
-    return found, _Vertical(values, values, profiles=False)
+    by_name["altitude"] = _with_bounds(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
+    return by_name, _Vertical(values, values, profiles=False)
 
 
 def _network_place(source: CheckedInput, layout: Layout, _station: float, _profiles: int) -> _Place:
-    """Return the coordinates of a kind whose values lie where beams of several lidars meet."""
+    """Return the coordinates of a kind whose values lie at crossings of beams."""
     angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
     beams = (f"beam_{name}" for name in angles)
     names = ("crossing_id", "latitude", "longitude", "altitude", "beam", *beams)
-    found = {name: _along(source, layout.row(name)) for name in names}
-    altitude = found["altitude"].values
-    # Points stand in no order of altitude: there is no step from one to the next.
-    return found, _Vertical(altitude, altitude[:, np.newaxis], profiles=False)
+    by_name = {name: _along(source, layout.row(name)) for name in names}
+    altitude = by_name["altitude"].values
+    # Crossings are not ordered by altitude, so there is no vertical step.
+    return by_name, _Vertical(altitude, altitude[:, np.newaxis], profiles=False)
 
 
 _PLACES: Final = {"altitude": _scan_place, "crossing": _network_place}
-"""By what a product is sampled over besides time; along a beam where it is none of these."""
+"""Dimension besides time -> function that returns the coordinates; else `_beam_place`."""
 
 
 def _fixed(context: Context) -> dict[str, float]:
@@ -176,7 +176,7 @@ def _fixed(context: Context) -> dict[str, float]:
         "latitude": station.latitude,
         "longitude": station.longitude,
         "station_altitude": station.altitude,
-        # Removes the last bits of metres times 1e9, so that 532 nm reads 532.
+        # Rounded, because metres times 1e9 is not exactly 532.
         "wavelength": round(context.wavelength * 1e9, 6),
     }
 
@@ -188,23 +188,23 @@ _ALONG: Final = {"range": ("range",), "section": ("section", "section_range")}
 def _time(source: CheckedInput, row: Row) -> Coordinate:
     moments, bounds = _moments(source)
     if np.isnat(moments).any() or np.isnat(bounds).any():
-        raise ProductError("holds times that are not set", field=row.name)
+        raise ProductError("holds missing times", field=row.name)
     if (np.diff(moments) <= np.timedelta64(0)).any():
         raise ProductError(
             "does not rise strictly",
             field=row.name,
             remedy="sort the profiles by time, and keep one of those at the same time",
         )
-    return _celled(row, _seconds(moments), _seconds(bounds))
+    return _with_bounds(row, _seconds(moments), _seconds(bounds))
 
 
 def _moments(source: CheckedInput) -> tuple[Values, Values]:
     values = []
     for name, dims in (("time", ("time",)), ("time_bnds", ("time", BOUNDS_DIM))):
-        taken = source.take(name, dims)
-        if taken.dtype.kind != "M":
-            raise ProductError(f"has data of type {taken.dtype}, not datetime64", field=name)
-        values.append(taken.astype("datetime64[ns]"))
+        times = source.take(name, dims)
+        if times.dtype.kind != "M":
+            raise ProductError(f"has data of type {times.dtype}, not datetime64", field=name)
+        values.append(times.astype("datetime64[ns]"))
     return values[0], values[1]
 
 
@@ -216,7 +216,7 @@ def _seconds(moments: Values) -> Values:
 def _along(source: CheckedInput, row: Row) -> Coordinate:
     values = source.take(row.name, row.dims)
     values = whole_numbers(row, values) if row.dtype.startswith("i") else _finite(row.name, values)
-    # The middles of sections may come in any order: sections overlap as the user likes.
+    # Sections may overlap, so their midpoints may come in any order.
     if row.dims == (row.name,) and (np.diff(values) <= 0).any():
         raise ProductError("does not rise strictly", field=row.name)
     if row.bounds is None:
@@ -226,9 +226,9 @@ def _along(source: CheckedInput, row: Row) -> Coordinate:
     elif row.dims == (row.name,):
         bounds = _midpoints(row, values)
     else:
-        # Sections overlap or leave gaps: nothing tells their ends.
+        # Sections may overlap or leave gaps: their ends do not follow from their midpoints.
         raise ProductError("is missing", field=row.bounds)
-    return _celled(row, values, bounds)
+    return _with_bounds(row, values, bounds)
 
 
 def _finite(name: str, values: Values) -> Values:
@@ -240,9 +240,9 @@ def _finite(name: str, values: Values) -> Values:
 def _midpoints(row: Row, values: Values) -> Values:
     if values.size < 2:
         raise ProductError(
-            "is missing, and cannot be derived of a single value",
+            "is missing, and cannot be derived from a single value",
             field=row.bounds,
-            remedy="give the limits of the cell",
+            remedy="give the cell bounds",
         )
     inner = (values[1:] + values[:-1]) / 2
     first, last = 2 * values[0] - inner[0], 2 * values[-1] - inner[-1]
@@ -250,16 +250,16 @@ def _midpoints(row: Row, values: Values) -> Values:
     return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 
-def _celled(row: Row, values: Values, bounds: Values) -> Coordinate:
+def _with_bounds(row: Row, values: Values, bounds: Values) -> Coordinate:
     if bounds.shape[-1] != 2:
-        raise ProductError(f"has {bounds.shape[-1]} limits of a cell, not 2", field=row.bounds)
+        raise ProductError(f"has {bounds.shape[-1]} bounds a cell, not 2", field=row.bounds)
     if ((bounds[..., 0] > values) | (values > bounds[..., 1])).any():
         raise ProductError(f"does not enclose {row.name}", field=row.bounds)
     return Coordinate(row, row.dims, values, bounds)
 
 
 def _beam(source: CheckedInput, row: Row, profiles: int) -> Coordinate:
-    """Return an angle of the beam: one number where it stands still, else over time."""
+    """Return an angle of the beam: one number for a fixed beam, else over time."""
     dims = ("time",) if row.name in source and source.dims(row.name) else ()
     values = _finite(row.name, source.take(row.name, dims))
     if dims and values.shape != (profiles,):
@@ -272,14 +272,14 @@ def _beam(source: CheckedInput, row: Row, profiles: int) -> Coordinate:
 def _altitude(
     row: Row, along: Coordinate, zenith: Coordinate, station: float
 ) -> tuple[Coordinate, Values]:
-    """Return the altitude as stored, and before it was rounded."""
+    """Return the altitude as stored, and before rounding."""
     rise = np.cos(np.deg2rad(zenith.values))[..., np.newaxis]
     exact = station + rise * along.values
     bounds = None
     if row.bounds and along.bounds is not None and not zenith.dims:
         bounds = (station + rise * along.bounds).astype(row.dtype)
     else:
-        # Limits of cells that change with time too would have to be polygons (CF, section 7.1).
+        # Cell bounds that also change with time would have to be polygons (CF, section 7.1).
         row = replace(row, bounds=None)
     return Coordinate(row, (*zenith.dims, *row.dims), exact.astype(row.dtype), bounds), exact
 

@@ -1,4 +1,4 @@
-"""Global attributes: what a product says of itself to catalogs and readers (`acdd13`)."""
+"""Global attributes of a product, after ACDD-1.3 (`acdd13`)."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from lidarops.records import DetectionMode, LeftOut, Step
 
 @dataclass(frozen=True, slots=True)
 class Extents:
-    """What a product covers, computed from its coordinates."""
+    """Extents of a product in time and space, computed from its coordinates."""
 
     start: datetime
     stop: datetime
     interval: float
     """s, between profiles."""
     latitudes: tuple[float, float]
-    """degree, least and greatest of the sounded air."""
+    """degree, smallest and largest of the sounded air."""
     longitudes: tuple[float, float]
     lowest: float
     """m above the geoid."""
     highest: float
     step: float | None
-    """m, vertical distance of neighbouring values; None where it is not one number."""
+    """m, vertical distance of neighbouring values; None where it is not constant."""
     vertical: bool
-    """Whether the beam stands still and points up or down, as CF profiles do."""
+    """Whether the beam is fixed and near the vertical, as CF profiles require."""
 
 
 def global_attributes(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
@@ -49,22 +49,22 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
     -------
     dict of str to str, float or numpy scalar
     """
-    made, why = product_date(extents.stop)
+    date, origin = product_date(extents.stop)
     profiles = "timeSeriesProfile" if extents.vertical else None
     feature_type = layout.feature_type or profiles
     feature = {"featureType": feature_type} if feature_type else {}
     return {
         "Conventions": CONVENTIONS,
         **feature,
-        **_description(context, layout, made, why),
+        **_description(context, layout, date, origin),
         **_people(context),
         **_place(context, layout, extents),
-        **_times(extents, made),
-        **_ours(context),
+        **_times(extents, date),
+        **_processing(context),
     }
 
 
-def _description(context: Context, layout: Layout, made: datetime, why: str) -> dict[str, Any]:
+def _description(context: Context, layout: Layout, date: datetime, origin: str) -> dict[str, Any]:
     metadata = context.metadata
     station = context.station.name
     wavelength = _wavelength(context)
@@ -72,7 +72,9 @@ def _description(context: Context, layout: Layout, made: datetime, why: str) -> 
         f"{layout.summary} Channel {context.channel} ({wavelength},"
         f" {_DETECTION[context.mode]}) of {context.instrument_name} at {station}."
     )
-    dates = f"Dates of creation and change are {why}, so that equal inputs give equal files."
+    dates = (
+        f"Dates of creation and modification are {origin}, so that equal inputs give equal files."
+    )
     references = (metadata.references, *layout.references)
     return {
         "title": f"{context.title}: {layout.title}, channel {context.channel}, {station}",
@@ -85,7 +87,7 @@ def _description(context: Context, layout: Layout, made: datetime, why: str) -> 
         f" {context.instrument_name}",
         "processing_level": layout.processing_level,
         "product_version": f"{__version__}+{context.provenance.code_version}",
-        "history": _history(context, layout, made),
+        "history": _history(context, layout, date),
         "references": "\n".join(text for text in references if text),
         "comment": _sentences(metadata.comment, layout.comment, dates),
         "acknowledgement": metadata.acknowledgement or "Not stated.",
@@ -104,11 +106,11 @@ def _sentences(*texts: str) -> str:
 def _wavelength(context: Context) -> str:
     if math.isfinite(context.wavelength):
         return f"{context.wavelength * 1e9:.6g} nm"
-    return "wavelength not known"
+    return "wavelength unknown"
 
 
-def _history(context: Context, layout: Layout, made: datetime) -> str:
-    """One line a step, as CF wants it: when, what, with which program."""
+def _history(context: Context, layout: Layout, date: datetime) -> str:
+    """Return one line for each step, as CF requires: date, step, program."""
     program = f"lidarops {__version__} ({context.provenance.code_version})"
     plan = context.provenance.plan
 
@@ -118,7 +120,7 @@ def _history(context: Context, layout: Layout, made: datetime) -> str:
     done = [f"{step.name}: {step.reason}" for step in plan.steps if concerns(step)]
     omitted = [f"left out {left.name}: {left.reason}" for left in plan.left_out if concerns(left)]
     lines = [*done, *omitted, f"wrote the {context.kind.value} product"]
-    return "\n".join(f"{_iso(made)} {' '.join(line.split())} [{program}]" for line in lines)
+    return "\n".join(f"{_iso(date)} {' '.join(line.split())} [{program}]" for line in lines)
 
 
 def _people(context: Context) -> dict[str, str]:
@@ -152,7 +154,7 @@ def _kind_of(name: str, institution: str) -> str:
 def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
     station = context.station
     (south, north), (west, east) = extents.latitudes, extents.longitudes
-    spread = "not applicable: one place"
+    spread = "not applicable: single position"
     if (south, west) != (north, east):
         spread = _SPREADS.get(layout.sampled, "along the beam")
     return {
@@ -182,11 +184,11 @@ def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]
     }
 
 
-_SPREADS = {"crossing": "irregular: where beams meet"}
+_SPREADS = {"crossing": "irregular: crossings of beams"}
 
 
 def _bounds(extents: Extents) -> str:
-    """Return the area of the sounded air as text: a point, or the rectangle around it."""
+    """Return the area of the sounded air as WKT: a point, or the bounding rectangle."""
     (south, north), (west, east) = extents.latitudes, extents.longitudes
     if (south, west) == (north, east):
         return f"POINT ({south!r} {west!r})"
@@ -194,18 +196,19 @@ def _bounds(extents: Extents) -> str:
     return f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
 
 
-def _times(extents: Extents, made: datetime) -> dict[str, str]:
+def _times(extents: Extents, date: datetime) -> dict[str, str]:
     dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
     return {
         "time_coverage_start": _iso(extents.start),
         "time_coverage_end": _iso(extents.stop),
         "time_coverage_duration": _duration((extents.stop - extents.start).total_seconds()),
         "time_coverage_resolution": _duration(extents.interval),
-        **dict.fromkeys(dates, _iso(made)),
+        **dict.fromkeys(dates, _iso(date)),
     }
 
 
-def _ours(context: Context) -> dict[str, Any]:
+def _processing(context: Context) -> dict[str, Any]:
+    """Return the attributes that lidarops itself reads."""
     provenance = context.provenance
     return {
         "lidarops_campaign": context.campaign,
@@ -228,7 +231,7 @@ def _iso(moment: datetime) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Write an ISO 8601 duration, such as ``P1DT2H30M0.5S``."""
+    """Return an ISO 8601 duration, such as ``P1DT2H30M0.5S``."""
     whole, milliseconds = divmod(round(seconds * 1000), 1000)
     minutes, second = divmod(whole, 60)
     hours, minute = divmod(minutes, 60)

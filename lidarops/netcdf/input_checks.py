@@ -1,4 +1,4 @@
-"""What the engine hands over, checked against the table of variables."""
+"""Check the data of a product against its layout."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Values = npt.NDArray[Any]
 
 
 class CheckedInput:
-    """A dataset whose variables are taken one by one, each as its row wants it.
+    """A dataset from which variables are taken one by one, each checked against its row.
 
     Parameters
     ----------
@@ -27,19 +27,19 @@ class CheckedInput:
     Raises
     ------
     ProductError
-        If the dataset holds a data variable that the layout does not know.
+        If the dataset holds a data variable that is not in the layout.
     """
 
     def __init__(self, data: xr.Dataset, layout: Layout) -> None:
         rows = (*layout.coordinates, *layout.variables)
-        # What is computed from the flags cannot be handed over, and so cannot contradict them.
+        # The summary is computed from the flags, so that it cannot contradict them.
         known = {row.name for row in rows if not row.summary} | {row.bounds for row in rows}
         for name in data.data_vars:
             if name not in known:
                 raise ProductError(
-                    "is no variable of this kind of product",
+                    "is not a variable of this kind of product",
                     field=str(name),
-                    remedy="add a row to lidarops/products/layouts.py, or drop the variable",
+                    remedy="add a row to lidarops/products/KIND/variables.py, or drop the variable",
                 )
         self._data = data
 
@@ -52,10 +52,10 @@ class CheckedInput:
         Raises
         ------
         ProductError
-            If the variable is missing, empty, lazy or no numbers, or has other dimensions.
+            If the variable is missing, empty, lazy, not numeric, or has other dimensions.
         """
         if name not in self:
-            raise ProductError("is missing", field=name, remedy=f"it has dimensions {dims}")
+            raise ProductError("is missing", field=name, remedy=f"its dimensions are {dims}")
         variable = self._data.variables[name]
         if variable.chunks is not None:
             raise ProductError(
@@ -81,13 +81,13 @@ def whole_numbers(row: Row, values: Values) -> Values:
     Raises
     ------
     ProductError
-        If a value is no whole number that the type can hold.
+        If a value is not a whole number that the type can hold.
     """
     stored = np.dtype(row.dtype)
     limits = np.iinfo(stored)
     if values.dtype.kind == "M":
         raise ProductError("holds times, not numbers", field=row.name)
-    # NaN compares false, so that it is refused too.
+    # NaN compares as false, so it is refused too.
     fits = (values >= limits.min) & (values <= limits.max)
     if not fits.all() or (values.dtype.kind == "f" and (values != np.rint(values)).any()):
         raise ProductError(f"holds values that are not whole numbers of {stored}", field=row.name)
@@ -95,12 +95,12 @@ def whole_numbers(row: Row, values: Values) -> Values:
 
 
 def check_range(row: Row, values: Values) -> None:
-    """Refuse values that readers would mask because they lie out of the valid range.
+    """Check that values lie in the valid range, outside of which readers would mask them.
 
     Raises
     ------
     ProductError
-        If there are any; missing values are none.
+        If any value lies outside; missing values do not count.
     """
     low = -np.inf if row.valid_min is None else row.valid_min
     high = np.inf if row.valid_max is None else row.valid_max
@@ -112,37 +112,38 @@ def check_range(row: Row, values: Values) -> None:
 
 
 def check_flags(row: Row, values: Values) -> None:
-    """Refuse quality bits that the kind of product does not have.
+    """Check that all quality bits belong to the kind of product.
 
     Raises
     ------
     ProductError
-        If there are any.
+        If any other bit is set.
     """
-    strange = int(np.bitwise_or.reduce(values & ~np.int32(row.flags or 0), axis=None))
-    if strange:
+    foreign = int(np.bitwise_or.reduce(values & ~np.int32(row.flags or 0), axis=None))
+    if foreign:
         known = int(sum(Quality))
-        names = [str(bit.name).lower() for bit in Quality if strange & bit]
-        names += [f"unknown bits {strange & ~known:#x}"] if strange & ~known else []
+        names = [str(bit.name).lower() for bit in Quality if foreign & bit]
+        names += [f"unknown bits {foreign & ~known:#x}"] if foreign & ~known else []
         raise ProductError(
             f"holds bits that this kind of product does not have: {', '.join(names)}",
             field=row.name,
-            remedy="add them to the kind in lidarops/products/layouts.py",
+            remedy="add them to the flags in lidarops/products/KIND/variables.py",
         )
 
 
 def check_flagged(row: Row, values: Values, flags: Values) -> None:
-    """Refuse missing values that carry no quality bit: each must say why it is missing.
+    """Check that every missing value carries a quality bit that states why.
 
     Raises
     ------
     ProductError
-        If there are any.
+        If a missing value carries no bit.
     """
-    silent = int(np.count_nonzero(~np.isfinite(values) & (flags == 0)))
-    if silent:
+    unflagged = int(np.count_nonzero(~np.isfinite(values) & (flags == 0)))
+    if unflagged:
         raise ProductError(
-            f"{silent} of {values.size} values are missing or not finite and carry no quality bit",
+            f"{unflagged} of {values.size} values are missing or not finite and carry no quality"
+            " bit",
             field=row.name,
             remedy="raise a bit in quality_flag where a value is missing",
         )

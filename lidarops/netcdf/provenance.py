@@ -1,4 +1,4 @@
-"""Where a product came from: W3C PROV-JSON, the version of the code, the date of a product."""
+"""Provenance of a product: W3C PROV-JSON, identifier, code version and date."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from lidarops.errors import NO_FILE, ProductError
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 RELEASE_DATE: Final = date(2026, 11, 21)
-"""Of this version of lidarops; a product is dated no earlier."""
+"""Release date of this version of lidarops; a product is dated no earlier."""
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
-"""First bytes of files of netCDF."""
+"""First bytes of NetCDF files."""
 
 _quoted: Final = json.JSONEncoder().encode
 
@@ -48,13 +48,13 @@ _NOT_COMPUTING: Final = (
     "site/",
     "system/",
 )
-"""Sources of lidarops that change no byte of a product. Whatever else there is may."""
+"""Sources of lidarops that cannot change a product. All others may."""
 
 
 def prov_json(provenance: Provenance) -> str:
-    """Write the provenance of a product as W3C PROV-JSON (`provo2013`).
+    """Return the provenance of a product as W3C PROV-JSON (`provo2013`).
 
-    Inputs with equal content are one entity, as content is what a product depends on.
+    Inputs with equal content are one entity, because a product depends on content only.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def prov_json(provenance: Provenance) -> str:
     Returns
     -------
     str
-        ASCII, keys sorted; equal for equal provenance, in whatever order the inputs come.
+        ASCII, with sorted keys; independent of the order of the inputs.
     """
     inputs = sorted(provenance.inputs, key=attrgetter("sha256", "path", "role"))
     entities = {
@@ -97,8 +97,8 @@ def prov_json(provenance: Provenance) -> str:
             }
         },
     }
-    told = {key: _canonical(value) for key, value in others.items()}
-    return _object({**told, "entity": _object(entities), "used": _object(uses)})
+    members = {key: _canonical(value) for key, value in others.items()}
+    return _object({**members, "entity": _object(entities), "used": _object(uses)})
 
 
 def _canonical(value: Any) -> str:
@@ -106,9 +106,9 @@ def _canonical(value: Any) -> str:
 
 
 def _object(members: Mapping[str, str]) -> str:
-    """Return a canonical JSON object of members that are JSON already.
+    """Return a canonical JSON object of members that are JSON texts already.
 
-    Of thousands of inputs `json` would take longer than a product takes to be written.
+    For thousands of inputs, `json` would take longer than writing the product.
     """
     return f"{{{','.join([f'{_quoted(key)}:{members[key]}' for key in sorted(members)])}}}"
 
@@ -134,7 +134,7 @@ def _plan(provenance: Provenance) -> dict[str, Any]:
     return {
         "prov:type": _type("prov:Plan"),
         "lidarops:sha256": plan.hash,
-        # The very text whose digest that is.
+        # The text of this digest.
         "lidarops:json": _canonical(plan.as_dict()),
         "lidarops:left_out": [
             f"{left.name} of {left.channel}: {left.reason}{_rule(left)}" for left in plan.left_out
@@ -187,8 +187,8 @@ def product_id(provenance: Provenance) -> str:
         "code_version": provenance.code_version,
     }
     inputs = sorted([f'["{record.role}","{record.sha256}"]' for record in provenance.inputs])
-    told = {key: _canonical(value) for key, value in content.items()}
-    text = _object({**told, "inputs": f"[{','.join(inputs)}]"})
+    members = {key: _canonical(value) for key, value in content.items()}
+    text = _object({**members, "inputs": f"[{','.join(inputs)}]"})
     return str(uuid5(NAMESPACE_URL, NAMESPACE + text))
 
 
@@ -231,7 +231,7 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
 
 
 def _is_netcdf(path: Path) -> bool:
-    """Return whether a file is NetCDF by its first bytes, or there and cannot be read."""
+    """Return whether a file is NetCDF by its first bytes, or exists but cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(4) in NETCDF_MAGIC
@@ -243,10 +243,10 @@ def _is_netcdf(path: Path) -> bool:
 
 @cache
 def code_version() -> str:
-    """Return a digest of the sources that compute, so that a changed figure makes nothing stale.
+    """Return a digest of the sources that can change a product.
 
-    Everything in the package counts but what is known to change no byte of a product, so that
-    a new module counts until someone says that it does not.
+    All modules count except those listed in `_NOT_COMPUTING`, so a new module counts by default.
+    A change of the others, such as figures, makes no product stale.
 
     Returns
     -------
@@ -259,7 +259,7 @@ def code_version() -> str:
 def _digest(root: Path) -> str:
     digest = hashlib.sha256()
     for name, source in _sources(root):
-        # A checkout with other line ends is the same code.
+        # Line endings depend on the checkout.
         content = source.read_bytes().replace(b"\r\n", b"\n")
         digest.update(f"{name}\0{len(content)}\0".encode() + content)
     return digest.hexdigest()[:16]
@@ -279,7 +279,7 @@ def package_versions() -> Mapping[str, str]:
 
 
 def product_date(end: datetime) -> tuple[datetime, str]:
-    """Return the date of a product, which must not depend on when or where it is made.
+    """Return the date of a product, which does not depend on when or where it is made.
 
     Parameters
     ----------
@@ -289,15 +289,15 @@ def product_date(end: datetime) -> tuple[datetime, str]:
     Returns
     -------
     datetime
-        Of the environment variable ``SOURCE_DATE_EPOCH`` if set, else the later of `end` and
-        the release date of the code.
+        The environment variable ``SOURCE_DATE_EPOCH`` if set, else the later of `end` and the
+        release date of the code.
     str
         Which of these it is, in words.
 
     Raises
     ------
     ProductError
-        If ``SOURCE_DATE_EPOCH`` is no number of seconds.
+        If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
     """
     epoch = os.environ.get(EPOCH_VARIABLE, "")
     if epoch:
@@ -305,7 +305,7 @@ def product_date(end: datetime) -> tuple[datetime, str]:
             return datetime.fromtimestamp(int(epoch), UTC), f"that of {EPOCH_VARIABLE}"
         except (ValueError, OverflowError, OSError) as error:
             raise ProductError(
-                f"is {epoch!r}",
+                f"is {epoch!r}, not a number of seconds",
                 field=EPOCH_VARIABLE,
                 remedy="set it to whole seconds since 1970-01-01, or unset it",
             ) from error

@@ -1,8 +1,7 @@
-"""Reads some variables of a product fast: a report reads thousands of products, a few of each.
+"""Read some variables of a product fast: a report reads a few variables of thousands of products.
 
-xarray reads these files too, and gives the same; but it looks at all that a file holds before it
-gives anything of it. Only what `lidarops.netcdf.write` writes is read faster, anything else in
-NetCDF-4 is read by HDF5 itself.
+xarray reads these files with the same result, but inspects the whole file first. Only files of
+`lidarops.netcdf.write` are read faster; other NetCDF-4 files are read through HDF5.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ _ATTRIBUTES: Final = (
     "_Encoding",
     "dtype",
 )
-"""What a variable's values mean. To look for others takes longer than to read the values."""
+"""Attributes needed to decode values. Reading all attributes takes longer than the values."""
 _NO_VARIABLE: Final = b"This is a netCDF dimension but not a netCDF variable"
 _OTHER_DIMENSION: Final = "_nc4_non_coord_"
-"""Stands before the name of a variable that has the name of a dimension that it does not have."""
+"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 _FILTERS: Final = [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
 
 
@@ -54,29 +53,28 @@ def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:
     path : path or str
         A product.
     names : iterable of str
-        Of variables. Those that the product does not have are left out, as not every product of
-        a kind has all of them: whoever needs one says so.
+        Names of variables. Those that the product does not have are left out.
 
     Returns
     -------
     xr.Dataset
-        To be closed, or used in a ``with``. Variables of 16 KiB and more are lazy, and only what
-        is asked of them is read. Without indexes, and of the attributes only those that tell what
-        values mean: their units. A variable that has the name of its dimension is a coordinate.
+        To be closed, or used in a ``with``. Variables of 16 KiB and more are lazy: only indexed
+        values are read. Without indexes, and of the attributes only units. A variable with the
+        name of its dimension is a coordinate.
 
     Raises
     ------
     ProductError
-        If there is no such file or it cannot be read, which may turn out while values are read.
+        If there is no such file or it cannot be read; possibly only when values are read.
     """
     with ExitStack() as until_closed:
         file = _File(Path(path))
         until_closed.callback(file.close)
         variables = file.variables(names)
         close = until_closed.pop_all().close
-    coordinates = {name: found for name, found in variables.items() if found.dims == (name,)}
+    coordinates = {name: var for name, var in variables.items() if var.dims == (name,)}
     dataset = xr.Dataset(
-        {name: found for name, found in variables.items() if name not in coordinates},
+        {name: var for name, var in variables.items() if name not in coordinates},
         coords=xr.Coordinates(coordinates, indexes={}),
     )
     dataset.set_close(close)
@@ -84,7 +82,7 @@ def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:
 
 
 def profiles_in(path: str | Path) -> int:
-    """Return the number of profiles of a product, without reading any value; 0 without a time.
+    """Return the number of profiles of a product without reading values; 0 without a time.
 
     Raises
     ------
@@ -99,7 +97,7 @@ def profiles_in(path: str | Path) -> int:
 
 
 class _File:
-    """An open file, whose every failure is told as that of a product."""
+    """An open file whose errors are raised as `ProductError`."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
@@ -115,10 +113,10 @@ class _File:
     @contextmanager
     def access(self) -> Iterator[None]:
         try:
-            # netCDF4 may use the same library, which lets nobody else in.
+            # netCDF4 may use the same HDF5 library, which is not thread-safe.
             with NETCDF4_PYTHON_LOCK:
                 yield
-        # What HDF5 raises depends on where it meets the damage.
+        # The type of HDF5's error depends on the place of the damage.
         except (OSError, RuntimeError, KeyError, ValueError) as error:
             raise self.damaged(error) from error
 
@@ -127,15 +125,15 @@ class _File:
 
     def length(self, dimension: str) -> int:
         with self.access():
-            found = self._file.get(dimension)
-            return int(found.shape[0]) if isinstance(found, h5py.Dataset) and found.shape else 0
+            item = self._file.get(dimension)
+            return int(item.shape[0]) if isinstance(item, h5py.Dataset) and item.shape else 0
 
     def variables(self, names: Iterable[str]) -> dict[str, xr.Variable]:
-        """Return those that are there, decoded."""
+        """Return the variables that the file holds, decoded."""
         with self.access():
-            there = set(self._file)
-            found = {name: self._stored(name, there) for name in names}
-        stored = {name: variable for name, variable in found.items() if variable is not None}
+            present = set(self._file)
+            candidates = {name: self._stored(name, present) for name in names}
+        stored = {name: variable for name, variable in candidates.items() if variable is not None}
         for variable in list(stored.values()):
             # Bounds of times have no units of their own.
             bounds = variable.attrs.pop("bounds", None)
@@ -143,22 +141,22 @@ class _File:
                 stored[bounds].attrs.setdefault("units", variable.attrs["units"])
         return {name: self._decoded(name, variable) for name, variable in stored.items()}
 
-    def _stored(self, name: str, there: Container[str]) -> xr.Variable | None:
+    def _stored(self, name: str, present: Container[str]) -> xr.Variable | None:
         foreign = f"{_OTHER_DIMENSION}{name}"
-        inside = foreign if foreign in there else name
-        if inside not in there:
+        inside = foreign if foreign in present else name
+        if inside not in present:
             return None
-        # To get it from the file takes four times as long.
-        found = h5py.Dataset(h5py.h5d.open(self._file.id, inside.encode()))
-        if _is_bare_dimension(found):
+        # Indexing the file object takes four times as long.
+        dataset = h5py.Dataset(h5py.h5d.open(self._file.id, inside.encode()))
+        if _is_bare_dimension(dataset):
             return None
-        dims, attributes = _dimensions(found, name), _attributes(found)
-        fill = _own_fill(found.dtype, attributes)
-        if found.size * found.dtype.itemsize < BULK_BYTES:
-            # Most are small and asked for again and again.
-            values = _unfilled(np.asarray(found[()]), fill)
+        dims, attributes = _dimensions(dataset, name), _attributes(dataset)
+        fill = _own_fill(dataset.dtype, attributes)
+        if dataset.size * dataset.dtype.itemsize < BULK_BYTES:
+            # Small variables are read at once: most are used several times.
+            values = _unfilled(np.asarray(dataset[()]), fill)
             return xr.Variable(dims, values, attributes, fastpath=True)
-        lazy = indexing.LazilyIndexedArray(_Stored(self, found, fill))
+        lazy = indexing.LazilyIndexedArray(_Stored(self, dataset, fill))
         return xr.Variable(dims, lazy, attributes, fastpath=True)
 
     def _decoded(self, name: str, stored: xr.Variable) -> xr.Variable:
@@ -174,7 +172,7 @@ class _File:
 
 
 class _Stored(BackendArray):
-    """The values of a variable, read where they are indexed; NaN where they are missing."""
+    """The values of a variable, read on indexing; NaN where they are missing."""
 
     def __init__(self, file: _File, dataset: h5py.Dataset, fill: np.floating[Any] | None) -> None:
         self._file = file
@@ -190,8 +188,8 @@ class _Stored(BackendArray):
         return np.asarray(values)
 
     def _read(self, key: tuple[Any, ...]) -> NDArray[Any]:
-        if self._deflated and all(isinstance(one, slice) for one in key):
-            spans = [range(size)[one] for size, one in zip(self.shape, key, strict=True)]
+        if self._deflated and all(isinstance(index, slice) for index in key):
+            spans = [range(size)[index] for size, index in zip(self.shape, key, strict=True)]
             if all(span.step == 1 for span in spans):
                 return _unfilled(self._inflate(spans), self._fill)
         with self._file.access():
@@ -199,7 +197,7 @@ class _Stored(BackendArray):
         return _unfilled(values, self._fill)
 
     def _inflate(self, spans: list[range]) -> NDArray[Any]:
-        """Read a block of whole chunks or parts of them, faster than HDF5's own filters do."""
+        """Read a block of values chunk by chunk, faster than HDF5's own filters do."""
         chunk = self._dataset.chunks
         values = np.empty([len(span) for span in spans], self.dtype)
         corners = (
@@ -213,7 +211,7 @@ class _Stored(BackendArray):
         return values
 
     def _part(self, corner: tuple[int, ...]) -> NDArray[Any]:
-        """Read a chunk; of one that HDF5 itself must read, what lies within the values."""
+        """Return a chunk; without its part beyond the array where HDF5 has to read it."""
         chunk = self._dataset.chunks
         with self._file.access():
             skipped, data = self._dataset.id.read_direct_chunk(corner)
@@ -228,13 +226,13 @@ class _Stored(BackendArray):
 
 
 def _shared(span: range, corner: int, step: int) -> tuple[slice, slice]:
-    """Return what a chunk and the values asked for have in common, in the latter and the former."""
+    """Return the overlap of requested values and a chunk, as slices into either."""
     first, last = max(span.start, corner), min(span.stop, corner + step)
     return slice(first - span.start, last - span.start), slice(first - corner, last - corner)
 
 
 def _is_deflated(dataset: h5py.Dataset) -> bool:
-    """Whether every chunk is there, shuffled and deflated, and nothing else was done to it."""
+    """Whether every chunk is stored, shuffled and deflated, without other filters."""
     if dataset.chunks is None:
         return False
     layout = dataset.id.get_create_plist()
@@ -245,7 +243,7 @@ def _is_deflated(dataset: h5py.Dataset) -> bool:
 
 
 def _own_fill(dtype: np.dtype[Any], attributes: dict[str, Any]) -> np.floating[Any] | None:
-    """Take out the fill value of a number that nothing else is said of, as in our products."""
+    """Remove and return the fill value of a float without other coding, as in our products."""
     fill = attributes.get("_FillValue")
     alone = attributes.keys() <= {"units", "_FillValue"} and not _has_time_units(attributes)
     if isinstance(fill, np.floating) and dtype == fill.dtype and dtype.isnative and alone:
@@ -261,7 +259,7 @@ def _unfilled(values: NDArray[Any], fill: np.floating[Any] | None) -> NDArray[An
 
 
 def _is_plain(stored: xr.Variable) -> bool:
-    """Whether a variable holds what is in the file: a number that nothing says how to take."""
+    """Whether the numbers in the file need no decoding."""
     coded = stored.attrs.keys() - {"units"} or _has_time_units(stored.attrs)
     return stored.dtype.kind in "iuf" and not coded
 
@@ -281,7 +279,7 @@ def _is_bare_dimension(dataset: h5py.Dataset) -> bool:
 
 
 def _dimensions(dataset: h5py.Dataset, name: str) -> tuple[str, ...]:
-    """Return the names of dimensions, which HDF5 holds as references to what lies along them."""
+    """Return the names of the dimensions, which HDF5 stores as references to scales."""
     if not dataset.shape:
         return ()
     if h5py.h5ds.is_scale(dataset.id):
@@ -294,16 +292,16 @@ def _dimensions(dataset: h5py.Dataset, name: str) -> tuple[str, ...]:
 
 
 def _attributes(dataset: h5py.Dataset) -> dict[str, Any]:
-    there = [name for name in _ATTRIBUTES if h5py.h5a.exists(dataset.id, name.encode())]
-    found = {name: _attribute(dataset, name) for name in there}
-    if _has_time_units(found) and "bounds" in dataset.attrs:
-        found["bounds"] = _attribute(dataset, "bounds")
-    return found
+    present = [name for name in _ATTRIBUTES if h5py.h5a.exists(dataset.id, name.encode())]
+    attributes = {name: _attribute(dataset, name) for name in present}
+    if _has_time_units(attributes) and "bounds" in dataset.attrs:
+        attributes["bounds"] = _attribute(dataset, "bounds")
+    return attributes
 
 
 def _attribute(dataset: h5py.Dataset, name: str) -> Any:
     value = dataset.attrs[name]
     if isinstance(value, bytes):
         return value.decode()
-    # What NetCDF holds as one number is an array of one in HDF5.
+    # NetCDF stores a single number as an HDF5 array of length one.
     return value[0] if isinstance(value, np.ndarray) and value.size == 1 else value

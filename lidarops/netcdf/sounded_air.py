@@ -1,4 +1,4 @@
-"""Where the air lies that a slanting beam sounds."""
+"""Geographic position of the air along a slant beam."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ def beam_positions(
     .. math:: x = x_0 + E (s \sin a,\; s \cos a,\; u)^T
 
     in Cartesian coordinates of the Earth, with the matrix E of the directions east, north and up
-    at the station, distance ahead s and up u of the point, and azimuth a; then back to geodetic
-    latitude by Bowring's formula, right to less than 1 mm here.
+    at the station, horizontal distance s and height u of the point, and azimuth a; then converted
+    to geodetic latitude by Bowring's formula, with an error below 1 mm.
 
     Parameters
     ----------
     latitude, longitude : float
-        Of the station, degree.
+        Position of the station, degree.
     altitude : float
-        Of the station, m; the geoid is taken as the ellipsoid.
+        Altitude of the station, m; the geoid is taken as the ellipsoid.
     ahead : ndarray
         Horizontal distance from the station, in its tangent plane, m.
     azimuth : ndarray
         degree, clockwise from north; broadcast against `ahead`.
     up : ndarray
-        Distance above the tangent plane of the station, m; broadcast too.
+        Distance above the tangent plane of the station, m; broadcast against `ahead`.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def beam_positions(
     lat, lon, direction = np.deg2rad(latitude), np.deg2rad(longitude), np.deg2rad(azimuth)
     east, north = ahead * np.sin(direction), ahead * np.cos(direction)
     curvature = EQUATOR / np.sqrt(1.0 - _ECCENTRICITY * np.sin(lat) ** 2)
-    # Seen from the meridian of the station, so that the longitude is a small difference.
+    # Relative to the meridian of the station, so that the longitude difference is small.
     outward = (curvature + altitude) * np.cos(lat) - north * np.sin(lat) + up * np.cos(lat)
     axis = (
         (curvature * (1.0 - _ECCENTRICITY) + altitude) * np.sin(lat)
@@ -59,9 +59,9 @@ def beam_positions(
     polar = EQUATOR * (1.0 - _FLATTENING)
     reduced = np.arctan2(axis * EQUATOR, across * polar)
     second = _ECCENTRICITY / (1.0 - _ECCENTRICITY)
-    found = np.arctan2(
+    geodetic = np.arctan2(
         axis + second * polar * np.sin(reduced) ** 3,
         across - _ECCENTRICITY * EQUATOR * np.cos(reduced) ** 3,
     )
     turned = np.rad2deg(lon + np.arctan2(east, outward))
-    return np.rad2deg(found), (turned + 180.0) % 360.0 - 180.0
+    return np.rad2deg(geodetic), (turned + 180.0) % 360.0 - 180.0

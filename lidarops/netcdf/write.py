@@ -1,4 +1,4 @@
-"""The only writer of NetCDF files: whole or not at all, and the same bytes every time."""
+"""The only writer of NetCDF files: writes atomically, with the same bytes for the same data."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from lidarops.netcdf._deflate import Offset, deflate_chunks
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
-"""A chunk is the whole variable, or as many whole rows of it as fit here."""
+"""Largest chunk: a chunk is the whole variable, or as many whole rows as fit."""
 
 BULK_BYTES: Final = 1 << 14
-"""From this size on, a variable is deflated by ISA-L: ten times faster, a little larger."""
+"""Smallest variable that ISA-L deflates: ten times faster, and a little larger in the file."""
 
 _TYPES: Final = {"S1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"}
 _Chunks = dict[str, list[tuple[Offset, bytes]]]
@@ -43,16 +43,16 @@ class Written:
 def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     """Write a product.
 
-    The file appears under its name when it is complete and on disk, or not at all; what stood
-    there before stays until then. Equal datasets give equal bytes with equal versions of netCDF4,
-    h5py and isal, on processors of one architecture. Safe in threads, which netCDF4 alone is not.
+    The file appears under its name when it is complete and on disk, or not at all; a former file
+    stays until then. Equal datasets give equal bytes with equal versions of netCDF4, h5py and isal
+    on one processor architecture. Thread-safe, unlike netCDF4.
 
     Parameters
     ----------
     dataset : xr.Dataset
         From `lidarops.netcdf.build.build_dataset`: encoded, in memory.
     path : path or str
-        The file; missing folders are made.
+        Path of the file; missing folders are created.
 
     Returns
     -------
@@ -67,14 +67,14 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
 
 
 def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
-    """Write any dataset as xarray would encode it, as safely and with the same bytes every time.
+    """Write any dataset as xarray would encode it, atomically and with reproducible bytes.
 
     Parameters
     ----------
     dataset : xr.Dataset
         In memory; may hold times and text.
     path : path or str
-        The file; missing folders are made.
+        Path of the file; missing folders are created.
 
     Returns
     -------
@@ -91,8 +91,8 @@ def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
         encoded, attributes = xr.conventions.cf_encoder(variables, attributes)
     except (TypeError, ValueError) as error:
         raise ProductError(f"cannot be encoded: {error}", file=path) from error
-    # As data variables: what xarray holds as coordinates it would encode a second time.
-    plain = {str(name): _as_chars(path, str(name), each) for name, each in encoded.items()}
+    # All as data variables: xarray would encode coordinates a second time.
+    plain = {str(name): _as_chars(path, str(name), var) for name, var in encoded.items()}
     return _write(xr.Dataset(plain, attrs=dict(attributes)), Path(path), "NETCDF4")
 
 
@@ -101,8 +101,8 @@ def _as_chars(path: str | Path, name: str, variable: xr.Variable) -> xr.Variable
     if values.dtype.kind not in "OU":
         return variable
     if not all(isinstance(value, str) for value in values.flat):
-        raise ProductError("holds objects that are no text", file=path, field=name)
-    # Text of variable length lies on HDF5's heap, where no order of bytes is promised.
+        raise ProductError("holds objects that are not text", file=path, field=name)
+    # Text of variable length lies on HDF5's heap, whose byte order is not reproducible.
     packed = np.char.encode(values.astype(str), "utf-8")
     length = max(packed.dtype.itemsize, 1)
     chars = np.ascontiguousarray(packed.astype(f"S{length}"))
@@ -162,7 +162,7 @@ def _write(dataset: xr.Dataset, path: Path, model: _Format) -> Written:
 
 def _is_bulk(dataset: xr.Dataset, name: str) -> bool:
     variable = dataset.variables[name]
-    # netCDF gives other names to HDF5 where these are not ASCII, or those of foreign dimensions.
+    # netCDF renames variables in HDF5 whose names are not ASCII, or are those of other dimensions.
     same_name = name.isascii() and (name not in dataset.sizes or variable.dims[:1] == (name,))
     return variable.nbytes >= BULK_BYTES and same_name
 
@@ -175,11 +175,11 @@ def _deflated(variable: xr.Variable) -> list[tuple[Offset, bytes]]:
 
 
 def _filled(image: bytes, dataset: xr.Dataset, chunks: _Chunks) -> bytes:
-    """Put the chunks into the image of a file that has their variables, but not their data."""
+    """Return the image of a file with the chunks of its still empty variables filled in."""
     with NETCDF4_PYTHON_LOCK, h5py.File.in_memory(image, block_size=CHUNK_BYTES) as file:
         for name, parts in chunks.items():
             target = file[name]
-            # Along the unlimited dimension it has no length yet.
+            # The unlimited dimension has no length yet.
             target.resize(dataset.variables[name].shape)
             for offset, data in parts:
                 target.id.write_direct_chunk(offset, data)
@@ -203,7 +203,7 @@ def _refuse_unstorable(dataset: xr.Dataset, path: Path) -> None:
 
 @contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary file that takes the place of `path` at the end, and is gone on failure."""
+    """Yield a temporary file that replaces `path` at the end, and is removed on failure."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +215,7 @@ def _replacing(path: Path) -> Iterator[Path]:
         raise ProductError(
             f"cannot be written: {error}",
             file=path,
-            remedy="see that the folder can be written and the disk has space, then run again",
+            remedy="check that the folder is writable and the disk has space, then run again",
         ) from error
     finally:
         with suppress(OSError):
@@ -240,22 +240,22 @@ def _settle(path: Path) -> Written:
 class _DefinedAtOnce(netCDF4.Dataset):
     """A file whose dimensions, variables and attributes are written together.
 
-    In the classic model netCDF4 would write all that it has of them anew after each one, which
-    takes as long as all the rest of a small product.
+    In the classic model, netCDF4 rewrites all definitions after each new one, which takes as long
+    as the rest of a small product.
     """
 
     def _enddef(self) -> None:
-        """Stay where things are defined: netCDF4 calls this after each of them."""
+        """Stay in define mode; netCDF4 calls this after each definition."""
 
     def end_definitions(self) -> None:
-        """Write what is defined; from now on there may be data."""
+        """Write the definitions, and leave define mode."""
         super()._enddef()  # type: ignore[misc]  # not in its stubs
 
 
 def _store(dataset: xr.Dataset, path: Path, model: _Format, *, without: Container[str]) -> None:
-    """Write all but the data of the variables named in `without`."""
+    """Write everything except the data of the variables in `without`."""
     unlimited = dataset.encoding.get("unlimited_dims", ())
-    # HDF5 may crash when it cannot write to a full disk; so it keeps the file until the end.
+    # In memory until the end, because HDF5 may crash on a full disk.
     with _DefinedAtOnce(
         path, "w", format=model, clobber=False, diskless=True, persist=True
     ) as file:

@@ -35,7 +35,7 @@ def _campaign(repository: Path, archive: Path, out: Path) -> Campaign:
 def demo(
     repository: Path, demo_archive: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Campaign, RunRecord]]:
-    """One serial run over it."""
+    """Campaign and record of one serial run over the demo archive."""
     campaign = _campaign(repository, demo_archive, tmp_path_factory.mktemp("serial"))
     return campaign, reprocess(campaign)
 
@@ -70,7 +70,7 @@ def test_extinction_agrees_with_the_truth(demo: tuple[Campaign, RunRecord]) -> N
     ].values
     assert good.mean() > 0.5
     assert (np.abs(score[good]) < 3).mean() >= 0.99
-    # Neither too small an error nor too large a one.
+    # The stated error is neither too small nor too large.
     assert 0.8 < score[good].std() < 1.2
 
 
@@ -86,11 +86,11 @@ def test_a_vertical_path_is_left_out_of_homogeneous_retrievals(
         omitted = (*scene.plan.left_out, *scene.left_out)
         (left,) = (left for left in omitted if left.rule == "section_level")
         assert left.channel == "analog_532o"
-        assert "climbs by 3750 m" in left.reason
+        assert "climbs 3750 m" in left.reason
         assert left.number == pytest.approx(3750.0)
 
 
-def test_a_vertical_path_that_is_retrieved_all_the_same_is_said_not_to_be_homogeneous(
+def test_a_vertical_path_that_is_retrieved_nevertheless_is_flagged(
     repository: Path, demo_archive: Path, tmp_path: Path
 ) -> None:
     campaign = _campaign(repository, demo_archive, tmp_path).model_copy(update={"all_steps": True})
@@ -147,7 +147,7 @@ def test_products_do_not_depend_on_workers_and_chunks(
     assert _hashes(again) == _hashes(demo[1])
 
 
-def test_the_command_line_reprocesses_and_tells(
+def test_the_command_line_reprocesses_and_reports(
     repository: Path, demo_archive: Path, tmp_path: Path, demo: tuple[Campaign, RunRecord]
 ) -> None:
     runner = CliRunner()
@@ -200,7 +200,7 @@ def test_the_command_line_reprocesses_and_tells(
         (["bench", "luck", "file"], 2, "throughput"),
     ],
 )
-def test_wrong_use_is_told(
+def test_wrong_use_is_reported(
     repository: Path, tmp_path: Path, arguments: list[str], code: int, said: str
 ) -> None:
     campaign = str(repository / "catalogs/demo.yaml")
@@ -234,17 +234,17 @@ def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:
     assert "times floor" in result.stdout
 
 
-def test_a_profile_without_shots_is_flagged_and_the_rest_stands(tmp_path: Path) -> None:
+def test_a_profile_without_shots_is_flagged_and_others_are_not(tmp_path: Path) -> None:
     for k in range(4):
         data = raw_archives.content(k, bins=1000)
         if k == 2:
             data = data.replace(b" 000600 ", b" 000000 ")
         raw_archives.write(tmp_path / "raw" / "coast" / f"h{k}", data)
-    wanted = {
+    products = {
         "signal": {},
         "homogeneous": {"channels": ["photon_532o", "analog_532o"], "sections": [[750, 4500]]},
     }
-    campaign = factories.campaign(products=wanted).model_copy(
+    campaign = factories.campaign(products=products).model_copy(
         update={
             "archive": str(tmp_path / "raw"),
             "output": str(tmp_path / "out"),
@@ -280,7 +280,7 @@ def test_a_file_that_changes_after_cataloguing_is_refused(tmp_path: Path) -> Non
     assert record.scenes[0].products[0].values == 1
 
 
-def test_a_disk_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_disk_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     raw_archives.write(tmp_path / "raw" / "coast" / "h0", raw_archives.content(0, bins=1000))
     campaign = factories.campaign().model_copy(
         update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}

@@ -1,4 +1,4 @@
-"""What plans leave out: every rule by name, and that nothing good is lost by it."""
+"""Steps that plans leave out: every rule by name, and no good value lost."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def planned(*granules: Any, all_steps: bool = False, **changes: Any) -> Plan:
 
 
 def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
-    """Return the steps that a rule asks for, and what it leaves out."""
+    """Return the steps that a rule runs, and the reasons of those that it leaves out."""
     steps = [step.name for step in made.steps if step.rule == rule]
     return steps, [left.reason for left in made.left_out if left.rule == rule]
 
@@ -56,11 +56,11 @@ def test_rules_have_names_and_questions():
     assert {CHANNEL, RANGE_WINDOW, *PRODUCTS} <= set(RULES)
 
 
-def told(**facts: Any) -> dict[str, Any]:
+def with_facts(**facts: Any) -> dict[str, Any]:
     return {"facts": [facts]}
 
 
-def wanted(**products: Any) -> dict[str, Any]:
+def with_products(**products: Any) -> dict[str, Any]:
     return {"products": products}
 
 
@@ -68,17 +68,17 @@ LEVEL = factories.granule(0)
 UP = factories.granule(0, zenith_angle=0.0)
 DARK = factories.granule(-30, path="dark/d", role=Role.DARK)
 SCAN = [factories.granule(k, zenith_angle=15.0 * k) for k in range(6)]
-ANALOG = wanted(signal={"channels": ["analog_532o"]})
-ELASTIC = wanted(elastic={"channels": ["photon_532o"]})
-TAIL = wanted(elastic={"channels": ["photon_532o"], "background": "tail_mean"})
-GLUED = wanted(elastic={"channels": ["glued_532o"]})
-LATE = {**GLUED, **told(channels={"analog_532o": {"lag": 3}})}
-MULTI = wanted(multiangle={"channels": ["photon_532o"]})
-CALM = wanted(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
-FEW = wanted(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
-OF_ANALOG = wanted(homogeneous={**SECTIONS, "channels": ["analog_532o"]})
-OFFSET = told(channels={"photon_532o": {"range_offset": 5}})
-SEEN = wanted(homogeneous={**SECTIONS, "visibility": {}})
+ANALOG = with_products(signal={"channels": ["analog_532o"]})
+ELASTIC = with_products(elastic={"channels": ["photon_532o"]})
+TAIL = with_products(elastic={"channels": ["photon_532o"], "background": "tail_mean"})
+GLUED = with_products(elastic={"channels": ["glued_532o"]})
+LATE = {**GLUED, **with_facts(channels={"analog_532o": {"lag": 3}})}
+MULTI = with_products(multiangle={"channels": ["photon_532o"]})
+CALM = with_products(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
+FEW = with_products(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
+OF_ANALOG = with_products(homogeneous={**SECTIONS, "channels": ["analog_532o"]})
+OFFSET = with_facts(channels={"photon_532o": {"range_offset": 5}})
+SEEN = with_products(homogeneous={**SECTIONS, "visibility": {}})
 
 
 def scans(*beams: tuple[float, float | None]) -> list[Any]:
@@ -90,24 +90,24 @@ def scans(*beams: tuple[float, float | None]) -> list[Any]:
 
 
 def multi(**settings: Any) -> dict[str, Any]:
-    return wanted(multiangle={"channels": ["photon_532o"], **settings})
+    return with_products(multiangle={"channels": ["photon_532o"], **settings})
 
 
 ONE_SIDE = scans(*((15.0 * k, 90.0) for k in range(6)))
 BOTH_SIDES = scans(*((15.0 * k, side) for k in range(6) for side in (90.0, 270.0)))
 TWO_BEAMS = scans((0.0, 90.0), (60.0, 90.0))
-BEYOND = wanted(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 16_000]]})
+BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 16_000]]})
 
 
 @pytest.mark.parametrize(
     ("rule", "needing", "needless"),
     [
-        ("channel", ([LEVEL], {}), ([LEVEL], wanted(signal={"channels": []}))),
+        ("channel", ([LEVEL], {}), ([LEVEL], with_products(signal={"channels": []}))),
         ("range_window", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
-        ("overlap", ([LEVEL], {}), ([LEVEL], told())),
+        ("overlap", ([LEVEL], {}), ([LEVEL], with_facts())),
         ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
         ("dark", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
-        ("dead_time", ([LEVEL], {}), ([LEVEL], told())),
+        ("dead_time", ([LEVEL], {}), ([LEVEL], with_facts())),
         ("lag", ([UP], LATE), ([UP], GLUED)),
         ("signal", ([LEVEL], ANALOG), ([LEVEL], FEW)),
         ("homogeneous", ([LEVEL], {}), ([LEVEL], ANALOG)),
@@ -141,9 +141,9 @@ def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless
 
 
 @pytest.mark.parametrize(
-    ("rule", "asked", "unasked"),
+    ("rule", "needing", "needless"),
     [
-        ("noise", ([LEVEL], {}), ([LEVEL], wanted())),
+        ("noise", ([LEVEL], {}), ([LEVEL], with_products())),
         ("glue", ([UP], GLUED), ([UP], ELASTIC)),
         ("background", ([LEVEL], ANALOG), ([LEVEL], {})),
         ("average", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
@@ -152,20 +152,20 @@ def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless
         ("look", ([LEVEL], {}), ([UP], {})),
     ],
 )
-def test_a_question_that_does_not_arise_is_not_answered(rule, asked, unasked):
-    assert decided(planned(*asked[0], **asked[1]), rule)[0]
-    assert decided(planned(*unasked[0], **unasked[1]), rule) == ([], [])
+def test_a_rule_whose_question_does_not_arise_decides_nothing(rule, needing, needless):
+    assert decided(planned(*needing[0], **needing[1]), rule)[0]
+    assert decided(planned(*needless[0], **needless[1]), rule) == ([], [])
 
 
 @pytest.mark.parametrize(
     ("rule", "changes"),
     [
         ("section_inside", BEYOND),
-        ("channel_present", wanted(signal={"channels": ["photon_999x"]})),
-        ("facts_fit", told(channels={"photon_999x": {}})),
+        ("channel_present", with_products(signal={"channels": ["photon_999x"]})),
+        ("facts_fit", with_facts(channels={"photon_999x": {}})),
     ],
 )
-def test_what_cannot_be_is_left_out_by_name(rule, changes):
+def test_impossible_requests_are_left_out_by_name(rule, changes):
     assert decided(planned(LEVEL, **changes), rule)[1]
     assert decided(planned(LEVEL), rule) == ([], [])
 
@@ -201,14 +201,14 @@ FLAT = scans((0.0, 90.0), (30.0, 90.0), (60.0, 90.0), (88.0, 270.0))
 )
 def test_the_beams_of_a_plan_are_those_of_the_retrieval(granules, count):
     made = planned(*granules, **MULTI)
-    told = {each.rule: each for each in (*made.steps, *made.left_out)}
+    decisions = {each.rule: each for each in (*made.steps, *made.left_out)}
     found, surrounded = retrieved(granules, highest=6000.0, step=60.0)
-    assert found == told["robust"].number == count
-    assert surrounded == (told["gradient_regressor"] in made.steps)
+    assert found == decisions["robust"].number == count
+    assert surrounded == (decisions["gradient_regressor"] in made.steps)
 
 
 def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int, bool]:
-    """Return how many beams the retrieval uses, and whether it can find a gradient."""
+    """Return the number of beams of the retrieval, and whether it can estimate a gradient."""
     times = np.datetime64("2026-03-01", "ns") + np.arange(len(granules)) * np.timedelta64(60, "s")
     distance = 7.5 * (np.arange(4000) + 0.5)
     power = np.tile(1e6 / distance**2, (len(granules), 1))
@@ -240,11 +240,11 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
     ).sides
 
 
-def test_angles_that_cannot_be_leave_the_plan_to_the_retrieval():
+def test_invalid_angles_are_left_to_the_retrieval():
     made = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
     assert decided(made, "robust") == (
         [],
-        ["fewer than 4 directions do not tell which of them is an outlier"],
+        ["fewer than 4 beam directions cannot identify an outlier"],
     )
 
 
@@ -257,11 +257,11 @@ def test_every_decision_has_a_rule_of_the_table():
         assert {each.rule for each in (*made.steps, *made.left_out)} <= names
 
 
-def test_every_row_is_asked_for_here():
-    """No row of the table without a test that names it."""
-    here = Path(__file__)
-    told = here.read_text() + (here.parents[1] / "plan/test_network_plan.py").read_text()
-    missing = {rule.name for rule in RULES if f'"{rule.name}"' not in told}
+def test_every_rule_is_tested():
+    """A test names every rule of the table."""
+    path = Path(__file__)
+    text = path.read_text() + (path.parents[1] / "plan/test_network_plan.py").read_text()
+    missing = {rule.name for rule in RULES if f'"{rule.name}"' not in text}
     # Tested by the bit that they set.
     assert missing <= {"section_saturated", "member_background"}
 
@@ -280,8 +280,8 @@ def test_every_row_is_asked_for_here():
         ([0.0, None], 0),
     ],
 )
-def test_sections_are_retrieved_where_a_beam_may_be_level(angles, kept):
-    # At 89 degree 3750 m climb by 65 m, 6000 m by 105 m, and 100 m are level.
+def test_sections_are_retrieved_along_nearly_level_beams(angles, kept):
+    # At 89 degree a beam climbs 65 m over 3750 m, 105 m over 6000 m; the limit is 100 m.
     granules = [factories.granule(k, zenith_angle=angle) for k, angle in enumerate(angles)]
     made = planned(*granules, products=HOMOGENEOUS)
     step = [step for step in made.steps if step.name == "homogeneous"]
@@ -290,17 +290,17 @@ def test_sections_are_retrieved_where_a_beam_may_be_level(angles, kept):
     whole = planned(*granules, products=HOMOGENEOUS, all_steps=True)
     (step,) = (step for step in whole.steps if step.name == "homogeneous")
     assert len(step.settings["sections"]) == 2
-    assert any("all steps" in left.reason for left in whole.left_out)
+    assert any("all_steps is set" in left.reason for left in whole.left_out)
 
 
-def test_the_window_holds_the_farthest_section_and_what_tells_its_noise():
+def test_the_window_holds_the_farthest_section_and_the_bins_for_its_noise():
     # 7500 m, a tenth more for the variance, and two bins for rounding.
     made = planned(products=HOMOGENEOUS)
     (window,) = (step for step in made.steps if step.name == "range_window")
     assert window.settings == {"bins": [[0, 1102]]}
     assert window.number == 1102
     assert window.as_dict()["rule"] == "range_window"
-    moved = told(channels={"photon_532o": {"range_offset": -75.0}})
+    moved = with_facts(channels={"photon_532o": {"range_offset": -75.0}})
     (window,) = (
         s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_window"
     )
@@ -318,24 +318,24 @@ def test_the_window_holds_the_farthest_section_and_what_tells_its_noise():
         ({**HOMOGENEOUS, **ELASTIC["products"], "signal": {}}, "signal and elastic need all bins"),
     ],
 )
-def test_a_window_that_keeps_no_bin_from_being_read_says_so(products, why):
-    # It climbs by 90 m along the section, which is level enough, and reaches clean air.
+def test_a_window_without_effect_states_why(products, why):
+    # The beam climbs 90 m along the section, below the limit, and reaches aerosol-free air.
     steep = factories.granule(0, zenith_angle=0.0)
-    wanted = {**products, "homogeneous": {**SECTIONS, "sections": [[750, 840]]}}
-    made = planned(steep, products=wanted)
+    products = {**products, "homogeneous": {**SECTIONS, "sections": [[750, 840]]}}
+    made = planned(steep, products=products)
     (window,) = (step for step in made.steps if step.name == "range_window")
     assert idle_window(window, made.steps) == why
     assert ("photon_532o" in read_windows(made.steps)) == (not why)
     assert not any(idle_window(step, made.steps) for step in made.steps if step is not window)
-    # The product of sections tells the same of itself, whatever else is made.
+    # The product of sections states the same, whatever other products there are.
     alone = product_dependence.plan_closure(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
     assert window in alone.steps
     assert not idle_window(window, alone.steps)
 
 
-def test_a_window_of_one_lidar_is_not_idle_for_what_another_needs():
+def test_a_window_does_not_depend_on_other_lidars():
     window = Step("range_window", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
-    signal = Step("signal", "photon_532o", {}, "asked for", "west")
+    signal = Step("signal", "photon_532o", {}, "requested", "west")
     assert not idle_window(window, [window, signal])
     assert read_windows([window, signal]) == {"photon_532o": ((0, 9),)}
 
@@ -346,7 +346,7 @@ RANGE = 7.5 * (np.arange(2000) + 0.5)
 
 
 def sky(light, *, saturated=()):
-    """Give profiles of a constant sky, in some of which there is light, by minute."""
+    """Return a source of profiles, with `light` as signal by minute, and the minutes it served."""
     seen: list[float] = []
 
     def profiles(_channel, granules):
@@ -379,29 +379,29 @@ def absent(made):
     return step.settings.get(OMITTED, [])
 
 
-def test_sixteen_profiles_with_light_are_enough():
+def test_sixteen_profiles_with_signal_are_enough():
     profiles, seen = sky(lambda _: 1.0)
     made = looked(profiles)
     assert absent(made) == []
     assert len(seen) == 16
 
 
-def test_a_dark_scene_is_left_out_and_told_with_its_number():
+def test_a_dark_scene_is_left_out_with_its_number():
     made = looked(sky(lambda _: 0.0)[0])
     assert absent(made) == [[750.0, 4500.0, "LOW_SIGNAL"], [1500.0, 7500.0, "LOW_SIGNAL"]]
     left = [each for each in made.left_out if each.rule == "section_dark"]
     assert [each.channel for each in left] == ["photon_532o"] * 2
     assert all(each.number is not None and each.number < 1e-6 for each in left)
-    assert "no light" in left[0].reason
+    assert "no signal" in left[0].reason
 
 
 @pytest.mark.parametrize("begins", [3, 101, 333, 580])
-def test_light_of_ten_minutes_in_a_dark_day_is_not_lost(begins):
+def test_a_signal_of_ten_minutes_in_a_dark_day_is_not_lost(begins):
     made = looked(sky(lambda minute: float(begins <= minute <= begins + 10))[0])
     assert absent(made) == []
 
 
-def test_profiles_that_are_looked_at_lie_close():
+def test_sampled_profiles_are_close_in_time():
     profiles, seen = sky(lambda _: 0.0)
     looked(profiles)
     assert np.diff(sorted(seen)).max() <= GAP.total_seconds() / 60
@@ -433,7 +433,7 @@ def archive(folder: Path, **changes: Any):
     )
 
 
-def test_a_file_that_is_known_is_not_read_again(tmp_path):
+def test_a_known_file_is_not_read_again(tmp_path):
     campaign = archive(tmp_path)
     first = reprocess(campaign)
     again = reprocess(campaign, options=Options(force=True))
@@ -466,13 +466,13 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
     assert np.isfinite(values[0]["extinction"]).any()
 
 
-def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeypatch):
+def test_an_omitted_section_flags_profiles_without_shots(tmp_path, monkeypatch):
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
     campaign = archive(tmp_path, products=products)
     scene = catalogued_scenes(campaign)[0]
     made = plan_scene(scene, campaign)
     absent = {OMITTED: [[700.0, 1500.0, "LOW_SIGNAL"]]}
-    told = [
+    steps = [
         replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
         for step in made.steps
         if step.name != "look"
@@ -485,7 +485,7 @@ def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeyp
         return found
 
     monkeypatch.setattr(processing, "open_archive", without_shots)
-    (product,) = process_scene(Job(campaign, scene, replace(made, steps=tuple(told)))).products
+    (product,) = process_scene(Job(campaign, scene, replace(made, steps=tuple(steps)))).products
     flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
     bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
     low = int(Quality.LOW_SIGNAL)
@@ -504,7 +504,7 @@ def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
     assert [product.sha256 for product in process_scene(job).products] == usual
 
 
-def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
+def test_a_file_with_a_changed_time_is_read_again(tmp_path, monkeypatch):
     campaign = archive(tmp_path)
     one = reprocess(campaign).scenes[0]
     size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
@@ -541,7 +541,7 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
             ]
         return seen
 
-    # Once for the look, of which all files are a part, and once for the whole.
+    # Once for the sample, which holds all files, and once for the scene.
     assert again() == ["h0", "h0"]
     assert set(again(all_steps=True)) == {"h0", "h1", "h2", "h3"}
     with Store(campaign.catalog_url, campaign.name) as store, store.transaction() as connection:
@@ -549,11 +549,11 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
     assert set(again()) == {"h0", "h1", "h2", "h3"}
 
 
-def test_what_was_asked_for_is_told_first_where_there_is_nothing_to_do(tmp_path):
+def test_reasons_of_an_empty_scene_begin_with_requested_products(tmp_path):
     campaign = archive(tmp_path, facts=[{"zenith_angle": 0.0}])
     (reason,) = bring_up_to_date(campaign).empty_scenes.values()
     assert reason.startswith("nothing to do: homogeneous of photon_532o: section 750-4500 m")
-    assert "no product of the campaign asks" not in reason
+    assert "no product of the campaign uses" not in reason
 
 
 # All together ---------------------------------------------------------------------------------
@@ -577,7 +577,7 @@ _MAIN = {
 
 
 @pytest.mark.slow
-def test_what_is_left_out_loses_and_changes_nothing_good(tmp_path):
+def test_omissions_lose_and_change_no_good_value(tmp_path):
     campaign = mixed_campaign.write(tmp_path, profiles=40)
     simulate_campaign(campaign)
     reprocess(campaign)

@@ -1,4 +1,4 @@
-"""Networks from raw files to products: the truth within the stated errors, the same bits always."""
+"""Networks from raw files to products: truth within stated errors, and reproducible bits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AIRS = {"homogeneous": made.HOMOGENEOUS, "gradient": made.GRADIENT, "plume": mad
 
 
 def reprocess_network(campaign: Campaign, **options: int) -> RunRecord:
-    """Make every visibility product of a campaign, also those that are fresh."""
+    """Make all visibility products of a campaign, also those that are up to date."""
     selection = Selection(kinds=(ProductKind.VISIBILITY,))
     record = reprocess(campaign, selection=selection, options=Options(force=True, **options))
     assert record is not None
@@ -48,7 +48,7 @@ def scores(product: xr.Dataset, truth: np.ndarray[Any, Any]) -> np.ndarray[Any, 
 
 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
-def test_visibility_is_found_within_its_errors(six_beams, tmp_path):
+def test_visibility_agrees_with_the_truth_within_its_errors(six_beams, tmp_path):
     found = []
     for air, told in AIRS.items():
         campaign, truth = made.written(tmp_path / air, made.tree(told, six_beams=six_beams))
@@ -91,7 +91,7 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
     assert digests[0] == digests[1] == digests[2]
 
 
-def test_the_window_leaves_the_product_as_it_is(tmp_path):
+def test_the_range_window_does_not_change_the_product(tmp_path):
     told = made.tree(made.PLUME, duration=1200)
     campaign, _ = made.written(tmp_path, told)
     (job,) = (job for job in scene_jobs(campaign) if job.scene.members)
@@ -109,7 +109,7 @@ def test_the_window_leaves_the_product_as_it_is(tmp_path):
         np.testing.assert_allclose(near[name], full[name], rtol=1e-6)
 
 
-def test_thin_air_is_flagged_and_never_believed(tmp_path):
+def test_optically_thin_air_is_flagged(tmp_path):
     air = {
         "homogeneous": {
             "extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
@@ -126,10 +126,10 @@ def test_thin_air_is_flagged_and_never_believed(tmp_path):
     assert not (usable & wrong).any()
 
 
-def test_a_lidar_that_falls_silent_leaves_a_reason(tmp_path):
+def test_values_are_flagged_after_a_lidar_stops(tmp_path):
     campaign, _ = made.written(tmp_path, made.tree(made.HOMOGENEOUS, duration=1800))
     raw = Path(campaign.archive)
-    # From its tenth file on, north is silent.
+    # North stops after ten files.
     for path in sorted((raw / "north").iterdir())[10:]:
         path.unlink()
     (outcome,) = reprocess_network(campaign).scenes
@@ -141,7 +141,7 @@ def test_a_lidar_that_falls_silent_leaves_a_reason(tmp_path):
     assert (np.isnan(product["visibility_in_air"]) <= (product["usable"] == 2)).all()
 
 
-def test_the_record_of_the_product_names_what_went_in(tmp_path):
+def test_attributes_of_the_product_name_inputs_and_steps(tmp_path):
     told = made.tree(made.HOMOGENEOUS, duration=900)
     campaign, _ = made.written(tmp_path, told)
     (outcome,) = reprocess_network(campaign).scenes
@@ -152,7 +152,7 @@ def test_the_record_of_the_product_names_what_went_in(tmp_path):
     history = product.attrs["history"]
     for name in beams_of(outcome):
         assert f"dead_time: {name}: given by the campaign" in history
-    assert "averaged before they are solved" in history
+    assert "averaged before the retrieval" in history
 
 
 def test_a_level_path_gives_visibility_too(tmp_path):

@@ -1,4 +1,4 @@
-"""Scans from raw files to products: the truth within the stated errors, the same bits always."""
+"""Scans from raw files to products: truth within stated errors, and reproducible bits."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from lidarops.simulate.campaign import simulate_campaign
 
 
 def campaign(folder: Path, **simulation: Any) -> tuple[Campaign, xr.Dataset]:
-    """The campaign, written to a folder and simulated there, and its truth."""
+    """Return a campaign that is simulated in a folder, and its truth."""
     tree = TREE | {"simulation": TREE["simulation"] | simulation}
     path = folder / "scans.yaml"
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
-    told = load_campaign(path)
-    return told, simulate_campaign(told).truth
+    settings = load_campaign(path)
+    return settings, simulate_campaign(settings).truth
 
 
-def scores(told: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[Any, Any]:
+def scores(settings: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[Any, Any]:
     """(retrieved - true) / stated error of the unflagged optical depths."""
     granule = truth["profile_granule_scanner"].values
     upward = truth["zenith_angle"].values[granule] < 1.0
@@ -34,7 +34,7 @@ def scores(told: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[An
     ends = np.append(0.0, truth["range_end_scanner"].values)
     found = []
     for path in paths:
-        product = xr.load_dataset(told.products_root / path)
+        product = xr.load_dataset(settings.products_root / path)
         error = np.hypot(
             product["optical_depth_standard_error"], product["optical_depth_gradient_error"]
         ).values
@@ -49,39 +49,39 @@ def scores(told: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[An
 
 
 def test_scans_become_optical_depths_within_their_errors(tmp_path):
-    told, truth = campaign(tmp_path)
-    (outcome,) = reprocess(told).scenes
+    settings, truth = campaign(tmp_path)
+    (outcome,) = reprocess(settings).scenes
     assert outcome.error == ""
     (product,) = outcome.products
-    score = scores(told, truth, [product.path])
+    score = scores(settings, truth, [product.path])
     assert score.size > 300
     assert (np.abs(score) < 3.0).mean() > 0.97
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.3
-    # The plan names what it did, and that the beam scans.
+    # The plan states that the beam scans.
     assert any(step.name == "multiangle" and "scans" in step.reason for step in outcome.plan.steps)
     for chunk in (1, 7):
         options = Options(force=True, profiles_per_chunk=chunk)
-        (again,) = reprocess(told, options=options).scenes
+        (again,) = reprocess(settings, options=options).scenes
         assert again.products[0].sha256 == product.sha256
 
 
-def test_a_beam_that_stands_still_is_no_scan(tmp_path):
+def test_a_fixed_beam_is_not_a_scan(tmp_path):
     simulation = dict(TREE["simulation"])
     instrument = simulation["instruments"]["scanner"]
     still = instrument | {"scan": {"zenith_angles": [0], "azimuth": 90}}
-    told, _ = campaign(tmp_path, duration=400, instruments={"scanner": still})
-    (outcome,) = reprocess(told).scenes
+    settings, _ = campaign(tmp_path, duration=400, instruments={"scanner": still})
+    (outcome,) = reprocess(settings).scenes
     assert "does not scan" in outcome.error
 
 
 @pytest.mark.slow
 def test_two_hundred_scans(tmp_path):
-    told, truth = campaign(tmp_path, duration=86_400)
-    outcomes = reprocess(told).scenes
+    settings, truth = campaign(tmp_path, duration=86_400)
+    outcomes = reprocess(settings).scenes
     assert [outcome.error for outcome in outcomes] == [""] * 4
     paths = [product.path for outcome in outcomes for product in outcome.products]
-    cycles = sum(xr.open_dataset(told.products_root / path).sizes["time"] for path in paths)
+    cycles = sum(xr.open_dataset(settings.products_root / path).sizes["time"] for path in paths)
     assert cycles >= 200
-    score = scores(told, truth, paths)
+    score = scores(settings, truth, paths)
     assert score.size > 5000
     assert (np.abs(score) < 3.0).mean() >= 0.99

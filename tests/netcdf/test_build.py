@@ -341,7 +341,7 @@ def test_every_missing_variable_is_named(kind: ProductKind):
 @pytest.mark.parametrize(
     ("change", "field", "problem"),
     [
-        (put("time", np.datetime64("NaT"), (1,)), "time", "not set"),
+        (put("time", np.datetime64("NaT"), (1,)), "time", "missing times"),
         (lambda data: data.isel(time=[1, 0]), "time", "rise"),
         (lambda data: data.isel(time=[1, 1]), "time", "rise"),
         (lambda data: data.isel(time=[]), None, "empty"),

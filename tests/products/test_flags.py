@@ -23,9 +23,11 @@ BITS = list(Quality)
 
 SCENES = {
     Quality.INPUT_MISSING: "test_cubic_and_tail::test_variance_that_is_not_finite_is_missing",
-    Quality.SATURATED: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
+    Quality.SATURATED: "test_labeled_homogeneous::"
+    "test_bad_bins_are_left_out_and_their_bits_carried",
     Quality.PILE_UP: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
-    Quality.INCOMPLETE_OVERLAP: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
+    Quality.INCOMPLETE_OVERLAP: "test_labeled_homogeneous::"
+    "test_bad_bins_are_left_out_and_their_bits_carried",
     Quality.TOO_FEW_BINS: "test_path_fit::test_few_bins",
     Quality.NO_SIGNAL: "test_path_fit::test_constant_profile_has_no_signal",
     Quality.LOW_SIGNAL: "test_cubic_and_tail::test_lost_roots_are_flagged",
@@ -40,8 +42,8 @@ SCENES = {
     "test_aerosol_in_the_far_range_makes_the_background_uncertain",
     Quality.NO_GLUING: "test_labeled_gluing::test_no_gluing_where_no_range_is_linear_in_both",
     Quality.CLOUD: "test_labeled_elastic::"
-    "test_a_cloud_below_the_reference_is_flagged_with_all_that_rests_on_it",
-    Quality.NO_REFERENCE: "test_labeled_elastic::test_behind_an_opaque_cloud_there_is_no_reference",
+    "test_a_cloud_below_the_reference_is_flagged_with_all_bins_below_it",
+    Quality.NO_REFERENCE: "test_labeled_elastic::test_an_opaque_cloud_leaves_no_reference",
     Quality.UNSTABLE_INVERSION: "test_labeled_elastic::"
     "test_an_inversion_away_from_the_reference_stops_where_it_is_unstable",
     Quality.NO_LEVERAGE: "test_labeled_multiangle::"
