@@ -131,24 +131,14 @@ class Raster:
         def merged(sums: Sums) -> Sums:
             return np.asarray(np.add.reduceat(sums[..., :rows], starts, axis=-1))
 
-        return Raster(
-            start=self.start,
-            stop=self.stop,
+        return replace(
+            self,
             edges=np.append(self.edges[starts], self.edges[rows]),
             total=merged(self.total),
             variance=merged(self.variance),
             used=merged(self.used),
             rejected=merged(self.rejected),
-            with_care=self.with_care,
             bins=np.add.reduceat(self.bins[:rows], starts),
-            profiles=self.profiles,
-            background=self.background,
-            background_error=self.background_error,
-            clouds=self.clouds,
-            units=self.units,
-            background_units=self.background_units,
-            bits=self.bits,
-            altitude=self.altitude,
         )
 
 
