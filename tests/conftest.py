@@ -13,7 +13,7 @@ from lidarops.cli import app
 
 pytest_plugins = ["support.report_fixtures", "support.s3_fixtures"]
 
-# Time is no property of a result, and a failure must come back when it is looked for.
+# Examples are derandomized, so that failures are reproducible; run times do not count as failures.
 hypothesis.settings.register_profile("lidarops", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("lidarops")
 
@@ -28,7 +28,7 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def data_root() -> Path:
-    """Folder of real raw files, where this machine has them."""
+    """Folder of real raw files; skip if this machine has none."""
     root = Path(os.environ.get("LIDAROPS_TEST_DATA", REPOSITORY.parent / "shared" / "data"))
     if not root.is_dir():
         pytest.skip("no real data here: set LIDAROPS_TEST_DATA")

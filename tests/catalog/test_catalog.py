@@ -45,7 +45,7 @@ def store(campaign: Campaign) -> Iterator[Store]:
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the files whose headers were parsed."""
+    """List that collects the names of files whose headers are parsed."""
     names: list[str] = []
     parse = headers.licel.parse_header
 
@@ -240,7 +240,7 @@ def test_a_name_that_is_no_text_is_refused_and_the_rest_goes_on(
 
 
 class TestManyFiles:
-    """What is entered does not depend on who reads the headers."""
+    """The catalog does not depend on the process that reads the headers."""
 
     @pytest.fixture(autouse=True)
     def few_are_many(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,7 +332,7 @@ def test_a_damaged_catalog_says_that_a_new_one_can_be_made(damage: str, campaign
 
 
 def _deadly(read: headers.Headers, due: headers.Due) -> GranuleRow:
-    """Take down any process but the first."""
+    """Kill any process but the main one."""
     if multiprocessing.parent_process() is not None and due.file.path == "coast/h13":
         os._exit(9)
     return headers.read_row(read, due)

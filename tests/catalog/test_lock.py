@@ -1,4 +1,4 @@
-"""One writer an archive, and the database that says which."""
+"""One writer at a time, and the database that holds the lock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where scenes are processed: what is asked for, what is started, and who may join."""
+"""Clusters: choice by options or file, start, and encryption."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_an_absent_scheduler_is_reported() -> None:
         clusters.connect_client(clusters.Scheduler(address=address, wait=1.0)),
     ):
         raise AssertionError("the client was given")
-    # It may come back.
+    # It may be restarted.
     assert not caught.value.wrong_use
 
 
@@ -135,7 +135,7 @@ def dask_settings(folder: Path) -> dict[str, str]:
 
 
 def certificates(folder: Path, host: str = "127.0.0.1") -> clusters.Tls:
-    """Make an authority and a certificate that it signed, as deploy/README.md does by openssl."""
+    """Make an authority and a signed certificate, as deploy/README.md does with openssl."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -232,7 +232,7 @@ def test_tls_keeps_strangers_out(encrypted: tuple[str, clusters.Tls], tmp_path: 
 
 
 class FakeApi(http.server.BaseHTTPRequestHandler):
-    """What Kubernetes answers to a change of scale."""
+    """A stand-in for the Kubernetes API that scales deployments."""
 
     seen: ClassVar[list[tuple[str, str, Any]]] = []
     status = 200
@@ -246,7 +246,7 @@ class FakeApi(http.server.BaseHTTPRequestHandler):
         self.wfile.write(b"{}" if self.status == 200 else b'{"message": "forbidden: user"}')
 
     def log_message(self, *args: object) -> None:
-        """Say nothing."""
+        """Do not log."""
 
 
 @pytest.fixture

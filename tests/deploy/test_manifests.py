@@ -1,4 +1,4 @@
-"""What deploy/ ships is well formed, says what it should, and opens nothing."""
+"""The files in deploy/ are valid, consistent with each other, and expose nothing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COUNT = {"type": "integer", "minimum": 0}
 
 
 def exactly(required: str = "", **properties: Any) -> dict[str, Any]:
-    """An object of these properties and no others: a typing error is an error."""
+    """Return the schema of an object with these properties only, so that typing errors fail."""
     return {
         "type": "object",
         "properties": properties,

@@ -1,4 +1,4 @@
-"""What deploy/prefect.yaml schedules really runs, and a dead worker cannot block it."""
+"""The schedule of deploy/prefect.yaml runs, and a dead worker cannot block it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.deployment, pytest.mark.timeout(900)]
 
 
 class Api:
-    """The few questions that the tests ask a Prefect server."""
+    """The requests of the tests to a Prefect server."""
 
     def __init__(self, site: servers.Site) -> None:
         user, _, password = site.environment["PREFECT_API_AUTH_STRING"].partition(":")
@@ -52,7 +52,7 @@ def campaign_file(folder: Path) -> Path:
 
 
 class Sink(http.server.BaseHTTPRequestHandler):
-    """Keeps what is posted to it."""
+    """A web hook that keeps the posted messages."""
 
     posted: ClassVar[list[str]] = []
 
@@ -62,7 +62,7 @@ class Sink(http.server.BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, *args: object) -> None:
-        """Say nothing."""
+        """Do not log."""
 
 
 def notified(problem: str) -> bool:
@@ -70,7 +70,7 @@ def notified(problem: str) -> bool:
 
 
 def schedule(site: servers.Site, api: Api) -> subprocess.Popen[bytes]:
-    """Deploy the shipped file, but for every 45 s and for the campaign of the test; start a worker.
+    """Deploy the file with a 45 s schedule and the campaign of the test; start a worker.
 
     The worker makes the pool while the file is read: each takes ten seconds to start.
     """
@@ -96,9 +96,9 @@ def work(site: servers.Site, name: str) -> subprocess.Popen[bytes]:
 
 
 SILENCE = 60.0
-"""s without a sign of life after which the reaper of the tests ends a run."""
+"""s without heartbeat after which maintenance ends a run in these tests."""
 RECOVERY = 120.0
-"""s from then until the next run is to be completed."""
+"""s from then within which the next run must be completed."""
 
 
 def scheduled_run_starts_and_dead_run_is_ended(
@@ -109,22 +109,22 @@ def scheduled_run_starts_and_dead_run_is_ended(
     api = Api(site)
     worker = schedule(site, api)
     servers.wait_until(lambda: bool(api.runs("RUNNING")), 240, "no run started", every=0.1)
-    zombie = api.runs("RUNNING")[0]
+    dead_run = api.runs("RUNNING")[0]
     servers.kill_tree(worker)
     killed = time.monotonic()
     site.start("reaper", "flows.maintenance", "--every", "5", "--silence", f"{SILENCE:.0f}")
     work(site, "second")
     time.sleep(5)
-    assert [run["id"] for run in api.runs("RUNNING")] == [zombie["id"]]
+    assert [run["id"] for run in api.runs("RUNNING")] == [dead_run["id"]]
     servers.wait_until(
-        lambda: zombie["id"] in {run["id"] for run in api.runs("CRASHED")}, 150, "not reaped"
+        lambda: dead_run["id"] in {run["id"] for run in api.runs("CRASHED")}, 150, "not reaped"
     )
     reaped = time.monotonic() - killed
 
     def completed_later() -> bool:
-        return any(run["start_time"] > zombie["start_time"] for run in api.runs("COMPLETED"))
+        return any(run["start_time"] > dead_run["start_time"] for run in api.runs("COMPLETED"))
 
-    # It was alive when it was killed, so it is due after the silence at the latest.
+    # It was alive when it was killed, so it is ended after the silence at the latest.
     left = SILENCE + RECOVERY - reaped
     servers.wait_until(completed_later, left, "no later run completed")
     completed = time.monotonic() - killed
@@ -138,7 +138,7 @@ def scheduled_run_starts_and_dead_run_is_ended(
 
 
 def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
-    """And whoever asked for it is told of runs that fail."""
+    """Notifications of failed runs are sent, too."""
     with (
         http.server.ThreadingHTTPServer(("127.0.0.1", 0), Sink) as sink,
         servers.prefect_site(tmp_path) as site,
@@ -150,7 +150,7 @@ def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
             assert told in said
         scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         (site.folder / "campaign.yaml").unlink()
-        # Prefect needs minutes to heed new automations: what failed first may not be told.
+        # Prefect needs minutes to activate automations: the first failure may not be reported.
         servers.wait_until(lambda: notified("cannot be read"), 300, "nobody was told")
         sink.shutdown()
 

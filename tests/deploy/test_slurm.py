@@ -1,4 +1,4 @@
-"""A single-node Slurm on loopback runs the workers of dask; losing one of them loses nothing."""
+"""Slurm on one node runs the dask workers; a cancelled worker loses no scene."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ PartitionName=work Nodes={host} Default=YES MaxTime=INFINITE State=UP
 
 @pytest.fixture
 def slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Munge, controller and node daemon in a folder of their own."""
+    """Run munge, controller and node daemon in their own folder."""
     pytest.importorskip("dask_jobqueue")
     if os.geteuid() != 0 or not all(shutil.which(program) for program in PROGRAMS):
         pytest.skip("needs Slurm's and munge's programs, and root to start them")

@@ -43,7 +43,7 @@ from lidarops.run.clusters import Local
 
 @pytest.fixture(scope="session")
 def prefect_server() -> Iterator[None]:
-    """An ephemeral server on a throw-away database: it takes 15 s to start."""
+    """A temporary Prefect server; it takes 15 s to start."""
     from prefect.testing.utilities import prefect_test_harness
 
     with prefect_test_harness(server_startup_timeout=120):
@@ -52,7 +52,7 @@ def prefect_server() -> Iterator[None]:
 
 @pytest.fixture
 def campaign_file(tmp_path: Path) -> Path:
-    """A campaign of three good files and a broken one."""
+    """A campaign of three good files and a damaged one."""
     for k in range(3):
         raw_archives.write(tmp_path / "raw" / "coast" / f"h{k}", raw_archives.content(k, bins=1000))
     raw_archives.write(tmp_path / "raw" / "coast" / "h9", b"broken")
@@ -82,7 +82,7 @@ def test_parameters_of_a_selection_are_validated_before_a_run_is_accepted(
 ) -> None:
     with pytest.raises(ParameterTypeError, match=next(iter(wrong))):
         reprocess.validate_parameters({"campaign": "campaign.yaml"} | wrong)
-    # What a server refuses, without the code of the flow.
+    # Refused by the server, without the code of the flow.
     schema = parameter_schema(reprocess).model_dump()
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({"campaign": "campaign.yaml"} | wrong, schema)
@@ -100,7 +100,7 @@ def called(command: Callable[..., None], *words: str) -> Called:
 def test_a_missing_or_invalid_campaign_file_is_wrong_use(
     command: Callable[..., None], content: str | None, tmp_path: Path
 ) -> None:
-    """And told before any server is started."""
+    """The error is shown before any server is started."""
     file = tmp_path / "campaign.yaml"
     if content is not None:
         file.write_text(content)
@@ -143,7 +143,7 @@ def test_wrong_options_of_the_flow_are_wrong_use(
 def test_places_that_are_none_are_wrong_use_of_every_flow(
     command: Callable[..., None], words: list[str], said: str, campaign_file: Path
 ) -> None:
-    """And told before any server is started."""
+    """The error is shown before any server is started."""
     result = called(command, str(campaign_file), *words)
     assert result.exit_code == 2
     assert result.output.startswith("error: ")
@@ -241,7 +241,7 @@ def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
 
 
 def without_profile(campaign_file: Path) -> None:
-    """Let the scene of the campaign fail, for an overlap function that is not there."""
+    """Make the scene of the campaign fail by a missing overlap function."""
     told = yaml.safe_load(campaign_file.read_text())
     (facts,) = told["instruments"]["lidar"]["facts"]
     facts.pop("full_overlap_range")
@@ -257,7 +257,7 @@ def test_a_run_with_failures_ends_in_its_own_state_and_reports_them(
     for night in range(2):
         caplog.clear()
         state = reprocess(str(campaign_file), return_state=True)
-        # In the second one nothing is tried again, and nothing is well.
+        # The second run tries nothing again, but reports the failure.
         assert (state.name, state.type) == (WITH_FAILURES, StateType.COMPLETED)
         assert state.message == "1 scenes failed, 1 files refused"
         result, _ = state.result()
@@ -364,7 +364,7 @@ def test_a_run_with_failures_counts_as_completed() -> None:
 
 
 def claimed(client: SyncPrefectClient, state: State, *tags: str) -> UUID:
-    """Make a run of a deployment that comes to a state now."""
+    """Create a deployed run that enters a state now."""
     flow_id = client.create_flow_from_name("stand-in")
     deployment = client.create_deployment(flow_id, f"stand-in-{uuid4()}", tags=list(tags))
     run = client.create_flow_run_from_deployment(deployment, tags=list(tags))
@@ -387,5 +387,5 @@ def test_reaper_ends_the_silent_and_spares_the_others(monkeypatch: pytest.Monkey
         assert reaped.silent > 90
         assert client.read_flow_run(dead).state_type is StateType.CRASHED
         assert reap_runs(client, silence=90.0, start=600.0) == []
-        # What was claimed and never ran blocks as well, only later.
+        # A pending run blocks its deployment, too, but may take longer.
         assert [run.id for run in reap_runs(client, silence=90.0, start=60.0)] == [starts]

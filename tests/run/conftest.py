@@ -1,4 +1,4 @@
-"""What tests of whole runs share: a small archive that was processed without its physics."""
+"""Fixtures of the tests of runs: a small archive, processed by a stand-in without retrievals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidarops.run.archive import reprocess
 
 @pytest.fixture(scope="module")
 def quickly() -> Iterator[None]:
-    """Leave the physics out: other tests show that products are what their plans say."""
+    """Replace the processing of scenes by `quick.attempt`; other tests prove the retrievals."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(executor, "attempt", quick.attempt)
         yield
@@ -24,14 +24,14 @@ def quickly() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def processed(quickly: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small archive, processed."""
-    made_here = Archive(tmp_path_factory.mktemp("processed"))
-    assert made(reprocess(made_here.write()))
-    return made_here.folder
+    """Folder of a small, processed archive."""
+    source = Archive(tmp_path_factory.mktemp("processed"))
+    assert made(reprocess(source.write()))
+    return source.folder
 
 
 @pytest.fixture
 def archive(processed: Path, tmp_path: Path) -> Archive:
-    """A copy of it, with the same modification times."""
+    """A copy of the processed archive, with the same modification times."""
     shutil.copytree(processed, tmp_path / "archive")
     return Archive(tmp_path / "archive")

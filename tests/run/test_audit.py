@@ -1,4 +1,4 @@
-"""What the ledger can be asked: history of runs, checksums; and the command line over it."""
+"""Commands that read the ledger: history of runs and verification of files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> No
     told = {("product", name), ("signal", "rich/h00"), ("overlap", "overlap.csv")}
     lost = {("signal", "poor/h11"), ("signal", "poor/h10")}
     assert _mismatches(archive) == told | lost
-    # Once the catalog has seen the move, the content is known to be there.
+    # Once the catalog knows the new path, the moved file is no mismatch.
     CliRunner().invoke(app, ["catalog", str(archive.file)])
     assert _mismatches(archive) == told | {("signal", "poor/h11")}
 
@@ -70,7 +70,7 @@ def test_the_command_line_shows_runs_and_mismatches(archive: Archive) -> None:
 def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) -> None:
     runner, file = CliRunner(), str(archive.file)
     nothing = runner.invoke(app, ["reprocess", file, "--json"])
-    # Its elastic retrievals have nothing to rest on, and every run says so.
+    # Its elastic products have no usable value, which every run reports.
     assert nothing.exit_code == 1
     told = json.loads(nothing.stdout)
     assert told["run"] is None
@@ -97,7 +97,7 @@ def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) 
 
 @pytest.mark.parametrize("command", ["runs", "verify"])
 def test_commands_that_read_the_ledger_create_none(command: str, archive: Archive) -> None:
-    """A wrong folder has nothing that is wrong, which is not the same as all being well."""
+    """A wrong folder must not count as an archive without mismatches."""
     elsewhere = archive.folder / "elsewhere"
     asked = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
     assert asked.exit_code == 1
@@ -204,7 +204,7 @@ def test_a_product_is_reproduced_from_moved_raw_files(
     assert code == 1
     assert "input poor/h10: missing" in said
     assert "--catalog" in said
-    # Another file takes the name of one that is an input.
+    # Another file takes the name of an input.
     (raw / "h11").rename(raw / "h-too")
     (raw / "h00").rename(raw / "h11")
     before = product.stat().st_mtime_ns
@@ -212,7 +212,7 @@ def test_a_product_is_reproduced_from_moved_raw_files(
     assert product.stat().st_mtime_ns == before
     code, said = made(product)
     assert code == 0, said
-    # Not one is left under its name.
+    # No input is left under its name.
     (raw / "h12").rename(raw / "h-last")
     (raw / "h11").rename(raw / "h-first")
     CliRunner().invoke(app, ["catalog", str(archive.file)])

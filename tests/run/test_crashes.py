@@ -1,4 +1,4 @@
-"""Killed at any point, out of space, without permission: nothing partial, nothing wrong."""
+"""Runs that are killed, run out of disk space or lack permission leave no partial products."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def test_kills_at_random_points_do_no_damage(tmp_path: Path) -> None:
         campaign = crash_archive.make(folder)
         mode = ("serial", "cluster", "flow")[rounds % 3]
         rounds += 1
-        # A flow has its own server to start, which takes longer than the archive.
+        # A flow starts its own server, which takes longer than the archive.
         for _ in range(3 if mode == "flow" else 8):
             process = crash_archive.start(folder, mode)
             began = time.monotonic()
-            # Wait for the start-up to pass, then strike anywhere within the work.
+            # Wait for the start, then kill at a random time.
             while process.poll() is None and not (folder / "out/products").exists():
                 time.sleep(0.01)
             if (folder / "out/products").exists():
@@ -149,7 +149,7 @@ def test_a_disk_that_fills_up_is_reported_and_the_next_run_recovers(
 
 @pytest.fixture
 def tiny_disk(tmp_path: Path) -> Path:
-    """A file system of 400 kB, where this user may mount one."""
+    """A file system of 400 kB; skip if this user may not mount one."""
     place = tmp_path / "disk"
     place.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
@@ -167,7 +167,7 @@ def test_a_full_file_system_is_reported_and_nothing_is_damaged(
     tmp_path: Path, tiny_disk: Path
 ) -> None:
     campaign = crash_archive.make(tmp_path, scenes=8).model_copy(update={"output": str(tiny_disk)})
-    # Whichever needs the space first: a product, which fails its scene, or the catalog.
+    # Either a product fails its scene, or the catalog needs the space first.
     with suppress(CatalogError):
         assert bring_up_to_date(campaign).troubled
     for path in (tiny_disk / "products").rglob("*"):

@@ -1,4 +1,4 @@
-"""Many scenes: on workers as in one process, none stopping the others, each entered as it ends."""
+"""Processing many scenes: the same on workers; no scene stops others; each entered as it ends."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from lidarops.run.staleness import Judge
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
-    """Two workers on this machine."""
+    """A client of two local workers."""
     with local_client(2) as started:
         yield started
 
@@ -59,7 +59,7 @@ def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client:
 def test_a_signal_while_workers_start_leaves_no_cluster_behind(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Python would close it at its end, in tracebacks, after its processes were gone."""
+    """Otherwise Python closes the cluster at exit, with tracebacks."""
     start = Nanny.instantiate
 
     async def interrupted(nanny: Nanny) -> Any:
@@ -93,18 +93,18 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
     archive: Archive, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = logging.getLogger("distributed.scheduler").level
-    # dask hands its records to nobody else.
+    # The loggers of dask do not propagate.
     monkeypatch.setattr(logging.getLogger("distributed"), "handlers", [caplog.handler])
     campaign = archive.write()
     scene = "rich_20260302T000000"
-    # A cluster of its own, as dask may lose workers that it restarts while they start.
+    # A separate cluster, because dask may lose workers that it restarts.
     with local_client(2) as client:
         client.register_plugin(Poison(scene))
         result = bring_up_to_date(campaign, client=client)
     assert set(result.failures) == {scene}
     assert "died 3 times" in result.failures[scene]
     assert "its worker died" in caplog.text
-    # Only that of `lidarops`: the scene was tried again, and had not failed yet.
+    # lidarops tried the scene again; it had not failed yet.
     assert "marked as failed" not in caplog.text
     assert logging.getLogger("distributed.scheduler").level == before
     others = {outcome.scene for outcome in result.record.scenes if not outcome.error}
@@ -183,7 +183,7 @@ def test_lost_local_workers_are_not_waited_for(
     campaign = archive.write()
     jobs = scene_jobs(campaign)
     with local_client(1) as client:
-        # Not before, as the first worker may well take longer to start.
+        # Only now, because the first worker may take longer to start.
         monkeypatch.setattr(executor, "WORKER_TIMEOUT", 1.0)
         monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.5)
         client.retire_workers()
@@ -193,51 +193,51 @@ def test_lost_local_workers_are_not_waited_for(
             list(process_one_by_one(jobs, client=client, stop=Stop()))
 
 
-class Growing:
-    """A cluster that has its workers after a while, and ends no scene before eight have begun."""
+class GrowingCluster:
+    """A cluster whose workers join later, and that ends no scene before eight have started."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.calls = 0
         self.open = False
-        self.begun: list[Callable[[], None]] = []
+        self.submitted: list[Callable[[], None]] = []
 
     def nthreads(self) -> dict[str, int]:
-        self.asked += 1
-        assert self.asked < 60, "no scene was handed on to the workers that came"
-        return {} if self.asked == 1 else {"worker": 4}
+        self.calls += 1
+        assert self.calls < 60, "no scene was handed on to the workers that came"
+        return {} if self.calls == 1 else {"worker": 4}
 
     def begin(self, end: Callable[[], None]) -> None:
-        self.begun.append(end)
-        self.open = self.open or len(self.begun) == 8
-        while self.open and self.begun:
-            self.begun.pop()()
+        self.submitted.append(end)
+        self.open = self.open or len(self.submitted) == 8
+        while self.open and self.submitted:
+            self.submitted.pop()()
 
 
-class Begun:
-    """A scene in the hands of a cluster."""
+class SubmittedScene:
+    """A scene that was submitted to the cluster."""
 
-    def __init__(self, cluster: Growing, _job: Job) -> None:
+    def __init__(self, cluster: GrowingCluster, _job: Job) -> None:
         self.cluster = cluster
 
-    def add_done_callback(self, told: Callable[[Begun], None]) -> None:
-        self.cluster.begin(lambda: told(self))
+    def add_done_callback(self, callback: Callable[[SubmittedScene], None]) -> None:
+        self.cluster.begin(lambda: callback(self))
 
     def release(self) -> None:
-        """Have nothing to give back."""
+        """Do nothing."""
 
 
 def test_workers_that_join_later_get_scenes_before_any_has_ended(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.0)
-    monkeypatch.setattr(executor, "_submit", Begun)
+    monkeypatch.setattr(executor, "_submit", SubmittedScene)
     monkeypatch.setattr(
         executor,
         "_outcome_of",
         lambda _, job: EndedScene(job, failed_outcome(job, "no"), final=True),
     )
     jobs = scene_jobs(archive.write()) * 4
-    assert len(list(process_jobs(jobs, client=Growing()))) == len(jobs)
+    assert len(list(process_jobs(jobs, client=GrowingCluster()))) == len(jobs)
 
 
 def test_a_worker_with_other_code_makes_nothing(

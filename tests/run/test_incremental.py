@@ -1,4 +1,4 @@
-"""Only what is stale is made again: every kind of change, and exactly what depends on it."""
+"""Incremental runs: each kind of change makes exactly the products stale that depend on it."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _sections(archive: Archive) -> None:
 
 
 def _closed_period(archive: Archive) -> None:
-    """A calibration that is valid from the last day on."""
+    """Add a calibration that is valid from the last day on."""
     facts = archive.tree["instruments"]["rich"]["facts"]
     facts[1]["valid_to"] = "2026-03-04T00:00:00Z"
     facts.append({**facts[1], "valid_from": "2026-03-04T00:00:00Z", "azimuth": 12.0})
@@ -105,7 +105,7 @@ def _name(archive: Archive) -> None:
     [
         (lambda a: a.flip("raw/rich/h11"), _all(range(2, 3))),
         (lambda a: a.flip("raw/poor/h30"), _poor(range(4, 5))),
-        # Taken on the first day: it serves that day and the next, and analog channels only.
+        # Taken on the first day: used on that day and the next, for analog channels only.
         (
             lambda a: a.flip("raw/rich/d0", -(4 * 1500 + 60)),
             _all(range(1, 3), ("signal analog", "elastic analog")),
@@ -167,7 +167,7 @@ def test_touched_and_moved_files_make_nothing_stale(archive: Archive) -> None:
 
 def test_a_lost_catalog_row_is_judged_by_content(archive: Archive) -> None:
     rich = archive.folder / "raw" / "rich"
-    # As when one of two disks is not mounted for one run.
+    # For example, one of two disks is not mounted during one run.
     rich.rename(archive.folder / "away")
     result = bring_up_to_date(archive.write())
     assert result.record is None
@@ -464,7 +464,7 @@ def test_replaced_versions_are_kept_if_the_campaign_says_so(archive: Archive) ->
     }
     kept = archive.contents("out/superseded")
     assert sorted(kept.values()) == sorted(version.sha256 for version in old)
-    # Forced, to the same bytes: nothing is replaced, so nothing more is kept.
+    # A forced run gives the same bytes, so no further version is kept.
     reprocess(campaign, options=Options(force=True))
     assert archive.contents("out/superseded") == kept
 
@@ -476,7 +476,7 @@ def test_a_new_day_is_processed_alone(archive: Archive) -> None:
 
 
 def _expected_verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
-    """Signature, barren scenes and granules set aside of the days on which all is fresh."""
+    """Return the verdicts (signature, empty scenes, granules set aside) of days with nothing stale."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store)
@@ -491,7 +491,7 @@ def _expected_verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
 
 
 def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
-    """What the ledger holds of the days that look as they did then."""
+    """Return the verdicts of days whose state is unchanged."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
         now = Judge(campaign, store).signatures()
@@ -500,7 +500,7 @@ def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
 
 
 def _unreadable_later(archive: Archive) -> None:
-    """Add a file whose header is good, and what follows it is not there."""
+    """Add a file with a good header and without data."""
     path = archive.raw("rich/h19", 2 * DAY + 620, seed=7)
     header = path.read_bytes()
     path.write_bytes(header[:400] + bytes(len(header) - 400))
@@ -568,7 +568,7 @@ def test_only_days_with_failures_are_judged_again(
 
 
 def _elsewhere(archive: Archive) -> None:
-    """Another sounding."""
+    """Change the sounding."""
     from support.small_archive import SOUNDING
 
     (archive.folder / "air.csv").write_text(SOUNDING.replace("288.15", "287.15"))
@@ -579,7 +579,7 @@ def _without_dark(archive: Archive) -> None:
 
 
 def _joined(archive: Archive) -> None:
-    """A file that another process enters in the catalog."""
+    """Add a file that another process enters in the catalog."""
     campaign = archive.write()
     archive.raw("rich/h08", 620, seed=44)
     with Store(campaign.catalog_url, campaign.name) as store:

@@ -1,4 +1,4 @@
-"""What a run tells, forgets and removes of files and scenes that are gone or were never used."""
+"""Files and scenes that are gone or unused: what runs report, forget and remove."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 pytestmark = pytest.mark.usefixtures("quickly")
 
 
-# Told ----------------------------------------------------------------------------------------
+# Reported ----------------------------------------------------------------------------------------
 
 
 def _told(archive: Archive) -> dict[str, object]:
-    """What the command tells programs; one that exits with 1 gives a reason."""
+    """Return the JSON output of the command; exit code 1 must come with a reason."""
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
     told = json.loads(result.stdout)
     reasons = (
@@ -82,7 +82,7 @@ def test_an_empty_scene_is_named_by_every_run(archive: Archive) -> None:
 
 
 def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
-    """Of a kind that gives nothing no product can tell, and the plans of the others do not."""
+    """The reasons for products that were left out are in the record of the run only."""
     archive.tree["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
     archive.tree["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
     record = reprocess(archive.write())
@@ -96,7 +96,7 @@ def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
         assert "the beam climbs 750 m" in told[0]
         every = (*scene.plan.left_out, *scene.left_out)
         assert len(set(every)) == len(every)
-    # One for all, as there may be many scenes.
+    # One entry for all scenes with the same reason.
     assert len({id(scene.left_out) for scene in record.scenes}) < len(record.scenes)
     page = report_run(archive.write(), record).page
     assert "the beam climbs 750 m" in page.read_text()
@@ -153,7 +153,7 @@ def test_a_channel_that_no_file_holds_is_named_by_every_run(
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file)], env={"COLUMNS": "200"})
     assert channel in shown.stdout
     assert shown.exit_code == 1
-    # Asked for another lidar alone, or for a time that these facts do not reach.
+    # Selection of another lidar, or of a time outside the period of these facts.
     other = CliRunner().invoke(app, ["reprocess", str(archive.file), "--instrument", "poor"])
     assert other.exit_code == 0
     early = ["reprocess", str(archive.file), "--until", "2026-03-02"]
@@ -191,7 +191,7 @@ def test_unused_files_of_some_days_are_named_and_the_others_counted(
 
 
 def _fail(archive: Archive, scenes: str, *, unmade: bool = False) -> None:
-    """Let scenes have failed for good."""
+    """Mark scenes as failed for good."""
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
         connection.execute(
             "update scene set error = 'bad', final = 1 where scene like ?", (scenes,)
@@ -256,7 +256,7 @@ def test_products_outside_the_selection_are_not_orphaned(archive: Archive) -> No
 
 
 def _leave_over(archive: Archive) -> None:
-    """Leave products over, of scenes that are there and of those that are gone."""
+    """Make orphans: of present scenes and of scenes that are gone."""
     del archive.tree["instruments"]["rich"]["products"]["homogeneous"]
     _without(archive, "poor")
 
@@ -322,7 +322,7 @@ def test_an_emptied_archive_fails_and_its_catalog_stays(archive: Archive, comman
     with Store(campaign.catalog_url, campaign.name) as store:
         assert store.granules() == known
     assert archive.contents("out/products") == before
-    # As the message says.
+    # The remedy of the message.
     other = ["--catalog", f"sqlite:///{archive.folder}/other.sqlite"]
     assert CliRunner().invoke(app, [command, str(archive.file), *other]).exit_code == 0
 
@@ -338,7 +338,7 @@ def test_products_without_raw_file_are_failures_until_they_are_removed(
         assert set(found.lost) == {each.path for each in found.orphans}
         assert len(found.lost) == 8
     command = ["reprocess", str(archive.file)]
-    # Also where the scenes that are asked for are all gone.
+    # Also if all selected scenes are gone.
     for options in ([], ["--instrument", "poor"]):
         shown = CliRunner().invoke(app, [*command, *options])
         assert shown.exit_code == 1
@@ -385,7 +385,7 @@ def test_products_of_scenes_that_are_cut_differently_are_not_reported_as_lost(
 def test_nothing_is_removed_if_the_archive_is_missing(archive: Archive) -> None:
     _empty(archive)
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
-        # As a catalog was left by what forgot the files of such an archive.
+        # A catalog that knows no file of the archive.
         connection.execute("delete from granule")
     campaign = archive.write()
     found = bring_up_to_date(campaign)

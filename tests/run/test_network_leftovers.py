@@ -1,4 +1,4 @@
-"""What is told of lidars that serve a network alone, and kept of one that has lost some of them."""
+"""Leftovers of networks: lidars used only by a network, and networks that lost lidars."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _tree() -> dict[str, Any]:
 
 
 class Net:
-    """Three lidars whose level beams meet, and that are asked for nothing themselves."""
+    """Campaign of three lidars with level beams that meet, and without products of their own."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -72,7 +72,7 @@ class Net:
         return load_campaign(self.file)
 
     def lose(self, *stations: str) -> None:
-        """Take away files, as where a disk is not mounted."""
+        """Remove files, as if a disk were not mounted."""
         for name in stations:
             (self.folder / "raw" / name).rename(self.folder / name)
 
@@ -96,7 +96,7 @@ def net(tmp_path: Path) -> Net:
     return made
 
 
-# Barren --------------------------------------------------------------------------------------
+# Empty scenes --------------------------------------------------------------------------------
 
 
 def test_lidars_used_only_by_a_network_are_no_failure(net: Net) -> None:

@@ -1,4 +1,4 @@
-"""Raw files in a store, products to a store: the same bytes as on a disk."""
+"""Raw files in a store and products copied to a store: the same bytes as on a disk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidarops.system.stores import RemoteStore
 
 @pytest.fixture
 def campaign_file(tmp_path: Path) -> Path:
-    """A campaign of two scenes and a file that is broken."""
+    """A campaign of two scenes and a damaged file."""
     for hour in (0, 30):
         content = raw_archives.content(60.0 * hour, bins=1000)
         raw_archives.write(tmp_path / "raw" / "coast" / f"h{hour:02d}", content)
@@ -54,7 +54,7 @@ def test_raw_from_s3_and_products_to_s3(tmp_path: Path, campaign_file: Path, s3:
     assert record is not None
     expected = digests(on_disk.products_root)
     assert len(expected) == 2
-    # The name of the archive stands in no product.
+    # No product contains the name of the archive.
     assert digests(in_store.products_root) == expected
 
     done = publish_products(in_store, f"{url}/products")

@@ -1,4 +1,4 @@
-"""An archive that takes a few seconds, and what must hold of it after any crash."""
+"""An archive whose processing takes seconds, and checks of its state after a crash."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCENES = 24
 
 
 def make(folder: Path, *, scenes: int = SCENES) -> Campaign:
-    """Write raw files of some days, and their campaign."""
+    """Write raw files of some days and their campaign file."""
     for day in range(scenes):
         for k in range(6):
             data = raw_archives.content(day * 1440 + k, bins=4000, seed=day * 10 + k)
@@ -42,7 +42,7 @@ def make(folder: Path, *, scenes: int = SCENES) -> Campaign:
 
 
 def start(folder: Path, mode: str, **environment: str) -> subprocess.Popen[bytes]:
-    """Start a run in a session of its own, so that all its processes can be killed at once."""
+    """Start a run in its own session, so that all its processes can be killed at once."""
     return subprocess.Popen(
         [sys.executable, str(RUNNER), str(folder), mode],
         start_new_session=True,
@@ -55,7 +55,7 @@ def start(folder: Path, mode: str, **environment: str) -> subprocess.Popen[bytes
 
 
 def products(folder: Path) -> dict[str, str]:
-    """Path -> sha256 of every file among the products, hidden ones too."""
+    """Return path -> SHA-256 of every product file, including hidden files."""
     root = folder / "out" / "products"
     return {
         str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -65,7 +65,7 @@ def products(folder: Path) -> dict[str, str]:
 
 
 def wrong_rows(folder: Path) -> list[str]:
-    """Return the products that the ledger records and that are not there with these bytes."""
+    """Return the products in the ledger whose file is missing or differs."""
     database = folder / "out" / "catalog.sqlite"
     if not database.exists():
         return []
@@ -80,7 +80,7 @@ def wrong_rows(folder: Path) -> list[str]:
 
 
 def visible_partial(folder: Path, whole: dict[str, str]) -> list[str]:
-    """Return products under their own names whose bytes are not those of an undisturbed run."""
+    """Return the products that differ from those of an undisturbed run."""
     return [
         path
         for path, sha256 in products(folder).items()

@@ -1,4 +1,4 @@
-"""Runs in a process of their own, to be killed: ``python crash_runs.py FOLDER MODE``."""
+"""Run a campaign in a separate process, to be killed: ``python crash_runs.py FOLDER MODE``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lidarops.run.archive import Options, bring_up_to_date
 
 
 def run(folder: Path, mode: str) -> int:
-    """Process the campaign of a folder in one of the ways that can be killed."""
+    """Process the campaign of a folder by the function or flow that `mode` names."""
     if mode == "flow":
         from flows.reprocess import reprocess
 

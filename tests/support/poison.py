@@ -1,4 +1,4 @@
-"""A scene that takes its worker down, on every worker of a cluster, restarted ones too."""
+"""A scene that kills its worker, on every worker of a cluster and on restarted ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _attempt = executor.attempt
 
 
 class Poison(WorkerPlugin):
-    """Lets a worker die of one scene."""
+    """Makes one scene kill its worker."""
 
     name = "poison"
 
@@ -22,7 +22,7 @@ class Poison(WorkerPlugin):
         self.scene = scene
 
     def setup(self, worker: Any) -> None:
-        """Put the poison into the engine of a worker."""
+        """Replace the processing of scenes on a worker."""
 
         def attempt(job: Any) -> Any:
             if job.scene.id == self.scene:

@@ -1,4 +1,4 @@
-"""Processing without physics: what is written tells all that a product depends on, and no more."""
+"""A stand-in for processing: its products contain exactly what real products depend on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
 from lidarops.plan import product_dependence
-from lidarops.process.scene import Job, _digest, failed
+from lidarops.process.scene import Job, _digest, failed_outcome
 from lidarops.records import ProductRecord, SceneOutcome
 
 
@@ -20,12 +20,12 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     try:
         inputs += Ancillaries.read(job.campaign.folder, job.plan).inputs
     except LidarOpsError as error:
-        return failed(job, str(error)), True
+        return failed_outcome(job, str(error)), True
     settings = product_dependence.Settings(job.campaign)
     products = []
-    for kind, channel in product_dependence.wanted(job.plan):
+    for kind, channel in product_dependence.planned_products(job.plan):
         mine = product_dependence.plan_closure(job.plan, [(kind, channel)])
-        used = sorted(record.sha256 for record in product_dependence.inputs(mine, inputs))
+        used = sorted(record.sha256 for record in product_dependence.product_inputs(mine, inputs))
         told = [mine.as_dict(), settings.of(job.scene, mine, channel), used]
         content = json.dumps(told, sort_keys=True).encode()
         path = f"{scene.instrument}/{scene.id}_{kind.value}_{channel}.nc"
@@ -37,7 +37,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         sha256 = hashlib.sha256(content).hexdigest()
         products.append(ProductRecord(path, kind, channel, sha256, len(content), 1, {}, 1))
     outcome = replace(
-        failed(job, ""), products=tuple(products), inputs=inputs, refused=refused,
+        failed_outcome(job, ""), products=tuple(products), inputs=inputs, refused=refused,
         seconds={"digest": 0.5, "retrieve": 1.0, "write": 0.25},
     )  # fmt: skip
     return outcome, True

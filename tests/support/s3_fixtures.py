@@ -13,7 +13,7 @@ from support.s3server import KEYS, free_port, wait_for
 
 @pytest.fixture(scope="module")
 def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A bucket of a local S3 server; gives its URL."""
+    """URL of a bucket on a local S3 server."""
     pytest.importorskip("moto.server")
     s3fs = pytest.importorskip("s3fs")
     port = free_port()

@@ -1,4 +1,4 @@
-"""What the tests of object stores share."""
+"""Ports of local servers for the tests of object stores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servers for the deployment tests: on loopback, in throw-away folders, stopped for sure."""
+"""Servers for the deployment tests: on loopback, in temporary folders, always stopped."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def free_port() -> int:
 def wait_until(
     condition: Callable[[], bool], seconds: float, problem: str, *, every: float = 0.5
 ) -> float:
-    """Wait for a condition; return how long it took."""
+    """Wait for a condition; return the time in s that it took."""
     started = time.monotonic()
     while not condition():
         if time.monotonic() - started > seconds:
@@ -41,7 +41,7 @@ def listens(port: int) -> bool:
 
 
 def descendants(process: int) -> list[int]:
-    """Return the children of a process, and theirs."""
+    """Return all descendants of a process."""
     parents: dict[int, list[int]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -70,7 +70,7 @@ def kill_tree(process: subprocess.Popen[bytes]) -> None:
 
 @dataclass
 class Site:
-    """A place where a Prefect server, workers and a reaper run."""
+    """A folder and settings for a Prefect server, workers and maintenance."""
 
     folder: Path
     environment: dict[str, str]
@@ -111,7 +111,7 @@ class Site:
 
 @contextmanager
 def prefect_site(folder: Path, **settings: str) -> Iterator[Site]:
-    """A Prefect server on loopback that asks for a password."""
+    """Start a Prefect server on loopback that requires a password."""
     port = free_port()
     password = f"operator:{secrets.token_hex(8)}"
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}

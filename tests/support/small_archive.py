@@ -1,4 +1,4 @@
-"""A small archive whose products depend on everything that a product can depend on."""
+"""A small archive whose products have every kind of dependence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OVERLAP = "range,overlap\n0,0.1\n300,0.6\n600,1.0\n"
 
 
 def tree() -> dict[str, Any]:
-    """The campaign file: one lidar with everything, one with little."""
+    """Return the campaign file: one lidar with all kinds of input, one with raw files only."""
     products = {
         "signal": {},
         "homogeneous": {"channels": ["photon_532o"], "sections": [[750, 840]]},
@@ -60,14 +60,14 @@ def tree() -> dict[str, Any]:
 
 
 class Archive:
-    """The campaign file, and the files around it."""
+    """A campaign file with its raw and ancillary files."""
 
     def __init__(self, folder: Path, *, days: int = 4) -> None:
         self.folder = folder
         self.file = folder / "campaign.yaml"
         self.tree = tree()
         if self.file.exists():
-            # A copy of one that was made before.
+            # A copy of an existing archive.
             return
         for day in range(days):
             for k in range(3):
@@ -96,7 +96,7 @@ class Archive:
         path.write_bytes(bytes(data))
 
     def contents(self, below: str = "out") -> dict[str, str]:
-        """Path -> sha256 of all that lies in a folder, the database's journal left out."""
+        """Return path -> SHA-256 of all files in a folder, without the journal of the database."""
         root = self.folder / below
         return {
             str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -106,7 +106,7 @@ class Archive:
 
 
 def made(record: RunRecord | None) -> set[str]:
-    """Scene, kind and channel of what a run made, such as ``rich 1 signal photon``."""
+    """Return instrument, day, kind and channel of a run's products, as ``rich 1 signal photon``."""
     return {
         f"{scene.instrument} {scene.start.day} {product.kind.value} {product.channel[:6]}"
         for scene in (() if record is None else record.scenes)

@@ -1,4 +1,4 @@
-"""Work that is spread over processes comes to the same, in the same order, whatever dies."""
+"""Work on several processes gives the same results in the same order, even if processes die."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def process(kept: int, item: int) -> int:
 
 
 def deadly(kept: int, item: int) -> int:
-    """Take down any process but the first."""
+    """Kill any process but the main one."""
     if multiprocessing.parent_process() is not None and item == 5:
         os._exit(9)
     return kept * item
@@ -100,7 +100,7 @@ class TestEach:
 
         def slowly(future: Future, error: BaseException) -> None:
             before(future, error)
-            # What waited for it goes on meanwhile.
+            # Other tasks continue meanwhile.
             time.sleep(0.02)
 
         monkeypatch.setattr(Future, "set_exception", slowly)
@@ -138,7 +138,7 @@ class TestEach:
             assert list(islice(found, 5)) == [(item, item) for item in range(5)]
             with pytest.raises(CatalogError, match=r"archive: is away \(wait\)"):
                 next(found)
-            # That was no loss of a process.
+            # No process was lost.
             others = {one for _, one in pool.map_items(process, [1, 2], at_a_time=1)}
         assert (os.getpid() not in others) == (number > 1)
 
@@ -178,9 +178,9 @@ if __name__ == "__main__":
     assert "colorsys" not in sys.modules
     assert os.getpid() not in {pid for _, pid, *_ in found.values()}
     assert {threads for _, _, threads, _ in found.values()} == {"1"}
-    # Ctrl-C reaches all processes of a terminal, and what is loaded is still of use.
+    # Ctrl-C reaches all processes of a terminal; the server must survive it.
     assert {held for _, _, _, held in found.values()} == {True}
-    # It may date products, or open a store.
+    # The variable may be one that dates products or gives keys of a store.
     os.environ["LIDAROPS_SEEN"] = "later"
     with Processes(2, 2) as pool:
         assert pool.later(variable, "LIDAROPS_SEEN")() == "later"
@@ -284,7 +284,7 @@ def test_existing_objects_are_not_collected_within_and_are_afterwards():
         assert frozen > 1000
         with processes.objects_frozen():
             assert gc.get_freeze_count() <= frozen
-        # The inner one has nothing to thaw.
+        # The inner context must not unfreeze.
         assert gc.get_freeze_count() > 1000
     assert gc.get_freeze_count() == 0
     with pytest.raises(ValueError, match="inside"), processes.objects_frozen():

@@ -1,4 +1,4 @@
-"""Scans of archives behind a URL: what cannot be listed ends them, what cannot be read does not."""
+"""Scans of archives behind a URL: a failed listing ends the scan, an unreadable file does not."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from lidarops.system.stores import RemoteStore
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *args: object) -> None:
-        """Say nothing."""
+        """Do not log."""
 
 
 @pytest.fixture
 def campaign(tmp_path: Path) -> Iterator[Campaign]:
-    """A campaign over two files that a web server offers with a plain index."""
+    """A campaign over two files on a web server with a plain index."""
     pytest.importorskip("aiohttp")
     for minute in range(2):
         path = tmp_path / "raw" / "coast" / f"h{minute}"
@@ -91,6 +91,6 @@ def test_a_denied_file_is_refused_but_a_lost_connection_ends_the_scan(
             return
         assert scan_archive(campaign, store).refused == refused
         monkeypatch.undo()
-        # It is looked at again, though nothing of it has changed.
+        # The next scan tries it again although it is unchanged.
         assert scan_archive(campaign, store).refused == 0
         assert len(store.granules(status=Status.GOOD)) == 2

@@ -1,4 +1,4 @@
-"""Raw files from and products to object stores: S3 (a server on loopback), HTTP, other URLs."""
+"""Read from and publish to stores: S3 (a server on loopback), HTTP, other URLs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lidarops.system.stores import RemoteStore, without_keys
 
 @pytest.fixture(params=["s3", "memory", "file"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty place of each kind."""
+    """URL of an empty store of each kind."""
     name = tmp_path.name
     if request.param == "s3":
         return f"{request.getfixturevalue('s3')}/{name}"
@@ -42,7 +42,7 @@ def test_publish_sends_what_is_missing_or_changed_and_nothing_else(
     store = RemoteStore(url)
     assert store.publish(root, made, journal).uploaded == tuple(made)
     assert store.publish(root, made, journal).uploaded == ()
-    # Of the same size, within the same second: times and sizes cannot tell.
+    # The same size within the same second: neither shows the change.
     made |= products(root, a=b"ONE", c=b"three")
     again = store.publish(root, made, journal)
     assert again.uploaded == ("coast/a.nc", "coast/c.nc")
@@ -96,7 +96,7 @@ def test_publish_refuses_a_product_that_differs_from_the_ledger(tmp_path: Path, 
 
 
 def test_publish_of_many_parts(tmp_path: Path, s3: str) -> None:
-    # Above twice the part size S3 assembles an object of parts.
+    # Above twice the part size, S3 assembles an object from parts.
     data = bytes(range(256)) * 4096 * 120
     made = products(tmp_path / "products", big=data)
     store = RemoteStore(f"{s3}/{tmp_path.name}")
@@ -161,7 +161,7 @@ def test_http_is_read_and_never_written(tmp_path: Path) -> None:
 
 class QuietHandler(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *args: object) -> None:
-        """Say nothing."""
+        """Do not log."""
 
 
 @pytest.mark.parametrize("unknown", ["nothing://bucket", "s3x://bucket/a"])
