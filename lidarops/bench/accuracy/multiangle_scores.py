@@ -280,19 +280,19 @@ def root(square: MonteCarloFigure) -> MonteCarloFigure:
     return MonteCarloFigure(value, square.error / (2.0 * value) if value > 0 else 0.0)
 
 
-def ratio(part: Array, whole: Array) -> MonteCarloFigure:
+def ratio(events: Array, trials: Array) -> MonteCarloFigure:
     """Return a share with the Monte Carlo error of independent clusters.
 
     Parameters
     ----------
-    part, whole : (cluster,) float
+    events, trials : (cluster,) float
         Counts.
     """
-    total = float(whole.sum())
+    total = float(trials.sum())
     if total == 0.0:
         return MonteCarloFigure(0.0, 0.0)
-    value = float(part.sum()) / total
-    error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
+    value = float(events.sum()) / total
+    error = float(np.sqrt(np.sum((events - value * trials) ** 2))) / total
     # Without any event the error would be zero; one event is assumed then.
     return MonteCarloFigure(value, max(error, 1.0 / total))
 

@@ -21,7 +21,7 @@ logarithm; below, the error of interpolating the signal itself is far less than 
 
 
 class AltitudeInterpolation(StrEnum):
-    """How values between range bins are found."""
+    """Interpolation between range bins."""
 
     CUBIC = "cubic"
     """Cubic through the two bins on either side: errs by 2e-6 on a layer of 50 m width (0.08 in

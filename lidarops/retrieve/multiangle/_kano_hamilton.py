@@ -117,16 +117,16 @@ def _fit_tile(
             sxx[j] += wx * (xs[j] - mx[j])
             sxy[j] += wx * (ys[j] - my[j])
             sww[j] += wx * wx
-    part = out[:, first:last]
+    columns = out[:, first:last]
     for j in range(width):
         fits = sxx[j] > _SAME_PATH * sw[j]
         inverse = 1.0 / sxx[j] if fits else 0.0
         tau = -0.5 * sxy[j] * inverse
-        part[TAU, j] = tau if fits else np.nan
-        part[INFORMATION, j] = 4.0 * sxx[j] if fits else 0.0
-        part[INTERCEPT, j] = my[j] + 2.0 * tau * mx[j] if fits else np.nan
-        part[INTERCEPT_VARIANCE, j] = 1.0 / sw[j] + mx[j] * mx[j] * inverse if fits else np.nan
-        part[SHARE, j] = sww[j] * inverse
+        columns[TAU, j] = tau if fits else np.nan
+        columns[INFORMATION, j] = 4.0 * sxx[j] if fits else 0.0
+        columns[INTERCEPT, j] = my[j] + 2.0 * tau * mx[j] if fits else np.nan
+        columns[INTERCEPT_VARIANCE, j] = 1.0 / sw[j] + mx[j] * mx[j] * inverse if fits else np.nan
+        columns[SHARE, j] = sww[j] * inverse
         sxx[j] = inverse
         sxy[j] = -2.0 * tau
 
@@ -156,13 +156,13 @@ def _chi2_tile(
             chi2[j] += w[j] * residual * residual
             trace[j] += w[j] * (1.0 - w[j] * (sw[j] + dx * dx * inverse[j]))
             beams[j] += 1.0 if w[j] > 0.0 else 0.0
-    part = out[:, first:last]
+    columns = out[:, first:last]
     for j in range(width):
         on = inverse[j] > 0.0 and beams[j] > 2.0
-        part[CHI2, j] = chi2[j] if on else 0.0
-        part[FREEDOM, j] = beams[j] - 2.0 if on else 0.0
-        part[EXPECTED, j] = beams[j] - 2.0 if on else 0.0
-        part[TRACE, j] = trace[j] if on else 0.0
+        columns[CHI2, j] = chi2[j] if on else 0.0
+        columns[FREEDOM, j] = beams[j] - 2.0 if on else 0.0
+        columns[EXPECTED, j] = beams[j] - 2.0 if on else 0.0
+        columns[TRACE, j] = trace[j] if on else 0.0
 
 
 @_compiled

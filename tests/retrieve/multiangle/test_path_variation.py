@@ -15,8 +15,9 @@ from support.oracle_multiangle import (
     random_scene,
 )
 
-from lidarops.retrieve.multiangle import _block, retrieve_optical_depth
+from lidarops.retrieve.multiangle import _block
 from lidarops.retrieve.multiangle._path_variation import GROWTH, path_variation_from
+from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 
 def varies(scan: Scan) -> bool:

@@ -143,9 +143,9 @@ def residual_moments(
     variance = _inputs.matrix(inhomogeneity_variance, "inhomogeneity_variance", shape)
     share = _inputs.matrix(inhomogeneity_share, "inhomogeneity_share", shape)
     products, norms, freedom = _correlation.lag_sums(*beams, variance)
-    holed = np.zeros(shape[0], dtype=np.bool_) if gaps is None else np.asarray(gaps, np.bool_)
+    has_gaps = np.zeros(shape[0], dtype=np.bool_) if gaps is None else np.asarray(gaps, np.bool_)
     share = np.clip(np.nan_to_num(share), 0.0, 1.0)
-    return ResidualMoments(products, norms, share, freedom, holed)
+    return ResidualMoments(products, norms, share, freedom, has_gaps)
 
 
 def smooth_optical_depth(
