@@ -117,9 +117,9 @@ def test_an_archive_without_any_of_its_files_is_refused_and_the_catalog_stays(
 def test_a_changed_fact_of_the_campaign_rescans(campaign: Campaign, store: Store) -> None:
     _fill(campaign)
     scan_archive(campaign, store)
-    told = factories.campaign(facts=[{"zenith_angle": 85.0}])
-    told = told.model_copy(update={"archive": campaign.archive, "output": campaign.output})
-    assert scan_archive(told, store).changed == 6
+    changed = factories.campaign(facts=[{"zenith_angle": 85.0}])
+    changed = changed.model_copy(update={"archive": campaign.archive, "output": campaign.output})
+    assert scan_archive(changed, store).changed == 6
     assert {granule.zenith_angle for granule in store.granules()} == {85.0}
 
 
@@ -167,12 +167,12 @@ def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None
     raw_archives.write(root / "coast" / "h0", raw_archives.content(0, position=(30.7, 46.4)))
     scan_archive(campaign, store)
     assert "swapped" in store.granules()[0].notes[-1]
-    told = {
+    changed = {
         "lidar": campaign.instruments["lidar"].model_copy(
             update={"header_position": "latitude_first"}
         )
     }
-    scan_archive(campaign.model_copy(update={"instruments": told}), store)
+    scan_archive(campaign.model_copy(update={"instruments": changed}), store)
     assert store.granules()[0].notes == ()
     assert store.granules()[0].latitude == 46.4
 

@@ -38,7 +38,7 @@ def test_choices_of_the_command_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("{kind: slurn}", "'local', 'scheduler', 'slurm', 'kubernetes'"),
         ("{workers: 3}", "kind"),
@@ -53,17 +53,17 @@ def test_choices_of_the_command_line(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_description_is_reported_with_file_and_field(
-    tmp_path: Path, text: str, told: str
+    tmp_path: Path, text: str, message: str
 ) -> None:
     described = tmp_path / "cluster.yaml"
     described.write_text(text)
     with pytest.raises(clusters.ClusterError, match=r"cluster\.yaml") as caught:
         clusters.choose_cluster(cluster=str(described))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("choice", "told"),
+    ("choice", "message"),
     [
         ({"scheduler": "tcp://head:8786", "workers": 2}, "has its own workers"),
         ({"cluster": "no-such.yaml"}, "cannot be read"),
@@ -72,8 +72,8 @@ def test_a_wrong_description_is_reported_with_file_and_field(
         ({"cluster": "slurm", "memory": "2GiB"}, "memory_limit: .*of this machine"),
     ],
 )
-def test_a_contradictory_choice_is_wrong_use(choice: dict[str, Any], told: str) -> None:
-    with pytest.raises(clusters.ClusterError, match=told) as caught:
+def test_a_contradictory_choice_is_wrong_use(choice: dict[str, Any], message: str) -> None:
+    with pytest.raises(clusters.ClusterError, match=message) as caught:
         clusters.choose_cluster(**choice)
     assert caught.value.wrong_use
 
@@ -213,9 +213,11 @@ def test_tls_keeps_strangers_out(encrypted: tuple[str, clusters.Tls], tmp_path: 
         assert all(
             each.startswith("tls://127.0.0.1") for each in client.scheduler_info()["workers"]
         )
-    told = dask.config.merge(dask.config.config, dask.config.collect_env(dask_settings(tmp_path)))
+    settings = dask.config.merge(
+        dask.config.config, dask.config.collect_env(dask_settings(tmp_path))
+    )
     with (
-        dask.config.set(told),
+        dask.config.set(settings),
         clusters.connect_client(clusters.Scheduler(address=address)) as client,
     ):
         assert client.submit(sum, [2, 2]).result() == 4

@@ -220,8 +220,8 @@ def test_container_file(repository: Path) -> None:
     (command,) = (rest for word, rest in instructions if word == "CMD")
     assert json.loads(entry) == ["python", "-m"]
     run = [sys.executable, "-m", *json.loads(command)]
-    told = subprocess.run(run, check=True, capture_output=True, text=True)
-    assert "Usage: lidarops" in told.stdout
+    result = subprocess.run(run, check=True, capture_output=True, text=True)
+    assert "Usage: lidarops" in result.stdout
     ignored = (repository / "deploy" / "Containerfile.dockerignore").read_text().split()
     assert {".git", ".venv", "deploy/.env"} <= set(ignored)
 

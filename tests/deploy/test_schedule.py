@@ -145,9 +145,9 @@ def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
     ):
         threading.Thread(target=sink.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{sink.server_port}/hook"
-        for told in ("new: lidarops: a run failed", ""):
+        for line in ("new: lidarops: a run failed", ""):
             said = site.call("flows.notifications", url)
-            assert told in said
+            assert line in said
         scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         (site.folder / "campaign.yaml").unlink()
         # Prefect needs minutes to activate automations: the first failure may not be reported.

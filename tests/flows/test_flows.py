@@ -207,16 +207,16 @@ def test_the_flow_takes_the_options_of_the_command_line(campaign_file: Path) -> 
     def products(*words: str) -> int:
         folder = campaign_file.parent / "out"
         shutil.rmtree(folder, ignore_errors=True)
-        there = ["--out", str(folder), "--catalog", f"sqlite:///{folder}/other.sqlite"]
-        result = called(flows.reprocess.main, str(campaign_file), *there, *words)
+        options = ["--out", str(folder), "--catalog", f"sqlite:///{folder}/other.sqlite"]
+        result = called(flows.reprocess.main, str(campaign_file), *options, *words)
         # A file of the archive is refused.
         assert result.exit_code == 1, result.output
         assert (folder / "other.sqlite").exists()
         return len(list(folder.rglob("*.nc")))
 
-    asked = ["--station", "coast", "--instrument", "lidar", "--product", "homogeneous"]
+    selection = ["--station", "coast", "--instrument", "lidar", "--product", "homogeneous"]
     inside = ["--since", "2026-02-28", "--until", "2026-03-02"]
-    assert products(*asked, *inside, "--wait", "1", "--memory-limit", "1GiB") == 1
+    assert products(*selection, *inside, "--wait", "1", "--memory-limit", "1GiB") == 1
     assert products("--since", "2026-03-05") == 0
 
 
@@ -242,11 +242,11 @@ def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
 
 def without_profile(campaign_file: Path) -> None:
     """Make the scene of the campaign fail by a missing overlap function."""
-    told = yaml.safe_load(campaign_file.read_text())
-    (facts,) = told["instruments"]["lidar"]["facts"]
+    tree = yaml.safe_load(campaign_file.read_text())
+    (facts,) = tree["instruments"]["lidar"]["facts"]
     facts.pop("full_overlap_range")
     facts["overlap_profile"] = "nowhere.csv"
-    campaign_file.write_text(yaml.safe_dump(told))
+    campaign_file.write_text(yaml.safe_dump(tree))
 
 
 @pytest.mark.usefixtures("prefect_server")
@@ -308,9 +308,9 @@ def test_the_log_of_a_run_with_failures_is_bounded(
 def test_a_run_reports_channels_that_no_file_holds(
     campaign_file: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    told = yaml.safe_load(campaign_file.read_text())
-    told["instruments"]["lidar"]["products"]["homogeneous"]["channels"].append("photon_999o")
-    campaign_file.write_text(yaml.safe_dump(told))
+    tree = yaml.safe_load(campaign_file.read_text())
+    tree["instruments"]["lidar"]["products"]["homogeneous"]["channels"].append("photon_999o")
+    campaign_file.write_text(yaml.safe_dump(tree))
     (campaign_file.parent / "raw" / "coast" / "h9").unlink()
     campaign = load_campaign(campaign_file)
     result = bring_up_to_date(campaign)
@@ -358,8 +358,8 @@ def test_a_run_with_failures_counts_as_completed() -> None:
     event = f"prefect.flow-run.{WITH_FAILURES}"
     assert event in plain[1].trigger.expect
     assert event not in plain[0].trigger.expect
-    told = notifications.automations(uuid4(), within=within, failures=True)
-    (troubled,) = [each for each in told if each.name == notifications.TROUBLED]
+    automations = notifications.automations(uuid4(), within=within, failures=True)
+    (troubled,) = [each for each in automations if each.name == notifications.TROUBLED]
     assert troubled.trigger.expect == {event}
 
 

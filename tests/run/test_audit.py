@@ -30,7 +30,7 @@ def archive(tmp_path: Path) -> Archive:
 def _mismatches(archive: Archive) -> set[tuple[str, str]]:
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
-        return {(found.what, found.path) for found in verify_archive(campaign, store)}
+        return {(mismatch.what, mismatch.path) for mismatch in verify_archive(campaign, store)}
 
 
 def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> None:
@@ -42,19 +42,19 @@ def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> No
     (archive.folder / "raw/poor/h11").unlink()
     (archive.folder / "raw/poor/h10").rename(archive.folder / "raw/poor/h-moved")
     name = str(product.relative_to(archive.folder / "out/products"))
-    told = {("product", name), ("signal", "rich/h00"), ("overlap", "overlap.csv")}
+    changed = {("product", name), ("signal", "rich/h00"), ("overlap", "overlap.csv")}
     lost = {("signal", "poor/h11"), ("signal", "poor/h10")}
-    assert _mismatches(archive) == told | lost
+    assert _mismatches(archive) == changed | lost
     # Once the catalog knows the new path, the moved file is no mismatch.
     CliRunner().invoke(app, ["catalog", str(archive.file)])
-    assert _mismatches(archive) == told | {("signal", "poor/h11")}
+    assert _mismatches(archive) == changed | {("signal", "poor/h11")}
 
 
 def test_the_command_line_shows_runs_and_mismatches(archive: Archive) -> None:
     runner, file = CliRunner(), str(archive.file)
-    told = runner.invoke(app, ["runs", file, "--json"])
-    assert told.exit_code == 0
-    (run,) = json.loads(told.stdout)
+    summary = runner.invoke(app, ["runs", file, "--json"])
+    assert summary.exit_code == 0
+    (run,) = json.loads(summary.stdout)
     assert (run["status"], run["scenes"], run["products"]) == ("finished", 4, 12)
     assert {"digest", "retrieve", "write"} <= set(run["seconds"])
     assert run["id"] in runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
@@ -72,17 +72,17 @@ def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) 
     nothing = runner.invoke(app, ["reprocess", file, "--json"])
     # Its elastic products have no usable value, which every run reports.
     assert nothing.exit_code == 1
-    told = json.loads(nothing.stdout)
-    assert told["run"] is None
-    assert told["unusable_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
+    summary = json.loads(nothing.stdout)
+    assert summary["run"] is None
+    assert summary["unusable_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
     assert not (archive.folder / "out/report").exists()
     archive.flip("raw/poor/h10")
     planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
-    told = json.loads(planned.stdout)
-    (scene,) = told["scenes"]
+    summary = json.loads(planned.stdout)
+    (scene,) = summary["scenes"]
     times = scene["estimated_cpu_seconds"]
     assert 0 < times["to_be_made"] <= times["everything"]
-    assert told["estimated_cpu_seconds"]["to_be_made"]["scenes"] == times["to_be_made"]
+    assert summary["estimated_cpu_seconds"]["to_be_made"]["scenes"] == times["to_be_made"]
     assert {stale["reason"] for stale in scene["stale"]} == {"changed: signal poor/h10"}
     log = archive.folder / "log.jsonl"
     words = ["--log-json", "--log-level", "info", "--log-file", str(log), "--json"]
@@ -99,9 +99,9 @@ def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) 
 def test_commands_that_read_the_ledger_create_none(command: str, archive: Archive) -> None:
     """A wrong folder must not count as an archive without mismatches."""
     elsewhere = archive.folder / "elsewhere"
-    asked = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
-    assert asked.exit_code == 1
-    assert "there is no catalog yet" in asked.output
+    result = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
+    assert result.exit_code == 1
+    assert "there is no catalog yet" in result.output
     assert not elsewhere.exists()
 
 

@@ -107,15 +107,15 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
 
 _FULL = """
 import errno, os, sys
-sys.path.insert(0, {here!r})
+sys.path.insert(0, {support_folder!r})
 real = os.{name}
 left = {after}
-def failing(*given):
+def failing(*arguments):
     global left
     left -= 1
     if left < 0:
         raise OSError(errno.ENOSPC, "No space left on device")
-    return real(*given)
+    return real(*arguments)
 os.{name} = failing
 import crash_runs
 from contextlib import suppress
@@ -132,8 +132,8 @@ def test_a_disk_that_fills_up_is_reported_and_the_next_run_recovers(
     reprocess(crash_archive.make(calm, scenes=8))
     folder = tmp_path / "full"
     campaign = crash_archive.make(folder, scenes=8)
-    here = str(crash_archive.RUNNER.parent)
-    code = _FULL.format(here=here, name=name, after=after, folder=str(folder))
+    support_folder = str(crash_archive.RUNNER.parent)
+    code = _FULL.format(support_folder=support_folder, name=name, after=after, folder=str(folder))
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert process.returncode == 1, process.stderr.decode()
     assert crash_archive.wrong_rows(folder) == []

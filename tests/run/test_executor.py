@@ -131,8 +131,8 @@ def test_scenes_that_killed_their_process_are_tried_in_another(
                 session.take(judged, note=True)
     with Store(campaign.catalog_url, campaign.name) as store:
         again = Judge(campaign, store)
-        found = again.days(sorted(again.signatures())).judgements
-        assert {each.scene.id for each in found if each.suspect} == scenes
+        judgements = again.days(sorted(again.signatures())).judgements
+        assert {each.scene.id for each in judgements if each.suspect} == scenes
     result = bring_up_to_date(campaign)
     assert [scene.error for scene in result.record.scenes] == [""] * 4
     assert result.status is RunStatus.FINISHED

@@ -244,15 +244,15 @@ def _planned(archive: Archive, *options: str) -> dict[str, Any]:
 def test_the_plan_of_a_selection_shows_its_products_only(archive: Archive) -> None:
     archive.write()
     whole = _planned(archive)["estimated_cpu_seconds"]["everything"]
-    told = _planned(archive, "--product", "homogeneous")
-    for scene in told["scenes"]:
+    summary = _planned(archive, "--product", "homogeneous")
+    for scene in summary["scenes"]:
         rich = scene["scene"].startswith("rich")
         assert (scene["fresh"], len(scene["stale"])) == (int(rich), 0)
         names = {step["name"] for step in scene["steps"]}
         assert ("homogeneous" in names) == bool(names) == rich
         assert not names & {"signal", "background", "elastic", "reference"}
         assert {left["name"] for left in scene["left_out"]} >= {"homogeneous"} - names
-    some = told["estimated_cpu_seconds"]["everything"]
+    some = summary["estimated_cpu_seconds"]["everything"]
     assert 0 < some["scenes"] < whole["scenes"]
     assert some["start"] < whole["start"], "elastic code is not loaded"
     nothing = _planned(archive, "--product", "homogeneous", "--instrument", "poor")
@@ -260,8 +260,8 @@ def test_the_plan_of_a_selection_shows_its_products_only(archive: Archive) -> No
     assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
 
 
-def _window_effects(told: dict[str, Any]) -> list[str]:
-    steps = [step for scene in told["scenes"] for step in scene["steps"]]
+def _window_effects(summary: dict[str, Any]) -> list[str]:
+    steps = [step for scene in summary["scenes"] for step in scene["steps"]]
     return [step.get("no_effect", "") for step in steps if step["name"] == "range_window"]
 
 
@@ -284,9 +284,9 @@ def test_a_kind_that_nothing_requests_is_wrong_use(archive: Archive) -> None:
 def test_products_that_were_never_made_are_not_fresh(archive: Archive, tmp_path: Path) -> None:
     archive.write()
     for kinds in ([], ["--product", "signal"], ["--product", "homogeneous"]):
-        told = _planned(archive, "--out", str(tmp_path / "new"), *kinds)
-        assert {scene["fresh"] for scene in told["scenes"]} == {0}
-        times = told["estimated_cpu_seconds"]
+        summary = _planned(archive, "--out", str(tmp_path / "new"), *kinds)
+        assert {scene["fresh"] for scene in summary["scenes"]} == {0}
+        times = summary["estimated_cpu_seconds"]
         assert times["to_be_made"] == times["everything"]
         assert times["everything"]["all"] > 0
 
@@ -298,8 +298,8 @@ def test_a_selection_without_scene_is_reported_as_text_and_json(archive: Archive
         for options, none in ((["--since", "2030-01-01"], True), (["--station", "coast"], False)):
             line = [command, str(archive.file), *options]
             assert (said in CliRunner().invoke(app, line).stdout) is none
-            told = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
-            assert told["no_scene_asked_for"] is none
+            summary = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
+            assert summary["no_scene_asked_for"] is none
 
 
 def test_force_makes_what_is_fresh(archive: Archive) -> None:
@@ -364,8 +364,8 @@ def test_the_run_that_makes_an_unusable_scene_reports_it(
     assert shown.exit_code == 1
     assert shown.stdout.count("gave no usable value") == 1
     assert "earlier runs" not in shown.stdout
-    told = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
-    assert told["unusable_scenes"] == ["rich_20260301T000000"]
+    summary = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    assert summary["unusable_scenes"] == ["rich_20260301T000000"]
 
 
 def test_orphaned_products_are_not_reported_as_unusable(archive: Archive) -> None:
@@ -476,17 +476,17 @@ def test_a_new_day_is_processed_alone(archive: Archive) -> None:
 
 
 def _expected_verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
-    """Return the verdicts (signature, empty scenes, granules set aside) of days with nothing stale."""
+    """Return day -> signature, empty scenes and granules set aside, where nothing is stale."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store)
         signatures = judge.signatures()
-        found = [judge.days(batch) for batch in judge.batches(signatures)]
+        judged = [judge.days(batch) for batch in judge.batches(signatures)]
     return {
         day: (signatures[day].whole, *unused)
-        for each in found
-        for day, unused in each.unused.items()
-        if day not in each.open
+        for days in judged
+        for day, unused in days.unused.items()
+        if day not in days.open
     }
 
 
@@ -496,7 +496,11 @@ def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
     with Store(campaign.catalog_url, campaign.name) as store:
         now = Judge(campaign, store).signatures()
         known = store.verdicts()
-    return {day: told for day, told in known.items() if day in now and told[0] == now[day].whole}
+    return {
+        day: verdict
+        for day, verdict in known.items()
+        if day in now and verdict[0] == now[day].whole
+    }
 
 
 def _unreadable_later(archive: Archive) -> None:
@@ -550,9 +554,9 @@ def test_only_days_with_failures_are_judged_again(
     looked: list[int] = []
     days = Judge.days
 
-    def counting(judge: Judge, wanted: Sequence[int]) -> DaysJudged:
-        looked.extend(wanted)
-        return days(judge, wanted)
+    def counting(judge: Judge, requested_days: Sequence[int]) -> DaysJudged:
+        looked.extend(requested_days)
+        return days(judge, requested_days)
 
     monkeypatch.setattr(Judge, "days", counting)
     _title(archive)

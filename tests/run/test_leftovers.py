@@ -42,10 +42,10 @@ pytestmark = pytest.mark.usefixtures("quickly")
 # Reported ----------------------------------------------------------------------------------------
 
 
-def _told(archive: Archive) -> dict[str, object]:
+def _json_output(archive: Archive) -> dict[str, object]:
     """Return the JSON output of the command; exit code 1 must come with a reason."""
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
-    told = json.loads(result.stdout)
+    summary = json.loads(result.stdout)
     reasons = (
         "failed_scenes",
         "unusable_scenes",
@@ -53,18 +53,18 @@ def _told(archive: Archive) -> dict[str, object]:
         "files_set_aside",
         "empty_scenes",
     )
-    nowhere = any(each["nowhere"] for each in told["not_in_files"])
-    assert result.exit_code == int(nowhere or any(told[name] for name in reasons))
-    return dict(told)
+    nowhere = any(each["nowhere"] for each in summary["not_in_files"])
+    assert result.exit_code == int(nowhere or any(summary[name] for name in reasons))
+    return dict(summary)
 
 
 def test_a_file_in_no_scene_is_named_by_every_run(archive: Archive) -> None:
     archive.raw("poor/h-twin", 600, seed=1)
     archive.write()
     for _ in range(3):
-        told = _told(archive)["files_set_aside"]
-        assert list(told) == ["poor/h00"]
-        assert "poor/h-twin" in told["poor/h00"]
+        summary = _json_output(archive)["files_set_aside"]
+        assert list(summary) == ["poor/h00"]
+        assert "poor/h-twin" in summary["poor/h00"]
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file)])
     assert "poor/h-twin" in shown.stdout
     assert shown.exit_code == 1
@@ -76,9 +76,9 @@ def test_an_empty_scene_is_named_by_every_run(archive: Archive) -> None:
     }
     archive.write()
     for _ in range(2):
-        told = _told(archive)["empty_scenes"]
-        assert len(told) == 4
-        assert all("photon_355o" in why for why in told.values())
+        summary = _json_output(archive)["empty_scenes"]
+        assert len(summary) == 4
+        assert all("photon_355o" in why for why in summary.values())
 
 
 def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
@@ -91,9 +91,9 @@ def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
     for scene in record.scenes:
         assert scene.plan is not None
         assert scene.plan.hash == plan_closure(scene.plan, planned_products(scene.plan)).hash
-        told = [left.reason for left in scene.left_out if left.rule == "section_level"]
-        assert len(told) == 1
-        assert "the beam climbs 750 m" in told[0]
+        summary = [left.reason for left in scene.left_out if left.rule == "section_level"]
+        assert len(summary) == 1
+        assert "the beam climbs 750 m" in summary[0]
         every = (*scene.plan.left_out, *scene.left_out)
         assert len(set(every)) == len(every)
     # One entry for all scenes with the same reason.
@@ -130,26 +130,30 @@ def _misspelt_facts(archive: Archive) -> None:
 
 
 @pytest.mark.parametrize(
-    ("misspell", "channel", "asked"),
+    ("misspell", "channel", "requested_by"),
     [
         (_misspelt_product, "photon_999o", "homogeneous"),
         (_misspelt_facts, "photon_533o", "facts from 2026-03-03T00:00:00Z"),
     ],
 )
 def test_a_channel_that_no_file_holds_is_named_by_every_run(
-    archive: Archive, misspell: Callable[[Archive], None], channel: str, asked: str
+    archive: Archive, misspell: Callable[[Archive], None], channel: str, requested_by: str
 ) -> None:
-    assert _told(archive)["not_in_files"] == []
+    assert _json_output(archive)["not_in_files"] == []
     misspell(archive)
-    found = bring_up_to_date(archive.write(), options=Options(force=True))
-    assert found.record is not None
-    assert found.record.failed
-    page = report_run(archive.write(), found.record).page.read_text()
+    result = bring_up_to_date(archive.write(), options=Options(force=True))
+    assert result.record is not None
+    assert result.record.failed
+    page = report_run(archive.write(), result.record).page.read_text()
     assert page.count(channel) >= 2
     assert "Requested, but not in the files" in page
     for _ in range(2):
-        (told,) = _told(archive)["not_in_files"]
-        assert (told["channel"], told["requested_by"], told["nowhere"]) == (channel, asked, True)
+        (summary,) = _json_output(archive)["not_in_files"]
+        assert (summary["channel"], summary["requested_by"], summary["nowhere"]) == (
+            channel,
+            requested_by,
+            True,
+        )
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file)], env={"COLUMNS": "200"})
     assert channel in shown.stdout
     assert shown.exit_code == 1
@@ -157,7 +161,7 @@ def test_a_channel_that_no_file_holds_is_named_by_every_run(
     other = CliRunner().invoke(app, ["reprocess", str(archive.file), "--instrument", "poor"])
     assert other.exit_code == 0
     early = ["reprocess", str(archive.file), "--until", "2026-03-02"]
-    assert CliRunner().invoke(app, early).exit_code == int(asked == "homogeneous")
+    assert CliRunner().invoke(app, early).exit_code == int(requested_by == "homogeneous")
 
 
 def test_a_channel_of_a_new_laser_is_reported_without_failure(archive: Archive) -> None:
@@ -165,9 +169,9 @@ def test_a_channel_of_a_new_laser_is_reported_without_failure(archive: Archive) 
         path.write_bytes(path.read_bytes().replace(b"00532.o", b"00533.o"))
     archive.tree["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
     archive.write()
-    told = _told(archive)
-    assert any("photon_533o" in path for path in told["products"])
-    files = {(each["channel"], each["requested_by"][:5]): each for each in told["not_in_files"]}
+    summary = _json_output(archive)
+    assert any("photon_533o" in path for path in summary["products"])
+    files = {(each["channel"], each["requested_by"][:5]): each for each in summary["not_in_files"]}
     assert files["photon_533o", "facts"]["files"] == 3
     assert files["photon_533o", "facts"]["of"] == 6
     assert files["photon_532o", "homog"]["files"] == 3
@@ -225,9 +229,9 @@ def test_failures_are_removed_with_the_last_files_of_their_day(archive: Archive)
     for path in (archive.folder / "raw").glob("*/h3*"):
         path.unlink()
     for _ in range(2):
-        found = bring_up_to_date(archive.write())
-        assert not found.failures
-        assert not found.troubled
+        result = bring_up_to_date(archive.write())
+        assert not result.failures
+        assert not result.troubled
 
 
 # Removed -------------------------------------------------------------------------------------
@@ -276,8 +280,8 @@ def test_leftovers_of_selected_scenes_are_reported(
 ) -> None:
     _leave_over(archive)
     campaign = archive.write()
-    found = bring_up_to_date(campaign, selection=Selection(since=since, until=until))
-    assert len(found.orphans) == number
+    result = bring_up_to_date(campaign, selection=Selection(since=since, until=until))
+    assert len(result.orphans) == number
 
 
 def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) -> None:
@@ -286,12 +290,12 @@ def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) 
         path.unlink()
     campaign = archive.write()
     before = archive.contents("out/products")
-    found = bring_up_to_date(campaign)
-    assert len(found.orphans) == 2
+    result = bring_up_to_date(campaign)
+    assert len(result.orphans) == 2
     for path, content in kept.items():
         path.write_bytes(content)
     assert reprocess(campaign, options=Options(force=True))
-    assert remove_orphans(campaign, found) == 0
+    assert remove_orphans(campaign, result) == 0
     assert archive.contents("out/products") == before
     assert reprocess(campaign) is None
 
@@ -333,10 +337,10 @@ def test_products_without_raw_file_are_failures_until_they_are_removed(
     _without(archive, "poor")
     campaign = archive.write()
     for _ in range(2):
-        found = bring_up_to_date(campaign)
-        assert found.troubled
-        assert set(found.lost) == {each.path for each in found.orphans}
-        assert len(found.lost) == 8
+        result = bring_up_to_date(campaign)
+        assert result.troubled
+        assert set(result.lost) == {each.path for each in result.orphans}
+        assert len(result.lost) == 8
     command = ["reprocess", str(archive.file)]
     # Also if all selected scenes are gone.
     for options in ([], ["--instrument", "poor"]):
@@ -361,12 +365,12 @@ def test_products_whose_files_became_unusable_are_kept(archive: Archive, how: st
             path.unlink()
             path.symlink_to("nowhere")
     for _ in range(2):
-        found = bring_up_to_date(campaign)
-        (orphan,) = {(each.reason, each.requested, each.lost) for each in found.orphans}
+        result = bring_up_to_date(campaign)
+        (orphan,) = {(each.reason, each.requested, each.lost) for each in result.orphans}
         assert orphan == ("its raw files are refused, or belong to no scene", True, False)
-        assert len(found.orphans) == 2
-        assert found.troubled
-        assert not found.lost
+        assert len(result.orphans) == 2
+        assert result.troubled
+        assert not result.lost
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
     assert shown.exit_code == 1
     assert archive.contents("out/products") == before
@@ -376,10 +380,10 @@ def test_products_of_scenes_that_are_cut_differently_are_not_reported_as_lost(
     archive: Archive,
 ) -> None:
     archive.tree["scenes"] = {"window": "6h"}
-    found = bring_up_to_date(archive.write())
-    assert {each.reason for each in found.orphans} == {"its files belong to other scenes now"}
-    assert len(found.orphans) == 24
-    assert not found.troubled
+    result = bring_up_to_date(archive.write())
+    assert {each.reason for each in result.orphans} == {"its files belong to other scenes now"}
+    assert len(result.orphans) == 24
+    assert not result.troubled
 
 
 def test_nothing_is_removed_if_the_archive_is_missing(archive: Archive) -> None:
@@ -388,11 +392,11 @@ def test_nothing_is_removed_if_the_archive_is_missing(archive: Archive) -> None:
         # A catalog that knows no file of the archive.
         connection.execute("delete from granule")
     campaign = archive.write()
-    found = bring_up_to_date(campaign)
+    result = bring_up_to_date(campaign)
     before = archive.contents("out/products")
-    assert len(found.orphans) == len(before) == 24
+    assert len(result.orphans) == len(before) == 24
     with pytest.raises(CatalogError, match="no raw file"):
-        remove_orphans(campaign, found)
+        remove_orphans(campaign, result)
     assert archive.contents("out/products") == before
 
 
@@ -429,8 +433,12 @@ def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
     if fails is _full:
         assert f"lidarops report {folder}" in failed.stderr
     if as_json:
-        told = json.loads(failed.stdout)
-        assert (told["report"], len(told["products"]), len(told["orphans"])) == (None, 2, 2)
+        summary = json.loads(failed.stdout)
+        assert (summary["report"], len(summary["products"]), len(summary["orphans"])) == (
+            None,
+            2,
+            2,
+        )
     else:
         assert "poor_20260301T000000" in failed.stdout
         assert "poor_20260302T000000" in failed.stdout

@@ -105,8 +105,8 @@ def test_lidars_used_only_by_a_network_are_no_failure(net: Net) -> None:
         assert (result.record is not None) == bool(made)
         assert not result.empty_scenes
         assert not result.troubled
-    code, told = net.command()
-    assert (code, told["empty_scenes"]) == (0, {})
+    code, summary = net.command()
+    assert (code, summary["empty_scenes"]) == (0, {})
     shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"]).stdout
     assert "used only by network valley" in shown
 
@@ -134,16 +134,16 @@ def test_an_empty_network_is_reported_once(net: Net) -> None:
     assert list(bring_up_to_date(net.write()).empty_scenes) == ["valley_20260301T000000"]
 
 
-@pytest.mark.parametrize("why", ["asked", "alone"])
+@pytest.mark.parametrize("why", ["requested", "alone"])
 def test_an_empty_lidar_is_reported_beside_a_network(net: Net, why: str) -> None:
     lidar = net.tree["instruments"]["west-lidar"]
-    if why == "asked":
+    if why == "requested":
         lidar["products"] = {"signal": {"channels": ["photon_355o"]}}
     else:
         net.tree["instruments"]["other"] = {**lidar, "files": "other/h*"}
         net.raw("other/h0", 9)
     (name,) = bring_up_to_date(net.write()).empty_scenes
-    assert name == ("west-lidar" if why == "asked" else "other") + "_20260301T000000"
+    assert name == ("west-lidar" if why == "requested" else "other") + "_20260301T000000"
 
 
 # Orphans -------------------------------------------------------------------------------------
@@ -160,10 +160,10 @@ def test_a_product_whose_network_lost_members_is_kept(net: Net, lost: list[str],
     assert reprocess(net.write())
     (path,) = net.products
     net.lose(*lost)
-    code, told = net.command("--remove-orphans")
-    (reason,) = told["kept_products"].values()
+    code, summary = net.command("--remove-orphans")
+    (reason,) = summary["kept_products"].values()
     assert said in reason
-    assert (code, told["orphans"], told["removed"], net.products) == (1, {}, 0, [path])
+    assert (code, summary["orphans"], summary["removed"], net.products) == (1, {}, 0, [path])
     assert "could not be made again" in CliRunner().invoke(app, ["reprocess", str(net.file)]).stdout
     net.find(*lost)
     again = bring_up_to_date(net.write())
@@ -177,9 +177,9 @@ def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
     net.raw("other/h0", 9)
     assert reprocess(net.write())
     net.lose(*PLACES)
-    _, told = net.command("--remove-orphans")
-    assert list(told["orphans"].values()) == ["no raw file of its scene is left"]
-    assert (told["kept_products"], told["removed"]) == ({}, 1)
+    _, summary = net.command("--remove-orphans")
+    assert list(summary["orphans"].values()) == ["no raw file of its scene is left"]
+    assert (summary["kept_products"], summary["removed"]) == ({}, 1)
     assert len(net.products) == 2
 
 
@@ -210,17 +210,17 @@ def test_a_product_that_the_campaign_made_impossible_is_removed(
     (path,) = net.products
     change(net)
     net.write()
-    _, told = net.command("--remove-orphans")
-    (reason,) = told["orphans"].values()
+    _, summary = net.command("--remove-orphans")
+    (reason,) = summary["orphans"].values()
     assert said in reason
-    assert (told["kept_products"], told["removed"]) == ({}, 1)
+    assert (summary["kept_products"], summary["removed"]) == ({}, 1)
     assert path not in net.products
 
 
 def test_a_kept_product_that_is_removed_by_hand_is_forgotten(net: Net) -> None:
     assert reprocess(net.write())
     net.lose("east")
-    found = bring_up_to_date(net.write())
+    result = bring_up_to_date(net.write())
     Path(net.products[0]).unlink()
-    assert remove_orphans(net.write(), found) == 0
+    assert remove_orphans(net.write(), result) == 0
     assert not bring_up_to_date(net.write()).orphans

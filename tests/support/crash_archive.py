@@ -24,7 +24,7 @@ def make(folder: Path, *, scenes: int = SCENES) -> Campaign:
         for k in range(6):
             data = raw_archives.content(day * 1440 + k, bins=4000, seed=day * 10 + k)
             raw_archives.write(folder / "raw" / f"h{day:02d}{k}", data)
-    told = {
+    tree = {
         "name": "crash", "title": "Crash", "archive": "raw", "output": "out",
         "stations": {"coast": {"name": "Coast", "latitude": 46.4, "longitude": 30.7}},
         "instruments": {
@@ -37,7 +37,7 @@ def make(folder: Path, *, scenes: int = SCENES) -> Campaign:
             }
         },
     }  # fmt: skip
-    (folder / "campaign.yaml").write_text(yaml.safe_dump(told))
+    (folder / "campaign.yaml").write_text(yaml.safe_dump(tree))
     return load_campaign(folder / "campaign.yaml")
 
 
@@ -69,14 +69,14 @@ def wrong_rows(folder: Path) -> list[str]:
     database = folder / "out" / "catalog.sqlite"
     if not database.exists():
         return []
-    here = products(folder)
+    present = products(folder)
     with sqlite3.connect(database) as connection:
         names = {row[0] for row in connection.execute("select name from sqlite_master")}
         if "product" not in names:
             return []
         assert connection.execute("pragma integrity_check").fetchone() == ("ok",)
         rows = connection.execute("select path, sha256 from product").fetchall()
-    return [path for path, sha256 in rows if here.get(path) != sha256]
+    return [path for path, sha256 in rows if present.get(path) != sha256]
 
 
 def visible_partial(folder: Path, whole: dict[str, str]) -> list[str]:

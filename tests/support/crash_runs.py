@@ -14,8 +14,8 @@ def run(folder: Path, mode: str) -> int:
     if mode == "flow":
         from flows.reprocess import reprocess
 
-        found, _ = reprocess(str(folder / "campaign.yaml"), wait=60.0)
-        return int(found.troubled)
+        result, _ = reprocess(str(folder / "campaign.yaml"), wait=60.0)
+        return int(result.troubled)
     campaign = load_campaign(folder / "campaign.yaml")
     workers = 2 if mode == "cluster" else 1
     result = bring_up_to_date(campaign, options=Options(workers=workers, wait=60.0))

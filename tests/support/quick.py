@@ -24,10 +24,12 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     settings = product_dependence.Settings(job.campaign)
     products = []
     for kind, channel in product_dependence.planned_products(job.plan):
-        mine = product_dependence.plan_closure(job.plan, [(kind, channel)])
-        used = sorted(record.sha256 for record in product_dependence.product_inputs(mine, inputs))
-        told = [mine.as_dict(), settings.of(job.scene, mine, channel), used]
-        content = json.dumps(told, sort_keys=True).encode()
+        closure = product_dependence.plan_closure(job.plan, [(kind, channel)])
+        used = sorted(
+            record.sha256 for record in product_dependence.product_inputs(closure, inputs)
+        )
+        fields = [closure.as_dict(), settings.of(job.scene, closure, channel), used]
+        content = json.dumps(fields, sort_keys=True).encode()
         path = f"{scene.instrument}/{scene.id}_{kind.value}_{channel}.nc"
         target = job.campaign.products_root / path
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -49,12 +49,12 @@ def descendants(process: int) -> list[int]:
         except OSError:
             continue
         parents.setdefault(int(fields[1]), []).append(int(stat.parent.name))
-    found, queue = [], [process]
+    processes, queue = [], [process]
     while queue:
         children = parents.get(queue.pop(), [])
-        found += children
+        processes += children
         queue += children
-    return found
+    return processes
 
 
 def kill_tree(process: subprocess.Popen[bytes]) -> None:

@@ -61,22 +61,22 @@ class TestEach:
     def test_keeps_the_order(self, number: int) -> None:
         with Processes(number, 2) as pool:
             assert list(pool.map_items(product, range(40), at_a_time=3)) == doubled(range(40))
-            others = {found for _, found in pool.map_items(process, range(40), at_a_time=3)}
+            others = {results for _, results in pool.map_items(process, range(40), at_a_time=3)}
             assert list(pool.map_items(product, [], at_a_time=3)) == []
         assert (os.getpid() not in others) == (number > 1)
 
     def test_takes_items_as_they_are_needed(self) -> None:
         taken = count()
         with Processes(2, 2) as pool:
-            found = pool.map_items(product, taken, at_a_time=1)
-            assert list(islice(found, 30)) == doubled(range(30))
+            results = pool.map_items(product, taken, at_a_time=1)
+            assert list(islice(results, 30)) == doubled(range(30))
         assert next(taken) < 100
 
     @pytest.mark.usefixtures("no_process")
     def test_starts_no_process_for_few_items(self) -> None:
         with Processes(2, 2) as pool:
-            found = pool.map_items(product, range(9), at_a_time=3, fewest=10)
-            assert list(found) == doubled(range(9))
+            results = pool.map_items(product, range(9), at_a_time=3, fewest=10)
+            assert list(results) == doubled(range(9))
 
     @pytest.mark.usefixtures("no_process")
     def test_a_daemon_that_may_start_no_process_does_it_itself(self, monkeypatch) -> None:
@@ -90,7 +90,7 @@ class TestEach:
             last = pool.later(product, 7)
             assert list(pool.map_items(deadly, range(40), at_a_time=2)) == doubled(range(40))
             assert last() == 14
-            assert {found for _, found in pool.map_items(process, range(4), at_a_time=1)} == {
+            assert {results for _, results in pool.map_items(process, range(4), at_a_time=1)} == {
                 os.getpid()
             }
         assert caplog.text.count("a process was lost") == 1
@@ -134,10 +134,10 @@ class TestEach:
     @pytest.mark.parametrize("number", [1, 2])
     def test_raises_what_a_task_raises(self, number: int) -> None:
         with Processes(number, 2) as pool:
-            found = pool.map_items(failing, range(40), at_a_time=1)
-            assert list(islice(found, 5)) == [(item, item) for item in range(5)]
+            results = pool.map_items(failing, range(40), at_a_time=1)
+            assert list(islice(results, 5)) == [(item, item) for item in range(5)]
             with pytest.raises(CatalogError, match=r"archive: is away \(wait\)"):
-                next(found)
+                next(results)
             # No process was lost.
             others = {one for _, one in pool.map_items(process, [1, 2], at_a_time=1)}
         assert (os.getpid() not in others) == (number > 1)
@@ -215,23 +215,23 @@ class TestPrefetchOne:
     def test_computes_the_next_item_meanwhile_and_no_more(self) -> None:
         begun = [threading.Event() for _ in range(4)]
 
-        def found() -> Iterator[int]:
+        def numbers() -> Iterator[int]:
             for number, event in enumerate(begun):
                 event.set()
                 yield number
 
-        items = prefetch_one(found())
+        items = prefetch_one(numbers())
         assert next(items) == 0
         assert begun[1].wait(10)
         items.close()
         assert not begun[2].is_set()
 
     def test_raises_the_error_in_place_of_the_item(self) -> None:
-        def found() -> Iterator[int]:
+        def numbers() -> Iterator[int]:
             yield 1
             raise CatalogError("is away", file="archive", remedy="wait")
 
-        items = prefetch_one(found())
+        items = prefetch_one(numbers())
         assert next(items) == 1
         with pytest.raises(CatalogError, match="is away"):
             next(items)
@@ -274,7 +274,7 @@ class TestLater:
     def test_gives_what_it_came_to(self, number: int) -> None:
         with Processes(number, 3) as pool:
             begun = [pool.later(product, item) for item in range(9)]
-            assert [found() for found in begun] == [3 * item for item in range(9)]
+            assert [results() for results in begun] == [3 * item for item in range(9)]
 
 
 def test_existing_objects_are_not_collected_within_and_are_afterwards():

@@ -46,14 +46,14 @@ def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Pat
     with Store(campaign.catalog_url, campaign.name) as store:
         assert scan_archive(campaign, store) == ScanSummary(2, 2, 0, 0, 0, 0)
         remote = store.granules()
-    there = campaign.model_copy(update={"archive": str(tmp_path / "raw"), "name": "folder"})
+    in_folder = campaign.model_copy(update={"archive": str(tmp_path / "raw"), "name": "folder"})
     with Store(campaign.catalog_url, "folder") as store:
-        scan_archive(there, store)
+        scan_archive(in_folder, store)
         local = store.granules()
     assert [(g.path, g.size, g.start) for g in remote] == [(g.path, g.size, g.start) for g in local]
     digests = [
-        [Source.of(each.archive).digest(granule.path) for granule in local]
-        for each in (campaign, there)
+        [Source.of(scanned.archive).digest(granule.path) for granule in local]
+        for scanned in (campaign, in_folder)
     ]
     assert digests[0] == digests[1]
 

@@ -133,8 +133,8 @@ def test_fetch_leaves_out_what_the_store_lacks(tmp_path: Path, url: str) -> None
     store = RemoteStore(url)
     store.publish(tmp_path / "products", made, tmp_path / "journal")
     store.fetch(["coast/a.nc", "coast/gone.nc", "coast/b.nc"], tmp_path / "back")
-    found = sorted(path.name for path in (tmp_path / "back").rglob("*") if path.is_file())
-    assert found == ["a.nc", "b.nc"]
+    fetched = sorted(path.name for path in (tmp_path / "back").rglob("*") if path.is_file())
+    assert fetched == ["a.nc", "b.nc"]
     assert (tmp_path / "back" / "coast" / "b.nc").read_bytes() == b"two"
 
 
@@ -191,7 +191,7 @@ def test_a_store_that_does_not_answer_is_reported(
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "shown"),
     [
         ("s3://key:secret@bucket/a", "s3://bucket/a"),
         ("s3://key:se/c@ret@bucket/a", "s3://bucket/a"),
@@ -203,5 +203,5 @@ def test_a_store_that_does_not_answer_is_reported(
         ("no address at all", "no address at all"),
     ],
 )
-def test_keys_are_left_out_of_messages(url: str, told: str) -> None:
-    assert without_keys(url) == told
+def test_keys_are_left_out_of_messages(url: str, shown: str) -> None:
+    assert without_keys(url) == shown
