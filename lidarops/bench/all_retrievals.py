@@ -1,4 +1,4 @@
-"""The work-precision study of all retrievals, on one page."""
+"""Error against run time of all retrievals, on one page."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from lidarops.bench.accuracy import (
 from lidarops.bench.accuracy.elastic import Elastic
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.multiangle_scores import measure_multiangle as measure_scans
-from lidarops.bench.accuracy.network_scores import MultiPosition
-from lidarops.bench.harness.terms import RESULT, Effort, Finding
+from lidarops.bench.accuracy.network_scores import NetworkAccuracy
+from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import Machine, least_times, machine
-from lidarops.bench.overview import Baseline, Work
+from lidarops.bench.overview import Baseline, WorkPrecision
 from lidarops.reports.benchmark_page import BenchmarkReport, Part
 
 _PROFILES: Final = 500
@@ -37,21 +37,21 @@ _ROUNDS: Final = 9
 
 
 @dataclass(frozen=True, slots=True)
-class Everything:
-    """The accuracy of all retrievals."""
+class AllRetrievals:
+    """Accuracy results of all retrievals."""
 
     date: str
     machine: Machine
     baselines: tuple[Baseline, ...]
-    works: tuple[Work, ...]
+    works: tuple[WorkPrecision, ...]
     homogeneous: accuracy.Accuracy
     elastic: Elastic
     multiangle: MultiAngle
-    multiposition: MultiPosition
+    multiposition: NetworkAccuracy
 
 
-def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Finding:
-    """Measure error against run time of every retrieval.
+def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> BenchmarkOutput:
+    """Measure error against run time of all retrievals.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Finding:
     Raises
     ------
     CampaignError
-        Where the folder holds no such files.
+        If the folder holds no such files.
     RawFormatError
-        Where a published file cannot be read.
+        If a published file cannot be read.
     """
     quick, date, progress = effort.quick, effort.date, effort.progress
     paths = accuracy.measure_homogeneous(quick=quick, date=date, progress=progress)
@@ -75,17 +75,17 @@ def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Finding:
     networks = network.measure_network(
         quick=quick, date=date, repeats=effort.repeats, progress=progress
     )
-    found = Everything(
+    result = AllRetrievals(
         date=date,
         machine=machine(),
         baselines=tuple(_baselines()),
-        works=overview.works(paths, vertical, scans, networks),
+        works=overview.work_precision_rows(paths, vertical, scans, networks),
         homogeneous=paths,
         elastic=vertical,
         multiangle=scans,
         multiposition=networks,
     )
-    return Finding(found, _report(found))
+    return BenchmarkOutput(result, _report(result))
 
 
 def _baselines() -> Iterator[Baseline]:
@@ -103,27 +103,29 @@ def _baselines() -> Iterator[Baseline]:
     )
 
 
-def _report(found: Everything) -> BenchmarkReport:
+def _report(result: AllRetrievals) -> BenchmarkReport:
     chapters = (
         (
             "Homogeneous path",
             "homogeneous",
-            homogeneous_report.homogeneous_accuracy_report(found.homogeneous),
+            homogeneous_report.homogeneous_accuracy_report(result.homogeneous),
         ),
-        ("Elastic inversion", "elastic", elastic.elastic_accuracy_report(found.elastic)),
-        ("Scans", "multiangle", multiangle_report.multiangle_accuracy_report(found.multiangle)),
-        ("Networks", "multiposition", network_report.network_accuracy_report(found.multiposition)),
+        ("Elastic inversion", "elastic", elastic.elastic_accuracy_report(result.elastic)),
+        ("Scans", "multiangle", multiangle_report.multiangle_accuracy_report(result.multiangle)),
+        ("Networks", "network", network_report.network_accuracy_report(result.multiposition)),
     )
-    told = [_apart(part, title, name) for title, name, report in chapters for part in report.parts]
+    parts = [
+        _prefixed(part, title, name) for title, name, report in chapters for part in report.parts
+    ]
     return BenchmarkReport(
         title="All retrievals: error against run time",
-        facts=homogeneous_report.facts(found.date, found.machine),
-        parts=(overview.overview(found.works, found.baselines), *told),
+        facts=homogeneous_report.facts(result.date, result.machine),
+        parts=(overview.overview(result.works, result.baselines), *parts),
         data=RESULT,
     )
 
 
-def _apart(part: Part, title: str, name: str) -> Part:
-    """Name a chapter and its files after their retrieval, so that no two are alike."""
+def _prefixed(part: Part, title: str, name: str) -> Part:
+    """Return a chapter with the retrieval in its title and file names, which makes them unique."""
     charts = tuple(replace(chart, name=f"{name}-{chart.name}") for chart in part.charts)
     return replace(part, title=f"{title}: {part.title}", charts=charts)

@@ -1,4 +1,4 @@
-"""The benchmarks by name."""
+"""The benchmarks by name: run one, write its result and page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidarops.bench.accuracy import (
     network,
 )
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import (
     archives,
@@ -29,14 +29,14 @@ from lidarops.errors import CampaignError
 from lidarops.reports import benchmark_page
 
 STABILITY: Final = "stability"
-"""The benchmark that is no `Kind`: it has no cases to choose from."""
+"""The benchmark that is no `Kind`, because it has no cases to choose from."""
 _REPEATS: Final = 7
 
 _Names = TypeVar("_Names", bound=StrEnum)
 
 
 class Benchmark(StrEnum):
-    """What is measured."""
+    """Case of a benchmark."""
 
     ALL = "all"
     ARCHIVE = "archive"
@@ -44,7 +44,7 @@ class Benchmark(StrEnum):
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
     MULTIANGLE = "multiangle"
-    MULTIPOSITION = "multiposition"
+    NETWORK = "network"
     PIPELINE = "pipeline"
     READER = "reader"
 
@@ -56,68 +56,74 @@ def run_benchmark(
     effort: Effort,
     *,
     data: Path | None = None,
-) -> Finding:
-    """Run a benchmark.
+) -> BenchmarkOutput:
+    """Run a benchmark and return its result and page.
 
     Parameters
     ----------
     what : {"accuracy", "throughput"}
-    case : Case or str, optional
-        None is "reader" where files are given; else all retrievals on one page for the accuracy,
-        and "homogeneous" for the throughput.
+    case : Benchmark or str, optional
+        None means "reader" if files are given, else "all" for the accuracy and "homogeneous" for
+        the throughput.
     files : sequence of Path
-        Raw files of one layout, for "reader" and no other.
+        Raw files of one layout, only for "reader".
     effort : Effort
     data : Path, optional
-        Folder of published signals, for the accuracy of "elastic" or of all.
+        Folder of published signals, for the accuracy of "elastic" or "all".
 
     Raises
     ------
     CampaignError
-        Where there is no such benchmark, or the case takes no files.
+        If there is no such benchmark, or the case takes no files.
     RawFormatError
-        Where "reader" gets no file, or one that cannot be read.
+        If "reader" gets no file, or one that cannot be read.
     """
     kind = _member(Kind, what, "benchmark", STABILITY)
-    usual = Benchmark.ALL if kind is Kind.ACCURACY else Benchmark.HOMOGENEOUS
-    chosen = _member(Benchmark, case or (Benchmark.READER if files else usual), "case")
-    _check(kind, chosen, files, data)
-    ways: dict[Benchmark, Callable[[], Finding]] = {
+    default = Benchmark.ALL if kind is Kind.ACCURACY else Benchmark.HOMOGENEOUS
+    benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
+    _check(kind, benchmark, files, data)
+    runs: dict[Benchmark, Callable[[], BenchmarkOutput]] = {
         Benchmark.ALL: lambda: all_retrievals.run_all_retrievals(effort, data=data),
         Benchmark.ARCHIVE: lambda: archives.run_archives(kind, effort=effort),
         Benchmark.COSTS: lambda: cost_calibration.run_cost_calibration(kind, effort=effort),
         Benchmark.ELASTIC: lambda: elastic.run_elastic(kind, data=data, effort=effort),
         Benchmark.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
         Benchmark.MULTIANGLE: lambda: multiangle_report.run_multiangle(kind, effort=effort),
-        Benchmark.MULTIPOSITION: lambda: network.run_network(kind, effort=effort),
+        Benchmark.NETWORK: lambda: network.run_network(kind, effort=effort),
         Benchmark.PIPELINE: lambda: campaigns.run_campaigns(kind, effort=effort),
         Benchmark.READER: lambda: _reader(files, effort),
     }
-    return ways[chosen]()
+    return runs[benchmark]()
 
 
-def _reader(files: Sequence[Path], effort: Effort) -> Finding:
-    read = readers.reader(files, repeats=effort.repeats or _REPEATS)
-    return Finding(read, homogeneous_report.reader_report(read, effort.date, machine(), RESULT))
+def _reader(files: Sequence[Path], effort: Effort) -> BenchmarkOutput:
+    rates = readers.measure_readers(files, repeats=effort.repeats or _REPEATS)
+    return BenchmarkOutput(
+        rates, homogeneous_report.reader_report(rates, effort.date, machine(), RESULT)
+    )
 
 
-def _homogeneous(kind: Kind, effort: Effort) -> Finding:
+def _homogeneous(kind: Kind, effort: Effort) -> BenchmarkOutput:
     if kind is Kind.ACCURACY:
-        found = homogeneous.measure_homogeneous(
+        accuracy = homogeneous.measure_homogeneous(
             quick=effort.quick, date=effort.date, progress=effort.progress
         )
-        return Finding(found, homogeneous_report.homogeneous_accuracy_report(found, RESULT))
-    timed = retrievals.measure_solvers(
+        return BenchmarkOutput(
+            accuracy, homogeneous_report.homogeneous_accuracy_report(accuracy, RESULT)
+        )
+    throughput = retrievals.measure_solvers(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, homogeneous_report.homogeneous_throughput_report(timed, RESULT))
+    return BenchmarkOutput(
+        throughput, homogeneous_report.homogeneous_throughput_report(throughput, RESULT)
+    )
 
 
 def _check(kind: Kind, case: Benchmark, files: Sequence[Path], data: Path | None) -> None:
     if case is Benchmark.READER and kind is Kind.ACCURACY:
         raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
     if case is Benchmark.ALL and kind is Kind.THROUGHPUT:
-        raise CampaignError("all retrievals at once have no throughput", remedy="choose a case")
+        raise CampaignError("the case 'all' has no throughput", remedy="choose another case")
     if case is not Benchmark.READER and files:
         raise CampaignError(f"the case {case.value!r} takes no files", remedy="leave them out")
     if data is not None and (
@@ -128,21 +134,21 @@ def _check(kind: Kind, case: Benchmark, files: Sequence[Path], data: Path | None
         )
 
 
-def write_benchmark(finding: Finding, folder: Path) -> Path:
-    """Write the figures as JSON and the page of a benchmark; return the page.
+def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
+    """Write the result of a benchmark as JSON, and its page; return the path of the page.
 
     Raises
     ------
     CatalogError
-        Where the folder cannot be written.
+        If the folder cannot be written.
     """
-    results.save(finding.result, folder / RESULT)
-    return benchmark_page.build_benchmark_page(finding.report, folder)
+    results.save(output.result, folder / RESULT)
+    return benchmark_page.build_benchmark_page(output.report, folder)
 
 
-def _member(names: type[_Names], value: str, what: str, *others: str) -> _Names:
+def _member(names: type[_Names], value: str, what: str, *other_choices: str) -> _Names:
     try:
         return names(value)
     except ValueError:
-        choices = " or ".join((*names, *others))
+        choices = " or ".join((*names, *other_choices))
         raise CampaignError(f"no {what} {value!r}", remedy=f"choose: {choices}") from None

@@ -1,4 +1,4 @@
-"""The page of all retrievals: whole, without name clashes, and the same figures as its parts."""
+"""The page of all retrievals: complete, without name clashes, with the results of its parts."""
 
 from __future__ import annotations
 
@@ -23,16 +23,18 @@ SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20, random=4)
 
 
 @pytest.fixture(scope="module")
-def finding():
-    """Return the finding of few profiles, and how often it told of progress."""
+def output():
+    """Return the output for few profiles."""
     steps = []
     small = {
-        (homogeneous, "measure"): partial(homogeneous.measure_homogeneous, profiles=64),
-        (elastic, "measure"): partial(elastic.measure_elastic_accuracy, draws=4),
+        (homogeneous, "measure_homogeneous"): partial(homogeneous.measure_homogeneous, profiles=64),
+        (elastic, "measure_elastic_accuracy"): partial(elastic.measure_elastic_accuracy, draws=4),
         (all_retrievals, "measure_scans"): partial(
             multiangle_scores.measure_multiangle, size=SMALL
         ),
-        (network, "measure"): partial(network.measure_network, profiles=25, peer_profiles=4),
+        (network, "measure_network"): partial(
+            network.measure_network, profiles=25, peer_profiles=4
+        ),
     }
     with pytest.MonkeyPatch.context() as patch:
         for (module, name), measure in small.items():
@@ -40,79 +42,80 @@ def finding():
         scenes = (multiangle_cases.clear(3000.0, bins=25), multiangle_cases.cloud())
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
         effort = Effort(quick=True, repeats=1, date="2024-01-01", progress=steps.append)
-        found = registry.run_benchmark("accuracy", None, [], effort)
+        result = registry.run_benchmark("accuracy", None, [], effort)
     assert len(steps) > 40
-    return found
+    return result
 
 
-def test_every_retrieval_has_ways_of_ours_and_peers(finding):
-    works = finding.result.works
+def test_every_retrieval_has_our_methods_and_peers(output):
+    works = output.result.works
     for retrieval in (overview.HOMOGENEOUS, overview.ELASTIC, overview.SCANS, overview.NETWORKS):
-        of = [work for work in works if work.retrieval == retrieval]
-        assert {work.ours for work in of} == {True, False}, retrieval
-        assert all(work.nanoseconds > 0 and work.error.value > 0 for work in of)
+        works_of_retrieval = [work for work in works if work.retrieval == retrieval]
+        assert {work.ours for work in works_of_retrieval} == {True, False}, retrieval
+        assert all(work.nanoseconds > 0 and work.error.value > 0 for work in works_of_retrieval)
 
 
-def test_rows_hold_the_figures_of_the_retrievals(finding):
-    works = {(w.setting, w.quantity, w.way): w for w in finding.result.works}
-    scene = finding.result.multiangle.scenes[0]
+def test_rows_hold_the_figures_of_the_retrievals(output):
+    works = {(w.setting, w.quantity, w.way): w for w in output.result.works}
+    scene = output.result.multiangle.scenes[0]
     score = next(score for score in scene.scores if score.way == "joint")
     row = works[scene.label, "optical depth", "joint"]
     assert (row.error, row.nanoseconds) == (score.rmse, score.nanoseconds)
-    case = finding.result.multiposition.cases[0]
-    way, networked = next(iter(case.scores.items()))
-    found = [w for w in finding.result.works if w.retrieval == overview.NETWORKS and w.way == way]
-    assert found[0].nanoseconds == pytest.approx(1e3 * networked.microseconds)
-    assert found[0].error == networked.rmse
+    case = output.result.multiposition.cases[0]
+    method, networked = next(iter(case.scores.items()))
+    rows = [w for w in output.result.works if w.retrieval == overview.NETWORKS and w.way == method]
+    assert rows[0].nanoseconds == pytest.approx(1e3 * networked.microseconds)
+    assert rows[0].error == networked.rmse
 
 
-def test_the_short_table_shows_the_best_and_nothing_that_is_told_more(finding):
-    table = overview.short(finding.result.works)
-    ways = [row[1] for row in table.rows]
-    assert any(way.startswith("peer: ") for way in ways)
-    assert not any("known_" in way.removeprefix("known_shape") or "told" in way for way in ways)
-    scans = [work for work in finding.result.works if work.retrieval == overview.SCANS]
+def test_the_first_table_shows_the_best_method_without_prior_knowledge(output):
+    table = overview.best_methods(output.result.works)
+    methods = [row[1] for row in table.rows]
+    assert any(method.startswith("peer: ") for method in methods)
+    names = [method.removeprefix("known_shape") for method in methods]
+    assert not any("known_" in name or "from 6 km" in name for name in names)
+    scans = [work for work in output.result.works if work.retrieval == overview.SCANS]
     first = [work for work in scans if work.setting == scans[0].setting and work.ours]
     best = min(first, key=lambda work: work.error.value)
-    told = [row[1] for row in table.rows if row[0].startswith(overview.SCANS)]
-    (shown,) = (work for work in first if work.way in told)
+    shown_methods = [row[1] for row in table.rows if row[0].startswith(overview.SCANS)]
+    (shown,) = (work for work in first if work.way in shown_methods)
     assert shown.error.value <= best.error.value + 3.0 * (shown.error.error + best.error.error)
     assert shown.nanoseconds <= best.nanoseconds
 
 
-def test_of_ways_that_are_as_good_the_short_table_shows_the_fastest():
-    def work(way: str, error: float, nanoseconds: float) -> overview.Work:
+def test_of_equally_accurate_methods_the_first_table_shows_the_fastest():
+    def work(way: str, error: float, nanoseconds: float) -> overview.WorkPrecision:
         measured = MonteCarloFigure(error, 0.01)
-        return overview.Work(
+        return overview.WorkPrecision(
             "paths", "all", "extinction", way, ours=True, error=measured, coverage=None,
             nanoseconds=nanoseconds,
         )  # fmt: skip
 
-    found = [work("slow", 1.0, 90.0), work("fast", 1.02, 9.0), work("rough", 1.2, 1.0)]
-    ((_, way, *_),) = overview.short(found).rows
+    works = [work("slow", 1.0, 90.0), work("fast", 1.02, 9.0), work("rough", 1.2, 1.0)]
+    ((_, way, *_),) = overview.best_methods(works).rows
     assert way == "fast"
 
 
-def test_page_and_figures_are_written_once_each(finding, tmp_path):
-    page = registry.write_benchmark(finding, tmp_path)
+def test_page_and_figures_are_written_once_each(output, tmp_path):
+    page = registry.write_benchmark(output, tmp_path)
     text = page.read_text(encoding="utf-8")
-    titles = [part.title for part in finding.report.parts]
-    charts = [chart.name for part in finding.report.parts for chart in part.charts]
+    titles = [part.title for part in output.report.parts]
+    charts = [chart.name for part in output.report.parts for chart in part.charts]
     assert len(set(titles)) == len(titles)
     assert len(set(charts)) == len(charts)
     assert all(f"{name}.png" in text and (tmp_path / f"{name}.png").is_file() for name in charts)
     assert "http://" not in text
     assert "https://" not in text
-    read = results.load(all_retrievals.Everything, tmp_path / "result.json")
-    assert read.works == finding.result.works
+    read = results.load(all_retrievals.AllRetrievals, tmp_path / "result.json")
+    assert read.works == output.result.works
 
 
-def test_floors_are_measured(finding):
-    assert [floor.nanoseconds > 0 for floor in finding.result.baselines] == [True, True]
+def test_minimal_operations_are_measured(output):
+    assert [floor.nanoseconds > 0 for floor in output.result.baselines] == [True, True]
 
 
 @pytest.mark.parametrize(
-    ("nanoseconds", "told"), [(3.21, "3.21 ns"), (4.2e3, "4.2 µs"), (5e6, "5 ms"), (2e9, "2 s")]
+    ("nanoseconds", "text"), [(3.21, "3.21 ns"), (4.2e3, "4.2 µs"), (5e6, "5 ms"), (2e9, "2 s")]
 )
-def test_times_are_told_in_a_unit_that_fits(nanoseconds, told):
-    assert overview.spelled_time(nanoseconds) == told
+def test_times_have_a_suitable_unit(nanoseconds, text):
+    assert overview.format_time(nanoseconds) == text

@@ -1,4 +1,4 @@
-"""How right backgrounds and elastic inversions are, by the level of the background."""
+"""Accuracy of backgrounds and elastic inversions, by the level of the background."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lidarops.bench.accuracy.homogeneous_report import (
     elastic_throughput_report,
     facts,
 )
-from lidarops.bench.harness.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput.retrievals import StepCost, elastic_costs, measure_elastic
 from lidarops.figures.charts import Chart, Panel, Series
@@ -38,11 +38,11 @@ from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
-FEW: Final = 5
-"""One in so many profiles is enough for `homogeneous`, which is slow: 2 percent of its error, 5 in
-the quick run."""
+SLOW_SHARE: Final = 5
+"""One in this many profiles is processed by `homogeneous`, which is slow. Its Monte Carlo error is
+2 percent, 5 in a quick run."""
 BLOCK: Final = 200
-"""Profiles that are simulated and solved at once."""
+"""Profiles simulated and solved together."""
 CLOSED_LEVELS: Final = (1.0, 1e4, 1e8)
 _BATCH: Final = 400
 _REPEATS: Final = 5
@@ -51,27 +51,27 @@ _QUICK_REPEATS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """What was found at one level of the background."""
+    """Scores at one level of the background."""
 
     level: float
-    """Counts a shot."""
+    """Counts per shot."""
     profiles: int
     least_error: float
     """Cramér-Rao bound of the background's standard error from 6 km on, counts."""
     backgrounds: Mapping[str, BackgroundScore]
-    """By way; without those that reject all but one profile."""
+    """By method; without those that reject all but one profile."""
     rejected: Mapping[str, float]
-    """Share of profiles, by way."""
+    """Share of rejected profiles, by method."""
     inversions: Mapping[str, InversionScore]
-    """By chain; without those that have values in less than two profiles."""
+    """By chain; without those with values in less than two profiles."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """What is left where there is no noise."""
+    """Errors without noise."""
 
     level: float | None
-    """Counts a shot; none where the background is known to be 0."""
+    """Counts per shot; None if the background is known to be 0."""
     background: float
     """Error, counts."""
     bias: float
@@ -82,7 +82,7 @@ class ClosedLoop:
 
 @dataclass(frozen=True, slots=True)
 class PublishedProfileScore:
-    """One way or chain on one published file."""
+    """Score of one method or chain on one published file."""
 
     way: str
     level: float
@@ -93,12 +93,12 @@ class PublishedProfileScore:
     truth_error: float
     """Standard error of the truth, counts."""
     inversion: InversionScore | None
-    """None where no chain follows, or it has no value."""
+    """None for a method without chain, or a chain without value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Elastic:
-    """The accuracy benchmark of the elastic retrieval."""
+    """Result of the accuracy benchmark of the elastic retrieval."""
 
     date: str
     machine: Machine
@@ -106,7 +106,7 @@ class Elastic:
     closed: tuple[ClosedLoop, ...]
     costs: tuple[StepCost, ...]
     published: tuple[PublishedProfileScore, ...]
-    """Empty where no folder was given."""
+    """Empty if no folder was given."""
 
 
 def measure_elastic_accuracy(
@@ -117,25 +117,25 @@ def measure_elastic_accuracy(
     data: Path | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> Elastic:
-    """Find background and particles of simulated profiles at each level of the background.
+    """Retrieve background and particles of simulated profiles at each level of the background.
 
     Parameters
     ----------
     quick : bool
         Fewer profiles.
     date : str
-        When it is run, as it is to be stated.
+        Date stated in the result.
     draws : int, optional
-        Profiles of each level, at least 2.
+        Profiles per level, at least 2.
     data : Path, optional
-        Folder of the published files; see `lidarops.bench.accuracy.elastic_cases.published_profiles`.
+        Folder of the published files (`elastic_cases.read_published_profiles`).
     progress : callable
-        Is given 1 after each level.
+        Called with 1 after each level.
 
     Raises
     ------
     CampaignError, RawFormatError
-        Where the published files cannot be read.
+        If the published files cannot be read.
     """
     published = _published(data) if data is not None else ()
     count = draws or (QUICK_DRAWS if quick else DRAWS)
@@ -154,9 +154,11 @@ def measure_elastic_accuracy(
 
 
 def _level(sky: SimulatedSky, level: float, draws: int, seed: int) -> Level:
-    sizes, few = enumerate(_sizes(draws)), draws / FEW
-    blocks = [_block(sky, level, size, (seed, k), every=k * BLOCK < few) for k, size in sizes]
-    found = {
+    sizes, slow_draws = enumerate(_sizes(draws)), draws / SLOW_SHARE
+    blocks = [
+        _block(sky, level, size, (seed, k), with_slow=k * BLOCK < slow_draws) for k, size in sizes
+    ]
+    estimates = {
         name: _join([block[0][name] for block in blocks if name in block[0]])
         for name in elastic_cases.background_methods()
     }
@@ -165,41 +167,41 @@ def _level(sky: SimulatedSky, level: float, draws: int, seed: int) -> Level:
         for name in elastic_cases.chains()
     }
     scores = {
-        name: background_score(each.background - level, each.standard_error, each.rejected)
-        for name, each in found.items()
+        name: background_score(result.background - level, result.standard_error, result.rejected)
+        for name, result in estimates.items()
     }
     inversions = {
-        name: inversion_score(each[0], each[1], _scale(sky)) for name, each in errors.items()
+        name: inversion_score(result[0], result[1], _scale(sky)) for name, result in errors.items()
     }
     return Level(
         level=level,
         profiles=draws,
         least_error=elastic_cases.least_error(sky, level),
         backgrounds={name: score for name, score in scores.items() if score is not None},
-        rejected={name: float(each.rejected.mean()) for name, each in found.items()},
+        rejected={name: float(result.rejected.mean()) for name, result in estimates.items()},
         inversions={name: score for name, score in inversions.items() if score is not None},
     )
 
 
 def _sizes(draws: int) -> list[int]:
-    whole, rest = divmod(draws, BLOCK)
-    return [BLOCK] * whole + [rest] * (rest > 0)
+    full_blocks, rest = divmod(draws, BLOCK)
+    return [BLOCK] * full_blocks + [rest] * (rest > 0)
 
 
 def _block(
-    sky: SimulatedSky, level: float, draws: int, seed: tuple[int, int], *, every: bool
+    sky: SimulatedSky, level: float, draws: int, seed: tuple[int, int], *, with_slow: bool
 ) -> tuple[dict[str, BackgroundEstimates], dict[str, Array]]:
-    """Return backgrounds by way, and errors and standard errors of backscatter by chain."""
+    """Return backgrounds by method, and errors and standard errors of backscatter by chain."""
     counts = sky.counts(level, draws, *seed)
-    found = {
-        name: way(counts, sky)
-        for name, way in elastic_cases.background_methods().items()
-        if every or name != elastic_cases.HOMOGENEOUS
+    estimates = {
+        name: method(counts, sky)
+        for name, method in elastic_cases.background_methods().items()
+        if with_slow or name != elastic_cases.HOMOGENEOUS
     }
     errors = {}
     for name, chain in elastic_cases.chains().items():
-        errors[name] = _errors(elastic_cases.invert(counts, sky, found[chain.way], chain), sky)
-    return found, errors
+        errors[name] = _errors(elastic_cases.invert(counts, sky, estimates[chain.way], chain), sky)
+    return estimates, errors
 
 
 def _errors(solved: Inverted, sky: SimulatedSky) -> Array:
@@ -214,11 +216,11 @@ def _scale(sky: SimulatedSky) -> float:
     return float(sky.backscatter[sky.compared].mean())
 
 
-def _join(parts: list[BackgroundEstimates]) -> BackgroundEstimates:
+def _join(blocks: list[BackgroundEstimates]) -> BackgroundEstimates:
     return BackgroundEstimates(
-        np.concatenate([part.background for part in parts]),
-        np.concatenate([part.standard_error for part in parts]),
-        np.concatenate([part.rejected for part in parts]),
+        np.concatenate([estimates.background for estimates in blocks]),
+        np.concatenate([estimates.standard_error for estimates in blocks]),
+        np.concatenate([estimates.rejected for estimates in blocks]),
     )
 
 
@@ -227,52 +229,53 @@ def _join(parts: list[BackgroundEstimates]) -> BackgroundEstimates:
 
 def _closed(sky: SimulatedSky, level: float | None) -> ClosedLoop:
     counts = (sky.signal + (level or 0.0))[np.newaxis]
-    known = BackgroundEstimates(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.bool_))
-    # A window that is told, so that what is left is numerics and no choice.
-    found = (
-        known
+    no_background = BackgroundEstimates(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.bool_))
+    # With a known clean range only numerical errors remain, none of the choice of a window.
+    estimates = (
+        no_background
         if level is None
-        else elastic_cases.background_methods()[elastic_cases.TOLD](counts, sky)
+        else elastic_cases.background_methods()[elastic_cases.KNOWN_CLEAN_RANGE](counts, sky)
     )
-    solved = elastic_cases.particles_of(
-        elastic_cases.cleared(counts, sky, found), sky, elastic_cases.GIVEN
+    solved = elastic_cases.invert_particles(
+        elastic_cases.subtract_background(counts, sky, estimates), sky, elastic_cases.GIVEN_WINDOW
     )
     near = sky.compared
     error = (solved.backscatter[0] - sky.backscatter)[near] / _scale(sky)
     return ClosedLoop(
         level,
-        float(found.background[0]) - (level or 0.0),
+        float(estimates.background[0]) - (level or 0.0),
         float(error.mean()),
         float(np.abs(error).max()),
     )
 
 
 def _published(folder: Path) -> tuple[PublishedProfileScore, ...]:
-    sky, files = elastic_cases.published_profiles(folder)
+    sky, files = elastic_cases.read_published_profiles(folder)
     return tuple(score for file in files for score in _file_scores(file, sky))
 
 
 def _file_scores(file: elastic_cases.Published, sky: SimulatedSky) -> list[PublishedProfileScore]:
-    found = {
-        name: way(file.counts, sky) for name, way in elastic_cases.background_methods().items()
+    estimates = {
+        name: method(file.counts, sky)
+        for name, method in elastic_cases.background_methods().items()
     }
     solved = {}
     for name, chain in elastic_cases.chains().items():
-        inverted = elastic_cases.invert(file.counts, sky, found[chain.way], chain)
+        inverted = elastic_cases.invert(file.counts, sky, estimates[chain.way], chain)
         error, stated = _errors(inverted, sky)
         solved[name] = inversion_score(error, stated, _scale(sky))
-    rows = {name: (name, None) for name in found} | {
+    rows = {name: (name, None) for name in estimates} | {
         name: (chain.way, solved[name]) for name, chain in elastic_cases.chains().items()
     }
     scores = []
-    for name, (way, inversion) in rows.items():
-        off = float(found[way].background[0]) - file.background
+    for name, (method, inversion) in rows.items():
+        error_of_background = float(estimates[method].background[0]) - file.background
         scores.append(
             PublishedProfileScore(
                 way=name,
                 level=file.level,
-                background=off,
-                deviation=off / float(found[way].standard_error[0]),
+                background=error_of_background,
+                deviation=error_of_background / float(estimates[method].standard_error[0]),
                 truth_error=file.background_error,
                 inversion=inversion,
             )
@@ -282,11 +285,15 @@ def _file_scores(file: elastic_cases.Published, sky: SimulatedSky) -> list[Publi
 
 # Pages ----------------------------------------------------------------------------------------
 
-_DRAWN: Final = (elastic_cases.KNOWN_SHAPE, elastic_cases.TOLD, elastic_cases.TAIL_MEAN)
+_DRAWN: Final = (
+    elastic_cases.KNOWN_SHAPE,
+    elastic_cases.KNOWN_CLEAN_RANGE,
+    elastic_cases.TAIL_MEAN,
+)
 _NONE: Final = "-"
 
 
-def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> Finding:
+def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> BenchmarkOutput:
     """Run a benchmark of the elastic retrieval.
 
     Parameters
@@ -299,57 +306,60 @@ def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> Finding:
     Raises
     ------
     CampaignError
-        Where the folder holds no such files.
+        If the folder holds no such files.
     RawFormatError
-        Where a published file cannot be read.
+        If a published file cannot be read.
     """
     if kind is Kind.ACCURACY:
-        found = measure_elastic_accuracy(
+        accuracy = measure_elastic_accuracy(
             quick=effort.quick, date=effort.date, data=data, progress=effort.progress
         )
-        return Finding(found, elastic_accuracy_report(found, RESULT))
-    timed = measure_elastic(
+        return BenchmarkOutput(accuracy, elastic_accuracy_report(accuracy, RESULT))
+    throughput = measure_elastic(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, elastic_throughput_report(timed, RESULT))
+    return BenchmarkOutput(throughput, elastic_throughput_report(throughput, RESULT))
 
 
-def elastic_accuracy_report(found: Elastic, data: str = "") -> BenchmarkReport:
+def elastic_accuracy_report(accuracy: Elastic, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
-    parts = [_backgrounds(found), _inversions(found), _without_noise(found.closed)]
-    if found.published:
-        parts.append(_files(found.published))
+    parts = [_backgrounds(accuracy), _inversions(accuracy), _without_noise(accuracy.closed)]
+    if accuracy.published:
+        parts.append(_files(accuracy.published))
     return BenchmarkReport(
         title="Elastic inversion: error against the level of the background",
-        facts=facts(found.date, found.machine),
-        parts=(*parts, cost_part(found.costs, elastic_cases.RANGE.size)),
+        facts=facts(accuracy.date, accuracy.machine),
+        parts=(*parts, cost_part(accuracy.costs, elastic_cases.RANGE.size)),
         data=data,
     )
 
 
-def _backgrounds(found: Elastic) -> Part:
+def _backgrounds(accuracy: Elastic) -> Part:
     names = list(elastic_cases.background_methods())
     return Part(
         title="Background",
-        text="Simulated as the EARLINET elastic intercomparison is: 532 nm, aerosol below 6 km "
+        text="Simulated like the EARLINET elastic intercomparison: 532 nm, aerosol below 6 km "
         "(optical depth 1.4), 1005 bins of 15 m, means of 1000 shots with Poisson noise; "
-        f"{found.levels[0].profiles:,} profiles a level, one in {FEW} of "
-        "them for homogeneous. known_shape finds its window by itself "
-        "or is told that air is clean from 6 km on; tail_mean averages the last tenth of the "
-        "bins, and the signal there with them. The methods homogeneous and cubic are "
-        "left out of the figure, as they are for paths along which nothing changes: from 6 km "
-        "up, the thinning air passes for extinction, which puts their background off by a count "
-        "or so however little noise there is, and one unknown more makes it scatter (folded "
-        "tables, from 6 km on).",
-        charts=(_background_chart(found),),
-        tables=tuple(_background_table(found, name) for name in _DRAWN),
-        details=tuple(_background_table(found, name) for name in names if name not in _DRAWN),
+        f"{accuracy.levels[0].profiles:,} profiles per level, one in {SLOW_SHARE} of them for "
+        "homogeneous. known_shape selects its window, or knows that the air is clean above 6 km. "
+        "tail_mean averages the last tenth of the bins, including the signal there. The methods "
+        "homogeneous and cubic are not in the figure, because they assume a homogeneous path. "
+        "Above 6 km the decreasing air density looks like extinction, which biases their "
+        "background by about one count for any noise, and the additional unknown increases its "
+        "scatter (folded tables, above 6 km).",
+        charts=(_background_chart(accuracy),),
+        tables=tuple(_background_table(accuracy, name) for name in _DRAWN),
+        details=tuple(_background_table(accuracy, name) for name in names if name not in _DRAWN),
     )
 
 
-def _background_chart(found: Elastic) -> Chart:
+def _background_chart(accuracy: Elastic) -> Chart:
     scores = {
-        name: [(at.level, at.backgrounds[name]) for at in found.levels if name in at.backgrounds]
+        name: [
+            (level.level, level.backgrounds[name])
+            for level in accuracy.levels
+            if name in level.backgrounds
+        ]
         for name in _DRAWN
     }
     drawn = {
@@ -360,14 +370,14 @@ def _background_chart(found: Elastic) -> Chart:
         name="background",
         title="Error of the background against its level",
         caption=_CAPTION,
-        panels=_panels(drawn, "error of background (counts a shot)"),
+        panels=_panels(drawn, "error of background (counts per shot)"),
     )
 
 
 _CAPTION: Final = (
     "Root mean square error, and size of the mean error where it exceeds 2 Monte Carlo standard "
-    "errors, the bars. Shaded: up to the stated standard error, on whose edge the full marks lie "
-    "where errors are as stated."
+    "errors (bars). Shaded: up to the stated standard error. Full marks on its edge mean that "
+    "errors are as stated."
 )
 
 
@@ -391,7 +401,7 @@ def _panels(drawn: Mapping[str, Sequence[_Drawn]], y_label: str) -> tuple[Panel,
     return tuple(
         Panel(
             title=name,
-            x_label="background (counts a shot)",
+            x_label="background (counts per shot)",
             y_label="" if number else y_label,
             series=(_rmse_series(points, floor), _bias_series(points, floor)),
         )
@@ -412,12 +422,12 @@ def _rmse_series(points: Sequence[_Drawn], floor: float) -> Series:
 
 
 def _bias_series(points: Sequence[_Drawn], floor: float) -> Series:
-    told = [p for p in points if p.significant and abs(p.bias.value) > floor]
-    sizes = [abs(p.bias.value) for p in told]
-    bars = [2.0 * p.bias.error for p in told]
+    significant = [p for p in points if p.significant and abs(p.bias.value) > floor]
+    sizes = [abs(p.bias.value) for p in significant]
+    bars = [2.0 * p.bias.error for p in significant]
     return Series(
         "size of the mean error",
-        tuple(p.level for p in told),
+        tuple(p.level for p in significant),
         tuple(sizes),
         tuple(max(size - bar, floor) for size, bar in zip(sizes, bars, strict=True)),
         tuple(size + bar for size, bar in zip(sizes, bars, strict=True)),
@@ -425,15 +435,15 @@ def _bias_series(points: Sequence[_Drawn], floor: float) -> Series:
     )
 
 
-def _background_table(found: Elastic, name: str) -> Table:
+def _background_table(accuracy: Elastic, name: str) -> Table:
     rows = []
-    for at in found.levels:
-        score = at.backgrounds.get(name)
+    for level in accuracy.levels:
+        score = level.backgrounds.get(name)
         cells = [_NONE] * 7 if score is None else _background_cells(score)
-        rejected = percent(at.rejected[name])
-        rows.append((_decade(at.level), *cells, f"{at.least_error:.3g}", rejected))
+        rejected = percent(level.rejected[name])
+        rows.append((_decade(level.level), *cells, f"{level.least_error:.3g}", rejected))
     return Table(
-        title=f"Background by {name}, counts a shot",
+        title=f"Background by {name}, counts per shot",
         columns=(
             "background",
             "mean error",
@@ -448,9 +458,9 @@ def _background_table(found: Elastic, name: str) -> Table:
         ),
         rows=tuple(rows),
         note="In brackets: Monte Carlo standard error of the last digits. Stated: median standard "
-        "error; mean and root mean square of the error over it, and share of profiles within 1 "
-        "and 1.96 of it: 68.3 and 95 % where errors are as stated. Bound: Cramér-Rao, from 6 km "
-        "on. Rejected profiles do not count.",
+        "error. Mean and root mean square of the error over the stated one, and share of profiles "
+        "within 1 and 1.96 stated errors: 68.3 and 95 % if errors are as stated. Bound: "
+        "Cramér-Rao, above 6 km. Rejected profiles are excluded.",
     )
 
 
@@ -465,23 +475,27 @@ def _background_cells(score: BackgroundScore) -> list[str]:
     ]
 
 
-def _inversions(found: Elastic) -> Part:
+def _inversions(accuracy: Elastic) -> Part:
     return Part(
         title="Backscatter",
         text="Backscatter of particles from 0.5 to 6 km, in percent of its mean there, with the "
-        "true lidar ratio. The reference window is given, 7 to 8 km, or chosen out of windows "
-        "of 1 km from 4 to 12 km, some of which hold a tenuous layer of up to 0.4 per Mm and sr; "
-        "error carried: with 1.5 standard errors of the window stated as error of the "
-        "reference, for particles that the noise hides. Bins that the inversion withholds do "
-        "not count: where few are solved, those that are have been selected by their noise.",
-        charts=(_inversion_chart(found),),
-        tables=tuple(_inversion_table(found, name) for name in elastic_cases.chains()),
+        "true lidar ratio. The reference window is given, 7 to 8 km, or chosen from windows of "
+        "1 km between 4 and 12 km, some of which hold a tenuous layer of up to 0.4 per Mm and sr. "
+        "Error carried: 1.5 standard errors of the window are stated as error of the reference, "
+        "for particles hidden by noise. Bins without value are excluded: where few bins are "
+        "solved, noise has selected them.",
+        charts=(_inversion_chart(accuracy),),
+        tables=tuple(_inversion_table(accuracy, name) for name in elastic_cases.chains()),
     )
 
 
-def _inversion_chart(found: Elastic) -> Chart:
+def _inversion_chart(accuracy: Elastic) -> Chart:
     scores = {
-        name: [(at.level, at.inversions[name]) for at in found.levels if name in at.inversions]
+        name: [
+            (level.level, level.inversions[name])
+            for level in accuracy.levels
+            if name in level.inversions
+        ]
         for name in elastic_cases.chains()
     }
     drawn = {
@@ -494,7 +508,7 @@ def _inversion_chart(found: Elastic) -> Chart:
     return Chart(
         name="backscatter",
         title="Error of backscatter, 0.5 to 6 km, against the level of the background",
-        caption=f"{_CAPTION} Bins that have a value only.",
+        caption=f"{_CAPTION} Only bins with a value.",
         panels=_panels(drawn, "error of backscatter (% of its mean)"),
     )
 
@@ -503,8 +517,11 @@ def _percents(figure: MonteCarloFigure) -> MonteCarloFigure:
     return MonteCarloFigure(100.0 * figure.value, 100.0 * figure.error)
 
 
-def _inversion_table(found: Elastic, name: str) -> Table:
-    rows = [(_decade(at.level), *_inversion_cells(at.inversions.get(name))) for at in found.levels]
+def _inversion_table(accuracy: Elastic, name: str) -> Table:
+    rows = [
+        (_decade(level.level), *_inversion_cells(level.inversions.get(name)))
+        for level in accuracy.levels
+    ]
     return Table(
         title=f"Backscatter by {name}, percent of its mean",
         columns=("background", *_INVERSION_COLUMNS),
@@ -528,12 +545,12 @@ _INVERSION_COLUMNS: Final = (
 def _inversion_cells(score: InversionScore | None) -> tuple[str, ...]:
     if score is None:
         return (_NONE,) * len(_INVERSION_COLUMNS)
-    alone = score.profiles == 1
+    single = score.profiles == 1
     bias = _percents(score.bias)
     return (
         percent(score.solved),
-        f"{bias.value:+.3g}" if alone else _signed(bias),
-        _NONE if alone else f"{100.0 * score.scatter:.3g}",
+        f"{bias.value:+.3g}" if single else _signed(bias),
+        _NONE if single else f"{100.0 * score.scatter:.3g}",
         f"{100.0 * score.rmse.value:.3g}",
         f"{100.0 * score.stated:.3g}",
         *(percent(inside.value) for inside in score.coverage),
@@ -552,8 +569,8 @@ def _without_noise(closed: tuple[ClosedLoop, ...]) -> Part:
     )
     return Part(
         title="Without noise",
-        text="What the method itself leaves: the signal is integrated by Gauss quadrature, the "
-        "inversion and the shape of air by trapezoids over bins of 15 m.",
+        text="Errors of the method itself: the signal is integrated by Gauss quadrature, the "
+        "inversion and the molecular shape by trapezoids over bins of 15 m.",
         tables=(
             Table(
                 title="Closed loop without noise",
@@ -568,38 +585,38 @@ def _without_noise(closed: tuple[ClosedLoop, ...]) -> Part:
 def _files(published: tuple[PublishedProfileScore, ...]) -> Part:
     backgrounds = tuple(
         (
-            _decade(one.level),
-            one.way,
-            f"{one.background:+.3g}",
-            f"{one.deviation:+.2f}",
-            f"{one.truth_error:.2g}",
+            _decade(score.level),
+            score.way,
+            f"{score.background:+.3g}",
+            f"{score.deviation:+.2f}",
+            f"{score.truth_error:.2g}",
         )
-        for one in published
-        if one.way in elastic_cases.background_methods()
+        for score in published
+        if score.way in elastic_cases.background_methods()
     )
     inversions = tuple(
-        (_decade(one.level), one.way, *_inversion_cells(one.inversion))
-        for one in published
-        if one.way in elastic_cases.chains()
+        (_decade(score.level), score.way, *_inversion_cells(score.inversion))
+        for score in published
+        if score.way in elastic_cases.chains()
     )
     return Part(
         title="Files of the intercomparison",
-        text="The published files at 532 nm, one a level, lidar ratio 39 sr. The truth of a "
-        "background is the fit of the noise-free signal to the same file, that of backscatter "
-        "the inversion of the noise-free signal with the reference from 7 to 8 km. From 2.5 to "
-        "5.5 km the set holds particles of 0.2 % of the air, which no test of shape finds in "
-        "noise: a window chosen there is off by them.",
+        text="The published files at 532 nm, one per level, lidar ratio 39 sr. The true background "
+        "is the fit of the noise-free signal to the same file, the true backscatter the inversion "
+        "of the noise-free signal with the reference from 7 to 8 km. From 2.5 to 5.5 km particles "
+        "scatter 0.2 % of what air does, which no test of shape detects in noise. A window chosen "
+        "there is biased by that amount.",
         tables=(
             Table(
-                title="Background of published files, counts a shot",
-                columns=("background", "way", "error", "error / stated", "truth known to"),
+                title="Background of published files, counts per shot",
+                columns=("background", "method", "error", "error / stated", "error of the truth"),
                 rows=backgrounds,
             ),
             Table(
                 title="Backscatter of published files, percent of its mean",
-                columns=("background", "way", *_INVERSION_COLUMNS),
+                columns=("background", "method", *_INVERSION_COLUMNS),
                 rows=inversions,
-                note="From 0.5 to 6 km, one profile a row: it has no scatter.",
+                note="From 0.5 to 6 km, one profile per row, so without scatter.",
             ),
         ),
     )

@@ -1,8 +1,8 @@
-"""Vertical profiles whose truth is known, and who finds their background and their particles.
+"""Vertical profiles with known truth, and methods that retrieve background and particles.
 
-The simulated set is made as the signals of the EARLINET elastic intercomparison are
-(boeckmann2004): 532 nm, no aerosol above 6 km, 1005 bins of 15 m, Poisson noise of a mean of
-1000 shots over a constant background. The files of the intercomparison are read where given.
+The simulated set follows the EARLINET elastic intercomparison (boeckmann2004): 532 nm, no
+aerosol above 6 km, 1005 bins of 15 m, means of 1000 shots with Poisson noise over a constant
+background. The files of the intercomparison are read if given.
 """
 
 from __future__ import annotations
@@ -35,12 +35,15 @@ BRIGHTEST: Final = 1.9093e7
 """Counts in the brightest bin, as in the intercomparison."""
 RANGE: Final = 15.0 * (np.arange(1005, dtype=np.float64) + 0.5)
 LEVELS: Final = tuple(10.0**power for power in range(9))
-"""Counts in a bin and a shot."""
+"""Backgrounds in counts per bin and shot."""
 CLEAN_FROM: Final = 6000.0
+"""m; no particles above."""
 OVERLAP: Final = 400.0
-"""m, from where on the inversion uses the signal."""
+"""m; the inversion uses the signal above."""
 COMPARED: Final = (500.0, 6000.0)
+"""m; backscatter is compared with the truth in this range."""
 GIVEN_WINDOW: Final = (7000.0, 8000.0)
+"""m; reference window that is given, not chosen."""
 CANDIDATES: Final = reference_window.candidate_windows(4000.0, 12000.0, 1000.0, 250.0)
 
 _SEED: Final = 20040101
@@ -49,7 +52,7 @@ _CHANNEL: Final = "analog_532o"
 _RAMP: Final = 15.0
 """Bins of incomplete overlap, from which the signal rises to the brightest bin."""
 _FIRST_TRUE_BIN: Final = 60
-"""Of the published files; the nearest bins hold a ramp."""
+"""First usable bin of the published files; nearer bins hold a ramp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,29 +66,29 @@ class SimulatedSky:
     molecular_extinction: Array
     """m-1."""
     shape: Array
-    """Of the signal from air alone, m-3 sr-1."""
+    """Shape of the molecular signal, m-3 sr-1."""
     signal: Array
-    """Counts a shot, free of noise and background."""
+    """Counts per shot, without noise and background."""
     backscatter: Array
-    """m-1 sr-1, of the particles: the truth."""
+    """m-1 sr-1, true backscatter of the particles."""
 
     @property
     def compared(self) -> npt.NDArray[np.bool_]:
-        """Bins whose backscatter is judged."""
+        """Bins whose backscatter is compared with the truth."""
         return (self.range >= COMPARED[0]) & (self.range <= COMPARED[1])
 
     @property
     def inverted(self) -> npt.NDArray[np.bool_]:
-        """Bins that the inversion is given."""
+        """Bins that the inversion uses."""
         return self.range > OVERLAP
 
     def counts(self, level: float, draws: int, *seed: int) -> Array:
-        """Return noisy profiles, mean counts of `SHOTS` shots; the same seed, the same noise.
+        """Return noisy profiles, mean counts of `SHOTS` shots; equal seeds give equal noise.
 
         Parameters
         ----------
         level : float
-            Background in counts a shot.
+            Background in counts per shot.
         draws : int
         *seed : int
 
@@ -115,7 +118,7 @@ def particles(height: npt.ArrayLike) -> Array:
     """Return the backscatter of the particles of the simulated set, m-1 sr-1.
 
     As turbid as the intercomparison (optical depth 1.4): a mixed layer with a soft top at
-    1.75 km and a tenuous layer from 3.9 to 5.7 km, nothing from 6 km on.
+    1.75 km, a tenuous layer from 3.9 to 5.7 km, no particles above 6 km.
     """
     z = np.asarray(height, dtype=np.float64)
     mixed = 2e-5 / (1.0 + np.exp((z - 1750.0) / 120.0))
@@ -128,8 +131,8 @@ def particles(height: npt.ArrayLike) -> Array:
 def simulated_sky() -> SimulatedSky:
     """Return the simulated set.
 
-    The optical depth is integrated by Gauss quadrature of 8 nodes from bin to bin, not by the
-    trapezoids of the inversion, whose error is thus part of what is measured.
+    The optical depth is integrated by Gauss quadrature with 8 nodes from bin to bin, not by the
+    trapezoids of the inversion. The error of these is therefore part of the measured error.
     """
     air = MolecularProfile.us_standard()
     nodes, weights = np.polynomial.legendre.leggauss(8)
@@ -149,32 +152,32 @@ def simulated_sky() -> SimulatedSky:
 
 @dataclass(frozen=True, slots=True)
 class BackgroundEstimates:
-    """Backgrounds in counts, one a profile."""
+    """Backgrounds in counts, one per profile."""
 
     background: Array
     standard_error: Array
     rejected: npt.NDArray[np.bool_]
-    """A quality bit that says not to use the value."""
+    """Whether a quality bit rejects the value."""
 
 
 BackgroundMethod = Callable[[Array, SimulatedSky], BackgroundEstimates]
-"""From counts (profile, range) and the set they stem from to backgrounds."""
+"""Returns backgrounds, given counts (profile, range) and their simulated sky."""
 
 KNOWN_SHAPE: Final = "known_shape"
-KNOWN_CLEAN_RANGE: Final = "known_shape, told 6 km"
+KNOWN_CLEAN_RANGE: Final = "known_shape, from 6 km"
 TAIL_MEAN: Final = "tail_mean"
 HOMOGENEOUS: Final = "homogeneous"
 
 
 def background_methods() -> dict[str, BackgroundMethod]:
-    """Return the ways to find the background by name.
+    """Return the methods of the background by name.
 
-    `homogeneous` and `cubic` solve for a path along which nothing changes, which a vertical one
-    is not; they are given the range from 6 km on, to show by how much they miss.
+    `homogeneous` and `cubic` assume a homogeneous path, which a vertical one is not. They use the
+    range above 6 km, to show how large their errors are.
     """
     return {
         KNOWN_SHAPE: _known_shape,
-        KNOWN_CLEAN_RANGE: _told,
+        KNOWN_CLEAN_RANGE: _known_clean_range,
         TAIL_MEAN: _tail_mean,
         HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
@@ -182,38 +185,38 @@ def background_methods() -> dict[str, BackgroundMethod]:
 
 
 def _known_shape(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    found = known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS)
-    return _found(found.background, found.background_standard_error, found.quality)
+    fit = known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS)
+    return _estimates(fit.background, fit.background_standard_error, fit.quality)
 
 
-def _told(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    found = known_shape.fit_known_shape(
+def _known_clean_range(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    fit = known_shape.fit_known_shape(
         counts, sky.range, sky.shape, exposure=SHOTS, start=CLEAN_FROM
     )
-    return _found(found.background, found.background_standard_error, found.quality)
+    return _estimates(fit.background, fit.background_standard_error, fit.quality)
 
 
 def _tail_mean(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    found = cubic_and_tail.tail_mean(counts, sky.range)
-    return _found(found.background, found.background_standard_error, found.quality)
+    result = cubic_and_tail.tail_mean(counts, sky.range)
+    return _estimates(result.background, result.background_standard_error, result.quality)
 
 
 def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
     variance = photon_counts.mean_profile_variance(counts[:, far], SHOTS)
-    found = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
-    return _found(found.background, found.background_standard_error, found.quality)
+    fit = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
+    return _estimates(fit.background, fit.background_standard_error, fit.quality)
 
 
 def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
-    found = cubic_and_tail.cubic(
+    result = cubic_and_tail.cubic(
         counts[:, far], sky.range[far], statistics=cubic_and_tail.Statistics.POISSON, shots=SHOTS
     )
-    return _found(found.background, found.background_standard_error, found.quality)
+    return _estimates(result.background, result.background_standard_error, result.quality)
 
 
-def _found(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> BackgroundEstimates:
+def _estimates(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> BackgroundEstimates:
     return BackgroundEstimates(value, error, (quality & Quality.rejecting()) != 0)
 
 
@@ -237,7 +240,7 @@ def least_error(sky: SimulatedSky, level: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Inverted:
-    """Particles of each profile."""
+    """Retrieved backscatter of particles of each profile."""
 
     backscatter: Array
     """m-1 sr-1, (profile, range); NaN where withheld."""
@@ -248,25 +251,25 @@ class Inverted:
 
 
 def count_variance(counts: Array) -> Array:
-    """Return the variance of mean counts, as one who knows no truth has it."""
-    # A bin without a count has one at most.
+    """Return the variance of mean counts, estimated from the counts."""
+    # A bin without counts is treated as one count.
     return np.maximum(counts, 1.0 / SHOTS) / SHOTS
 
 
-def subtract_background(counts: Array, sky: SimulatedSky, found: BackgroundEstimates) -> Array:
-    """Return counts without background; NaN where the inversion is not to use them."""
-    return np.where(sky.inverted, counts - found.background[:, np.newaxis], np.nan)
+def subtract_background(counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates) -> Array:
+    """Return counts without background; NaN in bins that the inversion does not use."""
+    return np.where(sky.inverted, counts - estimates.background[:, np.newaxis], np.nan)
 
 
 def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
-    """Return the clouds, none of which are there."""
+    """Return the detected clouds; the sky has none."""
     return layers.find_layers(power, sky.range, noise, molecular_attenuated=sky.shape)
 
 
 def choose_window(
     power: Array, noise: Array, sky: SimulatedSky, exclude: npt.NDArray[np.bool_] | None = None
 ) -> reference_window.ReferenceWindow:
-    """Return the reference windows out of `CANDIDATES`."""
+    """Return the reference windows chosen from `CANDIDATES`."""
     return reference_window.choose_reference(
         power,
         sky.range,
@@ -302,15 +305,15 @@ def invert_particles(
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """From counts to particles."""
+    """Steps from counts to particles."""
 
     way: str
-    """To find the background."""
+    """Method of the background."""
     choose: bool = False
-    """The reference window, instead of `GIVEN_WINDOW`."""
+    """Whether the reference window is chosen instead of `GIVEN_WINDOW`."""
     carried: float = 0.0
-    """What the particles that the noise hides in a chosen window may add to it: standard errors
-    of the window, stated as error of the reference (`lidarops.retrieve.elastic.reference_window.choose_reference`)."""
+    """Standard errors of the mean of a chosen window that are stated as error of the reference,
+    for particles hidden by noise."""
 
 
 def chains() -> dict[str, Chain]:
@@ -323,18 +326,20 @@ def chains() -> dict[str, Chain]:
     }
 
 
-def invert(counts: Array, sky: SimulatedSky, found: BackgroundEstimates, chain: Chain) -> Inverted:
-    """Return the particles.
+def invert(
+    counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates, chain: Chain
+) -> Inverted:
+    """Return the backscatter of particles.
 
     Parameters
     ----------
     counts : (profile, range) float
-    sky : Sky
-    found : Found
-        The background, as the chain finds it.
+    sky : SimulatedSky
+    estimates : BackgroundEstimates
+        From the method of the chain.
     chain : Chain
     """
-    power, noise = subtract_background(counts, sky, found), count_variance(counts)
+    power, noise = subtract_background(counts, sky, estimates), count_variance(counts)
     edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
     calibrated = np.ones(len(counts), dtype=np.bool_)
     hidden: npt.ArrayLike = 0.0
@@ -347,7 +352,7 @@ def invert(counts: Array, sky: SimulatedSky, found: BackgroundEstimates, chain: 
         sky,
         edges,
         noise=noise,
-        background_error=found.standard_error,
+        background_error=estimates.standard_error,
         reference_error=hidden,
     )
     return Inverted(
@@ -359,16 +364,16 @@ def invert(counts: Array, sky: SimulatedSky, found: BackgroundEstimates, chain: 
 
 
 def lstsq_backgrounds(counts: Array, sky: SimulatedSky) -> Array:
-    """Return backgrounds by `numpy.linalg.lstsq`, one weighted fit from 6 km on a profile."""
+    """Return backgrounds by `numpy.linalg.lstsq`, one weighted fit above 6 km per profile."""
     far = sky.range >= CLEAN_FROM
     shape = sky.shape[far] / sky.shape[far][0]
     slopes = np.stack([np.ones_like(shape), shape], axis=1)
-    found = np.empty(len(counts))
+    backgrounds = np.empty(len(counts))
     for row, profile in enumerate(counts[:, far]):
         weight = np.sqrt(SHOTS / np.maximum(profile, 1.0 / SHOTS))
         solution = np.linalg.lstsq(slopes * weight[:, np.newaxis], profile * weight, rcond=None)
-        found[row] = solution[0][0]
-    return found
+        backgrounds[row] = solution[0][0]
+    return backgrounds
 
 
 def klett_python(power: Array, sky: SimulatedSky) -> Array:
@@ -379,8 +384,8 @@ def klett_python(power: Array, sky: SimulatedSky) -> Array:
     distance = sky.range.tolist()
     air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
     inside = [k for k, r in enumerate(distance) if GIVEN_WINDOW[0] <= r <= GIVEN_WINDOW[1]]
-    found = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
-    return np.asarray(found)
+    rows = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
+    return np.asarray(rows)
 
 
 def _klett(
@@ -409,19 +414,19 @@ def _klett(
 
 
 def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
-    """Return the same as `klett_python` by cumulative sums, profile by profile."""
+    """Return the backscatter of `klett_python` by cumulative sums, profile by profile."""
     inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
     start = inside[inside.size // 2]
     excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter
-    found = np.empty(power.shape)
+    backscatter = np.empty(power.shape)
     for row, profile in enumerate(power):
         depth = _cumulated(excess, sky.range)
         corrected = profile * sky.range**2 * np.exp(2.0 * (depth - depth[start]))
         integral = _cumulated(LIDAR_RATIO * corrected, sky.range)
         ratio = np.mean(corrected[inside] / sky.molecular_backscatter[inside])
         total = corrected / (ratio - 2.0 * (integral - integral[start]))
-        found[row] = total - sky.molecular_backscatter
-    return found
+        backscatter[row] = total - sky.molecular_backscatter
+    return backscatter
 
 
 def _cumulated(values: Array, distance: Array) -> Array:
@@ -437,18 +442,18 @@ class Published:
     """One file of the intercomparison."""
 
     level: float
-    """Nominal background in counts a shot."""
+    """Nominal background in counts per shot."""
     counts: Array
-    """(1, range), counts a shot."""
+    """(1, range), counts per shot."""
     background: float
-    """Truth: with the shape of the noise-free file fitted to this one, as its scale is known
-    to 1e-5 only."""
+    """Truth, by a fit of the noise-free file to this one, because its scale is known only to
+    1e-5."""
     background_error: float
     """Standard error of that truth, counts."""
 
 
 def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]]:
-    """Read the files of the EARLINET elastic intercomparison at 532 nm.
+    """Return the files of the EARLINET elastic intercomparison at 532 nm.
 
     Parameters
     ----------
@@ -458,17 +463,17 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
 
     Returns
     -------
-    Sky
+    SimulatedSky
         The backscatter is that of the noise-free signal with the reference window `GIVEN_WINDOW`.
     list of Published
-        By rising background.
+        In order of the background.
 
     Raises
     ------
     CampaignError
-        Where the folder holds no such files.
+        If the folder holds no such files.
     RawFormatError
-        Where one cannot be read, or holds another number of bins.
+        If a file cannot be read, or holds another number of bins.
     """
     folder = Path(folder)
     files = {_level(file): file for file in folder.glob("background_1e*.licel")}
@@ -484,12 +489,12 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
 
 
 def _level(file: Path) -> float:
-    found = re.fullmatch(r"background_1e(\d+)\.licel", file.name)
-    if found is None:
+    match = re.fullmatch(r"background_1e(\d+)\.licel", file.name)
+    if match is None:
         raise CampaignError(
             "names no background", file=file, remedy="name it background_1eN.licel, N in decades"
         )
-    return float(f"1e{found[1]}")
+    return float(f"1e{match[1]}")
 
 
 def _published_sky(folder: Path) -> SimulatedSky:

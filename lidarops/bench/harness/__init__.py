@@ -1,1 +1,1 @@
-"""What all benchmarks share: terms, timing, results."""
+"""Shared by all benchmarks: `terms` (arguments and output), `timing`, `results` (JSON)."""

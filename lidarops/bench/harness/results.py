@@ -16,9 +16,9 @@ _Result = TypeVar("_Result")
 
 
 def plain(result: object) -> Any:
-    """Return a result, or a list of them, as what JSON holds."""
+    """Return a result, or a list of them, as lists and dicts for JSON."""
     if isinstance(result, list | tuple):
-        return [plain(one) for one in result]
+        return [plain(member) for member in result]
     if is_dataclass(result) and not isinstance(result, type):
         return asdict(result)
     return result
@@ -30,7 +30,7 @@ def save(result: object, path: Path) -> Path:
     Raises
     ------
     CatalogError
-        Where it cannot be written.
+        If it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,12 +46,12 @@ def save(result: object, path: Path) -> Path:
 
 
 def load(kind: type[_Result], path: Path) -> _Result:
-    """Read a result that `save` wrote.
+    """Return a result that `save` wrote.
 
     Raises
     ------
     CatalogError
-        Where the file is missing or holds something else.
+        If the file is missing or holds something else.
     """
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes())

@@ -1,4 +1,4 @@
-"""What is asked of a benchmark, and what it gives."""
+"""Arguments and output of all benchmarks."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Final
 from lidarops.reports import benchmark_page
 
 RESULT: Final = "result.json"
-"""Name of the figures beside the page."""
+"""Name of the JSON file with the results, beside the page."""
 CAMPAIGN_FILE: Final = "campaign.yaml"
-"""Name of the file of a campaign that a benchmark simulates, in a folder of its own."""
+"""Name of the campaign file in the folder of each simulated campaign."""
 
 
 class Kind(StrEnum):
-    """What is asked of it."""
+    """Quantity that a benchmark measures."""
 
     ACCURACY = "accuracy"
     THROUGHPUT = "throughput"
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """What a benchmark found."""
+class BenchmarkOutput:
+    """Result and report page of a benchmark."""
 
     result: object
     """A frozen dataclass, or a list of them."""
@@ -33,12 +33,12 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much is measured, and what is told of it."""
+    """Size of a run, its stated date, and the progress callback."""
 
     quick: bool = False
     repeats: int | None = None
-    """Of each timing; the benchmark's own where not given."""
+    """Repeats of each timing; None for the default of the benchmark."""
     date: str = ""
-    """When it is run, as it is to be stated."""
+    """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
-    """Is given 1 after each scenario or setting."""
+    """Called with 1 after each scenario or setting."""

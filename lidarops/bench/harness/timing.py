@@ -1,4 +1,4 @@
-"""CPU time of this process, and what machine it was measured on."""
+"""CPU time of this process, and the machine on which it was measured."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from typing import Final
 from lidarops.plan.cost_estimate import processor
 
 _SHORTEST: Final = 1e-9
-"""The clock of a fast machine with little work may not have moved."""
+"""s; least time, because a coarse clock may not advance during a fast call."""
 _PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy", "jax")
 
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Where and with what a benchmark ran."""
+    """Machine and software of a benchmark run."""
 
     processor: str
     python: str
     packages: Mapping[str, str]
-    """Version by name, of what is installed."""
+    """Versions of installed packages by name."""
 
 
 def machine() -> Machine:
@@ -32,42 +32,42 @@ def machine() -> Machine:
     return Machine(
         processor=processor(),
         python=platform.python_version(),
-        packages={name: found for name in _PACKAGES if (found := _version(name))},
+        packages={name: number for name in _PACKAGES if (number := _version(name))},
     )
 
 
 def least_times(
-    ways: Mapping[str, Callable[[], object]], repeats: int, *, clock: str = "process_time"
+    functions: Mapping[str, Callable[[], object]], repeats: int, *, clock: str = "process_time"
 ) -> dict[str, float]:
-    """Return the least time in seconds of each way, by name.
+    """Return the least time in seconds of each function, by name.
 
-    The ways take turns, so that what else the machine does meets all of them; one uncounted
-    round before compiles and fills caches.
+    The functions take turns, so that other load of the machine affects all of them. One round
+    before that is not counted: it compiles and fills caches.
 
     Parameters
     ----------
-    ways : mapping of str to callable
+    functions : mapping of str to callable
     repeats : int
         Counted rounds, at least 1.
     clock : {"process_time", "perf_counter"}
-        CPU time of all threads of the process, or time on the wall.
+        CPU time of all threads of the process, or wall time.
     """
     read: Callable[[], float] = getattr(time, clock)
-    least = dict.fromkeys(ways, float("inf"))
-    for way in ways.values():
-        way()
+    least = dict.fromkeys(functions, float("inf"))
+    for function in functions.values():
+        function()
     for _ in range(repeats):
-        for name, way in ways.items():
+        for name, function in functions.items():
             begin = read()
-            way()
+            function()
             least[name] = min(least[name], max(read() - begin, _SHORTEST))
     return least
 
 
-def in_threads(way: Callable[[int], object], parts: int) -> None:
-    """Call ``way(0)`` to ``way(parts - 1)`` in as many threads."""
-    with ThreadPoolExecutor(parts) as pool:
-        for future in [pool.submit(way, part) for part in range(parts)]:
+def in_threads(function: Callable[[int], object], threads: int) -> None:
+    """Call ``function(0)`` to ``function(threads - 1)``, each in its own thread."""
+    with ThreadPoolExecutor(threads) as pool:
+        for future in [pool.submit(function, number) for number in range(threads)]:
             future.result()
 
 

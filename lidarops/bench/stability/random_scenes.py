@@ -1,4 +1,8 @@
-"""How often random scenes are answered wrongly without a flag: counts and shares."""
+"""Rates of false values without a flag in random scenes.
+
+A random scene satisfies or violates the model of a retrieval in a known way. A value is false if
+it differs from the truth by more than 4 stated standard errors.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +24,13 @@ FALSE: Final = 4.0
 FINE: Final = 2.5
 """Stated standard errors within which a value needed no flag."""
 VISIBLE: Final = 5.0
-"""Least size of what a model cannot take up of a violation, in standard deviations of the noise,
-for the data to tell it. The best test that knows the very shape of the violation, but not its
-sign, goes by the size of one number of that mean and unit variance: with a false alarm in 2500, as
-our tests have it, it misses half of the violations of 3.5 and 7 percent of those of 5 (told the
-sign too, 5 percent); one that does not know the shape misses more."""
+"""Least misfit, in standard deviations of the noise, at which the data reveal a violation. The
+misfit is what the model cannot absorb. The best test that knows the shape of the violation but
+not its sign uses the size of one number with that mean and unit variance. With one false alarm in
+2500, as in our tests, it misses half of the violations of 3.5 and 7 percent of those of 5 (5
+percent if the sign is known as well). A test that does not know the shape misses more."""
 ALL: Final = "all together"
-"""Class that holds every scene of a retrieval."""
+"""Class of all scenes of a retrieval."""
 _COUNTS: Final = (
     "values",
     "kept",
@@ -46,11 +50,11 @@ _COUNTS: Final = (
 
 
 class Verdict(StrEnum):
-    """How a share stands to a target that it is not to exceed."""
+    """Comparison of a share with its upper limit, the target."""
 
     MET = "met"
-    UNTOLD = "not told by so few"
-    """Above it, by less than 2 Monte Carlo errors."""
+    UNDECIDED = "undecided"
+    """Above the target by less than 2 Monte Carlo errors."""
     MISSED = "MISSED"
 
 
@@ -60,14 +64,14 @@ class Failure:
 
     name: str
     satisfied: bool = False
-    """Whether the model holds, so that random errors alone have to cover."""
+    """Whether the model holds, so that random errors alone must cover the truth."""
     unseen: str = ""
-    """Why the data cannot tell it; empty where they can."""
+    """Reason why the data cannot reveal the violation; empty where they can."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """Values of one chunk of scenes of one class, all of one shape."""
+class ScoredValues:
+    """Values of a chunk of scenes of one class, with truth and flags; arrays of equal shape."""
 
     failure: Failure
     quantity: str
@@ -76,19 +80,19 @@ class Judged:
     random: Array
     """Stated standard error."""
     systematic: Any
-    """Stated systematic error; 0 where none is declared."""
+    """Stated systematic error; 0 where none is stated."""
     bits: npt.NDArray[np.int32]
-    doubted: Mask | None = None
-    """Where the retrieval's own flags doubt the stated error; where it is rejected, if None."""
+    uncertain: Mask | None = None
+    """Where flags of the retrieval mark the stated error as uncertain; None: where rejected."""
     solvable: Mask | None = None
-    """Where a flag is needless; not known where None."""
+    """Where a flag is needless; None where unknown."""
     hidden: Mask | None = None
-    """Where the violation is less than `VISIBLE`; not known where None."""
+    """Where the misfit of the violation is below `VISIBLE`; None where unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class FalseValueRate:
-    """What came of the scenes of one class."""
+    """Shares of kept, false and flagged values in the scenes of one class."""
 
     retrieval: str
     failure: str
@@ -98,80 +102,80 @@ class FalseValueRate:
     kept: MonteCarloFigure
     """Share of the values that no bit rejects."""
     false_random: MonteCarloFigure
-    """Of these, off by more than 4 stated standard errors."""
+    """Share of kept values that differ by more than 4 stated random errors."""
     false: MonteCarloFigure
-    """Of these, off by more than 4 of random and systematic error together."""
+    """Share of kept values that differ by more than 4 combined random and systematic errors."""
     false_undoubted: MonteCarloFigure
-    """The same of the values that the retrieval's own flags do not doubt either."""
+    """The same share of kept values that no flag marks as uncertain."""
     false_hidden: MonteCarloFigure | None
-    """Of `false_undoubted`, the part of violations that no test can be relied on to see; None
-    where that is not known."""
+    """Part of `false_undoubted` with violations that no test can reliably detect; None where that
+    is unknown."""
     false_seen: MonteCarloFigure
-    """The rest of it."""
+    """`false_undoubted` minus `false_hidden`."""
     false_of_seen: MonteCarloFigure | None
-    """That rest as a share of the values alone whose violation could be seen and was not; None
-    where that is not known, or there are none."""
+    """`false_seen` as a share of the values whose violation is detectable but not flagged; None
+    where that is unknown, or there are none."""
     false_bare: MonteCarloFigure | None
-    """The same of the values without any bit; None where there are none."""
+    """The same share of the values without any bit; None where there are none."""
     fine_of_rejected: MonteCarloFigure
-    """Share of the rejected values that are off by less than 2.5."""
+    """Share of the rejected values that differ by less than 2.5 stated errors."""
     needless: MonteCarloFigure | None
-    """Share flagged or withheld of the values that could be determined; None where the model does
-    not hold, so that a flag is right, or where nothing is known to be solvable."""
+    """Share of the determinable values that are flagged or withheld; None where the model does
+    not hold, so that a flag is right, or where it is unknown what can be determined."""
     satisfied: bool
     """Whether the model holds."""
     target: float
-    """For what `judged` returns."""
+    """Upper limit of `limited_share`."""
     needless_target: float | None
     unseen: str
 
     @property
-    def judged(self) -> MonteCarloFigure:
-        """What has to stay below the target: by random errors alone where the model holds."""
+    def limited_share(self) -> MonteCarloFigure:
+        """The share that the target limits: by random errors alone where the model holds."""
         return self.false_random if self.satisfied else self.false_seen
 
     @property
     def verdict(self) -> Verdict:
-        """How the false values stand to their target."""
-        return _held(self.judged, self.target)
+        """Comparison of the false values with their target."""
+        return _compare(self.limited_share, self.target)
 
     @property
     def needless_verdict(self) -> Verdict | None:
-        """How the needless flags stand to theirs; None where they have none."""
+        """Comparison of the needless flags with their target; None without one."""
         if self.needless is None or self.needless_target is None:
             return None
-        return _held(self.needless, self.needless_target)
+        return _compare(self.needless, self.needless_target)
 
 
-def _held(found: MonteCarloFigure, target: float) -> Verdict:
-    if found.value <= target:
+def _compare(share: MonteCarloFigure, target: float) -> Verdict:
+    if share.value <= target:
         return Verdict.MET
-    above = found.value - 2.0 * found.error > target
-    return Verdict.MISSED if above else Verdict.UNTOLD
+    above = share.value - 2.0 * share.error > target
+    return Verdict.MISSED if above else Verdict.UNDECIDED
 
 
 @dataclass(slots=True)
 class Tally:
-    """Counts of classes, cluster by cluster: scenes of one cluster share their geometry."""
+    """Counts by class and cluster; scenes of one cluster share their geometry."""
 
     counts: dict[tuple[str, str], list[dict[str, float]]] = field(default_factory=dict)
     scenes: dict[tuple[str, str], int] = field(default_factory=dict)
     failures: dict[str, Failure] = field(default_factory=dict)
     measured: set[tuple[str, str]] = field(default_factory=set)
-    """Classes and quantities of which it is known what can be seen."""
+    """Classes and quantities for which it is known which violations are detectable."""
 
-    def add(self, judged: Judged, scenes: int) -> None:
+    def add(self, values: ScoredValues, scenes: int) -> None:
         """Count the values of a chunk."""
-        self.failures[judged.failure.name] = judged.failure
-        for name in (judged.failure.name, ALL):
-            key = (name, judged.quantity)
-            self.counts.setdefault(key, []).append(_counted(judged))
+        self.failures[values.failure.name] = values.failure
+        for name in (values.failure.name, ALL):
+            key = (name, values.quantity)
+            self.counts.setdefault(key, []).append(_count(values))
             self.scenes[key] = self.scenes.get(key, 0) + scenes
-            if judged.hidden is not None:
+            if values.hidden is not None:
                 self.measured.add(key)
 
     def rates(self, retrieval: str, needless: float | None) -> Iterator[FalseValueRate]:
-        """Give one rate for each class and quantity.
+        """Yield the rates of each class and quantity.
 
         Parameters
         ----------
@@ -180,7 +184,7 @@ class Tally:
             Largest share of needless flags where the model holds.
         """
         for (name, quantity), chunks in self.counts.items():
-            column = {one: np.array([chunk[one] for chunk in chunks]) for one in _COUNTS}
+            column = {count: np.array([chunk[count] for chunk in chunks]) for count in _COUNTS}
             failure = self.failures.get(name, Failure(name))
             yield FalseValueRate(
                 retrieval=retrieval,
@@ -224,52 +228,52 @@ SATISFIED: Final = 1e-3
 VIOLATED: Final = 5e-3
 """Largest share where it does not."""
 
-Generator = Callable[[int], Iterator[tuple[Judged, int]]]
-"""From the number of a cluster to what its scenes gave, and how many scenes these were."""
+Generator = Callable[[int], Iterator[tuple[ScoredValues, int]]]
+"""Yields the values of the scenes of a cluster, given its number, and the number of scenes."""
 
 
 def collect(generator: Generator, clusters: int, progress: Callable[[int], object]) -> Tally:
-    """Count the scenes of so many clusters; the same numbers give the same scenes."""
+    """Count the values of that many clusters; the same numbers give the same scenes."""
     tally = Tally()
     for cluster in range(clusters):
-        for judged, scenes in generator(cluster):
-            tally.add(judged, scenes)
+        for values, scenes in generator(cluster):
+            tally.add(values, scenes)
         progress(1)
     return tally
 
 
-def clustered_share(part: Array, whole: Array) -> MonteCarloFigure:
+def clustered_share(count: Array, total_count: Array) -> MonteCarloFigure:
     """Return a share with the Monte Carlo error of independent clusters."""
-    total = float(whole.sum())
+    total = float(total_count.sum())
     if total == 0.0:
         return MonteCarloFigure(0.0, 0.0)
-    value = float(part.sum()) / total
-    error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
-    # Where none is found, one more keeps the error from being zero.
+    value = float(count.sum()) / total
+    error = float(np.sqrt(np.sum((count - value * total_count) ** 2))) / total
+    # With a count of 0, the error is that of one count.
     return MonteCarloFigure(value, max(error, 1.0 / total))
 
 
-def _counted(judged: Judged) -> dict[str, float]:
-    shape = judged.error.shape
-    size = np.abs(judged.error)
+def _count(values: ScoredValues) -> dict[str, float]:
+    shape = values.error.shape
+    size = np.abs(values.error)
     valued = np.isfinite(size)
-    bits = np.broadcast_to(judged.bits, shape)
+    bits = np.broadcast_to(values.bits, shape)
     rejected = (bits & REJECTING) != 0
-    doubted = rejected if judged.doubted is None else judged.doubted | rejected
-    solvable = np.zeros_like(valued) if judged.solvable is None else judged.solvable
-    hidden = np.zeros_like(valued) if judged.hidden is None else judged.hidden
-    random = np.broadcast_to(judged.random, shape)
-    stated = np.hypot(random, judged.systematic)
-    # A value without a stated error is false whatever it is.
-    wild, false = ~(size <= FALSE * random), ~(size <= FALSE * stated)
+    uncertain = rejected if values.uncertain is None else values.uncertain | rejected
+    solvable = np.zeros_like(valued) if values.solvable is None else values.solvable
+    hidden = np.zeros_like(valued) if values.hidden is None else values.hidden
+    random = np.broadcast_to(values.random, shape)
+    stated = np.hypot(random, values.systematic)
+    # A value without a stated error is false.
+    false_random, false = ~(size <= FALSE * random), ~(size <= FALSE * stated)
     kept = valued & ~rejected
-    plain, bare = kept & ~doubted, kept & (bits == 0)
+    plain, bare = kept & ~uncertain, kept & (bits == 0)
     masks = {
         "values": valued,
         "kept": kept,
         "plain": plain,
         "bare": bare,
-        "false random": kept & wild,
+        "false random": kept & false_random,
         "false": kept & false,
         "false plain": plain & false,
         "plain hidden": plain & hidden,

@@ -1,4 +1,4 @@
-"""The page of the stiff and extreme cases and of the false values."""
+"""The report page of the stability benchmark."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NONE: Final = "-"
 _PASSED: Final = "passed"
 _KNOWN: Final = "known finding"
 _FAILED: Final = "FAILED"
-_MENDED: Final = "passed, though listed as a finding"
+_PASSED_FINDING: Final = "passed, though listed as a finding"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class PartCost:
 
 @dataclass(frozen=True, slots=True)
 class Stability:
-    """What the benchmark found."""
+    """Result of the stability benchmark."""
 
     date: str
     machine: Machine
@@ -50,19 +50,19 @@ class Stability:
 
     @property
     def failed(self) -> bool:
-        """Whether a case went otherwise than it is known to."""
-        return any(one.passed == bool(one.finding) for one in self.outcomes)
+        """Whether a case failed unexpectedly, or passed although a failure is known."""
+        return any(outcome.passed == bool(outcome.finding) for outcome in self.outcomes)
 
 
-def stability_report(found: Stability, data: str = "") -> BenchmarkReport:
-    """Return the page."""
+def stability_report(stability: Stability, data: str = "") -> BenchmarkReport:
+    """Return the report page."""
     return BenchmarkReport(
         title="Stability: stiff and extreme cases, and false values without a flag",
         facts=(
-            *facts(found.date, found.machine),
-            ("CPU time", ", ".join(f"{s.what} {duration(s.seconds)}" for s in found.spent)),
+            *facts(stability.date, stability.machine),
+            ("CPU time", ", ".join(f"{s.what} {duration(s.seconds)}" for s in stability.spent)),
         ),
-        parts=(_cases(found.outcomes), *_rates(found.rates)),
+        parts=(_cases(stability.outcomes), *_rates(stability.rates)),
         data=data,
     )
 
@@ -71,21 +71,20 @@ def stability_report(found: Stability, data: str = "") -> BenchmarkReport:
 
 
 def verdict(outcome: CaseOutcome) -> str:
-    """Return what a case came to, in a word."""
+    """Return the verdict on a case."""
     if outcome.finding:
-        return _MENDED if outcome.passed else _KNOWN
+        return _PASSED_FINDING if outcome.passed else _KNOWN
     return _PASSED if outcome.passed else _FAILED
 
 
 def _cases(outcomes: tuple[CaseOutcome, ...]) -> Part:
-    names = tuple(dict.fromkeys(one.retrieval for one in outcomes))
-    passed = sum(one.passed for one in outcomes)
+    names = tuple(dict.fromkeys(outcome.retrieval for outcome in outcomes))
+    passed = sum(outcome.passed for outcome in outcomes)
     return Part(
         title="Stiff and extreme cases",
-        text=f"{counted(len(outcomes), 'case')}, {passed:,} passed. A case asks for a value "
-        "within a tolerance of one that is known (in closed form, or to 60 digits), for a flag, "
-        "or for an error that names the field. Anything else that leaves, a warning too, counts "
-        "as a crash.",
+        text=f"{counted(len(outcomes), 'case')}, {passed:,} passed. A case expects a value "
+        "within a tolerance of a known one (in closed form, or to 60 digits), a flag, or an error "
+        "that names the field. Any other exception, and a warning, counts as a crash.",
         tables=(_overview(outcomes, names), _unmet(outcomes)),
         details=tuple(_all_of(outcomes, name) for name in names),
     )
@@ -94,7 +93,7 @@ def _cases(outcomes: tuple[CaseOutcome, ...]) -> Part:
 def _overview(outcomes: tuple[CaseOutcome, ...], names: tuple[str, ...]) -> Table:
     rows = []
     for name in names:
-        words = [verdict(one) for one in outcomes if one.retrieval == name]
+        words = [verdict(outcome) for outcome in outcomes if outcome.retrieval == name]
         shares = (str(words.count(word)) for word in (_PASSED, _KNOWN, _FAILED))
         rows.append((name, str(len(words)), *shares))
     return Table(
@@ -106,12 +105,18 @@ def _overview(outcomes: tuple[CaseOutcome, ...], names: tuple[str, ...]) -> Tabl
 
 def _unmet(outcomes: tuple[CaseOutcome, ...]) -> Table:
     return Table(
-        title="Cases that do not come out as they should",
-        columns=("case", "verdict", "expected", "got", "why"),
+        title="Cases that fail, and known findings",
+        columns=("case", "verdict", "expected", "got", "reason"),
         rows=tuple(
-            (f"{one.retrieval}: {one.name}", verdict(one), one.expected, one.got, one.finding)
-            for one in outcomes
-            if not one.passed or one.finding
+            (
+                f"{outcome.retrieval}: {outcome.name}",
+                verdict(outcome),
+                outcome.expected,
+                outcome.got,
+                outcome.finding,
+            )
+            for outcome in outcomes
+            if not outcome.passed or outcome.finding
         ),
     )
 
@@ -121,9 +126,9 @@ def _all_of(outcomes: tuple[CaseOutcome, ...], name: str) -> Table:
         title=f"All cases: {name}",
         columns=("case", "verdict", "expected", "got"),
         rows=tuple(
-            (one.name, verdict(one), one.expected, one.got)
-            for one in outcomes
-            if one.retrieval == name
+            (outcome.name, verdict(outcome), outcome.expected, outcome.got)
+            for outcome in outcomes
+            if outcome.retrieval == name
         ),
     )
 
@@ -132,40 +137,40 @@ def _all_of(outcomes: tuple[CaseOutcome, ...], name: str) -> Table:
 
 
 def _rates(rates: tuple[FalseValueRate, ...]) -> Iterator[Part]:
-    for name in dict.fromkeys(one.retrieval for one in rates):
-        own = [one for one in rates if one.retrieval == name]
-        scenes = sum(one.scenes for one in own if one.quantity == own[0].quantity
-                     and one.failure == ALL)  # fmt: skip
+    for name in dict.fromkeys(rate.retrieval for rate in rates):
+        own = [rate for rate in rates if rate.retrieval == name]
+        first = own[0].quantity
+        scenes = sum(rate.scenes for rate in own if (rate.quantity, rate.failure) == (first, ALL))
         yield Part(
             title=f"False values: {name}",
-            text=f"{counted(scenes, 'random scene')}. A value is false where it is off by more "
-            f"than {FALSE:g} stated standard errors. Targets: {_percent(SATISFIED)} of what no "
-            f"flag rejects where the model holds, by random errors alone; {_percent(VIOLATED)} "
-            "elsewhere, with the declared systematic errors, without values that the "
-            "retrieval's own flags doubt and without violations that, as measured, no test can be "
-            f"relied on to see. {_told([one for one in own if one.failure != ALL])}",
+            text=f"{counted(scenes, 'random scene')}. A value is false if it differs from the "
+            f"truth by more than {FALSE:g} stated standard errors. Targets for values that no "
+            f"flag rejects: {_percent(SATISFIED)} where the model holds, by random errors alone; "
+            f"{_percent(VIOLATED)} elsewhere, with the stated systematic errors, excluding "
+            "values that flags mark as uncertain and violations that no test can reliably "
+            f"detect. {_targets([rate for rate in own if rate.failure != ALL])}",
             tables=(_table(name, own),),
         )
 
 
-def _told(rates: list[FalseValueRate]) -> str:
-    """Say which classes miss their targets, and of which so few scenes do not tell."""
-    parts = []
-    for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNTOLD, "Not told by so few")):
+def _targets(rates: list[FalseValueRate]) -> str:
+    """Return which classes miss their targets, and for which that is undecided."""
+    sentences = []
+    for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNDECIDED, "Undecided")):
         names = [
-            f"{one.failure} ({one.quantity})"
-            for one in rates
-            if verdict in {one.verdict, one.needless_verdict}
+            f"{rate.failure} ({rate.quantity})"
+            for rate in rates
+            if verdict in {rate.verdict, rate.needless_verdict}
         ]
         if names:
-            parts.append(f"{words}: {', '.join(names)}.")
-    return " ".join(parts) or "All targets are met."
+            sentences.append(f"{words}: {', '.join(names)}.")
+    return " ".join(sentences) or "All targets are met."
 
 
 def _table(name: str, rates: list[FalseValueRate]) -> Table:
-    ordered = sorted(rates, key=lambda one: (one.quantity, one.failure == ALL))
+    ordered = sorted(rates, key=lambda rate: (rate.quantity, rate.failure == ALL))
     return Table(
-        title=f"Values off by more than {FALSE:g} stated errors: {name}",
+        title=f"Values that differ by more than {FALSE:g} stated errors: {name}",
         columns=(
             "class",
             "quantity",
@@ -174,55 +179,54 @@ def _table(name: str, rates: list[FalseValueRate]) -> Table:
             "not rejected",
             "false, random error",
             "false, with systematic",
-            "and not doubted",
-            "of these not to be seen",
-            "share of what could be seen",
-            "without any bit",
-            "fine of the rejected",
+            "and not uncertain",
+            "of these undetectable",
+            "share of the detectable",
+            "without any flag",
+            "rejected but accurate",
             "needlessly flagged",
             "target",
-            "seen in the data",
+            "detectable in the data",
         ),
-        rows=tuple(_row(one) for one in ordered),
-        note="In brackets: Monte Carlo standard error in the last digits, of geometries drawn "
-        "independently. Not rejected: no bit that says not to use the value. Not doubted: no "
-        "flag of the retrieval that doubts the stated error. Not to be seen: what the model cannot "
-        f"take up of the violation is less than {VISIBLE:g} standard deviations of the noise, so "
-        "that even the best test that knows its very shape, though not its sign, misses 7 % "
-        "or more of such at our rate of false alarms (of 3.5 deviations, half); the target is for "
-        "the rest, as a share of all. Share of what could be seen: false ones among the few "
-        "values alone whose violation could be seen and still raised no flag. "
-        "Target: not told by so few where the share is above it by less than 2 Monte Carlo errors. "
-        f"Fine of the rejected, and needlessly flagged: off by less than {FINE:g}, and "
-        "flagged though the value could be determined.",
+        rows=tuple(_row(rate) for rate in ordered),
+        note="In brackets: Monte Carlo standard error in the last digits, from independently "
+        "drawn geometries. Not rejected: no flag rejects the value. Not uncertain: no flag marks "
+        "the stated error as uncertain. Undetectable: the misfit of the violation is below "
+        f"{VISIBLE:g} standard deviations of the noise. Even the best test that knows the shape "
+        "of the violation, but not its sign, misses 7 % or more of these at our rate of false "
+        "alarms (half at 3.5 deviations). The target applies to the rest, as a share of all. "
+        "Share of the detectable: false values among those whose violation is detectable but "
+        "raised no flag. Target, undecided: the share exceeds it by less than 2 Monte Carlo "
+        f"errors. Rejected but accurate: differs by less than {FINE:g} errors. Needlessly "
+        "flagged: flagged although the value can be determined.",
     )
 
 
-def _row(one: FalseValueRate) -> tuple[str, ...]:
+def _row(rate: FalseValueRate) -> tuple[str, ...]:
     return (
-        one.failure,
-        one.quantity,
-        f"{one.scenes:,}",
-        f"{one.values:,}",
-        percent_with_error(one.kept),
-        percent_with_error(one.false_random),
-        percent_with_error(one.false),
-        percent_with_error(one.false_undoubted),
-        _NONE if one.false_hidden is None else percent_with_error(one.false_hidden),
-        _NONE if one.false_of_seen is None else percent_with_error(one.false_of_seen),
-        _NONE if one.false_bare is None else percent_with_error(one.false_bare),
-        percent_with_error(one.fine_of_rejected),
-        _NONE if one.needless is None else percent_with_error(one.needless),
-        _goal(one),
-        f"no: {one.unseen}" if one.unseen else "yes",
+        rate.failure,
+        rate.quantity,
+        f"{rate.scenes:,}",
+        f"{rate.values:,}",
+        percent_with_error(rate.kept),
+        percent_with_error(rate.false_random),
+        percent_with_error(rate.false),
+        percent_with_error(rate.false_undoubted),
+        _NONE if rate.false_hidden is None else percent_with_error(rate.false_hidden),
+        _NONE if rate.false_of_seen is None else percent_with_error(rate.false_of_seen),
+        _NONE if rate.false_bare is None else percent_with_error(rate.false_bare),
+        percent_with_error(rate.fine_of_rejected),
+        _NONE if rate.needless is None else percent_with_error(rate.needless),
+        _goal(rate),
+        f"no: {rate.unseen}" if rate.unseen else "yes",
     )
 
 
-def _goal(one: FalseValueRate) -> str:
-    goal = f"{_percent(one.target)} {one.verdict}"
-    if one.needless_verdict is None or one.needless_target is None:
+def _goal(rate: FalseValueRate) -> str:
+    goal = f"{_percent(rate.target)} {rate.verdict}"
+    if rate.needless_verdict is None or rate.needless_target is None:
         return goal
-    return f"{goal}; needless {_percent(one.needless_target)} {one.needless_verdict}"
+    return f"{goal}; needless {_percent(rate.needless_target)} {rate.needless_verdict}"
 
 
 def _percent(share: float) -> str:

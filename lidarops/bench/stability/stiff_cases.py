@@ -1,4 +1,8 @@
-"""The vocabulary of stiff and extreme cases: what is asked, what has to come, what came."""
+"""Building blocks of the stiff and extreme cases: case, expectations, outcome.
+
+A stiff case calls a retrieval with difficult input and compares its answer with expectations: a
+known value within a tolerance, a flag, or an error that names the wrong field.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from lidarops.flags import Quality
 
 Array = npt.NDArray[np.float64]
 Reference = float | Array | Callable[[], "float | Array"]
-"""A value to compare with; a function where it is costly."""
+"""Reference value, or a function that returns it where it is costly."""
 
 REJECTING: Final = int(Quality.rejecting())
 _CRASHES: Final = (
@@ -27,13 +31,13 @@ _CRASHES: Final = (
     TypeError,
     ValueError,
 )
-"""What must not leave a retrieval, whatever it is given: only errors of ours may."""
+"""Exceptions that no input may cause: a retrieval raises only `LidarOpsError`."""
 _SHOWN: Final = 3
-"""Values of an array that are told."""
+"""Largest array that is printed in full."""
 
 
 class Retrieval(StrEnum):
-    """What a case is asked of."""
+    """The retrieval, or the forward model, of a case."""
 
     HOMOGENEOUS = "homogeneous"
     SIGNAL = "signal chain"
@@ -49,32 +53,32 @@ def _no_bits() -> npt.NDArray[np.int32]:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a retrieval gave: named values, and the quality bits of each of them."""
+    """Named values that a retrieval returned, and their quality bits."""
 
     values: Mapping[str, Any]
     quality: npt.NDArray[np.int32] = field(default_factory=_no_bits)
     """Bits of `lidarops.flags.Quality`, broadcast against the values."""
 
     def value(self, name: str) -> Array:
-        """Return one of the values."""
+        """Return the values of a quantity."""
         return np.asarray(self.values[name], dtype=np.float64)
 
     def rejected(self) -> npt.NDArray[np.bool_]:
-        """Return where a bit says that the value is not to be used."""
+        """Return where a bit rejects the value."""
         return np.asarray((self.quality & REJECTING) != 0)
 
 
 class Expectation(Protocol):
-    """What has to come."""
+    """Condition that an answer must meet."""
 
-    def told(self) -> str:
-        """Return it in words."""
+    def describe(self) -> str:
+        """Return the condition in words."""
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
+        """Return the answer in the same words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,17 +88,17 @@ class StiffCase:
     name: str
     retrieval: Retrieval
     build: Callable[[], Mapping[str, Any]]
-    """Of the arguments."""
+    """Returns the arguments of `solve`."""
     solve: Callable[..., Answer]
     expected: tuple[Expectation, ...]
-    """All of these; or that it is refused, which stands alone."""
+    """All must be met; `Refused` stands alone."""
     finding: str = ""
-    """Why it is known not to be met; empty where it is."""
+    """Reason of a known failure; empty for cases that pass."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaseOutcome:
-    """What came of a case."""
+    """Outcome of a case."""
 
     name: str
     retrieval: str
@@ -106,13 +110,13 @@ class CaseOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """An error of ours, of the field that is wrong."""
+    """A `LidarOpsError` that names the wrong field."""
 
     kind: type[LidarOpsError]
     field: str | None = None
 
-    def told(self) -> str:
-        """Return it in words."""
+    def describe(self) -> str:
+        """Return the condition in words."""
         return f"{self.kind.__name__}{f' of {self.field}' if self.field else ''}"
 
     def met(self, _: Answer) -> bool:
@@ -120,217 +124,218 @@ class Refused:
         return False
 
     def got(self, answer: Answer) -> str:
-        """Return what came in place of the error."""
+        """Return the answer that came in place of the error."""
         return f"an answer: {', '.join(answer.values)}"
 
     def raised(self, error: LidarOpsError) -> bool:
-        """Return whether it is this error."""
+        """Return whether this is the expected error."""
         return isinstance(error, self.kind) and self.field in {None, error.field}
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """A value within a tolerance of its reference, everywhere."""
+    """All values are within a tolerance of their reference."""
 
     quantity: str
     reference: Reference
     tolerance: float
     relative: bool = True
-    """Whether the tolerance is a share of the reference."""
+    """Whether the tolerance is relative to the reference."""
 
-    def told(self) -> str:
-        """Return it in words."""
+    def describe(self) -> str:
+        """Return the condition in words."""
         share = " relative" if self.relative else ""
-        return f"{self.quantity} {spelled(self._truth())} within {self.tolerance:.0e}{share}"
+        return f"{self.quantity} {format_values(self._truth())} within {self.tolerance:.0e}{share}"
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
         return bool(self._error(answer) <= self.tolerance)
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        value = spelled(answer.value(self.quantity))
+        """Return the answer in the same words."""
+        value = format_values(answer.value(self.quantity))
         return f"{self.quantity} {value}, off by {self._error(answer):.1e}"
 
     def _truth(self) -> Array:
-        found = self.reference() if callable(self.reference) else self.reference
-        return np.asarray(found, dtype=np.float64)
+        reference = self.reference() if callable(self.reference) else self.reference
+        return np.asarray(reference, dtype=np.float64)
 
     def _error(self, answer: Answer) -> float:
         truth = self._truth()
         error = np.abs(answer.value(self.quantity) - truth)
         if self.relative:
             error = error / np.abs(truth)
-        # A NaN is an error without bound.
+        # NaN counts as an infinite error.
         return float(np.max(np.where(np.isnan(error), np.inf, error)))
 
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """A value between two bounds, everywhere."""
+    """All values are between two bounds."""
 
     quantity: str
     low: float
     high: float
 
-    def told(self) -> str:
-        """Return it in words."""
+    def describe(self) -> str:
+        """Return the condition in words."""
         return f"{self.quantity} in [{self.low:.3g}, {self.high:.3g}]"
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
         value = answer.value(self.quantity)
         return bool(np.all((value >= self.low) & (value <= self.high)))
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        return f"{self.quantity} {spelled(answer.value(self.quantity))}"
+        """Return the answer in the same words."""
+        return f"{self.quantity} {format_values(answer.value(self.quantity))}"
 
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """No value, anywhere."""
+    """All values are missing."""
 
     quantity: str
 
-    def told(self) -> str:
-        """Return it in words."""
+    def describe(self) -> str:
+        """Return the condition in words."""
         return f"{self.quantity} NaN"
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
         return bool(np.isnan(answer.value(self.quantity)).all())
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        return f"{self.quantity} {spelled(answer.value(self.quantity))}"
+        """Return the answer in the same words."""
+        return f"{self.quantity} {format_values(answer.value(self.quantity))}"
 
 
 @dataclass(frozen=True, slots=True)
-class Raised:
-    """At least one of these bits, everywhere (or on a share of the values at least)."""
+class Flagged:
+    """At least one of these bits is set, for all or at least a share of the values."""
 
     bits: Quality
     share: float = 1.0
 
-    def told(self) -> str:
-        """Return it in words."""
-        part = "" if self.share == 1.0 else f" on {100.0 * self.share:g} % at least"
+    def describe(self) -> str:
+        """Return the condition in words."""
+        least = "" if self.share == 1.0 else f" on at least {100.0 * self.share:g} %"
         if int(self.bits) == REJECTING:
-            return f"rejected{part}"
-        return f"flag {bits_told(int(self.bits), ' or ')}{part}"
+            return f"rejected{least}"
+        return f"flag {_flag_names(int(self.bits), ' or ')}{least}"
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
         return bool(np.mean((answer.quality & int(self.bits)) != 0) >= self.share)
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        return f"flag {quality_told(answer)}"
+        """Return the answer in the same words."""
+        return f"flag {_flag_shares(answer)}"
 
 
 @dataclass(frozen=True, slots=True)
-class Stands:
-    """No bit that rejects (on a share of the values at least)."""
+class Accepted:
+    """No bit rejects, for all or at least a share of the values."""
 
     share: float = 1.0
 
-    def told(self) -> str:
-        """Return it in words."""
-        part = "" if self.share == 1.0 else f" of {100.0 * self.share:g} % at least"
-        return f"not rejected{part}"
+    def describe(self) -> str:
+        """Return the condition in words."""
+        least = "" if self.share == 1.0 else f" for at least {100.0 * self.share:g} %"
+        return f"not rejected{least}"
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
         return bool(np.mean(~answer.rejected()) >= self.share)
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        return f"flag {quality_told(answer)}"
+        """Return the answer in the same words."""
+        return f"flag {_flag_shares(answer)}"
 
 
 @dataclass(frozen=True, slots=True)
 class Unflagged:
-    """No bit at all."""
+    """No bit is set."""
 
-    def told(self) -> str:
-        """Return it in words."""
+    def describe(self) -> str:
+        """Return the condition in words."""
         return "no flag"
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
+        """Return whether an answer meets the condition."""
         return not answer.quality.any()
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        return f"flag {quality_told(answer)}"
+        """Return the answer in the same words."""
+        return f"flag {_flag_shares(answer)}"
 
 
 @dataclass(frozen=True, slots=True)
-class Honest:
-    """Each value within 4 stated standard errors of the truth, or rejected, or missing."""
+class Covered:
+    """Each value is within 4 stated standard errors of the truth, or rejected, or missing."""
 
     quantity: str
     truth: Reference
     errors: float = 4.0
+    """Stated standard errors."""
     valued: float = 0.0
-    """Share of the values that must stand."""
+    """Least share of accepted values among all."""
     most: float = 0.0
-    """Share of those that stand that may be farther off, where they are many."""
+    """Largest share of accepted values that may differ by more."""
 
-    def told(self) -> str:
-        """Return it in words."""
-        part = f", {100.0 * self.valued:g} % at least with a value" if self.valued else ""
-        but = f" but for {100.0 * self.most:g} %" if self.most else ""
+    def describe(self) -> str:
+        """Return the condition in words."""
+        least = f", at least {100.0 * self.valued:g} % with a value" if self.valued else ""
+        but = f" except {100.0 * self.most:g} %" if self.most else ""
         return (
-            f"{self.quantity} {spelled(self._truth())} within {self.errors:g} standard"
-            f" errors{but}, or flagged{part}"
+            f"{self.quantity} {format_values(self._truth())} within {self.errors:g} standard"
+            f" errors{but}, or flagged{least}"
         )
 
     def met(self, answer: Answer) -> bool:
-        """Return whether an answer is such."""
-        _, false, standing = self._judged(answer)
-        return false <= self.most and standing >= self.valued
+        """Return whether an answer meets the condition."""
+        _, false, accepted = self._shares(answer)
+        return false <= self.most and accepted >= self.valued
 
     def got(self, answer: Answer) -> str:
-        """Return what came, in the same words."""
-        worst, false, standing = self._judged(answer)
-        value = spelled(answer.value(self.quantity))
+        """Return the answer in the same words."""
+        worst, false, accepted = self._shares(answer)
+        value = format_values(answer.value(self.quantity))
         beyond = f", {100.0 * false:.2g} % beyond {self.errors:g}" if false else ""
         return (
-            f"{self.quantity} {value}, {100.0 * standing:.3g} % unflagged, worst {worst:.3g}"
-            f" standard errors{beyond}, flag {quality_told(answer)}"
+            f"{self.quantity} {value}, {100.0 * accepted:.3g} % unflagged, worst {worst:.3g}"
+            f" standard errors{beyond}, flag {_flag_shares(answer)}"
         )
 
     def _truth(self) -> Array:
-        found = self.truth() if callable(self.truth) else self.truth
-        return np.asarray(found, dtype=np.float64)
+        truth = self.truth() if callable(self.truth) else self.truth
+        return np.asarray(truth, dtype=np.float64)
 
-    def _judged(self, answer: Answer) -> tuple[float, float, float]:
-        """Return the worst error, the share that is false, and the share that stands."""
+    def _shares(self, answer: Answer) -> tuple[float, float, float]:
+        """Return the worst error, the share of false and the share of accepted values."""
         value = answer.value(self.quantity)
         stated = answer.value(f"{self.quantity}_standard_error")
-        standing = np.isfinite(value) & ~answer.rejected()
+        accepted = np.isfinite(value) & ~answer.rejected()
         error = np.abs(value - self._truth())
         with np.errstate(divide="ignore", invalid="ignore"):
-            off = np.where(error == 0.0, 0.0, error / stated)
-        # A value without a stated error is false whatever it is.
-        off = np.where(np.isnan(off), np.inf, off)[standing]
-        if not off.size:
+            score = np.where(error == 0.0, 0.0, error / stated)
+        # A value without a stated error is false.
+        score = np.where(np.isnan(score), np.inf, score)[accepted]
+        if not score.size:
             return 0.0, 0.0, 0.0
-        return float(off.max()), float(np.mean(off > self.errors)), float(np.mean(standing))
+        return float(score.max()), float(np.mean(score > self.errors)), float(np.mean(accepted))
 
 
 def evaluate(case: StiffCase) -> CaseOutcome:
-    """Return what comes of a case; a warning counts as a crash."""
-    told = "; ".join(one.told() for one in case.expected)
+    """Return the outcome of a case; a warning counts as a crash."""
+    expected = "; ".join(expectation.describe() for expectation in case.expected)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        passed, got = _tried(case)
-    return CaseOutcome(case.name, case.retrieval.value, told, got, passed, case.finding)
+        passed, got = _run(case)
+    return CaseOutcome(case.name, case.retrieval.value, expected, got, passed, case.finding)
 
 
-def _tried(case: StiffCase) -> tuple[bool, str]:
+def _run(case: StiffCase) -> tuple[bool, str]:
     try:
         answer = case.solve(**case.build())
     except LidarOpsError as error:
@@ -339,35 +344,36 @@ def _tried(case: StiffCase) -> tuple[bool, str]:
         return refused, f"{type(error).__name__}: {error}"
     except (*_CRASHES, RuntimeWarning) as error:
         return False, f"crash, {type(error).__name__}: {error}"
-    passed = all(one.met(answer) for one in case.expected)
-    return passed, "; ".join(dict.fromkeys(one.got(answer) for one in case.expected))
+    passed = all(expectation.met(answer) for expectation in case.expected)
+    texts = dict.fromkeys(expectation.got(answer) for expectation in case.expected)
+    return passed, "; ".join(texts)
 
 
-def spelled(values: Array) -> str:
-    """Return a number, or the first ones and the range of many."""
+def format_values(values: Array) -> str:
+    """Return up to 3 numbers in full, or the range of many."""
     flat = np.atleast_1d(values).ravel()
     if flat.size <= _SHOWN:
         return ", ".join(f"{value:.6g}" for value in flat)
     finite = flat[np.isfinite(flat)]
     if not finite.size:
         return f"{flat.size} times NaN or infinity"
-    few = "" if finite.size == flat.size else f", {flat.size - finite.size} not finite"
-    return f"{finite.min():.4g} to {finite.max():.4g} ({flat.size} values{few})"
+    not_finite = "" if finite.size == flat.size else f", {flat.size - finite.size} not finite"
+    return f"{finite.min():.4g} to {finite.max():.4g} ({flat.size} values{not_finite})"
 
 
-def bits_told(bits: int, between: str = ", ") -> str:
+def _flag_names(bits: int, between: str = ", ") -> str:
     """Return the names of quality bits."""
     names = [(bit.name or "").lower() for bit in Quality if bits & int(bit)]
     return between.join(names) or "none"
 
 
-def quality_told(answer: Answer) -> str:
+def _flag_shares(answer: Answer) -> str:
     """Return the names of all bits, and the share of the values that have them."""
     count = answer.quality.size
-    parts = []
+    names = []
     for bit in Quality:
         share = np.count_nonzero(answer.quality & int(bit)) / count if count else 0.0
         if share:
             name = (bit.name or "").lower()
-            parts.append(name if share == 1.0 else f"{name} ({100.0 * share:.3g} %)")
-    return ", ".join(parts) or "none"
+            names.append(name if share == 1.0 else f"{name} ({100.0 * share:.3g} %)")
+    return ", ".join(names) or "none"

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, and how often a wrong value comes without a flag."""
+"""The stability benchmark: stiff cases, and rates of false values without a flag."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from lidarops.bench.harness.terms import RESULT, Effort, Finding
+from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.stability import (
     random_elastic,
@@ -25,7 +25,7 @@ from lidarops.bench.stability import (
     stiff_scans,
     stiff_signals,
 )
-from lidarops.bench.stability.random_scenes import FalseValueRate, Judged, collect
+from lidarops.bench.stability.random_scenes import FalseValueRate, ScoredValues, collect
 from lidarops.bench.stability.stability_report import PartCost, Stability
 from lidarops.bench.stability.stiff_cases import CaseOutcome, Retrieval, StiffCase, evaluate
 
@@ -35,24 +35,25 @@ class Draws:
     """Random scenes of one retrieval."""
 
     retrieval: Retrieval
-    judged: Callable[[int, int], Iterator[tuple[Judged, int]]]
+    score: Callable[[int, int], Iterator[tuple[ScoredValues, int]]]
+    """Returns the values of a cluster, given its number and the number of profiles."""
     profiles: int
-    """Of a cluster and class, which share their geometry."""
+    """Number per cluster and class; they share their geometry."""
     clusters: int
     quick: int
-    """Clusters where little time is to be spent."""
+    """Number of clusters of a quick run."""
     needless: float
     """Largest share of needless flags where the model holds."""
 
 
 DRAWS: Final = (
-    Draws(Retrieval.HOMOGENEOUS, random_homogeneous.judge_homogeneous, 1000, 400, 15, 1e-3),
-    Draws(Retrieval.SIGNAL, random_signals.judge_signals, 50, 1500, 60, 0.05),
-    Draws(Retrieval.ELASTIC, random_elastic.judge_elastic, 20, 1500, 40, 0.05),
-    Draws(Retrieval.MULTIANGLE, random_scans.judge_scans, 8, 2000, 60, 0.13),
-    Draws(Retrieval.MULTIPOSITION, random_networks.judge_networks, 50, 800, 30, 0.05),
+    Draws(Retrieval.HOMOGENEOUS, random_homogeneous.score_homogeneous, 1000, 400, 15, 1e-3),
+    Draws(Retrieval.SIGNAL, random_signals.score_signals, 50, 1500, 60, 0.05),
+    Draws(Retrieval.ELASTIC, random_elastic.score_elastic, 20, 1500, 40, 0.05),
+    Draws(Retrieval.MULTIANGLE, random_scans.score_scans, 8, 2000, 60, 0.13),
+    Draws(Retrieval.MULTIPOSITION, random_networks.score_networks, 50, 800, 30, 0.05),
 )
-"""Chosen to take some 20 minutes on one core, and less than 2 where little is to be spent."""
+"""Sizes for about 20 minutes on one core, and less than 2 for a quick run."""
 
 
 def all_cases() -> tuple[StiffCase, ...]:
@@ -69,7 +70,7 @@ def all_cases() -> tuple[StiffCase, ...]:
 
 
 def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Stability:
-    """Evaluate all cases and count the false values of random scenes.
+    """Return the outcomes of all cases and the rates of false values in random scenes.
 
     Parameters
     ----------
@@ -77,20 +78,20 @@ def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Stabi
     draws : tuple of Draws
     """
     begin = time.process_time()
-    outcomes = tuple(_evaluated(effort.progress))
+    outcomes = tuple(_outcomes(effort.progress))
     spent = [PartCost("cases", time.process_time() - begin)]
     rates: list[FalseValueRate] = []
-    for one in draws:
+    for draw in draws:
         begin = time.process_time()
-        clusters = one.quick if effort.quick else one.clusters
-        tally = collect(partial(_cluster, one), clusters, effort.progress)
-        rates += tally.rates(one.retrieval.value, one.needless)
-        spent.append(PartCost(one.retrieval.value, time.process_time() - begin))
+        clusters = draw.quick if effort.quick else draw.clusters
+        tally = collect(partial(_score_cluster, draw), clusters, effort.progress)
+        rates += tally.rates(draw.retrieval.value, draw.needless)
+        spent.append(PartCost(draw.retrieval.value, time.process_time() - begin))
     return Stability(effort.date, machine(), outcomes, tuple(rates), tuple(spent))
 
 
-def run_stability(effort: Effort) -> Finding:
-    """Run the benchmark.
+def run_stability(effort: Effort) -> BenchmarkOutput:
+    """Run the stability benchmark.
 
     Parameters
     ----------
@@ -98,18 +99,18 @@ def run_stability(effort: Effort) -> Finding:
 
     Returns
     -------
-    Finding
+    BenchmarkOutput
         A `Stability` and its page.
     """
-    found = measure_stability(effort)
-    return Finding(found, stability_report.stability_report(found, RESULT))
+    stability = measure_stability(effort)
+    return BenchmarkOutput(stability, stability_report.stability_report(stability, RESULT))
 
 
-def _evaluated(progress: Callable[[int], object]) -> Iterator[CaseOutcome]:
+def _outcomes(progress: Callable[[int], object]) -> Iterator[CaseOutcome]:
     for case in all_cases():
         yield evaluate(case)
         progress(1)
 
 
-def _cluster(draws: Draws, cluster: int) -> Iterator[tuple[Judged, int]]:
-    return draws.judged(cluster, draws.profiles)
+def _score_cluster(draws: Draws, cluster: int) -> Iterator[tuple[ScoredValues, int]]:
+    return draws.score(cluster, draws.profiles)

@@ -1,4 +1,4 @@
-"""What a large archive costs a file: scans and runs of 10^3 to 10^5 files, and of 10^6 rows."""
+"""Cost per file of large archives: scans and runs of 10^3 to 10^5 files, and of 10^6 rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import (
+    CAMPAIGN_FILE,
+    RESULT,
+    BenchmarkOutput,
+    Effort,
+    Kind,
+)
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import stand_in_archives
 from lidarops.bench.throughput.campaigns import CampaignSize, simulate_campaign
@@ -32,13 +38,13 @@ from lidarops.run.staleness import Judge
 
 _NOTHING: Final = "-"
 _MICRO: Final = 1e6
-_OF_SCENE: Final = 480
+_FILES_PER_SCENE: Final = 480
 _BINS: Final = 200
 _STATUS: Final = Path("/proc/self/status")
 
 
 class Pass(StrEnum):
-    """What is done with an archive, in this order."""
+    """Operations on an archive, in this order."""
 
     FIRST = "first scan"
     PROCESS = "signals"
@@ -49,12 +55,12 @@ class Pass(StrEnum):
 
 
 _ABOUT: Final[Mapping[Pass, str]] = {
-    Pass.FIRST: "headers of all files into the catalog",
-    Pass.PROCESS: "from files to products and ledger",
-    Pass.SETTLE: "a first run where all products are there: every scene is cut and judged",
-    Pass.AGAIN: "files listed and compared with the catalog",
-    Pass.STALE: "days that may hold something stale, from catalog and ledger",
-    Pass.NOTHING: "both, and nothing written",
+    Pass.FIRST: "read the headers of all files into the catalog",
+    Pass.PROCESS: "process files to products and ledger",
+    Pass.SETTLE: "first run with all products present: every scene is cut and checked",
+    Pass.AGAIN: "list the files and compare them with the catalog",
+    Pass.STALE: "find days that may hold stale scenes, from catalog and ledger",
+    Pass.NOTHING: "both, without anything to write",
 }
 _OF_FILES: Final = (Pass.FIRST, Pass.PROCESS, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
 _OF_ROWS: Final = (Pass.SETTLE, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
@@ -62,99 +68,101 @@ _OF_ROWS: Final = (Pass.SETTLE, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
 
 @dataclass(frozen=True, slots=True)
 class ProcessCost:
-    """By a process that did nothing else, once what it needs was imported and compiled."""
+    """Cost of an operation in its own process, without imports and compilation."""
 
     cpu: float
     """s."""
     wall: float
     """s."""
     peak: float
-    """Most memory of the process, bytes."""
+    """Peak memory of the process, bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArchiveCost:
-    """One archive."""
+    """Costs of one archive."""
 
     files: int
     read: bool
-    """Whether its files can be read; else they are empty and stand for others."""
+    """Whether its files can be read; else they are empty stand-ins."""
     spent: Mapping[Pass, ProcessCost]
 
 
 @dataclass(frozen=True, slots=True)
 class Archives:
-    """The throughput benchmark of archives."""
+    """Result of the throughput benchmark of archives."""
 
     date: str
     machine: Machine
     measured: tuple[ArchiveCost, ...]
 
 
-SIZES: Final = tuple(CampaignSize(n, _OF_SCENE, _BINS, retrieved=False) for n in (2, 20, 200))
+SIZES: Final = tuple(
+    CampaignSize(n, _FILES_PER_SCENE, _BINS, retrieved=False) for n in (2, 20, 200)
+)
 STAND_INS: Final = StandIns(instruments=12, days=290)
-_QUICK: Final = tuple(CampaignSize(n, _OF_SCENE, _BINS, retrieved=False) for n in (1, 4))
+_QUICK: Final = tuple(CampaignSize(n, _FILES_PER_SCENE, _BINS, retrieved=False) for n in (1, 4))
 _QUICK_STAND_INS: Final = StandIns(instruments=4, days=10)
 _TO_WARM: Final = CampaignSize(1, 30, _BINS, retrieved=False)
 
 
-def run_archives(kind: Kind, *, effort: Effort) -> Finding:
+def run_archives(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
     """Run the benchmark of archives.
 
     Raises
     ------
     CampaignError
-        Where its accuracy is asked for.
+        If its accuracy is requested.
     """
     if kind is not Kind.THROUGHPUT:
         raise CampaignError("an archive has no accuracy benchmark", remedy="choose throughput")
-    found = measure_archives(
+    archives_result = measure_archives(
         _QUICK if effort.quick else SIZES,
         _QUICK_STAND_INS if effort.quick else STAND_INS,
         date=effort.date,
         progress=effort.progress,
     )
-    return Finding(found, archives_report(found, RESULT))
+    return BenchmarkOutput(archives_result, archives_report(archives_result, RESULT))
 
 
 def measure_archives(
     sizes: Sequence[CampaignSize],
-    standing: StandIns,
+    stand_ins: StandIns,
     *,
     date: str = "",
     progress: Callable[[int], object] = lambda _: None,
 ) -> Archives:
-    """Simulate archives in temporary folders, and time what is done with them.
+    """Simulate archives in temporary folders, and time the operations on them.
 
     Parameters
     ----------
-    sizes : sequence of Size
-        Of archives whose files are read.
-    standing : StandIns
-        An archive of which only the catalog is told.
+    sizes : sequence of CampaignSize
+        Archives with real files.
+    stand_ins : StandIns
+        Archive of stand-ins, which exists only in catalog and ledger.
     date : str
-        When it is run, as it is to be stated.
+        Date stated in the result.
     progress : callable
-        Is given 1 after each archive.
+        Called with 1 after each archive.
     """
     measured = []
     for size in sizes:
         with _folders() as (small, large):
             simulate_campaign(_TO_WARM, small)
             simulate_campaign(size, large)
-            measured.append(_measured(size.files, _OF_FILES, (small, large), read=True))
+            measured.append(_measure(size.files, _OF_FILES, (small, large), read=True))
         progress(1)
     with _folders() as (small, large):
-        stand_in_archives.enter(StandIns(instruments=1, days=1), small / CAMPAIGN_FILE)
-        stand_in_archives.enter(standing, large / CAMPAIGN_FILE)
-        measured.append(_measured(standing.files, _OF_ROWS, (small, large), read=False))
+        stand_in_archives.write_stand_ins(StandIns(instruments=1, days=1), small / CAMPAIGN_FILE)
+        stand_in_archives.write_stand_ins(stand_ins, large / CAMPAIGN_FILE)
+        measured.append(_measure(stand_ins.files, _OF_ROWS, (small, large), read=False))
     progress(1)
     return Archives(date, machine(), tuple(measured))
 
 
 @contextmanager
 def _folders() -> Iterator[tuple[Path, Path]]:
-    """Give folders for an archive to warm up with and for another, which are gone afterwards."""
+    """Yield temporary folders for a warm-up archive and for the measured one."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         small, large = Path(folder) / "small", Path(folder) / "large"
         small.mkdir()
@@ -162,35 +170,36 @@ def _folders() -> Iterator[tuple[Path, Path]]:
         yield small, large
 
 
-def _measured(
-    files: int, ways: Sequence[Pass], folders: tuple[Path, Path], *, read: bool
+def _measure(
+    files: int, passes: Sequence[Pass], folders: tuple[Path, Path], *, read: bool
 ) -> ArchiveCost:
     small, large = (folder / CAMPAIGN_FILE for folder in folders)
-    return ArchiveCost(files, read, {each: _alone(each, small, large) for each in ways})
+    costs = {operation: _cost_in_process(operation, small, large) for operation in passes}
+    return ArchiveCost(files, read, costs)
 
 
-def _alone(each: Pass, small: Path, large: Path) -> ProcessCost:
-    """Do it in a process of its own, whose memory holds nothing else."""
-    apart = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=apart) as one:
-        return one.submit(_spent, each, small, large).result()
+def _cost_in_process(operation: Pass, small: Path, large: Path) -> ProcessCost:
+    """Return the cost of an operation in a new process, whose memory holds nothing else."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_cost, operation, small, large).result()
 
 
-def _spent(each: Pass, small: Path, large: Path) -> ProcessCost:
-    do = _WAYS[each]
-    do(small)
+def _cost(operation: Pass, small: Path, large: Path) -> ProcessCost:
+    run = _OPERATIONS[operation]
+    run(small)
     cpu, wall = time.process_time(), time.perf_counter()
-    do(large)
+    run(large)
     return ProcessCost(time.process_time() - cpu, time.perf_counter() - wall, _peak())
 
 
 def _peak() -> float:
-    # What resource tells begins with the memory of the process that this one was started by.
+    # The maximum of `resource` includes the memory of the parent process.
     if _STATUS.exists():
-        told = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
-        return 1024.0 * float(told.split()[1])
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float(most) if sys.platform == "darwin" else 1024.0 * most
+        peak = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
+        return 1024.0 * float(peak.split()[1])
+    maximum = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(maximum) if sys.platform == "darwin" else 1024.0 * maximum
 
 
 def _scan(file: Path) -> None:
@@ -199,97 +208,97 @@ def _scan(file: Path) -> None:
 
 def _process(file: Path) -> None:
     if archive.reprocess(load_campaign(file)) is None:
-        raise CampaignError("the simulated archive gives nothing to do", file=file)
+        raise CampaignError("the simulated archive has nothing to process", file=file)
 
 
-def _stale(file: Path) -> None:
+def _check_nothing_stale(file: Path) -> None:
     campaign = load_campaign(file)
     with Store(campaign.catalog_url, campaign.name) as store:
         signatures, verdicts = Judge(campaign, store).signatures(), store.verdicts()
     if any(verdicts.get(day, ("",))[0] != now.whole for day, now in signatures.items()):
-        raise CampaignError("the simulated archive does not stay as it is", file=file)
+        raise CampaignError("the simulated archive is not up to date", file=file)
 
 
-def _rest(file: Path) -> None:
+def _check_up_to_date(file: Path) -> None:
     if archive.reprocess(load_campaign(file)) is not None:
-        raise CampaignError("the simulated archive does not stay as it is", file=file)
+        raise CampaignError("the simulated archive is not up to date", file=file)
 
 
-_WAYS: Final[Mapping[Pass, Callable[[Path], None]]] = {
+_OPERATIONS: Final[Mapping[Pass, Callable[[Path], None]]] = {
     Pass.FIRST: _scan,
     Pass.PROCESS: _process,
-    Pass.SETTLE: _rest,
+    Pass.SETTLE: _check_up_to_date,
     Pass.AGAIN: _scan,
-    Pass.STALE: _stale,
-    Pass.NOTHING: _rest,
+    Pass.STALE: _check_nothing_stale,
+    Pass.NOTHING: _check_up_to_date,
 }
 
 
 # Page -----------------------------------------------------------------------------------------
 
 
-def growth(first: ArchiveCost, last: ArchiveCost, each: Pass) -> float:
-    """Return what a file takes of the last archive over what one of the first takes."""
-    return (last.spent[each].cpu / last.files) / (first.spent[each].cpu / first.files)
+def growth(first: ArchiveCost, last: ArchiveCost, operation: Pass) -> float:
+    """Return the CPU time per file of the last archive over that of the first."""
+    return (last.spent[operation].cpu / last.files) / (first.spent[operation].cpu / first.files)
 
 
-def archives_report(found: Archives, data: str = "") -> BenchmarkReport:
-    """Return the page of the benchmark."""
-    real = [each for each in found.measured if each.read]
+def archives_report(archives: Archives, data: str = "") -> BenchmarkReport:
+    """Return the report page."""
+    real_archives = [cost for cost in archives.measured if cost.read]
     part = Part(
-        title="Cost of a file, and how it grows with the archive",
-        text="Simulated archives of one lidar on a local disk, in one process, which has done the "
-        "same with a small archive before: what is imported and compiled once is not counted. "
-        "TMPDIR tells on which disk.",
-        charts=(_chart(real),),
-        tables=tuple(_table(found.measured, each) for each in Pass),
+        title="Cost per file, and its growth with the archive",
+        text="Simulated archives of one lidar on a local disk, in one process. The process has "
+        "done the same with a small archive before, so imports and compilation are not counted. "
+        "TMPDIR selects the disk.",
+        charts=(_chart(real_archives),),
+        tables=tuple(_table(archives.measured, operation) for operation in Pass),
     )
     return BenchmarkReport(
-        title="Archives: cost of a file",
-        facts=facts(found.date, found.machine),
+        title="Archives: cost per file",
+        facts=facts(archives.date, archives.machine),
         parts=(part,),
         data=data,
     )
 
 
-def _chart(real: Sequence[ArchiveCost]) -> Chart:
+def _chart(costs: Sequence[ArchiveCost]) -> Chart:
     series = tuple(
         Series(
-            each.value,
-            tuple(float(one.files) for one in real),
-            tuple(_MICRO * one.spent[each].cpu / one.files for one in real),
+            operation.value,
+            tuple(float(cost.files) for cost in costs),
+            tuple(_MICRO * cost.spent[operation].cpu / cost.files for cost in costs),
             joined=True,
         )
-        for each in Pass
-        if all(each in one.spent for one in real)
+        for operation in Pass
+        if all(operation in cost.spent for cost in costs)
     )
     return Chart(
         name="archive",
-        title="CPU time of a file",
-        caption="A level line is a cost that does not grow with the archive.",
-        panels=(Panel("", "files", "CPU time of a file (\N{MICRO SIGN}s)", series),),
+        title="CPU time per file",
+        caption="A horizontal line is a cost that does not grow with the archive.",
+        panels=(Panel("", "files", "CPU time per file (\N{MICRO SIGN}s)", series),),
     )
 
 
-def _table(measured: Sequence[ArchiveCost], each: Pass) -> Table:
-    mine = [one for one in measured if each in one.spent]
+def _table(measured: Sequence[ArchiveCost], operation: Pass) -> Table:
+    costs = [cost for cost in measured if operation in cost.spent]
     rows = []
-    for one in mine:
-        spent = one.spent[each]
-        first = next(other for other in mine if other.read is one.read)
+    for cost in costs:
+        spent = cost.spent[operation]
+        first = next(other for other in costs if other.read is cost.read)
         rows.append(
             (
-                f"{one.files:,}" + ("" if one.read else " rows"),
+                f"{cost.files:,}" + ("" if cost.read else " rows"),
                 f"{spent.cpu:.3g}",
                 f"{spent.wall:.3g}",
-                f"{_MICRO * spent.cpu / one.files:.3g}",
-                _NOTHING if one is first else f"{growth(first, one, each):.2f}",
+                f"{_MICRO * spent.cpu / cost.files:.3g}",
+                _NOTHING if cost is first else f"{growth(first, cost, operation):.2f}",
                 wording.size(spent.peak),
             )
         )
     return Table(
-        title=f"{each.value}: {_ABOUT[each]}",
-        columns=("files", "CPU s", "wall s", "us a file", "times the first", "most memory"),
+        title=f"{operation.value}: {_ABOUT[operation]}",
+        columns=("files", "CPU s", "wall s", "us per file", "times the first", "peak memory"),
         rows=tuple(rows),
-        note="Rows: empty files stand for those of the catalog, and are not read.",
+        note="Rows: empty files stand in for those of the catalog, and are not read.",
     )

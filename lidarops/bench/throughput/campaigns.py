@@ -1,4 +1,4 @@
-"""What a campaign costs from raw files to report, stage by stage, and how that grows."""
+"""CPU time of a campaign from raw files to report, by stage, and its growth with the size."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ import yaml
 from scipy import stats
 
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import (
+    CAMPAIGN_FILE,
+    RESULT,
+    BenchmarkOutput,
+    Effort,
+    Kind,
+)
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import orchestration
 from lidarops.campaign.model import Campaign, load_campaign
@@ -32,15 +38,15 @@ from lidarops.simulate.campaign import plan_simulation, write_simulation
 
 _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = 60
-"""s, of a file."""
+"""s; duration of a file."""
 _NOTHING: Final = "-"
 _MILLI: Final = 1e3
 _SHORTEST: Final = 1e-4
-"""s; the clock of a fast machine with little work may not have moved."""
+"""s; least time, because a coarse clock may not advance during a fast call."""
 
 
 class Stage(StrEnum):
-    """Where the time of a campaign goes."""
+    """Stage of processing a campaign."""
 
     SCAN = "scan"
     READ = "read"
@@ -53,28 +59,28 @@ class Stage(StrEnum):
 
 _ABOUT: Final[Mapping[Stage, str]] = {
     Stage.SCAN: "headers of all files into the catalog",
-    Stage.READ: "digest and header of every file of a scene",
-    Stage.RETRIEVE: "counts to results, with reading the channels",
+    Stage.READ: "digest and header of each file of a scene",
+    Stage.RETRIEVE: "counts to results, including reading the channels",
     Stage.WRITE: "products as NetCDF",
-    Stage.ORCHESTRATION: "scenes, plans, what is stale, ledger",
+    Stage.ORCHESTRATION: "scenes, plans, staleness, ledger",
     Stage.REPORT: "page and figures",
-    Stage.UNCHANGED: "a second run, which finds nothing to do",
+    Stage.UNCHANGED: "a second run without anything to process",
 }
-_OF_SCENE: Final = {"digest": Stage.READ, "retrieve": Stage.RETRIEVE, "write": Stage.WRITE}
+_SCENE_STAGES: Final = {"digest": Stage.READ, "retrieve": Stage.RETRIEVE, "write": Stage.WRITE}
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignSize:
-    """Of a simulated campaign."""
+    """Size of a simulated campaign."""
 
     scenes: int = 2
     profiles: int = 30
-    """Files of a scene; 1440 is a multiple of it."""
+    """Files per scene; must divide 1440."""
     bins: int = 1000
     angles: int = 0
-    """Directions of a scan; 0 is a horizontal lidar."""
+    """Directions of a scan; 0 for a horizontal lidar."""
     retrieved: bool = True
-    """Whether paths are solved, or only their signals kept."""
+    """Whether homogeneous paths are retrieved, or only signals kept."""
 
     @property
     def files(self) -> int:
@@ -84,7 +90,7 @@ class CampaignSize:
 
 @dataclass(frozen=True, slots=True)
 class CampaignCost:
-    """CPU time of a campaign."""
+    """CPU time of a campaign by stage."""
 
     size: CampaignSize
     seconds: Mapping[Stage, float]
@@ -92,26 +98,25 @@ class CampaignCost:
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """How the CPU time grows with one property of a campaign."""
+    """Growth of the CPU time with one property of a campaign."""
 
     along: str
     costs: tuple[CampaignCost, ...]
     slopes: Mapping[Stage, tuple[float, float]]
-    """Log-log slope and half of its 95 percent interval, of the time beyond that of a run with
-    nothing to do."""
+    """Log-log slope of the time of each stage, and half of its 95 percent interval."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """The throughput benchmark of the pipeline."""
+    """Result of the throughput benchmark of the pipeline."""
 
     date: str
     machine: Machine
     growths: tuple[Growth, ...]
     workers: Mapping[int, float]
-    """Seconds on the wall of a run, by number of worker processes."""
+    """Wall time of a run in s, by number of worker processes."""
     ways: tuple[orchestration.RunMode, ...] = ()
-    """Whole commands, on campaigns of `OF_WAYS`."""
+    """Times of whole commands, on campaigns of `COMMAND_SIZES`."""
 
 
 _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
@@ -123,22 +128,22 @@ _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
 _QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
 }
-_OF_WORKERS: Final = CampaignSize(scenes=16, profiles=60)
-OF_WAYS: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
+_WORKER_SIZE: Final = CampaignSize(scenes=16, profiles=60)
+COMMAND_SIZES: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
 
 
-def run_campaigns(kind: Kind, *, effort: Effort) -> Finding:
+def run_campaigns(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
     """Run the benchmark of the pipeline.
 
     Raises
     ------
     CampaignError
-        Where its accuracy is asked for.
+        If its accuracy is requested.
     """
     if kind is not Kind.THROUGHPUT:
         raise CampaignError("the pipeline has no accuracy benchmark", remedy="choose throughput")
-    found = measure_campaigns(quick=effort.quick, date=effort.date, progress=effort.progress)
-    return Finding(found, campaigns_report(found, RESULT))
+    result = measure_campaigns(quick=effort.quick, date=effort.date, progress=effort.progress)
+    return BenchmarkOutput(result, campaigns_report(result, RESULT))
 
 
 def measure_campaigns(
@@ -149,31 +154,31 @@ def measure_campaigns(
     workers: Sequence[int] | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> Pipeline:
-    """Simulate campaigns of several sizes in a temporary folder, and reprocess them.
+    """Simulate campaigns of several sizes in temporary folders, and time their processing.
 
     Parameters
     ----------
     quick : bool
         Fewer and smaller campaigns, one worker.
     date : str
-        When it is run, as it is to be stated.
-    along : mapping of str to sequence of Size, optional
-        What is varied, and how; at least 2 sizes each.
+        Date stated in the result.
+    along : mapping of str to sequence of CampaignSize, optional
+        Sizes for each varied property, at least 2.
     workers : sequence of int, optional
         Numbers of processes to compare.
     progress : callable
-        Is given 1 after each campaign.
+        Called with 1 after each campaign.
     """
     growths = []
-    # The first campaign of a process pays for what is compiled and imported.
+    # The first campaign of a process includes imports and compilation; it is not counted.
     _cost(CampaignSize(scenes=1, profiles=15), progress)
     for name, sizes in (along or (_QUICK if quick else _ALONG)).items():
         costs = tuple(_cost(size, progress) for size in sizes)
         growths.append(Growth(name, costs, dict(_slopes(name, costs))))
     counts = workers if workers is not None else (() if quick else (1, 2))
     times = {count: _wall(count, progress) for count in counts}
-    ways = _ways(progress) if workers is None and not quick else ()
-    return Pipeline(date, machine(), tuple(growths), times, ways)
+    commands = _time_commands(progress) if workers is None and not quick else ()
+    return Pipeline(date, machine(), tuple(growths), times, commands)
 
 
 def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
@@ -182,30 +187,30 @@ def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost
         seconds = {Stage.SCAN: _timed(lambda: archive.update_catalog(campaign))}
         begin, started = time.process_time(), time.perf_counter()
         record = archive.reprocess(campaign)
-        whole, lasted = time.process_time() - begin, time.perf_counter() - started
+        cpu, wall = time.process_time() - begin, time.perf_counter() - started
         if record is None:
-            raise CampaignError("the simulated campaign gives nothing to do", field="simulation")
-        seconds |= _parts(record, whole, lasted)
+            raise CampaignError("the simulated campaign has nothing to process", field="simulation")
+        seconds |= _stage_times(record, cpu, wall)
         seconds[Stage.REPORT] = _timed(lambda: archive.report_run(campaign, record))
         seconds[Stage.UNCHANGED] = _timed(lambda: archive.reprocess(campaign))
     progress(1)
     return CampaignCost(size, seconds)
 
 
-def _parts(record: RunRecord, whole: float, lasted: float) -> dict[Stage, float]:
-    """Share the CPU time of a run among its stages as its time on the wall is shared."""
-    laps = dict.fromkeys(_OF_SCENE.values(), 0.0)
+def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[Stage, float]:
+    """Return the CPU time of a run by stage, in proportion to wall time."""
+    laps = dict.fromkeys(_SCENE_STAGES.values(), 0.0)
     for outcome in record.scenes:
         for name, lap in outcome.seconds.items():
-            if name in _OF_SCENE:
-                laps[_OF_SCENE[name]] += lap
-    laps[Stage.ORCHESTRATION] = lasted - sum(laps.values())
-    return {stage: max(whole * lap / lasted, _SHORTEST) for stage, lap in laps.items()}
+            if name in _SCENE_STAGES:
+                laps[_SCENE_STAGES[name]] += lap
+    laps[Stage.ORCHESTRATION] = wall - sum(laps.values())
+    return {stage: max(cpu * lap / wall, _SHORTEST) for stage, lap in laps.items()}
 
 
 def _wall(workers: int, progress: Callable[[int], object]) -> float:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        campaign = simulate_campaign(_OF_WORKERS, Path(folder))
+        campaign = simulate_campaign(_WORKER_SIZE, Path(folder))
         archive.update_catalog(campaign)
         begin = time.perf_counter()
         archive.reprocess(campaign, options=archive.Options(workers=workers))
@@ -214,17 +219,17 @@ def _wall(workers: int, progress: Callable[[int], object]) -> float:
     return seconds
 
 
-def _ways(progress: Callable[[int], object]) -> tuple[orchestration.RunMode, ...]:
+def _time_commands(progress: Callable[[int], object]) -> tuple[orchestration.RunMode, ...]:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         files = []
-        for size in OF_WAYS:
-            place = Path(folder) / str(size.scenes)
-            place.mkdir()
-            simulate_campaign(size, place)
-            files.append(place / CAMPAIGN_FILE)
-        found = orchestration.measure_orchestration(files)
+        for size in COMMAND_SIZES:
+            directory = Path(folder) / str(size.scenes)
+            directory.mkdir()
+            simulate_campaign(size, directory)
+            files.append(directory / CAMPAIGN_FILE)
+        modes = orchestration.measure_orchestration(files)
     progress(1)
-    return found
+    return modes
 
 
 def _timed(call: Callable[[], object]) -> float:
@@ -234,12 +239,12 @@ def _timed(call: Callable[[], object]) -> float:
 
 
 def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
-    """Write the raw files of a campaign of this size.
+    """Simulate a campaign of this size and write its raw files.
 
     Returns
     -------
     Campaign
-        With products of all profiles.
+        The campaign, not processed yet.
     """
     path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
@@ -260,7 +265,7 @@ def _settings(size: CampaignSize) -> dict[str, Any]:
             "channels": [channel],
             "sections": [[750, 0.9 * 7.5 * size.bins]],
         }
-    known = {"full_overlap_range": 300, "channels": {channel: {"dead_time": 3e-9}}}
+    facts_of_lidar = {"full_overlap_range": 300, "channels": {channel: {"dead_time": 3e-9}}}
     return {
         "name": "measured",
         "title": "Campaign of a benchmark",
@@ -271,7 +276,7 @@ def _settings(size: CampaignSize) -> dict[str, Any]:
             "lidar": {
                 "station": "here",
                 "files": "here/h*",
-                "facts": [known if scans else known | {"zenith_angle": 90}],
+                "facts": [facts_of_lidar if scans else facts_of_lidar | {"zenith_angle": 90}],
                 "products": products,
             }
         },
@@ -341,40 +346,42 @@ def _slopes(
 # Page -----------------------------------------------------------------------------------------
 
 
-def campaigns_report(found: Pipeline, data: str = "") -> BenchmarkReport:
-    """Return the page of the benchmark."""
+def campaigns_report(pipeline: Pipeline, data: str = "") -> BenchmarkReport:
+    """Return the report page."""
     return BenchmarkReport(
         title="Pipeline: cost of a campaign",
-        facts=facts(found.date, found.machine),
-        parts=tuple(_parts_of_page(found)),
+        facts=facts(pipeline.date, pipeline.machine),
+        parts=tuple(_parts_of_page(pipeline)),
         data=data,
     )
 
 
-def _parts_of_page(found: Pipeline) -> Iterator[Part]:
-    yield _stages(found)
-    if found.workers:
-        yield _workers(found)
-    if found.ways:
-        yield orchestration.part(found.ways, [size.scenes for size in OF_WAYS])
+def _parts_of_page(pipeline: Pipeline) -> Iterator[Part]:
+    yield _stages(pipeline)
+    if pipeline.workers:
+        yield _workers(pipeline)
+    if pipeline.ways:
+        yield orchestration.orchestration_part(
+            pipeline.ways, [size.scenes for size in COMMAND_SIZES]
+        )
 
 
-def _stages(found: Pipeline) -> Part:
+def _stages(pipeline: Pipeline) -> Part:
     return Part(
-        title="Cost of each stage, and how it grows",
+        title="Cost of each stage, and its growth",
         text="Simulated campaigns of one lidar, from raw files on disk to products and report, "
-        "in one process. CPU time; that of a run is shared among its stages as its time on the "
-        "wall is. Slope: of the logarithm of time over that of the size, with "
-        "its 95 % interval; 1 is linear.",
+        "in one process. CPU time; that of a run is divided among its stages in proportion to "
+        "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
+        "interval; 1 is linear.",
         charts=(
             Chart(
                 name="growth",
                 title="CPU time of a campaign",
-                caption="One line a stage; a slope of 1 means a constant cost each.",
-                panels=tuple(_panel(growth) for growth in found.growths),
+                caption="One line per stage; a slope of 1 means a constant cost per item.",
+                panels=tuple(_panel(growth) for growth in pipeline.growths),
             ),
         ),
-        tables=tuple(_table(growth) for growth in found.growths),
+        tables=tuple(_table(growth) for growth in pipeline.growths),
     )
 
 
@@ -399,29 +406,29 @@ def _table(growth: Growth) -> Table:
         slope, half = growth.slopes[stage]
         seconds = largest.seconds[stage]
         share = _NOTHING if stage is Stage.UNCHANGED else percent(seconds / total)
-        each = f"{_MILLI * seconds / largest.size.files:.3g}"
-        told = f"{slope:.2f} ± {half:.2f}"
-        rows.append((stage.value, _ABOUT[stage], f"{seconds:.3g}", share, each, told))
+        per_file = f"{_MILLI * seconds / largest.size.files:.3g}"
+        slope_text = f"{slope:.2f} ± {half:.2f}"
+        rows.append((stage.value, _ABOUT[stage], f"{seconds:.3g}", share, per_file, slope_text))
     size = largest.size
     return Table(
         title=f"By number of {growth.along}; times at {getattr(size, growth.along)}",
-        columns=("stage", "what", "CPU s", "share", "ms a file", "slope"),
+        columns=("stage", "work", "CPU s", "share", "ms per file", "slope"),
         rows=tuple(rows),
         note=f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
         + (f", {size.angles} directions." if size.angles else "."),
     )
 
 
-def _workers(found: Pipeline) -> Part:
-    one = found.workers.get(1)
+def _workers(pipeline: Pipeline) -> Part:
+    single = pipeline.workers.get(1)
     rows = tuple(
-        (f"{count}", f"{seconds:.1f}", f"{one / seconds:.2f}" if one else _NOTHING)
-        for count, seconds in found.workers.items()
+        (f"{count}", f"{seconds:.1f}", f"{single / seconds:.2f}" if single else _NOTHING)
+        for count, seconds in pipeline.workers.items()
     )
-    size = _OF_WORKERS
+    size = _WORKER_SIZE
     table = Table(
-        title="Time on the wall by number of processes",
-        columns=("processes", "s", "times one"),
+        title="Wall time by number of processes",
+        columns=("processes", "s", "speedup"),
         rows=rows,
         note=f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
     )

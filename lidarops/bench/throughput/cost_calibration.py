@@ -1,7 +1,7 @@
-"""What each thing that a plan asks for costs on this machine, for the estimates of run times.
+"""Calibration of the cost model of ``lidarops plan`` on this machine.
 
-A campaign of many kinds and sizes of scenes is simulated and processed, whole and product by
-product. The costs are those of least relative squares, none of them negative.
+A campaign with many kinds and sizes of scenes is simulated and processed, whole scenes and single
+products. A fit of non-negative least squares of relative errors gives the cost of each term.
 """
 
 from __future__ import annotations
@@ -25,7 +25,13 @@ import yaml
 from scipy.optimize import nnls
 
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import (
+    CAMPAIGN_FILE,
+    RESULT,
+    BenchmarkOutput,
+    Effort,
+    Kind,
+)
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
@@ -42,14 +48,14 @@ _LOG = logging.getLogger(__name__)
 
 _START: Final = datetime(2025, 3, 20, 20, tzinfo=UTC)
 _LENGTH: Final = 7200
-"""s, of the campaign and its one scene an instrument."""
+"""s; duration of the campaign and of the one scene of each instrument."""
 _ROUNDS: Final = 3
 _IDLE_RUNS: Final = 3
-_OFF: Final = 1.5
-"""Ratio between estimate and measurement that is told, as estimates are meant to be closer."""
-_TRUST: Final = 0.05
-"""Of the costs that come with lidarops: a relative departure of 1 from one of them weighs as much
-as a misfit of this share in one scene. It decides only what the scenes do not tell."""
+_LARGEST_RATIO: Final = 1.5
+"""Ratio between estimate and measurement above which a warning is given."""
+_PRIOR_WEIGHT: Final = 0.05
+"""Weight of the default costs: a relative deviation of 1 from a default counts like a misfit of
+this share in one scene. It matters only for costs that the scenes do not determine."""
 _PHOTON: Final = "photon_532o"
 _ANALOG: Final = "analog_532o"
 _GLUED: Final = "glued_532o"
@@ -57,7 +63,7 @@ _GLUED: Final = "glued_532o"
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One scene, or a part of it, that was processed."""
+    """One processed scene, or a part of it."""
 
     scene: str
     products: tuple[str, ...]
@@ -65,55 +71,55 @@ class Observation:
     seconds: float
     """CPU time."""
     estimated: float
-    """From the costs that were found, s."""
+    """Estimate from the fitted costs, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """The costs of a machine, and what they were found from."""
+    """Fitted costs of a machine, and the observations of the fit."""
 
     date: str
     machine: Machine
     seconds: Mapping[str, float]
-    """By term."""
+    """Cost per unit of each term."""
     observations: tuple[Observation, ...]
     path: str
-    """Where the costs are kept."""
+    """File in which the costs are saved."""
 
     @property
-    def farthest(self) -> float:
-        """Largest ratio between estimated and measured time, whichever is larger."""
-        ratios = [each.estimated / each.seconds for each in self.observations]
+    def largest_ratio(self) -> float:
+        """Largest ratio between estimated and measured time, in either direction."""
+        ratios = [observation.estimated / observation.seconds for observation in self.observations]
         return max(max(ratio, 1.0 / ratio) for ratio in ratios)
 
 
-def doubt(found: Calibration) -> str:
-    """Say where the costs do not tell what they were found from; empty where they do."""
-    if found.farthest <= _OFF:
+def accuracy_warning(calibration: Calibration) -> str:
+    """Return a warning if an estimate is far from its measurement, else an empty text."""
+    if calibration.largest_ratio <= _LARGEST_RATIO:
         return ""
     return (
-        f"the estimate of one of the scenes that the costs were found from is off by a factor of"
-        f" {found.farthest:.2f}: calibrate again while the machine does nothing else"
+        f"the estimate of one of the calibration scenes is off by a factor of"
+        f" {calibration.largest_ratio:.2f}: calibrate again while the machine is idle"
     )
 
 
-def run_cost_calibration(kind: Kind, *, effort: Effort) -> Finding:
-    """Calibrate this machine, and keep what was found for ``lidarops plan``.
+def run_cost_calibration(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
+    """Calibrate this machine, and save the costs for ``lidarops plan``.
 
     Raises
     ------
     CampaignError
-        Where accuracy is asked for.
+        If accuracy is requested.
     CatalogError
-        Where the calibration cannot be kept.
+        If the calibration cannot be saved.
     """
     if kind is not Kind.THROUGHPUT:
         raise CampaignError("costs have no accuracy benchmark", remedy="choose throughput")
     rounds = effort.repeats or (1 if effort.quick else _ROUNDS)
-    found = calibrate(date=effort.date, rounds=rounds, progress=effort.progress)
-    if told := doubt(found):
-        _LOG.warning(told)
-    return Finding(found, calibration_report(found, RESULT))
+    calibration = calibrate(date=effort.date, rounds=rounds, progress=effort.progress)
+    if warning := accuracy_warning(calibration):
+        _LOG.warning(warning)
+    return BenchmarkOutput(calibration, calibration_report(calibration, RESULT))
 
 
 def calibrate(
@@ -123,81 +129,89 @@ def calibrate(
     path: Path | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> Calibration:
-    """Measure the costs of this machine, in about a minute once code is compiled.
+    """Measure the costs of this machine, in about a minute after compilation.
 
     Parameters
     ----------
     date : str
-        When it is run, as it is to be stated.
+        Date stated in the result.
     rounds : int
-        Of which the median counts.
+        The median of these counts.
     path : Path, optional
-        Where to keep the costs, instead of this user's cache.
+        File for the costs, instead of the user's cache.
     progress : callable
-        Is given 1 after each round, and after the report.
+        Called with 1 after each round, and after the report.
     """
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         campaign = _simulated(Path(folder))
-        # The first run pays for what is compiled and loaded.
+        # The first run includes compilation and loading; it is not counted.
         record = archive.reprocess(campaign)
         if record is None or any(scene.error for scene in record.scenes):
             raise CampaignError("the simulated campaign cannot be processed", field="simulation")
         progress(1)
-        measured = _scenes(campaign, rounds, progress)
-        seconds = fitted(measured)
-        seconds |= _report(campaign, record) | _loads(campaign)
+        observations = _scenes(campaign, rounds, progress)
+        seconds = fit_costs(observations)
+        seconds |= _report(campaign, record) | _load_times(campaign)
         progress(1)
-        seconds[Term.RUN] = _beside(campaign, Costs(seconds | {Term.RUN: 0.0}))
+        seconds[Term.RUN] = _run_cost(campaign, Costs(seconds | {Term.RUN: 0.0}))
         progress(1)
-    here = machine()
-    kept = cost_estimate.save_calibration(Costs(seconds, processor=here.processor, date=date), path)
+    this_machine = machine()
+    saved = cost_estimate.save_calibration(
+        Costs(seconds, processor=this_machine.processor, date=date), path
+    )
     model = Costs(seconds)
     return Calibration(
         date=date,
-        machine=here,
+        machine=this_machine,
         seconds={term.value: seconds[term] for term in Term},
-        observations=tuple(replace(each, estimated=model.of(each.amounts)) for each in measured),
-        path=str(kept),
+        observations=tuple(
+            replace(observation, estimated=model.of(observation.amounts))
+            for observation in observations
+        ),
+        path=str(saved),
     )
 
 
-def fitted(observations: Sequence[Observation]) -> dict[Term, float]:
-    """Return the costs of least relative squares, s a unit.
+def fit_costs(observations: Sequence[Observation]) -> dict[Term, float]:
+    """Return the costs by least squares of relative errors, s per unit.
 
     Minimises sum_i (1 - a_i x / t_i)^2 + sum_k (w (x_k / d_k - 1))^2 over x >= 0, with the
-    amounts a, the times t and the costs d that come with lidarops.
+    amounts a, the times t, the default costs d and their weight w.
 
     Parameters
     ----------
     observations : sequence of Observation
         With times above zero.
     """
-    usual = np.array([cost_estimate.DEFAULTS[term] for term in Term])
-    amounts = np.array([[each.amounts.get(term, 0.0) for term in Term] for each in observations])
-    seconds = np.array([each.seconds for each in observations])
-    told = amounts * usual / seconds[:, np.newaxis]
-    weak = _TRUST * np.eye(len(Term))
-    found, _ = nnls(
-        np.vstack([told, weak]), np.concatenate([np.ones(len(seconds)), np.full(len(Term), _TRUST)])
+    defaults = np.array([cost_estimate.DEFAULTS[term] for term in Term])
+    amounts = np.array(
+        [[observation.amounts.get(term, 0.0) for term in Term] for observation in observations]
     )
-    return {term: float(value) for term, value in zip(Term, found * usual, strict=True)}
+    seconds = np.array([observation.seconds for observation in observations])
+    matrix = amounts * defaults / seconds[:, np.newaxis]
+    prior = _PRIOR_WEIGHT * np.eye(len(Term))
+    relative, _ = nnls(
+        np.vstack([matrix, prior]),
+        np.concatenate([np.ones(len(seconds)), np.full(len(Term), _PRIOR_WEIGHT)]),
+    )
+    return {term: float(value) for term, value in zip(Term, relative * defaults, strict=True)}
 
 
 def _scenes(
     campaign: Campaign, rounds: int, progress: Callable[[int], object]
 ) -> list[Observation]:
-    """Process every scene whole, with and without known digests, and product by product."""
+    """Return the times of whole scenes, with and without known digests, and of single products."""
     jobs = [
         job
-        for judged in archive.assess(campaign, force=True)
-        for job in _parts(Job(campaign, judged.scene, judged.plan))
+        for assessment in archive.assess(campaign, force=True)
+        for job in _job_variants(Job(campaign, assessment.scene, assessment.plan))
     ]
     times: list[list[float]] = [[] for _ in jobs]
     for _ in range(rounds):
-        for job, spent in zip(jobs, times, strict=True):
+        for job, seconds in zip(jobs, times, strict=True):
             begin = time.process_time()
             outcome = process_scene(job)
-            spent.append(time.process_time() - begin)
+            seconds.append(time.process_time() - begin)
             if outcome.error:
                 raise CampaignError(f"{job.scene.id}: {outcome.error}", field="simulation")
         progress(1)
@@ -205,86 +219,90 @@ def _scenes(
         Observation(
             scene=job.scene.instrument,
             products=tuple(
-                f"{kind} {channel}" for kind, channel in product_dependence.wanted(job.plan)
+                f"{kind} {channel}"
+                for kind, channel in product_dependence.planned_products(job.plan)
             ),
             amounts=cost_estimate.amounts(job.scene, job.plan),
-            seconds=median(spent),
+            seconds=median(seconds),
             estimated=0.0,
         )
-        for job, spent in zip(jobs, times, strict=True)
+        for job, seconds in zip(jobs, times, strict=True)
     ]
 
 
-def _parts(job: Job) -> Iterator[Job]:
+def _job_variants(job: Job) -> Iterator[Job]:
     yield job
-    granules = tuple(replace(each, sha256=None) for each in job.scene.granules)
+    granules = tuple(replace(granule, sha256=None) for granule in job.scene.granules)
     yield replace(job, scene=replace(job.scene, granules=granules))
-    wanted = product_dependence.wanted(job.plan)
-    for product in wanted if len(wanted) > 1 else ():
+    products = product_dependence.planned_products(job.plan)
+    for product in products if len(products) > 1 else ():
         yield replace(job, plan=product_dependence.plan_closure(job.plan, [product]))
 
 
 def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
-    """Return what a page of a report costs, and the figures of each kind of product."""
+    """Return the costs of a report page, and of the figures of each kind of product."""
     page = _page(campaign, replace(record, scenes=()))
-    found = {Term.PAGE: page}
+    costs = {Term.PAGE: page}
     for kind in ProductKind:
-        some = sorted(
-            (replace(scene, products=mine)
+        scenes = sorted(
+            (replace(scene, products=first_product)
              for scene in record.scenes
-             if (mine := tuple(made for made in scene.products if made.kind is kind)[:1])),
+             if (first_product := tuple(p for p in scene.products if p.kind is kind)[:1])),
             key=lambda scene: scene.products[0].values,
         )  # fmt: skip
-        least = max(_page(campaign, replace(record, scenes=(some[0],))) - page, 0.0)
-        found[cost_estimate.figure(kind)] = least
+        smallest_cost = max(_page(campaign, replace(record, scenes=(scenes[0],))) - page, 0.0)
+        costs[cost_estimate.figure_term(kind)] = smallest_cost
         if kind is ProductKind.SIGNAL:
-            most = max(_page(campaign, replace(record, scenes=(some[-1],))) - page, least)
-            few, many = (some[place].products[0].values for place in (0, -1))
-            found[Term.FIGURE_VALUE] = (most - least) / (many - few)
-    return found
+            largest_cost = max(
+                _page(campaign, replace(record, scenes=(scenes[-1],))) - page, smallest_cost
+            )
+            least_values, most_values = (scenes[index].products[0].values for index in (0, -1))
+            costs[Term.FIGURE_VALUE] = (largest_cost - smallest_cost) / (most_values - least_values)
+    return costs
 
 
-def _loads(campaign: Campaign) -> dict[Term, float]:
-    """Return what a process of its own loads with the first product of each kind, s."""
-    told = _child(
-        "from lidarops.bench.throughput.cost_calibration import first_times; first_times(sys.argv[1])",
+def _load_times(campaign: Campaign) -> dict[Term, float]:
+    """Return the time to load code for the first product of each kind, in a new process, s."""
+    output = _child(
+        "from lidarops.bench.throughput.cost_calibration import first_times;"
+        " first_times(sys.argv[1])",
         campaign,
     )
-    found: dict[str, list[float]] = json.loads(told)
+    times: dict[str, list[float]] = json.loads(output)
     return {
-        cost_estimate.load_of(kind): max(first - again, 0.0)
-        for kind, (first, again) in found.items()
+        cost_estimate.load_term(kind): max(first - second, 0.0)
+        for kind, (first, second) in times.items()
     }
 
 
 def first_times(path: str) -> None:
-    """Write for each kind of product what the first scene and the same again cost, as JSON."""
+    """Write the times of the first scene of each kind and of the same scene again, as JSON."""
     campaign = load_campaign(path)
     jobs: dict[str, Job] = {}
-    for judged in archive.assess(campaign, force=True):
-        for kind, channel in product_dependence.wanted(judged.plan):
-            mine = product_dependence.plan_closure(judged.plan, [(kind, channel)])
-            jobs.setdefault(kind.value, Job(campaign, judged.scene, mine))
-    found = {}
-    # What all kinds load counts for the first of them, signals.
+    for assessment in archive.assess(campaign, force=True):
+        for kind, channel in product_dependence.planned_products(assessment.plan):
+            plan = product_dependence.plan_closure(assessment.plan, [(kind, channel)])
+            jobs.setdefault(kind.value, Job(campaign, assessment.scene, plan))
+    times = {}
+    # Code that all kinds load counts for the first of them, signals.
     for kind in ProductKind:
-        found[kind.value] = [process_scene(jobs[kind.value]).cpu_seconds for _ in range(2)]
-    sys.stdout.write(json.dumps(found))
+        times[kind.value] = [process_scene(jobs[kind.value]).cpu_seconds for _ in range(2)]
+    sys.stdout.write(json.dumps(times))
 
 
 def _child(code: str, campaign: Campaign, *words: str) -> str:
-    """Run Python in a process of its own, and return what it writes."""
+    """Run Python code in a new process, and return its output."""
     path = str(campaign.folder / CAMPAIGN_FILE)
-    done = subprocess.run(  # noqa: S603 - this very Python and a file of our own
+    process = subprocess.run(  # noqa: S603 - this Python and our own file
         [sys.executable, "-c", f"import sys; {code}", path, *words],
         check=False,
         capture_output=True,
         text=True,
     )
-    # 1 tells of scenes without a value to use, which cost as much.
-    if done.returncode not in (0, 1) or not done.stdout:
-        raise CampaignError(f"a process of the calibration failed: {done.stderr[-500:]}")
-    return done.stdout
+    # Status 1 means scenes without usable values, which cost the same.
+    if process.returncode not in (0, 1) or not process.stdout:
+        raise CampaignError(f"a process of the calibration failed: {process.stderr[-500:]}")
+    return process.stdout
 
 
 def _page(campaign: Campaign, record: RunRecord) -> float:
@@ -293,28 +311,28 @@ def _page(campaign: Campaign, record: RunRecord) -> float:
     return time.process_time() - begin
 
 
-def _beside(campaign: Campaign, model: Costs) -> float:
-    """Return what a run in a process of its own costs beside its scenes and its report, s.
+def _run_cost(campaign: Campaign, model: Costs) -> float:
+    """Return the cost of a run in a new process, without its scenes and its report, s.
 
-    No less than the median of runs with nothing to do: as a difference of large numbers alone it
-    came out at a quarter of that where the machine was busy.
+    It is at least the median of runs without anything to process. The difference of large numbers
+    alone was only a quarter of that on a busy machine.
     """
     tally = cost_estimate.Tally(model)
-    for judged in archive.assess(campaign, force=True):
-        tally.add(judged.scene, judged.plan)
-    beside = _of_run(campaign, "--force") - tally.total
-    return max(beside, median(_of_run(campaign) for _ in range(_IDLE_RUNS)))
+    for assessment in archive.assess(campaign, force=True):
+        tally.add(assessment.scene, assessment.plan)
+    difference = _run_time(campaign, "--force") - tally.total
+    return max(difference, median(_run_time(campaign) for _ in range(_IDLE_RUNS)))
 
 
-def _of_run(campaign: Campaign, *words: str) -> float:
-    """Return the CPU time of a run in a process of its own, s."""
-    before = _of_children()
+def _run_time(campaign: Campaign, *words: str) -> float:
+    """Return the CPU time of a run in a new process, s."""
+    before = _children_time()
     command = "from lidarops.cli import app; sys.argv.insert(1, 'reprocess'); app()"
     _child(command, campaign, *words, "--json")
-    return _of_children() - before
+    return _children_time() - before
 
 
-def _of_children() -> float:
+def _children_time() -> float:
     used = os.times()
     return used.children_user + used.children_system
 
@@ -442,17 +460,17 @@ def _settings() -> dict[str, Any]:
 
 
 def _instrument(name: str, lidar: _Lidar) -> dict[str, Any]:
-    known: dict[str, Any] = {
+    facts_of_lidar: dict[str, Any] = {
         "full_overlap_range": 150,
         "channels": {_PHOTON: {"dead_time": 3e-9}},
     }
     if "scan" not in lidar.air:
-        known["zenith_angle"] = 0 if lidar.air["kind"] == "vertical" else 90
+        facts_of_lidar["zenith_angle"] = 0 if lidar.air["kind"] == "vertical" else 90
     return {
         "station": lidar.station,
         "files": f"{name}/m*",
         "dark_files": f"{name}/dark/d*",
-        "facts": [known],
+        "facts": [facts_of_lidar],
         "products": dict(lidar.products),
     }
 
@@ -485,41 +503,41 @@ def _simulation(lidar: _Lidar) -> dict[str, Any]:
 # Page -----------------------------------------------------------------------------------------
 
 
-def calibration_report(found: Calibration, data: str = "") -> BenchmarkReport:
+def calibration_report(calibration: Calibration, data: str = "") -> BenchmarkReport:
     """Return the page of a calibration."""
     terms = Table(
-        title="What things cost",
-        columns=("term", "CPU s each", "that come with lidarops"),
+        title="Costs by term",
+        columns=("term", "CPU s per unit", "default"),
         rows=tuple(
-            (term.value, f"{found.seconds[term]:.3g}", f"{cost_estimate.DEFAULTS[term]:.3g}")
+            (term.value, f"{calibration.seconds[term]:.3g}", f"{cost_estimate.DEFAULTS[term]:.3g}")
             for term in Term
         ),
-        note=f"Kept in {found.path}; lidarops plan estimates run times with them.",
+        note=f"Saved in {calibration.path}; lidarops plan estimates run times with them.",
     )
     scenes = Table(
-        title="Scenes they were found from",
+        title="Calibration scenes",
         columns=("instrument", "products", "CPU s", "estimated", "ratio"),
         rows=tuple(
             (
-                each.scene,
-                ", ".join(each.products),
-                f"{each.seconds:.3f}",
-                f"{each.estimated:.3f}",
-                f"{each.estimated / each.seconds:.2f}",
+                observation.scene,
+                ", ".join(observation.products),
+                f"{observation.seconds:.3f}",
+                f"{observation.estimated:.3f}",
+                f"{observation.estimated / observation.seconds:.2f}",
             )
-            for each in found.observations
+            for observation in calibration.observations
         ),
     )
     text = (
-        "CPU time of simulated scenes of many kinds and sizes, whole and product by product, as a"
-        " sum over what there is in them. The farthest estimate of these is off by a factor of"
-        f" {found.farthest:.2f}."
+        "CPU time of simulated scenes of many kinds and sizes, whole and single products, as a sum"
+        " over their contents. The worst estimate is off by a factor of"
+        f" {calibration.largest_ratio:.2f}."
     )
-    if told := doubt(found):
-        text += f" Do not trust them: {told}."
+    if warning := accuracy_warning(calibration):
+        text += f" Do not trust them: {warning}."
     return BenchmarkReport(
-        title="Costs: what the estimates of run times come from",
-        facts=facts(found.date, found.machine),
+        title="Costs: calibration of the estimates of run times",
+        facts=facts(calibration.date, calibration.machine),
         parts=(Part(title="Costs of this machine", text=text, tables=(terms, scenes)),),
         data=data,
     )

@@ -1,4 +1,4 @@
-"""What it costs to run a campaign by workers or as a Prefect flow, over a plain loop."""
+"""Extra cost of running a campaign with workers or as a Prefect flow, over a plain loop."""
 
 from __future__ import annotations
 
@@ -19,116 +19,118 @@ from lidarops.reports.benchmark_page import Part, Table
 SERIAL: Final = "plain loop"
 _CLI: Final = ("-c", "from lidarops.cli import app; app()", "reprocess")
 _FLOW: Final = ("-m", "flows.reprocess")
-WAYS: Final[Mapping[str, tuple[str, ...]]] = {
+COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     SERIAL: _CLI,
     "2 workers": (*_CLI, "--workers", "2"),
     "flow": _FLOW,
     "flow, 2 workers": (*_FLOW, "--workers", "2"),
 }
 JOB: Final = 300.0
-"""s of CPU time of the plain loop, of the job that the table extrapolates to."""
+"""s; CPU time of the plain loop for the job to which the table extrapolates."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunMode:
-    """How campaigns were run, and what each took with all processes that it started."""
+    """A way of running campaigns, and the times of each campaign with all its processes."""
 
     name: str
     cpu: tuple[float, ...]
-    """s, a campaign."""
+    """s, for each campaign."""
     wall: tuple[float, ...]
+    """s, for each campaign."""
 
 
 @dataclass(frozen=True, slots=True)
 class Overhead:
-    """CPU time of a way over that of the plain loop, as a line."""
+    """Extra CPU time over the plain loop, as a straight line."""
 
     fixed: float
-    """s, whatever the size."""
+    """s, independent of the size."""
     share: float
-    """s for each s of the plain loop."""
+    """s per s of the plain loop."""
 
     def of(self, job: float) -> float:
-        """Return the share of a job that takes the plain loop so many s."""
+        """Return the extra share of a job that takes the plain loop `job` s."""
         return self.fixed / job + self.share
 
 
 def measure_orchestration(
-    campaigns: Sequence[Path], *, ways: Sequence[str] = tuple(WAYS)
+    campaigns: Sequence[Path], *, names: Sequence[str] = tuple(COMMANDS)
 ) -> tuple[RunMode, ...]:
-    """Run campaigns by every way, each with an output folder of its own.
+    """Return the times of campaigns run by each command, each with its own output folder.
 
     Parameters
     ----------
     campaigns : sequence of Path
-        Campaign files with their archives, of rising size.
-    ways : sequence of str
-        Of `WAYS`; flows are left out where their package is not there.
+        Campaign files with their archives, of ascending size.
+    names : sequence of str
+        Keys of `COMMANDS`; flows are omitted if their package is not installed.
 
     Raises
     ------
     SceneError
         If a run fails.
     """
-    there = importlib.util.find_spec("flows") is not None
-    asked = [name for name in ways if there or not name.startswith("flow")]
-    found = []
-    for name in asked:
-        taken = [_run(WAYS[name], file, name.replace(", ", "-")) for file in campaigns]
-        found.append(
-            RunMode(name, tuple(cpu for cpu, _ in taken), tuple(wall for _, wall in taken))
+    has_flows = importlib.util.find_spec("flows") is not None
+    modes = []
+    for name in names:
+        if name.startswith("flow") and not has_flows:
+            continue
+        times = [_run(COMMANDS[name], file, name.replace(", ", "-")) for file in campaigns]
+        modes.append(
+            RunMode(name, tuple(cpu for cpu, _ in times), tuple(wall for _, wall in times))
         )
-    return tuple(found)
+    return tuple(modes)
 
 
 def _run(words: Sequence[str], campaign: Path, name: str) -> tuple[float, float]:
     command = [sys.executable, *words, str(campaign), "--out", str(campaign.parent / name)]
-    before, began = _children(), time.perf_counter()
-    # Of the words above and the path of a campaign that is written here.
-    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    before, began = _children_cpu(), time.perf_counter()
+    # The command consists of constants and the path of a campaign written by us.
+    process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     wall = time.perf_counter() - began
-    if done.returncode:
-        told = f"{done.stdout}\n{done.stderr}".strip()[-500:]
-        raise SceneError(f"the run by {name} failed: {told}", file=campaign)
-    return _children() - before, wall
+    if process.returncode:
+        output = f"{process.stdout}\n{process.stderr}".strip()[-500:]
+        raise SceneError(f"the run by {name} failed: {output}", file=campaign)
+    return _children_cpu() - before, wall
 
 
-def _children() -> float:
-    """Return the CPU time in s of the processes that ended, and of all that they waited for."""
+def _children_cpu() -> float:
+    """Return the CPU time in s of all ended child processes and their descendants."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def overhead(way: RunMode, serial: RunMode) -> Overhead:
+def overhead(mode: RunMode, serial: RunMode) -> Overhead:
     """Return the line through the smallest and the largest campaign."""
-    extra = [mine - plain for mine, plain in zip(way.cpu, serial.cpu, strict=True)]
+    extra = [cpu - plain for cpu, plain in zip(mode.cpu, serial.cpu, strict=True)]
     share = (extra[-1] - extra[0]) / (serial.cpu[-1] - serial.cpu[0])
     return Overhead(fixed=extra[0] - share * serial.cpu[0], share=share)
 
 
-def part(ways: Sequence[RunMode], scenes: Sequence[int]) -> Part:
-    """Return the part of the page."""
-    serial = next(way for way in ways if way.name == SERIAL)
-    told: list[Callable[[RunMode], str]] = [
-        lambda way: f"{way.cpu[-1]:.1f}",
-        lambda way: f"{way.wall[-1]:.1f}",
-        lambda way: f"{overhead(way, serial).fixed:.1f}",
-        lambda way: percent(overhead(way, serial).share),
-        lambda way: percent(overhead(way, serial).of(JOB)),
+def orchestration_part(modes: Sequence[RunMode], scenes: Sequence[int]) -> Part:
+    """Return the chapter on workers and flows."""
+    serial = next(mode for mode in modes if mode.name == SERIAL)
+    cells: list[Callable[[RunMode], str]] = [
+        lambda mode: f"{mode.cpu[-1]:.1f}",
+        lambda mode: f"{mode.wall[-1]:.1f}",
+        lambda mode: f"{overhead(mode, serial).fixed:.1f}",
+        lambda mode: percent(overhead(mode, serial).share),
+        lambda mode: percent(overhead(mode, serial).of(JOB)),
     ]
     table = Table(
-        title=f"Whole commands, with the start of all processes, at {scenes[-1]} scenes",
+        title=f"Whole commands, including the start of all processes, for {scenes[-1]} scenes",
         columns=(
-            "way",
+            "command",
             "CPU s",
             "wall s",
             "fixed extra CPU s",
             "extra CPU of the rest",
             f"extra CPU of a job of {JOB:.0f} s",
         ),
-        rows=tuple((way.name, *(cell(way) for cell in told)) for way in ways),
-        note=f"Lines through campaigns of {scenes[0]} and {scenes[-1]} scenes; the flow starts a "
-        "Prefect server of its own, which a deployment has already.",
+        rows=tuple((mode.name, *(cell(mode) for cell in cells)) for mode in modes),
+        note=f"Lines through campaigns of {scenes[0]} and {scenes[-1]} scenes. The flow starts its "
+        "own Prefect server, which a deployment already has.",
     )
     return Part(
         title="Workers and flows",

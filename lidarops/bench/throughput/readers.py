@@ -1,6 +1,6 @@
-"""How fast raw files become arrays, against floors measured in the same run.
+"""Speed of reading raw files into arrays, compared with minimal operations in the same run.
 
-Times are CPU times of this process, the least of several repeats, with files in the page cache.
+Times are CPU times of this process, the minimum of several repeats, with files in the page cache.
 """
 
 from __future__ import annotations
@@ -23,38 +23,40 @@ from lidarops.raw.licel import read_header, read_physical, select
 
 @dataclass(frozen=True, slots=True)
 class ReaderThroughput:
-    """How fast one way of reading is."""
+    """Speed of one reading function."""
 
     name: str
     files_per_second: float
-    """Of CPU time."""
+    """Files per second of CPU time."""
     megabytes_per_second: float
     """10^6 bytes of raw file per second of CPU time."""
     times_floor: float
-    """CPU time as a multiple of that of the floor; 1 for a floor itself."""
+    """CPU time over that of the minimal operation (floor); 1 for the floor itself."""
 
 
-def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[ReaderThroughput]:
-    """Measure header scan, raw files to float32 and the archive path.
+def measure_readers(
+    paths: Sequence[str | os.PathLike[str]], repeats: int = 7
+) -> list[ReaderThroughput]:
+    """Return the speed of the header scan, of raw files to float32 and of opening an archive.
 
     Parameters
     ----------
     paths : sequence of path or str
         Files of one layout.
     repeats : int
-        Of which the least time counts.
+        The least time of these counts.
 
     Returns
     -------
-    list of Throughput
-        The floors first: reading the bytes, the same with ``np.frombuffer`` and one
-        multiplication a channel at known offsets. The header scan is compared with the first,
-        what gives physical values with the second.
+    list of ReaderThroughput
+        The floors first: reading the bytes; reading them with ``np.frombuffer`` and one
+        multiplication per channel at known offsets. The header scan is compared with the first,
+        functions that return physical values with the second.
 
     Raises
     ------
     RawFormatError
-        Where there is no file, or one cannot be read.
+        If there is no file, or one cannot be read.
     """
     if not paths or repeats < 1:
         raise RawFormatError("at least one file and one repeat are needed", field="paths")
@@ -65,26 +67,26 @@ def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[Re
     ]
     read = _least(lambda: _read_bytes(paths), repeats)
     multiply = _least(lambda: _multiply(paths, channels), repeats)
-    ways: list[tuple[str, Callable[[], object], float]] = [
+    functions: list[tuple[str, Callable[[], object], float]] = [
         ("header scan", lambda: [read_header(path) for path in paths], read),
         ("raw to float32", lambda: read_physical(paths), multiply),
         ("archive to float32", lambda: _archive(paths), multiply),
     ]
     timed = [("read bytes (floor)", read, read), ("numpy (floor)", multiply, multiply)]
-    timed += [(name, _least(way, repeats), floor) for name, way, floor in ways]
+    timed += [(name, _least(function, repeats), floor) for name, function, floor in functions]
     return [
         ReaderThroughput(name, len(paths) / seconds, size / seconds / 1e6, seconds / floor)
         for name, seconds, floor in timed
     ]
 
 
-def _least(way: Callable[[], object], repeats: int) -> float:
+def _least(function: Callable[[], object], repeats: int) -> float:
     times = []
     for _ in range(repeats):
         begin = time.process_time()
-        way()
+        function()
         times.append(time.process_time() - begin)
-    # The clock of a fast machine with few files may not have moved.
+    # A coarse clock may not advance during a fast call.
     return max(min(times), 1e-9)
 
 

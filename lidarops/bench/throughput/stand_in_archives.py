@@ -1,4 +1,4 @@
-"""Archives of empty files that stand for others: catalog and ledger are as after a run."""
+"""Archives of empty stand-in files, with catalog and ledger as after a complete run."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from lidarops.records import (
 )
 from lidarops.run.staleness import Judge
 
-A_DAY: Final = 288
-"""Files of an instrument a day: one every 5 minutes."""
+FILES_PER_DAY: Final = 288
+"""Files per instrument and day: one every 5 minutes."""
 _FIRST: Final = datetime(2025, 1, 1, tzinfo=UTC)
-_LASTS: Final = timedelta(days=1) / A_DAY
+_INTERVAL: Final = timedelta(days=1) / FILES_PER_DAY
 _CHANNEL: Final = ChannelLayout("photon_532o", DetectionMode.PHOTON, 532e-9, 2000, 7.5, 0)
 _CONTENT: Final = b"stands for a product"
 _RUN: Final = "simulated"
@@ -44,7 +44,7 @@ _RUN: Final = "simulated"
 
 @dataclass(frozen=True, slots=True)
 class StandIns:
-    """Size of such an archive."""
+    """Size of an archive of stand-ins."""
 
     instruments: int
     days: int
@@ -52,23 +52,23 @@ class StandIns:
     @property
     def files(self) -> int:
         """Number of files."""
-        return self.instruments * self.days * A_DAY
+        return self.instruments * self.days * FILES_PER_DAY
 
 
-def enter(standing: StandIns, path: Path) -> Campaign:
-    """Write campaign, empty files, catalog and ledger of an archive in which nothing is stale.
+def write_stand_ins(size: StandIns, path: Path) -> Campaign:
+    """Write campaign, empty files, catalog and ledger of an archive that is up to date.
 
     Parameters
     ----------
-    standing : StandIns
+    size : StandIns
     path : Path
-        Of the campaign file, in a folder of its own.
+        Campaign file, in its own folder.
 
     Returns
     -------
     Campaign
     """
-    path.write_text(yaml.safe_dump(_settings(standing)), encoding="utf-8")
+    path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
     campaign = load_campaign(path)
     keys = scan_keys(campaign)
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
@@ -77,7 +77,7 @@ def enter(standing: StandIns, path: Path) -> Campaign:
             Run(_RUN, _FIRST, _FIRST, RunStatus.FINISHED, "nobody", "0", "0"), lock.token
         )
         judge = Judge(campaign, store)
-        for day in range(standing.days):
+        for day in range(size.days):
             granules = [
                 granule
                 for name in campaign.instruments
@@ -85,8 +85,8 @@ def enter(standing: StandIns, path: Path) -> Campaign:
             ]
             store.replace(
                 [
-                    row_of(each, store.campaign, keys[str(each.instrument), each.role])
-                    for each in granules
+                    row_of(granule, store.campaign, keys[str(granule.instrument), granule.role])
+                    for granule in granules
                 ]
             )
             for scene in cut_scenes(campaign, granules).scenes:
@@ -94,7 +94,7 @@ def enter(standing: StandIns, path: Path) -> Campaign:
     return campaign
 
 
-def _settings(standing: StandIns) -> dict[str, Any]:
+def _settings(size: StandIns) -> dict[str, Any]:
     instrument = {
         "station": "here",
         "facts": [{"zenith_angle": 90, "full_overlap_range": 300}],
@@ -108,7 +108,7 @@ def _settings(standing: StandIns) -> dict[str, Any]:
         "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
         "instruments": {
             f"i{number:02d}": instrument | {"files": f"*/i{number:02d}/h*"}
-            for number in range(standing.instruments)
+            for number in range(size.instruments)
         },
         "scenes": {"window": "24h"},
     }
@@ -117,23 +117,23 @@ def _settings(standing: StandIns) -> dict[str, Any]:
 def _granules(campaign: Campaign, instrument: str, day: int) -> Iterator[Granule]:
     station = campaign.stations[campaign.instruments[instrument].station]
     folder = f"d{day:05d}/{instrument}"
-    within = Path(campaign.archive) / folder
-    within.mkdir(parents=True)
-    for number in range(A_DAY):
+    directory = Path(campaign.archive) / folder
+    directory.mkdir(parents=True)
+    for number in range(FILES_PER_DAY):
         name = f"h{number:03d}"
-        file = within / name
+        file = directory / name
         file.touch()
-        about = file.stat()
-        start = _FIRST + timedelta(days=day) + number * _LASTS
+        status = file.stat()
+        start = _FIRST + timedelta(days=day) + number * _INTERVAL
         yield Granule(
             path=f"{folder}/{name}",
-            size=about.st_size,
-            mtime_ns=about.st_mtime_ns,
+            size=status.st_size,
+            mtime_ns=status.st_mtime_ns,
             instrument=instrument,
             role=Role.SIGNAL,
             status=Status.GOOD,
             start=start,
-            stop=start + _LASTS,
+            stop=start + _INTERVAL,
             zenith_angle=90.0,
             latitude=station.latitude,
             longitude=station.longitude,
@@ -144,11 +144,13 @@ def _granules(campaign: Campaign, instrument: str, day: int) -> Iterator[Granule
 
 
 def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> Entry:
-    whole = plan_scene(scene, campaign)
-    files = [InputRecord(each.path, Role.SIGNAL, str(each.sha256)) for each in scene.granules]
+    plan = plan_scene(scene, campaign)
+    files = [
+        InputRecord(granule.path, Role.SIGNAL, str(granule.sha256)) for granule in scene.granules
+    ]
     products = tuple(
-        _product(judge, campaign, scene, wanted, files)
-        for wanted in product_dependence.wanted(whole)
+        _product(judge, campaign, scene, key, files)
+        for key in product_dependence.planned_products(plan)
     )
     outcome = SceneOutcome(
         scene.id,
@@ -156,26 +158,26 @@ def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> Entry:
         scene.instrument,
         scene.start,
         len(scene.granules),
-        whole,
-        products=tuple(each.record for each in products),
+        plan,
+        products=tuple(product.record for product in products),
     )
-    judged = judge.judgement(scene, whole)
-    return Entry(outcome, judged.day, judge.key(judged), final=True, products=products)
+    judgement = judge.judgement(scene, plan)
+    return Entry(outcome, judgement.day, judge.key(judgement), final=True, products=products)
 
 
 def _product(
     judge: Judge,
     campaign: Campaign,
     scene: Scene,
-    wanted: product_dependence.Wanted,
+    key: product_dependence.ProductKey,
     files: Sequence[InputRecord],
 ) -> NewProduct:
-    kind, channel = wanted
+    kind, channel = key
     path = f"{scene.instrument}/{scene.id}_{kind}_{channel}.nc"
     target = campaign.products_root / path
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(_CONTENT)
     content = hashlib.sha256(_CONTENT).hexdigest()
-    depends_on, used = judge.depends_on(scene, plan_scene(scene, campaign), wanted, files)
+    depends_on, used = judge.depends_on(scene, plan_scene(scene, campaign), key, files)
     record = ProductRecord(path, kind, channel, content, len(_CONTENT), 1, {}, 1)
     return NewProduct(record, target.stat().st_mtime_ns, depends_on, used)

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases: each one, and what judges them."""
+"""All stiff and extreme cases, and the expectations that they use."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 
 from lidarops.bench.stability import study
 from lidarops.bench.stability.stiff_cases import (
+    Accepted,
     Answer,
     Between,
-    Honest,
+    Covered,
+    Flagged,
     Missing,
     Near,
-    Raised,
     Refused,
     Retrieval,
-    Stands,
     StiffCase,
     Unflagged,
     evaluate,
-    spelled,
+    format_values,
 )
 from lidarops.bench.stability.stiff_homogeneous import CLEAR, exact_root
 from lidarops.errors import RetrievalInputError
@@ -40,7 +40,7 @@ def parameter(case):
 
 
 @pytest.mark.parametrize("case", [parameter(case) for case in CASES])
-def test_case_comes_out_as_it_should(case):
+def test_case_meets_its_expectations(case):
     outcome = evaluate(case)
     assert outcome.passed, f"expected {outcome.expected}; got {outcome.got}"
 
@@ -50,15 +50,15 @@ def test_no_two_cases_of_a_retrieval_share_a_name():
     assert len(set(names)) == len(names)
 
 
-def test_every_retrieval_has_cases_that_stand_and_cases_that_are_refused():
+def test_every_retrieval_has_accepted_and_refused_cases():
     for retrieval in Retrieval:
-        kinds = {type(one) for case in CASES if case.retrieval is retrieval
-                 for one in case.expected}  # fmt: skip
+        kinds = {type(expectation) for case in CASES if case.retrieval is retrieval
+                 for expectation in case.expected}  # fmt: skip
         assert Refused in kinds
-        assert kinds & {Near, Honest}
+        assert kinds & {Near, Covered}
 
 
-# What judges them -----------------------------------------------------------------------------
+# Expectations ---------------------------------------------------------------------------------
 
 
 def answer(value, error=1.0, bits=0):
@@ -74,21 +74,21 @@ def answer(value, error=1.0, bits=0):
         (Near("x", lambda: 2.0, 0.1), answer([2.0]), answer([np.nan])),
         (Between("x", 1.0, 2.0), answer([1.0, 2.0]), answer([1.5, np.nan])),
         (Missing("x"), answer([np.nan, np.nan]), answer([np.nan, 0.0])),
-        (Raised(Quality.POOR_FIT), answer([1.0], bits=BAD), answer([1.0], bits=CARE)),
-        (Stands(), answer([1.0], bits=CARE), answer([1.0], bits=BAD)),
+        (Flagged(Quality.POOR_FIT), answer([1.0], bits=BAD), answer([1.0], bits=CARE)),
+        (Accepted(), answer([1.0], bits=CARE), answer([1.0], bits=BAD)),
         (Unflagged(), answer([1.0]), answer([1.0], bits=CARE)),
-        (Honest("x", 0.0), answer([3.9, -3.9]), answer([0.0, 4.1])),
-        (Honest("x", 0.0), answer([9.0], bits=BAD), answer([9.0], bits=CARE)),
-        (Honest("x", 0.0), answer([np.nan]), answer([1.0], error=np.nan)),
-        (Honest("x", 0.0), answer([0.0], error=0.0), answer([1e-9], error=0.0)),
-        (Honest("x", 0.0, valued=0.5), answer([1.0, np.nan]), answer([np.nan, np.nan])),
-        (Honest("x", 0.0, most=0.5), answer([1.0, 5.0]), answer([5.0, 5.0])),
+        (Covered("x", 0.0), answer([3.9, -3.9]), answer([0.0, 4.1])),
+        (Covered("x", 0.0), answer([9.0], bits=BAD), answer([9.0], bits=CARE)),
+        (Covered("x", 0.0), answer([np.nan]), answer([1.0], error=np.nan)),
+        (Covered("x", 0.0), answer([0.0], error=0.0), answer([1e-9], error=0.0)),
+        (Covered("x", 0.0, valued=0.5), answer([1.0, np.nan]), answer([np.nan, np.nan])),
+        (Covered("x", 0.0, most=0.5), answer([1.0, 5.0]), answer([5.0, 5.0])),
     ],
 )
-def test_expectations_tell_good_from_bad(expectation, good, bad):
+def test_expectations_separate_good_from_bad(expectation, good, bad):
     assert expectation.met(good)
     assert not expectation.met(bad)
-    assert expectation.told()
+    assert expectation.describe()
     assert expectation.got(bad)
 
 
@@ -110,27 +110,27 @@ def warn():
 
 
 @pytest.mark.parametrize(
-    ("solve", "expected", "passed", "told"),
+    ("solve", "expected", "passed", "text"),
     [
-        (lambda: answer([1.0]), Stands(), True, "flag none"),
+        (lambda: answer([1.0]), Accepted(), True, "flag none"),
         (refuse, Refused(RetrievalInputError, "range"), True, "range: is wrong"),
         (refuse, Refused(RetrievalInputError, "power"), False, "range: is wrong"),
-        (refuse, Stands(), False, "RetrievalInputError"),
+        (refuse, Accepted(), False, "RetrievalInputError"),
         (crash, Refused(RetrievalInputError), False, "crash, IndexError: deep inside"),
-        (warn, Stands(), False, "crash, RuntimeWarning: divide by zero"),
+        (warn, Accepted(), False, "crash, RuntimeWarning: divide by zero"),
         (lambda: answer([1.0]), Refused(RetrievalInputError), False, "an answer"),
     ],
 )
-def test_outcome_of_answers_errors_crashes_and_warnings(solve, expected, passed, told):
+def test_outcome_of_answers_errors_crashes_and_warnings(solve, expected, passed, text):
     outcome = evaluate(made(solve, expected))
     assert outcome.passed is passed
-    assert told in outcome.got
+    assert text in outcome.got
 
 
-def test_many_values_are_told_by_their_range():
-    assert spelled(np.array([1.0, 2.0])) == "1, 2"
-    assert spelled(np.array([1.0, 5.0, np.nan, 3.0])) == "1 to 5 (4 values, 1 not finite)"
-    assert spelled(np.full(7, np.nan)) == "7 times NaN or infinity"
+def test_many_values_are_described_by_their_range():
+    assert format_values(np.array([1.0, 2.0])) == "1, 2"
+    assert format_values(np.array([1.0, 5.0, np.nan, 3.0])) == "1 to 5 (4 values, 1 not finite)"
+    assert format_values(np.full(7, np.nan)) == "7 times NaN or infinity"
 
 
 @pytest.mark.parametrize("lag", [1, 11])

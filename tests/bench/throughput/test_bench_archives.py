@@ -1,4 +1,4 @@
-"""Benchmark of archives: nothing is stale in what stands for files, and tables that add up."""
+"""Benchmark of archives: stand-ins are up to date, and tables add up."""
 
 from __future__ import annotations
 
@@ -22,87 +22,87 @@ SMALL = StandIns(instruments=2, days=2)
 
 
 def test_nothing_is_stale_in_an_archive_of_stand_ins(tmp_path):
-    campaign = stand_in_archives.enter(SMALL, tmp_path / "campaign.yaml")
+    campaign = stand_in_archives.write_stand_ins(SMALL, tmp_path / "campaign.yaml")
     summary = pipeline.update_catalog(campaign)
     assert (summary.files, summary.unchanged) == (SMALL.files, SMALL.files) == (1152, 1152)
     with Store(campaign.catalog_url, campaign.name) as store:
         assert store.count(status=Status.GOOD) == SMALL.files
-        with store.all_made() as made:
-            kinds = [each.kind for each in made]
+        with store.all_made() as products:
+            kinds = [product.kind for product in products]
     assert kinds == [ProductKind.SIGNAL.value] * SMALL.instruments * SMALL.days
-    found = pipeline.bring_up_to_date(campaign)
-    assert (found.record, found.fresh, found.orphans) == (None, 4, ())
+    result = pipeline.bring_up_to_date(campaign)
+    assert (result.record, result.fresh, result.orphans) == (None, 4, ())
 
 
-def test_a_stand_in_that_changes_is_found(tmp_path):
-    campaign = stand_in_archives.enter(SMALL, tmp_path / "campaign.yaml")
+def test_a_changed_stand_in_is_detected(tmp_path):
+    campaign = stand_in_archives.write_stand_ins(SMALL, tmp_path / "campaign.yaml")
     pipeline.bring_up_to_date(campaign)
-    archives._stale(tmp_path / "campaign.yaml")
+    archives._check_nothing_stale(tmp_path / "campaign.yaml")
     next((tmp_path / "raw" / "d00001" / "i01").iterdir()).write_bytes(b"more")
     assert pipeline.update_catalog(campaign).refused == 1
-    with pytest.raises(CampaignError, match="does not stay"):
-        archives._stale(tmp_path / "campaign.yaml")
+    with pytest.raises(CampaignError, match="not up to date"):
+        archives._check_nothing_stale(tmp_path / "campaign.yaml")
 
 
 @pytest.fixture(scope="module")
-def found():
-    told = []
+def measured_archives():
+    steps = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(archives, "_alone", archives._spent)
+        patch.setattr(archives, "_cost_in_process", archives._cost)
         result = archives.measure_archives(
             [CampaignSize(scenes=n, profiles=15, bins=100, retrieved=False) for n in (1, 2)],
             SMALL,
             date="2024-01-01",
-            progress=told.append,
+            progress=steps.append,
         )
-    assert told == [1, 1, 1]
+    assert steps == [1, 1, 1]
     return result
 
 
-def test_every_pass_is_measured(found):
-    assert [(each.files, each.read) for each in found.measured] == [
+def test_every_pass_is_measured(measured_archives):
+    assert [(cost.files, cost.read) for cost in measured_archives.measured] == [
         (15, True),
         (30, True),
         (SMALL.files, False),
     ]
     read = {Pass.FIRST, Pass.PROCESS, Pass.AGAIN, Pass.STALE, Pass.NOTHING}
-    assert [set(each.spent) for each in found.measured] == [
+    assert [set(cost.spent) for cost in measured_archives.measured] == [
         read,
         read,
         {Pass.SETTLE, Pass.AGAIN, Pass.STALE, Pass.NOTHING},
     ]
 
 
-def test_a_pass_can_be_measured_in_a_process_of_its_own(tmp_path):
+def test_an_operation_can_be_measured_in_its_own_process(tmp_path):
     for name in ("small", "large"):
         (tmp_path / name).mkdir()
-        stand_in_archives.enter(StandIns(1, 1), tmp_path / name / "campaign.yaml")
+        stand_in_archives.write_stand_ins(StandIns(1, 1), tmp_path / name / "campaign.yaml")
     files = (tmp_path / "small" / "campaign.yaml", tmp_path / "large" / "campaign.yaml")
-    spent = archives._alone(Pass.SETTLE, *files)
+    spent = archives._cost_in_process(Pass.SETTLE, *files)
     assert spent.cpu > 0.0
     assert 1e7 < spent.peak < 1e10
 
 
-def test_growth_is_that_of_the_cost_of_a_file(tmp_path):
+def test_growth_is_that_of_the_cost_per_file(tmp_path):
     def measured(files, cpu, *, read=True):
         return ArchiveCost(files, read, {Pass.AGAIN: ProcessCost(cpu, 2.0 * cpu, 3e8)})
 
-    few, more = measured(1000, 0.02), measured(100_000, 2.2)
-    assert archives.growth(few, more, Pass.AGAIN) == pytest.approx(1.1)
+    small, large = measured(1000, 0.02), measured(100_000, 2.2)
+    assert archives.growth(small, large, Pass.AGAIN) == pytest.approx(1.1)
     rows = measured(1_000_000, 10.0, read=False)
-    whole = archives.Archives("2024-01-01", machine(), (few, more, rows))
-    report = archives.archives_report(whole, "result.json")
+    result_of_archives = archives.Archives("2024-01-01", machine(), (small, large, rows))
+    report = archives.archives_report(result_of_archives, "result.json")
     assert report.parts[0].tables[3].rows == (
         ("1,000", "0.02", "0.04", "20", "-", "300 MB"),
         ("100,000", "2.2", "4.4", "22", "1.10", "300 MB"),
         ("1,000,000 rows", "10", "20", "10", "-", "300 MB"),
     )
-    page = registry.write_benchmark(registry.Finding(whole, report), tmp_path)
+    page = registry.write_benchmark(registry.BenchmarkOutput(result_of_archives, report), tmp_path)
     assert "archive.png" in page.read_text(encoding="utf-8")
-    told = json.loads((tmp_path / "result.json").read_text())
-    assert told["measured"][2]["spent"]["scan, all known"]["cpu"] == 10.0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["measured"][2]["spent"]["scan, all known"]["cpu"] == 10.0
 
 
-def test_there_is_no_accuracy_of_an_archive():
+def test_archives_have_no_accuracy():
     with pytest.raises(CampaignError, match="no accuracy"):
         archives.run_archives(Kind.ACCURACY, effort=Effort())

@@ -1,4 +1,4 @@
-"""Benchmark of the pipeline: campaigns of the sizes that are asked for, and figures that add up."""
+"""Benchmark of the pipeline: campaigns of the requested sizes, and numbers that add up."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ SMALL = CampaignSize(scenes=2, profiles=15, bins=500)
 
 
 @pytest.fixture(scope="module")
-def found():
-    told = []
+def pipeline():
+    steps = []
     result = campaigns.measure_campaigns(
         date="2024-01-01",
         along={"scenes": (replace(SMALL, scenes=1), SMALL)},
         workers=(),
-        progress=told.append,
+        progress=steps.append,
     )
-    assert told == [1, 1, 1]
+    assert steps == [1, 1, 1]
     return result
 
 
-def test_every_stage_has_a_time(found):
-    (growth,) = found.growths
+def test_every_stage_has_a_time(pipeline):
+    (growth,) = pipeline.growths
     assert set(growth.costs[1].seconds) == set(Stage)
     assert all(seconds > 0 for seconds in growth.costs[1].seconds.values())
 
 
 @pytest.mark.parametrize("size", [SMALL, CampaignSize(scenes=1, profiles=30, bins=600, angles=5)])
-def test_campaigns_have_the_size_that_is_asked_for(size, tmp_path):
+def test_campaigns_have_the_requested_size(size, tmp_path):
     campaign = campaigns.simulate_campaign(size, tmp_path)
     record = reprocess(campaign)
     assert [scene.error for scene in record.scenes] == [""] * size.scenes
@@ -48,7 +48,7 @@ def test_campaigns_have_the_size_that_is_asked_for(size, tmp_path):
     assert reprocess(campaign) is None
 
 
-def test_slopes_are_those_of_the_times(found, tmp_path):
+def test_slopes_are_those_of_the_times(pipeline, tmp_path):
     costs = tuple(
         CampaignCost(
             CampaignSize(scenes=n), {stage: 0.01 * n**power for power, stage in enumerate(Stage)}
@@ -59,39 +59,41 @@ def test_slopes_are_those_of_the_times(found, tmp_path):
     for power, stage in enumerate(Stage):
         assert slopes[stage] == pytest.approx((power, 0.0), abs=1e-6)
     growth = Growth("scenes", costs, slopes)
-    whole = replace(found, growths=(growth,), workers={1: 4.0, 2: 2.5})
-    report = campaigns.campaigns_report(whole, "result.json")
+    changed = replace(pipeline, growths=(growth,), workers={1: 4.0, 2: 2.5})
+    report = campaigns.campaigns_report(changed, "result.json")
     assert report.parts[1].tables[0].rows[1][2] == "1.60"
     shares = [row[3] for row in report.parts[0].tables[0].rows if row[3] != "-"]
     assert math.isclose(
         sum(float(share.split()[0].lstrip("<")) for share in shares), 100.0, abs_tol=0.4
     )
-    page = registry.write_benchmark(registry.Finding(whole, report), tmp_path)
+    page = registry.write_benchmark(registry.BenchmarkOutput(changed, report), tmp_path)
     assert "growth.png" in page.read_text(encoding="utf-8")
-    assert whole.machine == machine()
+    assert changed.machine == machine()
 
 
-def test_there_is_no_accuracy_of_the_pipeline():
+def test_the_pipeline_has_no_accuracy():
     with pytest.raises(CampaignError, match="no accuracy"):
         campaigns.run_campaigns(Kind.ACCURACY, effort=Effort())
 
 
-def test_the_overhead_of_a_way_is_a_line_over_the_plain_loop():
+def test_overhead_is_a_line_over_the_plain_loop():
     serial = orchestration.RunMode("plain loop", (10.0, 110.0), (11.0, 120.0))
     flow = orchestration.RunMode("flow", (10.0 + 16.5, 110.0 + 21.5), (30.0, 140.0))
     line = orchestration.overhead(flow, serial)
     assert line.fixed == pytest.approx(16.0)
     assert line.share == pytest.approx(0.05)
     assert line.of(300.0) == pytest.approx(16.0 / 300.0 + 0.05)
-    (table,) = orchestration.part((serial, flow), (2, 22)).tables
+    (table,) = orchestration.orchestration_part((serial, flow), (2, 22)).tables
     assert table.rows[1] == ("flow", "131.5", "140.0", "16.0", "5.0 %", "10.3 %")
 
 
 def test_a_whole_command_is_measured_with_its_processes(tmp_path):
     campaigns.simulate_campaign(CampaignSize(scenes=1, profiles=15, bins=500), tmp_path)
-    (way,) = orchestration.measure_orchestration([tmp_path / "campaign.yaml"], ways=("plain loop",))
-    assert way.cpu[0] > 0.0
+    (mode,) = orchestration.measure_orchestration(
+        [tmp_path / "campaign.yaml"], names=("plain loop",)
+    )
+    assert mode.cpu[0] > 0.0
     assert list((tmp_path / "plain loop" / "products").rglob("*.nc"))
     (tmp_path / "campaign.yaml").write_text("name: 3")
     with pytest.raises(SceneError, match="failed"):
-        orchestration.measure_orchestration([tmp_path / "campaign.yaml"], ways=("plain loop",))
+        orchestration.measure_orchestration([tmp_path / "campaign.yaml"], names=("plain loop",))

@@ -1,4 +1,4 @@
-"""Costs of a machine: what is fitted, and that estimates hold."""
+"""Cost calibration: the fit, and that its estimates hold."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support import mixed_campaign
 from lidarops.bench.harness.terms import Effort, Kind
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import cost_calibration as calibration
-from lidarops.bench.throughput.cost_calibration import Observation, fitted
+from lidarops.bench.throughput.cost_calibration import Observation, fit_costs
 from lidarops.errors import CampaignError
 from lidarops.plan import cost_estimate
 from lidarops.plan.cost_estimate import DEFAULTS, Costs, Term
@@ -21,61 +21,61 @@ from lidarops.simulate.campaign import simulate_campaign
 
 
 def observed(truth: Costs, count: int = 60, noise: float = 0.0) -> list[Observation]:
-    """Return scenes of random amounts that cost what a machine says."""
+    """Return scenes of random amounts with the costs of a machine."""
     rng = np.random.default_rng(2)
-    found = []
+    observations = []
     for _ in range(count):
         terms = {term: float(rng.uniform(0, 1) / DEFAULTS[term]) for term in Term}
         seconds = truth.of(terms) * float(np.exp(noise * rng.standard_normal()))
-        found.append(Observation("", (), terms, seconds, 0.0))
-    return found
+        observations.append(Observation("", (), terms, seconds, 0.0))
+    return observations
 
 
-def test_costs_are_found_again():
+def test_known_costs_are_recovered():
     rng = np.random.default_rng(1)
     truth = Costs({term: cost * float(rng.uniform(0.5, 2)) for term, cost in DEFAULTS.items()})
-    found = fitted(observed(truth, count=1500))
-    assert [found[term] for term in Term] == pytest.approx(
+    costs = fit_costs(observed(truth, count=1500))
+    assert [costs[term] for term in Term] == pytest.approx(
         [truth.seconds[term] for term in Term], rel=0.1
     )
-    model = Costs(fitted(observed(truth, count=600, noise=0.2)))
-    for each in observed(truth):
-        assert model.of(each.amounts) == pytest.approx(each.seconds, rel=0.25)
+    model = Costs(fit_costs(observed(truth, count=600, noise=0.2)))
+    for observation in observed(truth):
+        assert model.of(observation.amounts) == pytest.approx(observation.seconds, rel=0.25)
 
 
-def test_no_cost_is_negative_and_what_is_not_seen_stays():
+def test_no_cost_is_negative_and_unobserved_ones_keep_their_default():
     scenes = [Observation("", (), {Term.SCENE: 1.0, Term.FILE: 9.0 * k}, 0.3, 0.0) for k in (1, 9)]
-    found = fitted(scenes)
-    assert min(found.values()) >= 0
-    assert found[Term.VISIBILITY] == pytest.approx(DEFAULTS[Term.VISIBILITY])
+    costs = fit_costs(scenes)
+    assert min(costs.values()) >= 0
+    assert costs[Term.VISIBILITY] == pytest.approx(DEFAULTS[Term.VISIBILITY])
 
 
 @pytest.mark.parametrize(("whole", "cost"), [(102.4, 4.5), (90.0, 4.5), (110.0, 9.0)])
-def test_a_run_costs_no_less_than_one_with_nothing_to_do(
+def test_a_run_costs_at_least_as_much_as_an_idle_one(
     whole: float, cost: float, monkeypatch: pytest.MonkeyPatch
 ):
-    """Whatever the noise of the one that does all, of which scenes and report are subtracted."""
+    """This holds for any noise of the full run, from which scenes and report are subtracted."""
     idle = iter([4.4, 30.0, 4.5])
 
-    def of_run(_: object, *words: str) -> float:
+    def run_time(_: object, *words: str) -> float:
         return whole if "--force" in words else next(idle)
 
-    monkeypatch.setattr(calibration, "_of_run", of_run)
+    monkeypatch.setattr(calibration, "_run_time", run_time)
     monkeypatch.setattr(calibration.archive, "assess", lambda *_, **__: [])
     monkeypatch.setattr(cost_estimate.Tally, "total", 101.0)
-    assert calibration._beside(None, Costs(DEFAULTS)) == pytest.approx(cost)
+    assert calibration._run_cost(None, Costs(DEFAULTS)) == pytest.approx(cost)
 
 
-@pytest.mark.parametrize(("ratio", "doubted"), [(1.4, False), (1.6, True), (1 / 1.6, True)])
-def test_costs_that_miss_what_they_were_found_from_are_told(
-    ratio: float, doubted: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("ratio", "warned"), [(1.4, False), (1.6, True), (1 / 1.6, True)])
+def test_poor_estimates_of_the_calibration_scenes_give_a_warning(
+    ratio: float, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    scenes = tuple(Observation("", (), {}, 2.0, 2.0 * each) for each in (1.0, ratio))
-    found = calibration.Calibration("", machine(), DEFAULTS, scenes, "")
-    monkeypatch.setattr(calibration, "calibrate", lambda **_: found)
+    scenes = tuple(Observation("", (), {}, 2.0, 2.0 * factor) for factor in (1.0, ratio))
+    result = calibration.Calibration("", machine(), DEFAULTS, scenes, "")
+    monkeypatch.setattr(calibration, "calibrate", lambda **_: result)
     page = calibration.run_cost_calibration(Kind.THROUGHPUT, effort=Effort()).report
-    assert ("calibrate again" in caplog.text) == doubted
-    assert ("calibrate again" in page.parts[0].text) == doubted
+    assert ("calibrate again" in caplog.text) == warned
+    assert ("calibrate again" in page.parts[0].text) == warned
 
 
 def test_costs_have_no_accuracy():
@@ -85,8 +85,8 @@ def test_costs_have_no_accuracy():
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_calibration_serves_the_next_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """How close estimates come is told by the page of the calibration, not here."""
+def test_the_next_run_uses_the_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The page of the calibration reports the accuracy of the estimates."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     campaign = mixed_campaign.write(tmp_path, profiles=10)
     simulate_campaign(campaign)
@@ -98,6 +98,6 @@ def test_a_calibration_serves_the_next_run(tmp_path: Path, monkeypatch: pytest.M
     record = archive.reprocess(campaign, options=archive.Options(force=True))
     assert isinstance(record, RunRecord)
     assert record.costs == "calibrated on this machine on today"
-    made = [scene for scene in record.scenes if scene.products]
-    assert made
-    assert all(scene.estimated_seconds > 0.0 and scene.cpu_seconds > 0.0 for scene in made)
+    scenes = [scene for scene in record.scenes if scene.products]
+    assert scenes
+    assert all(scene.estimated_seconds > 0.0 and scene.cpu_seconds > 0.0 for scene in scenes)
