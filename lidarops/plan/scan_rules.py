@@ -90,9 +90,9 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
     if up.size == 0:
         return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
     scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
-    leaning = scan.leaning
-    free = math.degrees(slant_paths.widest_azimuth_gap(leaning))
-    return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(leaning))
+    tilted = scan.tilted_azimuths
+    free = math.degrees(slant_paths.widest_azimuth_gap(tilted))
+    return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(tilted))
 
 
 def _gradient(case: ChannelCase) -> Decisions:

@@ -95,16 +95,17 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
     if StepName.MULTIANGLE in steps:
         lazy[ProductKind.MULTIANGLE] = _beams(source, steps, bench)
     # Computed together, so that the products of a channel share one reading of the files.
-    data = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
-    if ProductKind.HOMOGENEOUS in data and "visibility" in steps[StepName.HOMOGENEOUS].settings:
-        data[ProductKind.HOMOGENEOUS] = _with_visibility(data[ProductKind.HOMOGENEOUS], steps)
-    if ProductKind.ELASTIC in data:
-        averages = source.glued(data[ProductKind.ELASTIC])
-        data[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
-    if ProductKind.MULTIANGLE in data:
+    computed = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
+    sections = computed.get(ProductKind.HOMOGENEOUS)
+    if sections is not None and "visibility" in steps[StepName.HOMOGENEOUS].settings:
+        computed[ProductKind.HOMOGENEOUS] = _with_visibility(sections, steps)
+    if ProductKind.ELASTIC in computed:
+        averages = source.glued(computed[ProductKind.ELASTIC])
+        computed[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
+    if ProductKind.MULTIANGLE in computed:
         settings = steps[StepName.MULTIANGLE].settings
-        data[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
-            data[ProductKind.MULTIANGLE],
+        computed[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
+            computed[ProductKind.MULTIANGLE],
             station_altitude=bench.station_altitude,
             method=settings["method"],
             largest_gradient=settings["largest_gradient"],
@@ -113,7 +114,7 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
                 for low, high in settings["layers"]
             ],
         )
-    return data
+    return computed
 
 
 def load_small(bench: Bench, channels: Sequence[str]) -> Bench:

@@ -1,4 +1,4 @@
-"""Campaign files: what is accepted, and how a mistake is told."""
+"""Campaign files: accepted settings and messages on errors."""
 
 from __future__ import annotations
 
@@ -54,7 +54,11 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
         ('files: "h*"', 'files: "../h*"', "must be a relative path"),
         ('files: "h*"', 'files: "/h*"', "must be a relative path"),
         ("archive: raw", "archve: raw", "line 3: archve: .* keys here are archive, all_steps, "),
-        ("station: coast", "products: {elastik: {}}", r"elastik: .* keys here are elastic, homogeneous"),
+        (
+            "station: coast",
+            "products: {elastik: {}}",
+            r"elastik: .* keys here are elastic, homogeneous",
+        ),
         ("lidar:", "my_lidar:", r"line 8: instruments\.my_lidar: .*letters, digits and hyphens"),
         ("station: coast", "station: x y", r"line 9: .*letters, digits and hyphens.*not 'x y'"),
         ("output: out", "output: out\ntitle: B", "title: given twice, in lines 2 and 5"),
@@ -65,7 +69,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
         ("name: small", "name: !!python/object/apply:os.getcwd []", "not valid YAML"),
     ],
 )
-def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, expected: str) -> None:
+def test_an_error_is_named(tmp_path: Path, old: str, new: str, expected: str) -> None:
     path = _write(tmp_path, MINIMAL.replace(old, new))
     with pytest.raises(CampaignError, match=expected) as caught:
         load_campaign(path)
@@ -83,18 +87,18 @@ simulation:
 """
 
 
-def test_a_wrong_key_of_one_of_several_kinds_is_told_with_those_of_its_kind(tmp_path: Path) -> None:
+def test_an_unknown_key_is_reported_with_the_keys_of_its_kind(tmp_path: Path) -> None:
     path = _write(tmp_path, MINIMAL + SIMULATED)
     with pytest.raises(CampaignError) as caught:
         load_campaign(path)
-    (told,) = [line for line in str(caught.value).splitlines() if "aquisition" in line]
-    assert told.strip().startswith("line 18: ")
-    assert "keys here are acquisition, " in told
-    assert "aerosol_extinction" in told
-    assert "scan" not in told
+    (message,) = [line for line in str(caught.value).splitlines() if "aquisition" in line]
+    assert message.strip().startswith("line 18: ")
+    assert "keys here are acquisition, " in message
+    assert "aerosol_extinction" in message
+    assert "scan" not in message
 
 
-def test_keys_that_stand_twice_in_different_places_are_no_mistake(tmp_path: Path) -> None:
+def test_equal_keys_in_different_mappings_are_valid(tmp_path: Path) -> None:
     anchored = """
 networks: {}
 metadata: {license: x, comment: y}
@@ -112,15 +116,15 @@ metadata: {license: x, comment: y}
         load_campaign(_write(tmp_path, loop))
 
 
-def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
+def test_a_url_for_output_is_refused(tmp_path: Path) -> None:
     path = _write(tmp_path, MINIMAL)
     for command in (["runs", str(path)], ["publish", str(path), "memory://there"]):
-        told = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
-        assert told.exit_code == 2
-        assert "output: is a URL" in told.stderr
-    told = CliRunner().invoke(app, ["bench", "luck", "--out", "s3://bucket/out"])
-    assert told.exit_code == 2
-    assert "is a URL" in " ".join(told.stderr.split())
+        message = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
+        assert message.exit_code == 2
+        assert "output: is a URL" in message.stderr
+    message = CliRunner().invoke(app, ["bench", "luck", "--out", "s3://bucket/out"])
+    assert message.exit_code == 2
+    assert "is a URL" in " ".join(message.stderr.split())
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
@@ -175,8 +179,8 @@ def _instrument(**changes: object) -> Campaign:
 
 
 def _elastic(**settings: object) -> ElasticSettings:
-    wanted = {"elastic": {"channels": ["photon_532o"], **settings}}
-    found = _instrument(products=wanted).instruments["lidar"].products.elastic
+    products = {"elastic": {"channels": ["photon_532o"], **settings}}
+    found = _instrument(products=products).instruments["lidar"].products.elastic
     assert found is not None
     return found
 
@@ -270,10 +274,10 @@ def test_the_folder_is_that_of_the_campaign_file(
 
 
 @pytest.mark.parametrize("wrong_use", [False, True])
-def test_an_error_tells_the_same_in_other_processes(*, wrong_use: bool) -> None:
+def test_an_error_survives_pickling(*, wrong_use: bool) -> None:
     error = CatalogError("is away", file="a", field="b", remedy="wait", wrong_use=wrong_use)
-    told = pickle.loads(pickle.dumps(error))
-    assert (str(told), told.wrong_use) == ("a: b: is away (wait)", wrong_use)
+    message = pickle.loads(pickle.dumps(error))
+    assert (str(message), message.wrong_use) == ("a: b: is away (wait)", wrong_use)
     assert pickle.loads(pickle.dumps(CampaignError("is no campaign"))).wrong_use
 
 

@@ -161,16 +161,16 @@ def test_the_command_line_reprocesses_and_reports(
         app, ["reprocess", name, *where, "--instrument", "hill-vertical", "--json"]
     )
     assert result.exit_code == 1
-    told = json.loads(result.stdout)
-    assert told["scenes"] > 0
-    assert all(path.startswith("hill/") for path in told["products"])
-    assert len(told["refused_files"]) == summary["refused"]
-    page = Path(told["report"])
+    output = json.loads(result.stdout)
+    assert output["scenes"] > 0
+    assert all(path.startswith("hill/") for path in output["products"])
+    assert len(output["refused_files"]) == summary["refused"]
+    page = Path(output["report"])
     assert page.is_file()
     result = runner.invoke(app, ["report", str(page.parent), "--workers", "2"])
     assert result.exit_code == 0
     assert result.stdout.strip() == str(page)
-    product = tmp_path / "products" / told["products"][0]
+    product = tmp_path / "products" / output["products"][0]
     assert runner.invoke(app, ["inspect", str(product)]).exit_code == 0
     result = runner.invoke(app, ["inspect", str(product), "--provenance"])
     assert "wasGeneratedBy" in json.loads(result.stdout)

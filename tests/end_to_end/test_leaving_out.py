@@ -533,8 +533,8 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
 
     def again(**changes: Any) -> list[str]:
         seen.clear()
-        asked = campaign.model_copy(update=changes)
-        (scene,) = reprocess(asked, options=Options(force=True)).scenes
+        changed = campaign.model_copy(update=changes)
+        (scene,) = reprocess(changed, options=Options(force=True)).scenes
         if not changes:
             assert [each.sha256 for each in scene.products] == [
                 each.sha256 for each in first.products

@@ -50,8 +50,8 @@ def scores(product: xr.Dataset, truth: np.ndarray[Any, Any]) -> np.ndarray[Any, 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
 def test_visibility_agrees_with_the_truth_within_its_errors(six_beams, tmp_path):
     found = []
-    for air, told in AIRS.items():
-        campaign, truth = made.written(tmp_path / air, made.tree(told, six_beams=six_beams))
+    for air, settings in AIRS.items():
+        campaign, truth = made.written(tmp_path / air, made.tree(settings, six_beams=six_beams))
         (outcome,) = reprocess_network(campaign).scenes
         product = opened(campaign, outcome)
         true = made.truth_at(product, truth, beams_of(outcome))
@@ -72,9 +72,9 @@ def test_visibility_agrees_with_the_truth_within_its_errors(six_beams, tmp_path)
 
 
 def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
-    told = made.tree(made.PLUME, duration=1200)
-    told["scenes"] = {"window": "10min"}
-    campaign, _ = made.written(tmp_path, told)
+    settings = made.tree(made.PLUME, duration=1200)
+    settings["scenes"] = {"window": "10min"}
+    campaign, _ = made.written(tmp_path, settings)
     records = [
         reprocess_network(campaign, **options)
         for options in (
@@ -92,8 +92,8 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
 
 
 def test_the_range_window_does_not_change_the_product(tmp_path):
-    told = made.tree(made.PLUME, duration=1200)
-    campaign, _ = made.written(tmp_path, told)
+    settings = made.tree(made.PLUME, duration=1200)
+    campaign, _ = made.written(tmp_path, settings)
     (job,) = (job for job in scene_jobs(campaign) if job.scene.members)
     windows = [step for step in job.plan.steps if step.rule == "member_window"]
     assert windows
@@ -142,8 +142,8 @@ def test_values_are_flagged_after_a_lidar_stops(tmp_path):
 
 
 def test_attributes_of_the_product_name_inputs_and_steps(tmp_path):
-    told = made.tree(made.HOMOGENEOUS, duration=900)
-    campaign, _ = made.written(tmp_path, told)
+    settings = made.tree(made.HOMOGENEOUS, duration=900)
+    campaign, _ = made.written(tmp_path, settings)
     (outcome,) = reprocess_network(campaign).scenes
     product = opened(campaign, outcome)
     assert product.attrs["lidarops_input_count"] == 45
@@ -156,8 +156,8 @@ def test_attributes_of_the_product_name_inputs_and_steps(tmp_path):
 
 
 def test_a_level_path_gives_visibility_too(tmp_path):
-    told = made.tree(made.HOMOGENEOUS, duration=600, rate=2.0)
-    instrument = told["instruments"]["west-lidar"]
+    settings = made.tree(made.HOMOGENEOUS, duration=600, rate=2.0)
+    instrument = settings["instruments"]["west-lidar"]
     instrument["products"] = {
         "homogeneous": {
             "channels": ["photon_532o"],
@@ -165,7 +165,7 @@ def test_a_level_path_gives_visibility_too(tmp_path):
             "visibility": {"contrast": 0.02},
         }
     }
-    campaign, truth = made.written(tmp_path, told)
+    campaign, truth = made.written(tmp_path, settings)
     (outcome,) = reprocess(campaign, selection=Selection(instruments=("west-lidar",))).scenes
     product = opened(campaign, outcome)
     usable = product["usable"].values < 2

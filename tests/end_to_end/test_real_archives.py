@@ -22,7 +22,7 @@ CAMPAIGNS = Path(__file__).parent / "campaigns"
 
 def _reprocess(name: str, data_root: Path, out: Path) -> RunRecord:
     campaign = load_campaign(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=out)
-    # What a plan would leave out has to be flagged by what is found.
+    # Sections that a plan would leave out have to be flagged by the retrieval.
     campaign = campaign.model_copy(update={"all_steps": True})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -60,13 +60,13 @@ def test_pilar_loses_no_file(pilar: RunRecord) -> None:
     assert scene.error == ""
     assert scene.granules == 120
     assert not pilar.failed
-    # The header's 53200 nm is told by the campaign for one of its two channels only.
-    told = [
+    # The header states 53200 nm; the campaign corrects it for one of the two channels only.
+    channels = [
         left.channel
         for left in (*(scene.plan.left_out if scene.plan else ()), *scene.left_out)
         if "wavelength" in left.reason
     ]
-    assert told == ["photon_53200o"]
+    assert channels == ["photon_53200o"]
     assert len(scene.products) == 11 + 2 + 3
 
 
@@ -166,12 +166,12 @@ def test_pilar_has_aerosol_below_clean_air(pilar: RunRecord) -> None:
     assert 1.2 < float(near) < 20.0
     assert abs(float(far) - 1.0) < 0.5
     assert product["profiles"].sum() == 120
-    # What the campaign assumes, and its error, decide on the error near the ground.
+    # The lidar ratio of the campaign determines the extinction.
     ratio = product["extinction"] / product["backscatter"]
     np.testing.assert_allclose(ratio.values[np.isfinite(ratio.values)], 60.0, rtol=1e-3)
 
 
-def test_saopaulo_is_glued_with_the_lag_that_its_noise_tells(saopaulo: RunRecord) -> None:
+def test_saopaulo_is_glued_with_the_lag_of_its_noise(saopaulo: RunRecord) -> None:
     product = _open(saopaulo, "signal", "glued_532o")
     slope, error = product["glue_slope"].values, product["glue_slope_standard_error"].values
     assert np.isfinite(slope).all()

@@ -1,4 +1,4 @@
-"""A product is made again from its own provenance, or it is said what is not what it was."""
+"""Reproduction of a product from its provenance, and reports of what differs."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def campaign(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Camp
     (folder / "overlap.csv").write_text(OVERLAP, encoding="utf-8")
     path = folder / "again.yaml"
     path.write_text(yaml.safe_dump(tree(repository)), encoding="utf-8")
-    told = load_campaign(path)
-    simulate_campaign(told)
-    record = reprocess(told)
+    loaded = load_campaign(path)
+    simulate_campaign(loaded)
+    record = reprocess(loaded)
     assert not [outcome.error for outcome in record.scenes if outcome.error]
-    return told
+    return loaded
 
 
 def of_kind(campaign: Campaign, kind: ProductKind) -> Path:
@@ -80,7 +80,7 @@ def names(result: Reproduction, what: str) -> list[str]:
 
 @pytest.fixture
 def moved(campaign: Campaign, tmp_path: Path) -> Campaign:
-    """The same archive where it can be changed, without the campaign file."""
+    """A copy of the archive that tests may change, without the campaign file."""
     shutil.copytree(campaign.archive, tmp_path / "raw")
     for name in ("air.csv", "overlap.csv"):
         shutil.copy(campaign.folder / name, tmp_path)
@@ -98,21 +98,21 @@ def test_every_kind_is_made_again_to_the_last_byte(kind: ProductKind, campaign: 
 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
 def test_the_product_of_a_network_is_made_again(six_beams: bool, tmp_path: Path):
-    told, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))
-    reprocess(told)
-    product = of_kind(told, ProductKind.VISIBILITY)
+    loaded, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))
+    reprocess(loaded)
+    product = of_kind(loaded, ProductKind.VISIBILITY)
     result = reproduce_product(product)
     assert result.identical, explain_difference(result)
     with xr.open_dataset(product) as opened:
         paths = json.loads(opened["provenance"].item())["entity"].values()
-    changed = Path(told.archive) / max(str(each.get("lidarops:path", "")) for each in paths)
+    changed = Path(loaded.archive) / max(str(each.get("lidarops:path", "")) for each in paths)
     content = bytearray(changed.read_bytes())
     content[-3] ^= 1
     changed.write_bytes(content)
     assert len(names(reproduce_product(product), "input")) == 1
 
 
-def test_products_that_were_dated_by_the_environment_are_dated_so_again(
+def test_the_date_from_the_environment_is_reproduced(
     campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
@@ -127,7 +127,7 @@ def test_products_that_were_dated_by_the_environment_are_dated_so_again(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_changed_byte_and_a_missing_file_are_told_by_name(
+def test_a_changed_byte_and_a_missing_file_are_named(
     kind: ProductKind, moved: Campaign, tmp_path: Path
 ):
     product = of_kind(moved, kind)
@@ -152,7 +152,7 @@ def test_a_changed_byte_and_a_missing_file_are_told_by_name(
     assert f"input {missing}: missing" in text
 
 
-def test_a_changed_sounding_is_told(moved: Campaign, tmp_path: Path):
+def test_a_changed_sounding_is_reported(moved: Campaign, tmp_path: Path):
     (tmp_path / "air.csv").write_text(SOUNDING.replace("288.15", "289.15"), encoding="utf-8")
     product = of_kind(moved, ProductKind.ELASTIC)
     result = reproduce_product(product, archive=moved.archive, ancillary=tmp_path)
@@ -172,7 +172,7 @@ def test_one_changed_byte_of_an_input_changes_the_id(moved: Campaign, tmp_path: 
             assert after.attrs["id"] != original.attrs["id"]
 
 
-def test_other_software_is_told_where_the_bytes_differ(
+def test_other_software_is_reported_where_bytes_differ(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ):
     for module in ("lidarops.run.reproduction", "lidarops.netcdf.provenance"):
@@ -185,7 +185,7 @@ def test_other_software_is_told_where_the_bytes_differ(
     assert ":lidarops_code_version" in names(result, "attribute")
 
 
-def test_a_tampered_value_is_found(campaign: Campaign, tmp_path: Path):
+def test_a_tampered_value_is_detected(campaign: Campaign, tmp_path: Path):
     source = of_kind(campaign, ProductKind.HOMOGENEOUS)
     copied = Path(shutil.copy(source, tmp_path / "tampered.nc"))
     with netCDF4.Dataset(copied, "a") as file:
@@ -198,7 +198,7 @@ def test_a_tampered_value_is_found(campaign: Campaign, tmp_path: Path):
     assert "1 of" in explain_difference(result)
 
 
-def test_the_same_content_in_other_bytes_is_told(campaign: Campaign, tmp_path: Path):
+def test_the_same_content_in_other_bytes_is_reported(campaign: Campaign, tmp_path: Path):
     source = of_kind(campaign, ProductKind.HOMOGENEOUS)
     copied = Path(shutil.copy(source, tmp_path / "same.nc"))
     copied.write_bytes(copied.read_bytes() + b"\0")
@@ -208,7 +208,7 @@ def test_the_same_content_in_other_bytes_is_told(campaign: Campaign, tmp_path: P
     assert names(result, "bytes") == ["same.nc"]
 
 
-def test_a_product_that_tells_too_little_is_refused(campaign: Campaign, tmp_path: Path):
+def test_a_product_with_too_little_provenance_is_refused(campaign: Campaign, tmp_path: Path):
     source = of_kind(campaign, ProductKind.HOMOGENEOUS)
     with xr.open_dataset(source, decode_cf=False) as opened:
         product = opened.load()
@@ -230,13 +230,13 @@ def test_a_product_that_tells_too_little_is_refused(campaign: Campaign, tmp_path
         reproduce_product(tmp_path / "old.nc", archive=campaign.archive)
 
 
-def test_inputs_that_are_nowhere_are_asked_for(campaign: Campaign, tmp_path: Path):
+def test_an_error_names_the_option_for_missing_inputs(campaign: Campaign, tmp_path: Path):
     lost = shutil.copy(of_kind(campaign, ProductKind.SIGNAL), tmp_path / "deep.nc")
     with pytest.raises(ProductError, match="--archive"):
         reproduce_product(lost)
 
 
-def test_raw_files_may_lie_behind_a_url(campaign: Campaign):
+def test_raw_files_may_be_behind_a_url(campaign: Campaign):
     product = of_kind(campaign, ProductKind.MULTIANGLE)
     assert reproduce_product(product, archive=f"file://{campaign.archive}").identical
 
@@ -250,7 +250,9 @@ def test_a_store_that_cannot_be_reached_lacks_nothing(campaign: Campaign) -> Non
     assert not caught.value.wrong_use
 
 
-def test_what_a_store_lacks_is_told_with_its_url(campaign: Campaign, moved: Campaign) -> None:
+def test_a_missing_file_of_a_store_is_reported_with_its_url(
+    campaign: Campaign, moved: Campaign
+) -> None:
     (gone, *_) = sorted(Path(moved.archive).glob("coast/h*"))
     gone.unlink()
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
@@ -263,7 +265,7 @@ def test_what_a_store_lacks_is_told_with_its_url(campaign: Campaign, moved: Camp
 @pytest.mark.parametrize(
     "words", [["--archive", "s3x://foo"], ["--archive", "nowhere"], ["--ancillary", "nowhere"]]
 )
-def test_a_place_that_is_none_is_wrong_use(words: list[str], campaign: Campaign) -> None:
+def test_an_unknown_folder_is_wrong_use(words: list[str], campaign: Campaign) -> None:
     product = of_kind(campaign, ProductKind.ELASTIC)
     refused = CliRunner().invoke(app, ["reproduce", str(product), *words])
     assert refused.exit_code == 2
@@ -271,7 +273,7 @@ def test_a_place_that_is_none_is_wrong_use(words: list[str], campaign: Campaign)
     assert len(refused.output.splitlines()) == 1
 
 
-def test_a_damaged_product_is_no_wrong_use(campaign: Campaign, tmp_path: Path) -> None:
+def test_a_damaged_product_is_not_wrong_use(campaign: Campaign, tmp_path: Path) -> None:
     whole = of_kind(campaign, ProductKind.SIGNAL).read_bytes()
     (tmp_path / "cut.nc").write_bytes(whole[:20_000])
     (tmp_path / "log.nc").write_bytes(b"no product")
@@ -280,7 +282,7 @@ def test_a_damaged_product_is_no_wrong_use(campaign: Campaign, tmp_path: Path) -
             assert CliRunner().invoke(app, [*command, str(tmp_path / name)]).exit_code == code
 
 
-def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign):
+def test_the_exit_code_states_the_result(campaign: Campaign, moved: Campaign):
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
     good = CliRunner().invoke(app, ["reproduce", str(product)])
     assert (good.exit_code, "identical" in good.output) == (0, True)
@@ -288,9 +290,9 @@ def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign)
     gone.unlink()
     bad = CliRunner().invoke(app, ["reproduce", str(product), "--archive", moved.archive, "--json"])
     assert bad.exit_code == 1
-    told = json.loads(bad.output)
-    assert not told["identical"]
-    assert told["differences"][0]["name"] == f"coast/{gone.name}"
+    output = json.loads(bad.output)
+    assert not output["identical"]
+    assert output["differences"][0]["name"] == f"coast/{gone.name}"
 
 
 @pytest.mark.parametrize("escape", ["{outside}", "../outside"])
@@ -300,10 +302,12 @@ def test_a_product_that_names_raw_files_elsewhere_is_refused(
     outside = tmp_path / "outside"
     outside.write_bytes(b"of somebody else")
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
-    told = read_provenance(product)
-    raw = next(each for each in told["entity"].values() if "/h" in each.get("lidarops:path", ""))
+    document = read_provenance(product)
+    raw = next(
+        each for each in document["entity"].values() if "/h" in each.get("lidarops:path", "")
+    )
     raw["lidarops:path"] = escape.format(outside=outside)
-    monkeypatch.setattr("lidarops.run.reproduction.read_provenance", lambda _: told)
+    monkeypatch.setattr("lidarops.run.reproduction.read_provenance", lambda _: document)
     with pytest.raises(ProductError, match="outside its archive"):
         reproduce_product(product, archive=campaign.archive, catalog=campaign.catalog_url)
     assert outside.read_bytes() == b"of somebody else"

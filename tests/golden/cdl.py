@@ -1,4 +1,4 @@
-"""What NetCDF files hold, as text in the manner of ncdump, that no library version changes."""
+"""Dump of NetCDF files as text like that of ncdump, independent of library versions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OF_VERSIONS = {
     "lidarops_code_version",
     "product_version",
 }
-"""Attributes that change with every release; that they are there is told, not what they say."""
+"""Attributes that change with every release: the dump names them without their value."""
 
 
 def dump(path: Path) -> str:

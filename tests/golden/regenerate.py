@@ -1,4 +1,4 @@
-"""Write the golden texts again: ``make golden``. Read what changed before it is committed."""
+"""Regenerate the golden texts: ``make golden``. Read the changes before committing them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the builder makes of results, and what it refuses."""
+"""Building of products from results, and refused input."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def decoded(data: xr.Dataset, kind: ProductKind, **changes) -> xr.Dataset:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_numbers_come_through(kind: ProductKind):
+def test_numbers_are_preserved(kind: ProductKind):
     data = MAKERS[kind]()
     product = decoded(data, kind)
     for row in LAYOUTS[kind].variables:
@@ -66,7 +66,7 @@ def test_numbers_come_through(kind: ProductKind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_attribute_names_what_is_not_there(kind: ProductKind):
+def test_attributes_name_existing_variables_only(kind: ProductKind):
     product = build_product(MAKERS[kind](), context(kind))
     for name, variable in product.variables.items():
         for attribute in ("ancillary_variables", "coordinates", "bounds"):
@@ -97,7 +97,7 @@ def test_usable_is_the_worst_severity_of_the_bits(kind: ProductKind):
     np.testing.assert_array_equal(decoded_flags.attrs["flag_values"], [0, 1, 2])
 
 
-def test_usable_cannot_be_handed_over():
+def test_usable_cannot_be_passed_in():
     data = homogeneous()
     data["usable"] = (data["quality_flag"].dims, np.zeros(data["quality_flag"].shape, np.int8))
     with pytest.raises(ProductError, match="usable"):
@@ -125,7 +125,7 @@ def test_order_of_dimensions_does_not_matter():
     xr.testing.assert_identical(build_product(data, context()), build_product(turned, context()))
 
 
-def test_the_input_is_left_as_it_was():
+def test_the_input_is_not_changed():
     data = signal()
     before = data.copy(deep=True)
     build_product(data, context(ProductKind.SIGNAL))
@@ -154,7 +154,7 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
     }
 
 
-def test_no_variable_of_three_dimensions_names_a_place_which_cdo_could_not_read():
+def test_variables_of_three_dimensions_name_no_position():
     product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
     for row in LAYOUTS[ProductKind.MULTIANGLE].variables:
         if row.name not in product:
@@ -165,7 +165,7 @@ def test_no_variable_of_three_dimensions_names_a_place_which_cdo_could_not_read(
         )
 
 
-def test_range_limits_are_half_way_between_centres():
+def test_range_bounds_are_half_way_between_centres():
     product = build_product(signal(), context(ProductKind.SIGNAL))
     np.testing.assert_array_equal(product["range_bnds"][:, 0], 7.5 * np.arange(40))
     np.testing.assert_array_equal(product["range_bnds"][:, 1], 7.5 * np.arange(1, 41))
@@ -261,7 +261,7 @@ def test_dates_are_those_of_data_or_release_or_environment(monkeypatch: pytest.M
         (ProductKind.VISIBILITY, ["read", "background", "visibility"]),
     ],
 )
-def test_history_tells_what_made_this_product_one_line_a_step(kind: ProductKind, steps: list[str]):
+def test_history_has_one_line_for_each_step(kind: ProductKind, steps: list[str]):
     lines = build_product(MAKERS[kind](), context(kind)).attrs["history"].splitlines()
     assert all(line.startswith("2026-") and "lidarops" in line for line in lines)
     *done, omitted, last = lines
@@ -270,7 +270,7 @@ def test_history_tells_what_made_this_product_one_line_a_step(kind: ProductKind,
     assert f"wrote the {kind} product" in last
 
 
-def test_empty_metadata_still_says_something():
+def test_empty_metadata_have_defaults():
     bare = Metadata(publisher_name="", references="", acknowledgement="", license="")
     attrs = build_product(homogeneous(), context(metadata=bare)).attrs
     assert all(attrs[name] for name in ("publisher_name", "publisher_email", "publisher_url"))
@@ -307,7 +307,7 @@ def test_paths_stay_in_their_folder(channel: str):
         product_path(context(channel=channel))
 
 
-# What is refused
+# Refused input
 
 
 def drop(name: str) -> Callable[[xr.Dataset], xr.Dataset]:
@@ -367,7 +367,7 @@ def test_every_missing_variable_is_named(kind: ProductKind):
         (lambda data: data.rename(section="level"), "section", "missing"),
         (lambda data: data.assign(shots=data["extinction"]), "shots", "dimensions"),
         (lambda data: data.assign(shots=data["shots"].astype(str)), "shots", "not numbers"),
-        (lambda data: data.assign(extra=data["shots"]), "extra", "no variable"),
+        (lambda data: data.assign(extra=data["shots"]), "extra", "not a variable"),
         (lambda data: data.chunk(), "time_bnds", "dask"),
     ],
 )
@@ -390,7 +390,7 @@ def test_bad_results_are_refused(change, field, problem):
                 time_bnds=(("time", "nv"), np.tile(data["time"], (3, 1)).T)
             ),
             "time_bnds",
-            "3 limits",
+            "3 bounds",
         ),
     ],
 )
@@ -443,13 +443,13 @@ def test_layers_of_a_scan_reach_from_the_station_upwards():
     assert "featureType" not in product.attrs
 
 
-def test_a_product_tells_the_steps_of_its_retrieval():
+def test_a_product_states_the_steps_of_its_retrieval():
     product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
     assert product.attrs["lidarops_steps"] == "joint: extinction is requested"
     assert "lidarops_steps" not in build_product(homogeneous(), context()).attrs
 
 
-def test_a_bin_alone_may_bring_its_limits():
+def test_a_single_bin_may_have_given_bounds():
     data = signal(bins=4).isel(range=[2])
     data = data.assign_coords(range_bnds=(("range", "nv"), [[15.0, 22.5]]))
     product = build_product(data, context(ProductKind.SIGNAL))
@@ -518,7 +518,7 @@ def test_bitround_is_rounding_of_the_mantissa_half_to_even(values: list[float], 
     np.testing.assert_array_equal(bitround(rounded, bits), rounded)
 
 
-def test_bitround_keeps_what_is_no_number():
+def test_bitround_keeps_nan_and_infinity():
     # A NaN with all bits set would overflow into zero.
     worst = np.array([0x7FFFFFFF, 0xFFFFFFFF, 0x7F800000], np.uint32).view(np.float32)
     rounded = bitround(worst, 13)
@@ -545,7 +545,7 @@ def test_every_mode_has_its_unit():
         assert build_product(homogeneous(), context(mode=mode))["amplitude"].attrs["units"] == unit
 
 
-def test_the_window_is_told_in_utc():
+def test_the_window_is_stated_in_utc():
     start = datetime(2026, 3, 1, tzinfo=UTC)
     attrs = build_product(
         homogeneous(), context(start=start, stop=start + timedelta(hours=6))

@@ -1,4 +1,4 @@
-"""What is put into a file as a chunk must be what HDF5's own filters would have made of it."""
+"""Chunks that are deflated here are equal to those of HDF5's own filters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarops.netcdf._deflate import deflate_chunks, inflate_chunk, _planes
+from lidarops.netcdf._deflate import _planes, deflate_chunks, inflate_chunk
 
 DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
 

@@ -1,4 +1,4 @@
-"""Where a product came from, and which code made it."""
+"""Provenance of a product, and the version of the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is read fast must be what xarray reads, whatever part of it is asked for."""
+"""The fast reader gives the values of xarray, for any part of a variable."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_missing_values_are_nan(chunked: Path):
 
 
 def slices(size: int) -> st.SearchStrategy[slice]:
-    # Of an empty one xarray cannot tell where it ends if it goes backwards.
+    # xarray cannot handle empty slices that go backwards.
     return st.slices(size).filter(lambda part: len(range(size)[part]) > 0)
 
 
@@ -104,7 +104,7 @@ def test_any_part_is_that_part_of_the_whole(chunked: Path, time: object, bins: o
         np.testing.assert_array_equal(twice.values, flags[time][..., bins])
 
 
-def test_only_what_is_asked_for_is_read(chunked: Path, monkeypatch: pytest.MonkeyPatch):
+def test_only_requested_values_are_read(chunked: Path, monkeypatch: pytest.MonkeyPatch):
     inflated = []
     before = read.inflated
 
@@ -197,7 +197,7 @@ def _spoilt(whole: bytes) -> bytes:
 class TestDamage:
     @pytest.mark.parametrize("damage", [bytes, lambda whole: b"garbage", _cut, _spoilt])
     @pytest.mark.parametrize("opened", [lambda p: open_product(p, ["signal"]).load(), profiles_in])
-    def test_of_a_file_is_told(
+    def test_of_a_file_is_reported(
         self,
         damage: Callable[[bytes], bytes],
         opened: Callable[[Path], object],
@@ -215,7 +215,7 @@ class TestDamage:
         with pytest.raises(ProductError, match="the file is missing"):
             profiles_in(tmp_path)
 
-    def test_of_one_chunk_is_told_when_it_is_read(self, chunked: Path, tmp_path: Path):
+    def test_of_one_chunk_is_reported_when_it_is_read(self, chunked: Path, tmp_path: Path):
         path = tmp_path / "rotten.nc"
         whole = bytearray(chunked.read_bytes())
         with h5py.File(chunked) as file:

@@ -1,4 +1,4 @@
-"""Where slanting beams are, against Cartesian coordinates that are made the other way."""
+"""Positions along slant beams, compared with an inverse computation in Cartesian coordinates."""
 
 from __future__ import annotations
 

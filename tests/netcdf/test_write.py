@@ -1,4 +1,4 @@
-"""Whole or not at all, and the same bytes every time."""
+"""The writer is atomic, and writes the same bytes for the same data."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_what_is_defined_is_written_once(
         writer._DefinedAtOnce, "end_definitions", lambda file: ends.append("end") or written(file)
     )
     write_product(product, tmp_path / "product.nc")
-    # Otherwise netCDF4 has another way, and this one would be in vain.
+    # Otherwise netCDF4 took another path, and the test would prove nothing.
     assert ends.count("kept") > len(product.variables)
     assert ends.count("end") == 1
 

@@ -1,4 +1,4 @@
-"""What products depend on, in digests that stay as they are."""
+"""Dependences of products, with fixed digests."""
 
 from __future__ import annotations
 

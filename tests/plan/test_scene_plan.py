@@ -123,8 +123,8 @@ def test_an_implausible_wavelength_needs_the_campaign() -> None:
     odd = tuple(replace(channel, wavelength=math.nan) for channel in factories.granule().layout)
     scene = _scene(factories.granule(0, layout=odd))
     assert "wavelength" in _left_out(plan_scene(scene, factories.campaign()), "photon_532o")["read"]
-    told = factories.campaign(facts=[{"channels": {"photon_532o": {"wavelength": 532e-9}}}])
-    assert _steps(plan_scene(scene, told), "photon_532o")["read"]["wavelength"] == 532e-9
+    known_facts = factories.campaign(facts=[{"channels": {"photon_532o": {"wavelength": 532e-9}}}])
+    assert _steps(plan_scene(scene, known_facts), "photon_532o")["read"]["wavelength"] == 532e-9
 
 
 def test_the_hash_follows_every_setting() -> None:
@@ -148,9 +148,9 @@ def test_a_background_without_bins_leaves_the_signal_out(background: list[float]
 
 def _elastic(*granules: object, facts: dict[str, object] | None = None, **settings: object) -> Plan:
     """Plan the elastic product of a vertical lidar whose bins end at 15 km."""
-    told: dict[str, object] = {"zenith_angle": 0.0} if facts is None else facts
+    known_facts: dict[str, object] = {"zenith_angle": 0.0} if facts is None else facts
     products = {"elastic": {"channels": ["photon_532o"], **settings}}
-    campaign = factories.campaign(products=products, facts=[told])
+    campaign = factories.campaign(products=products, facts=[known_facts])
     return plan_scene(_scene(*granules), campaign)
 
 
@@ -360,13 +360,15 @@ class TestGlued:
         facts: dict[str, object] | None = None,
         products: dict[str, object] | None = None,
     ) -> Plan:
-        told: dict[str, object] = {
+        known_facts: dict[str, object] = {
             "zenith_angle": 0.0,
             "channels": {"analog_532o": analog or {}, "photon_532o": {"dead_time": 4e-9}},
             **(facts or {}),
         }
         products = products or {"elastic": {"channels": ["glued_532o"]}}
-        return plan_scene(_scene(*granules), factories.campaign(products=products, facts=[told]))
+        return plan_scene(
+            _scene(*granules), factories.campaign(products=products, facts=[known_facts])
+        )
 
     def test_both_parts_are_read_and_glued(self) -> None:
         result = self._plan()
@@ -404,14 +406,14 @@ class TestGlued:
         assert "lag" not in _left_out(result, "glued_532o")
 
     def test_a_lag_of_another_channel_is_not_overlooked(self) -> None:
-        told = {"channels": {"photon_532o": {"lag": 5}, "analog_532o": {}}}
-        result = self._plan(facts=told)
+        known_facts = {"channels": {"photon_532o": {"lag": 5}, "analog_532o": {}}}
+        result = self._plan(facts=known_facts)
         assert "lag" not in _steps(result, "glued_532o")
         assert "analog" in _left_out(result, "photon_532o")["lag"]
 
     def test_facts_of_a_channel_that_the_files_lack_are_not_overlooked(self) -> None:
-        told = {"channels": {"photon_523o": {"dead_time": 4e-9}}}
-        reason = _left_out(self._plan(facts=told), "photon_523o")["read"]
+        known_facts = {"channels": {"photon_523o": {"dead_time": 4e-9}}}
+        reason = _left_out(self._plan(facts=known_facts), "photon_523o")["read"]
         assert "photon_532o" in reason
 
     def test_a_part_that_the_files_lack_is_named(self) -> None:

@@ -1,4 +1,4 @@
-"""Cutting granules into scenes."""
+"""Grouping of granules into scenes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The steps of a plan, carried out: counts of a simulated lidar in, its truth out."""
+"""Steps of a plan on counts of a simulated lidar, compared with its truth."""
 
 from __future__ import annotations
 
@@ -116,9 +116,9 @@ def campaign(products, **facts) -> Campaign:
         "photon_532o": {"dead_time": DEAD_TIME},
         "analog_532o": {"noise_variance": 4e-4},
     }
-    told = {"zenith_angle": 0.0, "channels": channels, **facts}
-    made = factories.campaign(products=products, facts=[told])
-    # Sections along a vertical beam too: this asks what a step does, not whether it is worth it.
+    settings = {"zenith_angle": 0.0, "channels": channels, **facts}
+    made = factories.campaign(products=products, facts=[settings])
+    # all_steps: retrieves sections along a vertical beam too.
     return made.model_copy(update={"all_steps": True})
 
 
@@ -135,7 +135,7 @@ def planned(settings: Campaign, *, dark: bool = False, bins: int = 1200) -> Plan
     return plan_scene(cut_scenes(settings, granules).scenes[0], settings)
 
 
-def carried(products, raw=None, *, channel="photon_532o", dark=None, ancillaries=None, **facts):
+def carry_out(products, raw=None, *, channel="photon_532o", dark=None, ancillaries=None, **facts):
     raw = archive() if raw is None else raw
     made = planned(campaign(products, **facts), dark=dark is not None, bins=raw.sizes["range"])
     files = NONE if ancillaries is None else ancillaries
@@ -159,16 +159,16 @@ def between(low, high):
 
 @cache
 def both():
-    """The elastic products of the plain and of the joined channel."""
-    wanted = {"elastic": {**ELASTIC, "average": "10min"}}
+    """Return the elastic products of the photon-counting and the glued channel."""
+    products = {"elastic": {**ELASTIC, "average": "10min"}}
     return {
-        channel: carried(wanted, channel=channel)[ProductKind.ELASTIC]
+        channel: carry_out(products, channel=channel)[ProductKind.ELASTIC]
         for channel in ("photon_532o", "glued_532o")
     }
 
 
 def off(found, inside):
-    """Deviation from the truth in standard errors, of values that no bit speaks against."""
+    """Return the deviation of unflagged values from the truth, in standard errors."""
     score = (found["backscatter"] - particles(STATION + distance)) / found[
         "backscatter_standard_error"
     ]
@@ -176,7 +176,7 @@ def off(found, inside):
 
 
 @pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
-def test_elastic_gives_the_truth_back(channel: str) -> None:
+def test_elastic_recovers_the_truth(channel: str) -> None:
     found = both()[channel]
     assert found.sizes == {"time": 2, "range": 1200, "nv": 2}
     assert np.isfinite(found["reference_bottom"]).all()
@@ -189,12 +189,12 @@ def test_elastic_gives_the_truth_back(channel: str) -> None:
     np.testing.assert_array_equal(found["time"], START + np.array([5, 15]) * MINUTE)
 
 
-def test_the_joined_channel_reaches_nearer_than_photon_counting() -> None:
+def test_the_glued_channel_starts_nearer_than_photon_counting() -> None:
     near = between(300, 700)
-    plain, joined = (off(both()[c], near) for c in ("photon_532o", "glued_532o"))
+    plain, glued = (off(both()[c], near) for c in ("photon_532o", "glued_532o"))
     assert np.isfinite(plain).mean() < 0.1
-    assert np.isfinite(joined).all()
-    assert np.abs(joined).max() < 4.0
+    assert np.isfinite(glued).all()
+    assert np.abs(glued).max() < 4.0
     slope = both()["glued_532o"]
     score = (slope["glue_slope"] - RATIO) / slope["glue_slope_standard_error"]
     assert np.abs(score).max() < 4.0
@@ -202,10 +202,10 @@ def test_the_joined_channel_reaches_nearer_than_photon_counting() -> None:
 
 
 @pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
-def test_results_are_products(channel: str) -> None:
+def test_results_can_be_built_into_products(channel: str) -> None:
     made = planned(campaign({"elastic": ELASTIC}))
     found = both()[channel]
-    told = {
+    settings = {
         "kind": ProductKind.ELASTIC,
         "channel": channel,
         "mode": DetectionMode.PHOTON,
@@ -225,7 +225,7 @@ def test_results_are_products(channel: str) -> None:
             "test", made.scene, ProductKind.ELASTIC, channel, (), made, {}, {}, "0"
         ),
     }
-    product = build_product(found, Context(**told))
+    product = build_product(found, Context(**settings))
     assert product["backscatter"].dims == ("time", "range")
     stored = product["backscatter"].to_numpy()
     np.testing.assert_allclose(
@@ -239,16 +239,16 @@ def test_results_are_products(channel: str) -> None:
 @pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
 @pytest.mark.parametrize("chunk", [1, 13])
 def test_any_chunks_and_threads_give_the_same_bits(channel: str, chunk: int) -> None:
-    wanted = {"elastic": {**ELASTIC, "average": "10min"}}
+    products = {"elastic": {**ELASTIC, "average": "10min"}}
     with dask.config.set(scheduler="threads", num_workers=2):
-        found = carried(wanted, archive(chunk=chunk), channel=channel)[ProductKind.ELASTIC]
+        found = carry_out(products, archive(chunk=chunk), channel=channel)[ProductKind.ELASTIC]
     xr.testing.assert_identical(found, both()[channel])
 
 
-def test_a_slanted_beam_gives_the_same_truth() -> None:
-    wanted = {"elastic": {**ELASTIC, "reference": {"lowest": 3000, "highest": 6000}}}
+def test_a_slant_beam_recovers_the_same_truth() -> None:
+    products = {"elastic": {**ELASTIC, "reference": {"lowest": 3000, "highest": 6000}}}
     raw = archive(zenith=30.0)
-    found = carried(wanted, raw, zenith_angle=30.0)[ProductKind.ELASTIC]
+    found = carry_out(products, raw, zenith_angle=30.0)[ProductKind.ELASTIC]
     altitude = STATION + np.cos(np.deg2rad(30.0)) * distance
     assert float(found["zenith_angle"]) == 30.0
     score = (found["backscatter"] - particles(altitude)) / found["backscatter_standard_error"]
@@ -265,9 +265,9 @@ def test_missing_profiles_give_flags_and_no_error() -> None:
         raw[name] = (("time", "range"), da.from_array(counts, chunks=(6, -1)), raw[name].attrs)
     raw["photon_532o_shots"] = ("time", np.where(np.arange(20) < 10, SHOTS, 0).astype(np.int32))
     raw["analog_532o_shots"] = raw["photon_532o_shots"]
-    wanted = {"elastic": {**ELASTIC, "average": "10min"}, "signal": {"channels": ["glued_532o"]}}
+    products = {"elastic": {**ELASTIC, "average": "10min"}, "signal": {"channels": ["glued_532o"]}}
     for channel in ("photon_532o", "glued_532o"):
-        for kind, found in carried(wanted, raw, channel=channel).items():
+        for kind, found in carry_out(products, raw, channel=channel).items():
             flag = found["quality_flag"].to_numpy()
             name = "backscatter" if kind is ProductKind.ELASTIC else "signal"
             assert (flag[np.isnan(found[name].to_numpy())] != 0).all()
@@ -288,9 +288,9 @@ def test_a_sounding_replaces_the_standard_atmosphere(tmp_path: Path) -> None:
     found = read(tmp_path, molecular=text)
     air = found.profiles["molecular.csv"]
     raw = archive(count_rate(distance, air=air))
-    wanted = {"elastic": ELASTIC}
-    right = carried(wanted, raw, ancillaries=found, molecular_profile="molecular.csv")
-    plain = carried(wanted, raw)
+    products = {"elastic": ELASTIC}
+    right = carry_out(products, raw, ancillaries=found, molecular_profile="molecular.csv")
+    plain = carry_out(products, raw)
     np.testing.assert_allclose(
         right[ProductKind.ELASTIC]["molecular_backscatter"],
         air.backscatter(STATION + distance, 532e-9),
@@ -313,10 +313,10 @@ class TestOverlap:
     raw = staticmethod(lambda: archive(count_rate(distance, constant=4e11) * SEEN))
 
     def test_the_signal_is_divided_by_it(self, tmp_path: Path) -> None:
-        wanted = {"signal": {"channels": ["photon_532o"]}}
+        products = {"signal": {"channels": ["photon_532o"]}}
         files = read(tmp_path, overlap=OVERLAP)
-        whole = carried(wanted, self.raw(), ancillaries=files, **FACTS)[ProductKind.SIGNAL]
-        plain = carried(wanted, self.raw())[ProductKind.SIGNAL]
+        whole = carry_out(products, self.raw(), ancillaries=files, **FACTS)[ProductKind.SIGNAL]
+        plain = carry_out(products, self.raw())[ProductKind.SIGNAL]
         known = distance > 300.0
         for name in ("signal", "signal_standard_error"):
             np.testing.assert_allclose(
@@ -330,33 +330,33 @@ class TestOverlap:
 
     def test_elastic_is_unbiased_where_it_is_given(self, tmp_path: Path) -> None:
         files = read(tmp_path, overlap=OVERLAP)
-        found = carried({"elastic": ELASTIC}, self.raw(), ancillaries=files, **FACTS)
+        found = carry_out({"elastic": ELASTIC}, self.raw(), ancillaries=files, **FACTS)
         score = off(found[ProductKind.ELASTIC], between(450, 1200))
         assert np.isfinite(score).mean() > 0.9
         assert np.sqrt(np.nanmean(score**2)) < 1.4
 
-    def test_it_holds_for_the_joined_channel_too(self, tmp_path: Path) -> None:
+    def test_it_also_holds_for_the_glued_channel(self, tmp_path: Path) -> None:
         files = read(tmp_path, overlap=OVERLAP)
-        wanted = {"signal": {"channels": ["photon_532o", "glued_532o"]}}
-        found = carried(wanted, channel="glued_532o", ancillaries=files, **FACTS)
+        products = {"signal": {"channels": ["photon_532o", "glued_532o"]}}
+        found = carry_out(products, channel="glued_532o", ancillaries=files, **FACTS)
         flag = found[ProductKind.SIGNAL]["quality_flag"].to_numpy()
         assert (flag[:, distance < 300.0] & int(Quality.INCOMPLETE_OVERLAP) != 0).all()
 
-    def test_one_product_does_not_depend_on_another(self, tmp_path: Path) -> None:
+    def test_products_are_independent(self, tmp_path: Path) -> None:
         files = read(tmp_path, overlap=OVERLAP)
         sections = {"channels": ["photon_532o"], "sections": [[100, 900], [900, 4500]]}
-        alone = carried({"homogeneous": sections}, self.raw(), ancillaries=files, **FACTS)
-        wanted = {"homogeneous": sections, "signal": {"channels": ["photon_532o"]}}
-        beside = carried(wanted, self.raw(), ancillaries=files, **FACTS)
+        alone = carry_out({"homogeneous": sections}, self.raw(), ancillaries=files, **FACTS)
+        products = {"homogeneous": sections, "signal": {"channels": ["photon_532o"]}}
+        beside = carry_out(products, self.raw(), ancillaries=files, **FACTS)
         xr.testing.assert_identical(alone[ProductKind.HOMOGENEOUS], beside[ProductKind.HOMOGENEOUS])
 
     def test_a_path_through_partial_overlap_is_corrected_or_flagged(self, tmp_path: Path) -> None:
         files = read(tmp_path, overlap=OVERLAP)
         level = 1e9 * np.exp(-2.0 * 3e-4 * distance) / distance**2
         sections = {"channels": ["photon_532o"], "sections": [[400, 3000]]}
-        told = {**FACTS, "zenith_angle": 90.0}
-        found = carried(
-            {"homogeneous": sections}, archive(level * SEEN), ancillaries=files, **told
+        settings = {**FACTS, "zenith_angle": 90.0}
+        found = carry_out(
+            {"homogeneous": sections}, archive(level * SEEN), ancillaries=files, **settings
         )[ProductKind.HOMOGENEOUS]
         right = np.abs(found["extinction"] - 3e-4) < 5 * found["extinction_standard_error"]
         assert (right | (found["quality_flag"] != 0)).all()
@@ -370,17 +370,17 @@ def _dark(profiles: int = 12, ripple: float = 0.5) -> xr.Dataset:
     return archive(nothing, profiles=profiles, ripple=ripple, seed=8, first=START - 30 * MINUTE)
 
 
-def test_the_dark_signal_is_subtracted_and_its_error_is_told() -> None:
-    wanted = {"signal": {"channels": ["analog_532o"]}}
+def test_the_dark_signal_is_subtracted_and_its_error_included() -> None:
+    products = {"signal": {"channels": ["analog_532o"]}}
     raw = archive(ripple=0.5)
-    dirty = carried(wanted, raw, channel="analog_532o")[ProductKind.SIGNAL]
-    clean = carried(wanted, raw, channel="analog_532o", dark=_dark())[ProductKind.SIGNAL]
+    dirty = carry_out(products, raw, channel="analog_532o")[ProductKind.SIGNAL]
+    clean = carry_out(products, raw, channel="analog_532o", dark=_dark())[ProductKind.SIGNAL]
     r2 = distance**2
     true = count_rate(distance) / RATIO * r2
     far = between(3000, 6000)
     error = clean["signal_standard_error"].to_numpy()[:, far]
     score = (clean["signal"].to_numpy() - true)[:, far] / error
-    # A fixed dark signal has one error for all 20 profiles, told for each of them.
+    # A fixed dark signal has one error for all 20 profiles, stated for each of them.
     assert 0.85 < np.sqrt(np.mean(score**2)) < 1.15
     missed = (dirty["signal"].to_numpy() - true)[:, far]
     assert np.sqrt(np.mean((missed / error) ** 2)) > 5.0
@@ -389,11 +389,11 @@ def test_the_dark_signal_is_subtracted_and_its_error_is_told() -> None:
 
 
 def test_means_of_many_profiles_keep_the_error_of_the_dark_signal() -> None:
-    wanted = {"elastic": {**ELASTIC, "channels": ["analog_532o"], "average": "2h"}}
+    products = {"elastic": {**ELASTIC, "channels": ["analog_532o"], "average": "2h"}}
     raw = archive(count_rate(distance, constant=4e13), profiles=120)
     errors = {}
     for name, dark in (("without", None), ("with", _dark(profiles=3, ripple=0.0))):
-        found = carried(wanted, raw, channel="analog_532o", dark=dark)[ProductKind.ELASTIC]
+        found = carry_out(products, raw, channel="analog_532o", dark=dark)[ProductKind.ELASTIC]
         assert found.sizes["time"] == 1
         inside = between(2000, 3000)
         errors[name] = np.nanmedian(found["backscatter_error_noise"].to_numpy()[0, inside])
@@ -406,12 +406,12 @@ def _glued(raw: xr.Dataset, **analog: object) -> xr.Dataset:
         "photon_532o": {"dead_time": DEAD_TIME},
         "analog_532o": {"noise_variance": 4e-4, **analog},
     }
-    wanted = {"signal": {"channels": ["glued_532o"]}}
-    return carried(wanted, raw, channel="glued_532o", channels=channels)[ProductKind.SIGNAL]
+    products = {"signal": {"channels": ["glued_532o"]}}
+    return carry_out(products, raw, channel="glued_532o", channels=channels)[ProductKind.SIGNAL]
 
 
 @pytest.mark.parametrize(
-    ("lag", "told"),
+    ("lag", "settings"),
     [
         (6, {"lag": 6}),
         (6, {"range_offset": -45.0}),
@@ -421,9 +421,9 @@ def _glued(raw: xr.Dataset, **analog: object) -> xr.Dataset:
         (0, {"lag": "estimate"}),
     ],
 )
-def test_a_lag_that_is_known_is_undone(lag: int, told: dict[str, object]) -> None:
-    """Whether the campaign gives the lag or the range of the analog bins."""
-    found = _glued(archive(lag=lag), **told)
+def test_a_given_lag_is_corrected(lag: int, settings: dict[str, object]) -> None:
+    """The campaign may give the lag or the range offset of the analog bins."""
+    found = _glued(archive(lag=lag), **settings)
     score = (found["glue_slope"] - RATIO) / found["glue_slope_standard_error"]
     assert abs(float(score.mean())) < 1.0
     near = between(250, 600)
@@ -433,7 +433,7 @@ def test_a_lag_that_is_known_is_undone(lag: int, told: dict[str, object]) -> Non
     np.testing.assert_array_equal(found["range"], distance)
 
 
-def test_a_lag_that_is_not_known_shows_near_the_lidar() -> None:
+def test_an_uncorrected_lag_shows_near_the_lidar() -> None:
     found = _glued(archive(lag=6))
     near = between(250, 600)
     apart = found["signal"].to_numpy()[:, near] / (count_rate(distance) * distance**2)[near] - 1.0
@@ -441,12 +441,12 @@ def test_a_lag_that_is_not_known_shows_near_the_lidar() -> None:
 
 
 def test_geometry_and_shots_go_with_every_product() -> None:
-    wanted = {
+    products = {
         "signal": {"channels": ["photon_532o"]},
         "homogeneous": {"channels": ["photon_532o"], "sections": [[1500, 4500]]},
         "elastic": {**ELASTIC, "channels": ["photon_532o"]},
     }
-    found = carried(wanted, archive().assign_coords(azimuth=("time", np.full(20, 40.0))))
+    found = carry_out(products, archive().assign_coords(azimuth=("time", np.full(20, 40.0))))
     assert list(found) == [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS, ProductKind.ELASTIC]
     for data in found.values():
         assert {"time", "time_bnds", "zenith_angle", "azimuth"} <= set(data.coords)
@@ -456,25 +456,25 @@ def test_geometry_and_shots_go_with_every_product() -> None:
     assert int(found[ProductKind.ELASTIC]["shots"][0]) == 20 * SHOTS
 
 
-def test_only_what_the_plan_holds_is_made() -> None:
-    found = carried({"signal": {"channels": ["photon_532o"]}})
+def test_only_planned_products_are_made() -> None:
+    found = carry_out({"signal": {"channels": ["photon_532o"]}})
     assert list(found) == [ProductKind.SIGNAL]
 
 
-def test_a_plan_that_says_yes_can_be_carried_out() -> None:
+def test_a_planned_product_can_be_made() -> None:
     """The bins end just where the nearest reference window does."""
-    wanted = {"elastic": {**ELASTIC, "reference": {"lowest": 3002.5, "highest": 8000}}}
+    products = {"elastic": {**ELASTIC, "reference": {"lowest": 3002.5, "highest": 8000}}}
     raw = archive(count_rate(7.5 * (np.arange(534) + 0.5)))
-    made = planned(campaign(wanted), bins=534)
+    made = planned(campaign(products), bins=534)
     names = [step.name for step in made.steps if step.channel == "photon_532o"]
     if "elastic" in names:
-        assert carried(wanted, raw)[ProductKind.ELASTIC].sizes["time"] == 1
+        assert carry_out(products, raw)[ProductKind.ELASTIC].sizes["time"] == 1
 
 
 @pytest.mark.parametrize("zenith", [0.0, 20.0, 30.0, 60.0])
-def test_a_single_window_that_the_plan_allows_is_found_at_any_angle(zenith: float) -> None:
+def test_a_single_window_that_the_plan_allows_is_used_at_any_angle(zenith: float) -> None:
     window = {"lowest": 2500, "highest": 3500, "width": 1000, "relative_error": 0.0}
-    found = carried(
+    found = carry_out(
         {"elastic": {**ELASTIC, "reference": window}}, archive(zenith=zenith), zenith_angle=zenith
     )[ProductKind.ELASTIC]
     climb = np.cos(np.deg2rad(zenith))
@@ -482,10 +482,10 @@ def test_a_single_window_that_the_plan_allows_is_found_at_any_angle(zenith: floa
     assert float(found["reference_top"][0]) * climb == pytest.approx(3500.0)
 
 
-def test_bins_nearer_than_full_overlap_are_flagged_and_not_retrieved_from() -> None:
-    wanted = {"signal": {"channels": ["photon_532o"]}, "elastic": ELASTIC}
+def test_bins_nearer_than_full_overlap_are_flagged_and_excluded() -> None:
+    products = {"signal": {"channels": ["photon_532o"]}, "elastic": ELASTIC}
     for channel in ("photon_532o", "glued_532o"):
-        found = carried(wanted, channel=channel, full_overlap_range=450.0)
+        found = carry_out(products, channel=channel, full_overlap_range=450.0)
         near = distance < 450.0
         for kind, data in found.items():
             hit = (data["quality_flag"].to_numpy() & int(Quality.INCOMPLETE_OVERLAP)) != 0
@@ -495,18 +495,18 @@ def test_bins_nearer_than_full_overlap_are_flagged_and_not_retrieved_from() -> N
         assert np.isfinite(elastic[:, between(900, 3000)]).all()
 
 
-def test_the_background_is_found_as_the_campaign_asks() -> None:
+def test_the_background_follows_the_method_of_the_campaign() -> None:
     dim = archive(count_rate(distance, constant=4e12), profiles=20)
     kinds = {}
     for way in ("known_shape", "tail_mean"):
-        wanted = {"elastic": {**ELASTIC, "background": way}}
-        kinds[way] = float(carried(wanted, dim)[ProductKind.ELASTIC]["background"][0])
+        products = {"elastic": {**ELASTIC, "background": way}}
+        kinds[way] = float(carry_out(products, dim)[ProductKind.ELASTIC]["background"][0])
     left = count_rate(distance)[-120:].mean()
     assert kinds["known_shape"] == pytest.approx(SKY, abs=0.2 * left)
     assert kinds["tail_mean"] == pytest.approx(SKY + left, abs=0.2 * left)
 
 
-def test_counts_at_hand_are_not_those_of_the_caller():
+def test_loading_does_not_change_the_bench_of_the_caller():
     lazy = archive(profiles=3)
     bench = channel_steps.Bench(planned(campaign({"signal": {}})), lazy, None, NONE, STATION)
     near = channel_steps.load_small(bench, ["photon_532o"]).archive

@@ -1,4 +1,4 @@
-"""The table of variables against the CF tables, not against itself."""
+"""Rows of variables, checked against the CF tables."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_standard_names_exist_and_their_units_convert(
 
 @pytest.mark.parametrize(("kind", "row"), ROWS)
 @pytest.mark.parametrize("mode", list(DetectionMode))
-def test_every_unit_is_one_and_no_placeholder_is_left(
+def test_every_unit_is_valid_and_no_placeholder_is_left(
     kind: ProductKind, row: Row, mode: DetectionMode
 ):
     found = attributes(row, mode=mode)
@@ -69,7 +69,7 @@ def test_every_unit_is_one_and_no_placeholder_is_left(
 _CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular")
 
 
-def test_what_has_no_standard_name_is_what_the_table_does_not_know():
+def test_variables_without_standard_name():
     gluing = {"glue_slope", "glue_slope_standard_error", "glue_bottom", "glue_top"}
     unnamed = {
         kind: {row.name for row in layout.variables if not row.standard_name}
@@ -164,7 +164,7 @@ def test_units_of_the_signal_follow_the_mode(mode: DetectionMode, name: str, uni
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
-def test_ancillaries_and_flags_hang_together(layout):
+def test_ancillaries_and_standard_errors_are_consistent(layout):
     names = [row.name for row in (*layout.coordinates, *layout.variables)]
     assert len(set(names)) == len(names)
     for row in layout.variables:

@@ -1,4 +1,4 @@
-"""What a product of scans may hold besides its profiles."""
+"""Optional variables of the ``multiangle`` product."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def test_layers_have_their_errors():
     layer = product["layer_optical_depth"]
     assert layer.dims == ("time", "layer")
     np.testing.assert_allclose(layer[1:], 0.1, rtol=1e-3)
-    told = set(layer.attrs["ancillary_variables"].split())
-    assert {f"layer_optical_depth_{kind}_error" for kind in ("standard", "gradient")} == told
+    ancillaries = set(layer.attrs["ancillary_variables"].split())
+    assert {f"layer_optical_depth_{kind}_error" for kind in ("standard", "gradient")} == ancillaries
     assert product["layer_optical_depth_gradient_error"].attrs["error_kind"] == "systematic"
 
 
-def test_layers_come_with_their_errors_and_places_or_not_at_all():
+def test_layers_need_their_errors_and_altitudes():
     plain = build_product(multiangle(layers=False), context(ProductKind.MULTIANGLE))
     assert not [name for name in plain.variables if str(name).startswith("layer")]
     whole = multiangle()

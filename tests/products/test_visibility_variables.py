@@ -33,7 +33,7 @@ def test_it_complies(intervals: int, tmp_path: Path):
     assert findings(path) == (set(), permitted(KIND, found))
 
 
-def test_nothing_but_missing_values_complies(data: xr.Dataset, tmp_path: Path):
+def test_missing_values_only_comply(data: xr.Dataset, tmp_path: Path):
     lost = data.copy(deep=True)
     lost["quality_flag"][:] = int(Quality.INPUT_MISSING)
     for name, variable in lost.data_vars.items():
@@ -60,7 +60,7 @@ def test_each_crossing_is_a_time_series(data: xr.Dataset, tmp_path: Path):
         assert found.attrs["geospatial_lat_min"] == pytest.approx(float(data["latitude"].min()))
         assert found.attrs["geospatial_lon_max"] == pytest.approx(float(data["longitude"].max()))
         assert "POLYGON" in found.attrs["geospatial_bounds"]
-        # Where the lidars stand and point is told.
+        # Positions and pointings of the lidars.
         np.testing.assert_allclose(found["beam_azimuth"], [70, 310, 190])
         np.testing.assert_allclose(found["beam_latitude"], data["beam_latitude"])
         assert np.isfinite(found["beam_range"]).sum() == 6

@@ -1,4 +1,4 @@
-"""Results as the engine hands them over, made up."""
+"""Made-up results of retrievals, as input of the builder."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
         steps=(
             Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
             Step("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
-            Step("homogeneous", "photon_532o", {"method": "auto"}, "asked for"),
-            Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "asked for"),
-            Step("multiangle", "photon_532o", {"method": "auto"}, "asked for"),
-            Step("visibility", "photon_532o", {"contrast": 0.05}, "asked for"),
+            Step("homogeneous", "photon_532o", {"method": "auto"}, "requested"),
+            Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "requested"),
+            Step("multiangle", "photon_532o", {"method": "auto"}, "requested"),
+            Step("visibility", "photon_532o", {"contrast": 0.05}, "requested"),
             Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
@@ -89,7 +89,7 @@ def context(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Cont
 
 
 def clock(profiles: int, zenith: Any = 90.0, azimuth: Any = None) -> dict[str, Any]:
-    """Coordinates that every kind has: profiles of 10 minutes, zenith angle over time."""
+    """Return the coordinates of all kinds: profiles of 10 minutes, zenith angle over time."""
     first = np.datetime64("2026-03-01T10:00:00", "ns")
     length = np.timedelta64(600, "s")
     starts = first + length * np.arange(profiles)
@@ -104,7 +104,7 @@ def clock(profiles: int, zenith: Any = 90.0, azimuth: Any = None) -> dict[str, A
 
 
 def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset:
-    """A labelled homogeneous retrieval, as `lidarops.retrieve.homogeneous.labeled.fit_homogeneous_path` gives it."""
+    """Return a made-up result of `homogeneous.labeled.fit_homogeneous_path`."""
     rng = np.random.default_rng(1)
     shape = (profiles, sections)
     dims = ("time", "section")
@@ -138,7 +138,7 @@ def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset
 
 
 def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
-    """A background-subtracted, range-corrected signal."""
+    """Return a made-up background-subtracted, range-corrected signal."""
     rng = np.random.default_rng(2)
     dims = ("time", "range")
     shape = (profiles, bins)
@@ -161,7 +161,7 @@ def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
 
 
 def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
-    """An elastic retrieval, as `lidarops.retrieve.elastic.labeled.invert_elastic` gives it."""
+    """Return a made-up result of `elastic.labeled.invert_elastic`."""
     rng = np.random.default_rng(3)
     dims = ("time", "range")
     shape = (profiles, bins)
@@ -218,7 +218,7 @@ def multiangle(
     *,
     layers: bool = True,
 ) -> xr.Dataset:
-    """A multi-angle retrieval, as `lidarops.retrieve.multiangle.labeled.retrieve_optical_depth` gives it."""
+    """Return a made-up result of `multiangle.labeled.retrieve_optical_depth`."""
     rng = np.random.default_rng(4)
     angles = np.atleast_1d(np.float64(zenith))
     dims = ("time", "altitude")
@@ -274,7 +274,7 @@ def multiangle(
 
 
 def with_layers(data: xr.Dataset) -> xr.Dataset:
-    """Add the optical depths of two layers, that of the second in the first cycle missing."""
+    """Return data with optical depths of two layers, the second one missing in the first cycle."""
     bounds = STATION.altitude + 60.0 * np.array([[0.0, 2.0], [1.0, 4.0]])
     dims, shape = ("time", "layer"), (data.sizes["time"], 2)
     missing = np.zeros(shape, np.bool_)
@@ -293,7 +293,7 @@ def with_layers(data: xr.Dataset) -> xr.Dataset:
 def visibility(
     profiles: int = 5, crossings: int = 3, zenith: Any = 90.0, azimuth: Any = None
 ) -> xr.Dataset:
-    """A retrieval of a network, as `lidarops.retrieve.network.labeled.retrieve_network` gives it."""
+    """Return a made-up result of `network.labeled.retrieve_network`."""
     rng = np.random.default_rng(5)
     beams = max(3, np.size(zenith))
     pair = ("time", "crossing")
@@ -321,7 +321,7 @@ def visibility(
     for crossing in range(crossings):
         meeting = [crossing % beams, (crossing + 1) % beams]
         distance[meeting, crossing] = 500.0 + 1000.0 * crossing + 100.0 * np.arange(2)
-    told = {
+    beam_values = {
         "latitude": STATION.latitude + 0.01 * np.arange(beams),
         "longitude": STATION.longitude + 0.02 * np.arange(beams),
         "altitude": STATION.altitude + np.arange(beams),
@@ -347,7 +347,7 @@ def visibility(
             "longitude": ("crossing", STATION.longitude + 0.004 * (crossing + 1)),
             "altitude": ("crossing", STATION.altitude + 5.0 * crossing[::-1]),
             "beam": ("beam", np.arange(beams, dtype=np.int32)),
-            **{f"beam_{name}": ("beam", found) for name, found in told.items()},
+            **{f"beam_{name}": ("beam", found) for name, found in beam_values.items()},
         },
         attrs={"steps": "method iterative; beam 0: lidar-0, with the crossings 0 at 500 m"},
     )

@@ -120,7 +120,7 @@ _UP = ("upward", "vertical", "cloudy")
 
 
 def tree(*, profiles: int = 60, bins: int = 4000) -> dict[str, Any]:
-    """The campaign file: one scene an instrument, and one of the three that meet."""
+    """Return the campaign file: one scene for each instrument, and one for the network."""
     instruments: dict[str, Any] = {}
     simulated: dict[str, Any] = {}
     shooting = {"interval": 60, "shots": 600, "repetition_rate": 20, "bins": bins}

@@ -1,4 +1,4 @@
-"""Simulated campaigns of networks of lidars, and the truth where their beams meet."""
+"""Simulated campaigns of networks of lidars, and the truth at their crossings."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _SIX_BEAMS = {"west": ([60, 75], 90), "east": ([60, 75], 270), "middle": ([35, 6
 def tree(
     air: dict[str, Any], *, six_beams: bool = False, rate: float = 4.0, **simulation: Any
 ) -> dict[str, Any]:
-    """The campaign file of three lidars in an air.
+    """Return the campaign file of three lidars in a given air.
 
     Parameters
     ----------
@@ -129,17 +129,17 @@ def tree(
     }
 
 
-def written(folder: Path, told: dict[str, Any]) -> tuple[Campaign, xr.Dataset]:
-    """The campaign, written to a folder and simulated there, and its truth."""
+def written(folder: Path, settings: dict[str, Any]) -> tuple[Campaign, xr.Dataset]:
+    """Return a campaign that is simulated in a folder, and its truth."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "net.yaml"
-    path.write_text(yaml.safe_dump(told), encoding="utf-8")
+    path.write_text(yaml.safe_dump(settings), encoding="utf-8")
     campaign = load_campaign(path)
     return campaign, simulate_campaign(campaign).truth
 
 
 def truth_at(product: xr.Dataset, truth: xr.Dataset, instruments: list[str]) -> np.ndarray:
-    """True extinction (time, crossing) of a product, m-1: the mean over its beams and profiles.
+    """Return the true extinction (time, crossing) of a product, m-1, averaged like the product.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Products of every kind and shape of beam, as other people's tools get them."""
+"""Files of every kind and pointing, for tests with tools of other people."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CDO, NCO and ncdump on products of every kind: means, cuts and joins are what they should be."""
+"""CDO, NCO and ncdump on products of every kind: means, subsets and joined files."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_cdo_says_that_it_skips_series_of_many_places(made: Callable[[ProductKin
 @needs("cdo")
 def test_cdo_takes_means_over_time(product: Path, for_cdo: Path, tmp_path: Path):
     names = values_of(product)
-    # CDO means floats as floats; double precision is asked for, as anyone who compares does.
+    # CDO averages floats in single precision unless double precision is requested.
     call(
         "cdo",
         "-s",
@@ -109,7 +109,7 @@ def test_cdo_sees_every_number_and_says_which_text_it_skips(product: Path, for_c
 @needs("cdo")
 def test_cdo_joins_days_and_keeps_bits(product: Path, for_cdo: Path, tmp_path: Path):
     one, later = tmp_path / "one.nc", tmp_path / "later.nc"
-    # Without their places, CDO cannot tell the beams of a network from series.
+    # Without positions, CDO takes the beams of a network for series.
     chosen = ["-selname,extinction,quality_flag"] if for_cdo != product else []
     call("cdo", "-s", "copy", *chosen, for_cdo, one)
     call("cdo", "-s", "shifttime,1day", one, later)

@@ -1,4 +1,4 @@
-"""What docs/products.md says and shows is so."""
+"""The tables and examples of docs/products.md."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def files(made: Callable[[ProductKind, str], Path], tmp_path: Path) -> dict[str,
     return {"PRODUCT": str(product), "LATER": str(later)}
 
 
-def test_its_tables_are_those_of_the_code(repository: Path):
+def test_the_tables_match_the_code(repository: Path):
     spec = spec_from_file_location("products_table", repository / "docs/products_table.py")
     assert spec
     assert spec.loader
