@@ -23,7 +23,7 @@ from flows import WITH_FAILURES
 BLOCK = "lidarops-operators"
 FAILED = "lidarops: a run failed"
 ABSENT = "lidarops: no nightly run was completed"
-TROUBLED = "lidarops: a run completed with failures"
+COMPLETED_WITH_FAILURES = "lidarops: a run completed with failures"
 
 _BODY = "{{ flow_run.name }} is {{ flow_run.state.name }}: {{ flow_run.state.message }}"
 
@@ -51,10 +51,10 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
         threshold=1,
         within=within,
     )
-    troubled = [_ended(block, TROUBLED, WITH_FAILURES)] if failures else []
+    with_failures = [_ended(block, COMPLETED_WITH_FAILURES, WITH_FAILURES)] if failures else []
     return [
         _ended(block, FAILED, "Failed", "Crashed", "TimedOut"),
-        *troubled,
+        *with_failures,
         Automation(
             name=ABSENT,
             trigger=absent,
@@ -108,7 +108,7 @@ def main(
     # Prefect types the result as value or awaitable.
     block = cast("UUID", hook.save(BLOCK, overwrite=True))
     new = automations(block, within=timedelta(hours=hours), failures=failures)
-    replaced = {name for name in (FAILED, TROUBLED, ABSENT) if _removed(name)}
+    replaced = {name for name in (FAILED, COMPLETED_WITH_FAILURES, ABSENT) if _removed(name)}
     for automation in new:
         if automation.name not in replaced:
             typer.echo(f"new: {automation.name}")

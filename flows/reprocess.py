@@ -243,7 +243,7 @@ def reprocess(
     selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # First, because copy and report may fail.
-    message = _log_problems(settings, result) if result.troubled else ""
+    message = _log_problems(settings, result) if result.has_failures else ""
     # Even if nothing was stale: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
@@ -259,7 +259,7 @@ def reprocess(
         built = report_task(_opaque(settings), _opaque(result.record), local)
         scenes = len(result.record.scenes)
         get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
-    if not result.troubled:
+    if not result.has_failures:
         return result, built
     # Prefect uses a returned state as that of the flow, and gives its data to callers.
     ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
@@ -405,7 +405,7 @@ def main(
         typer.echo("nothing to do")
     else:
         typer.echo(f"products: {result.record.products}\nreport:   {built}")
-    raise typer.Exit(1 if result.troubled else 0)
+    raise typer.Exit(1 if result.has_failures else 0)
 
 
 if __name__ == "__main__":

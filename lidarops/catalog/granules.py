@@ -61,7 +61,7 @@ class Granules(Database):
             yield map(Fingerprint._make, rows)
 
     @contextmanager
-    def unread(self) -> Iterator[Iterator[tuple[str, int, datetime | None]]]:
+    def without_digest(self) -> Iterator[Iterator[tuple[str, int, datetime | None]]]:
         """Yield path, size and start of good granules without SHA-256 (never read in full)."""
         query = (
             sa.select(_C.path, _C.size, _C.start)

@@ -27,7 +27,7 @@ _FAR_FROM_STATION = 0.5
 """degree; a header position farther from the station gets a note."""
 
 
-class Due(NamedTuple):
+class UnreadFile(NamedTuple):
     """A file whose header must be read."""
 
     file: RawFile
@@ -94,18 +94,18 @@ class Headers:
         """Return position and pointing of an instrument."""
         return self._places[instrument]
 
-    def row(self, due: Due, granule: Granule) -> GranuleRow:
+    def row(self, due: UnreadFile, granule: Granule) -> GranuleRow:
         """Return the row of a granule."""
         retry = granule.reason.startswith(_UNREADABLE)
         return row_of(granule, self._campaign, RETRY if retry else due.scan_key)
 
 
-def read_row(headers: Headers, due: Due) -> GranuleRow:
+def read_row(headers: Headers, due: UnreadFile) -> GranuleRow:
     """Read the header of a file and return its row; see `read_header`."""
     return headers.row(due, read_header(headers, due))
 
 
-def read_header(headers: Headers, due: Due) -> Granule:
+def read_header(headers: Headers, due: UnreadFile) -> Granule:
     """Return the granule of a file; if it is unusable, a refused one with the reason."""
     file = due.file
     if printable(file.path) != file.path:
@@ -124,7 +124,7 @@ def read_header(headers: Headers, due: Due) -> Granule:
         return _refused(due, f"{_UNREADABLE}: {error.strerror or error}")
 
 
-def _refused(due: Due, reason: str) -> Granule:
+def _refused(due: UnreadFile, reason: str) -> Granule:
     return Granule(
         path=printable(due.file.path),
         size=due.file.size,
@@ -136,7 +136,7 @@ def _refused(due: Due, reason: str) -> Granule:
     )
 
 
-def _accepted(due: Due, header: licel.Header, place: _Place) -> Granule:
+def _accepted(due: UnreadFile, header: licel.Header, place: _Place) -> Granule:
     zenith_angle, azimuth = place.pointing(header.start)
     notes = header.notes
     latitude, longitude = place.latitude, place.longitude

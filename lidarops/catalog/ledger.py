@@ -64,7 +64,7 @@ class Dependence:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class RecordedProduct:
     """A product in the ledger."""
 
     path: str
@@ -97,7 +97,7 @@ class NewProduct:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class SceneEntry:
     """The outcome of one scene, entered as it ends."""
 
     outcome: SceneOutcome
@@ -111,7 +111,7 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
+class LastTry:
     """Result of the last try of a scene."""
 
     key: str
@@ -142,7 +142,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class OldVersion:
+class SupersededVersion:
     """A version of a product that was replaced."""
 
     path: str
@@ -228,7 +228,7 @@ class Ledger(Granules):
                 row,
             )
 
-    def record(self, entry: Entry, run: str, token: str) -> None:
+    def record(self, entry: SceneEntry, run: str, token: str) -> None:
         """Enter the outcome of a scene in one transaction: products, inputs, digests, timings."""
         outcome = entry.outcome
         with self.transaction() as connection:
@@ -262,7 +262,7 @@ class Ledger(Granules):
                 remedy="see lidarops runs; the scenes that this run entered are kept",
             )
 
-    def _enter_products(self, connection: sa.Connection, entry: Entry, run: str) -> None:
+    def _enter_products(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
         if not entry.products:
             return
         rows = [self._product_row(new, entry, run) for new in entry.products]
@@ -287,7 +287,7 @@ class Ledger(Granules):
         connection.execute(sa.insert(PRODUCT), rows)
         self._enter_inputs(connection, entry.products)
 
-    def _product_row(self, new: NewProduct, entry: Entry, run: str) -> dict[str, Any]:
+    def _product_row(self, new: NewProduct, entry: SceneEntry, run: str) -> dict[str, Any]:
         record, depends_on = new.record, new.depends_on
         return {
             "campaign": self.campaign,
@@ -336,7 +336,7 @@ class Ledger(Granules):
         if rows:
             connection.execute(sa.insert(PRODUCT_INPUT), rows)
 
-    def _enter_scene(self, connection: sa.Connection, entry: Entry, run: str) -> None:
+    def _enter_scene(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
         outcome = entry.outcome
         row = {
             "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
@@ -362,14 +362,14 @@ class Ledger(Granules):
 
     # Products
 
-    def made(self, first: int, last: int) -> list[Made]:
+    def products_of_days(self, first: int, last: int) -> list[RecordedProduct]:
         """Return the products of scenes that start on days `first` to `last`."""
         query = sa.select(*_MADE).where(_P.campaign == self.campaign, _P.day.between(first, last))
         with self.transaction() as connection:
             return [_made_from(row) for row in connection.execute(query)]
 
     @contextmanager
-    def all_made(self) -> Iterator[Iterator[Made]]:
+    def all_products(self) -> Iterator[Iterator[RecordedProduct]]:
         """Yield every product, ordered by path, without holding them all."""
         query = sa.select(*_MADE).where(_P.campaign == self.campaign).order_by(_P.path)
         with self.stream(query) as rows:
@@ -445,7 +445,7 @@ class Ledger(Granules):
                 gone,
             )
 
-    def superseded(self) -> list[OldVersion]:
+    def superseded(self) -> list[SupersededVersion]:
         """Return the replaced versions of products, ordered by path."""
         old = SUPERSEDED.c
         query = (
@@ -454,20 +454,20 @@ class Ledger(Granules):
             .order_by(old.path, old.run)
         )
         with self.transaction() as connection:
-            return [OldVersion(*row) for row in connection.execute(query)]
+            return [SupersededVersion(*row) for row in connection.execute(query)]
 
     # Scenes and verdicts
 
-    def tried(self, first: int, last: int) -> dict[str, Tried]:
+    def last_tries(self, first: int, last: int) -> dict[str, LastTry]:
         """Return the result of the last try of every scene on days `first` to `last`."""
         known = SCENE.c
         query = sa.select(
             known.scene, known.key, known.error, known.final, known.crashes, known.day
         ).where(known.campaign == self.campaign, known.day.between(first, last))
         with self.transaction() as connection:
-            return {row[0]: Tried(*row[1:]) for row in connection.execute(query)}
+            return {row[0]: LastTry(*row[1:]) for row in connection.execute(query)}
 
-    def tried_on_others(self, days: Collection[int]) -> list[str]:
+    def scenes_of_other_days(self, days: Collection[int]) -> list[str]:
         """Return the scenes of other days than these that were tried."""
         known = SCENE.c
         where = known.campaign == self.campaign
@@ -552,8 +552,8 @@ def _set_id(files: Sequence[InputRecord]) -> str:
     return digest.hexdigest()[:32]
 
 
-def _made_from(row: Any) -> Made:
-    return Made(
+def _made_from(row: Any) -> RecordedProduct:
+    return RecordedProduct(
         path=row.path,
         scene=row.scene,
         day=row.day,

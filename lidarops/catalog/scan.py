@@ -12,7 +12,7 @@ from datetime import datetime
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
-from lidarops.catalog.headers import Due, Headers, read_row
+from lidarops.catalog.headers import Headers, UnreadFile, read_row
 from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
@@ -166,7 +166,9 @@ class _Scan:
         self._added = 0
         self._gone: list[Fingerprint] = []
 
-    def due(self, pairs: Iterable[tuple[RawFile | None, Fingerprint | None]]) -> Iterator[Due]:
+    def due(
+        self, pairs: Iterable[tuple[RawFile | None, Fingerprint | None]]
+    ) -> Iterator[UnreadFile]:
         """Compare each file with the catalog, and yield those whose header must be read."""
         for file, before in pairs:
             owners = [] if file is None else self._owners(file.path)
@@ -289,7 +291,7 @@ class _Scan:
         moved: dict[str, str] = {}
         if not (lost and self._new):
             return moved
-        with self._store.unread() as rows:
+        with self._store.without_digest() as rows:
             for path, size, start in rows:
                 candidates = lost.get((size, start)) if path in self._new else None
                 digest = self._digest(path) if candidates else None
@@ -356,7 +358,7 @@ def _regex(pattern: str) -> re.Pattern[str]:
     return re.compile("".join(expressions.get(token, re.escape(token)) for token in tokens) + r"\Z")
 
 
-def _due(file: RawFile, owners: list[_Claim], key: str) -> Due:
+def _due(file: RawFile, owners: list[_Claim], key: str) -> UnreadFile:
     owner = owners[0]
     rivals = {claim.instrument for claim in owners} - {owner.instrument}
-    return Due(file, owner.instrument, owner.role, tuple(sorted(rivals)), key)
+    return UnreadFile(file, owner.instrument, owner.role, tuple(sorted(rivals)), key)

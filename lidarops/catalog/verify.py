@@ -54,7 +54,7 @@ def verify_archive(
 
 def _check_all(campaign: Campaign, store: Store, *, inputs: bool) -> Iterator[Mismatch | None]:
     read = _digests_below(campaign.products_root)
-    with store.all_made() as rows:
+    with store.all_products() as rows:
         for made in rows:
             problem = _problem(read, made.path, made.sha256)
             yield Mismatch("product", made.path, problem) if problem else None

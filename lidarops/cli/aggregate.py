@@ -14,12 +14,12 @@ from lidarops.cli.app import (
     JsonOption,
     add_row,
     app,
-    leave,
+    exit_with_status,
     make_table,
-    plainly,
     progress_bar,
     show,
     utc,
+    with_plain_errors,
 )
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def aggregate(
     out: Annotated[
         Path,
@@ -79,7 +79,7 @@ def aggregate(
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
         _tell(made)
-    leave(failed=bool(made.refused or made.failed))
+    exit_with_status(failed=bool(made.refused or made.failed))
 
 
 def _root(out: Path) -> Path:

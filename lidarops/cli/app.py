@@ -76,12 +76,12 @@ WRONG_USE = 2
 REFUSED = 1
 
 
-def tell(error: LidarOpsError) -> None:
+def show_error(error: LidarOpsError) -> None:
     """Show an error on standard error."""
     typer.secho(f"error: {error}", fg="red", err=True)
 
 
-def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
+def with_plain_errors(command: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorate a command to show a lidarops error as one line, not as a traceback."""
 
     @wraps(command)
@@ -89,7 +89,7 @@ def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
         try:
             return command(*args, **kwargs)
         except LidarOpsError as error:
-            tell(error)
+            show_error(error)
             raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
 
     return wrapped
@@ -118,7 +118,7 @@ def utc(moment: datetime | None) -> datetime | None:
     return None if moment is None else moment.replace(tzinfo=moment.tzinfo or UTC)
 
 
-def leave(*, failed: bool) -> None:
+def exit_with_status(*, failed: bool) -> None:
     """Exit with code 1 if something failed."""
     if failed:
         raise typer.Exit(REFUSED)

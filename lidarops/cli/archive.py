@@ -26,14 +26,14 @@ from lidarops.cli.app import (
     WaitOption,
     add_row,
     app,
+    exit_with_status,
     growing_bar,
-    leave,
     make_table,
-    plainly,
     progress_bar,
     show,
-    tell,
+    show_error,
     utc,
+    with_plain_errors,
 )
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 from lidarops.errors import LidarOpsError
@@ -83,7 +83,7 @@ def _size(text: str | None) -> str | None:
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def catalog(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -117,11 +117,11 @@ def catalog(
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
             f" {summary.refused} refused"
         )
-    leave(failed=bool(refused))
+    exit_with_status(failed=bool(refused))
 
 
 @app.command("plan")
-@plainly
+@with_plain_errors
 def show_plan(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -190,7 +190,7 @@ def show_plan(
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def reprocess(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -298,7 +298,7 @@ def reprocess(
     if result.signal:
         raise typer.Exit(128 + result.signal)
     left = result if removed is None else replace(result, orphans=())
-    leave(failed=left.troubled or (result.record is not None and page is None))
+    exit_with_status(failed=left.has_failures or (result.record is not None and page is None))
 
 
 def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
@@ -308,7 +308,7 @@ def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
     try:
         return report_run(campaign, run, workers=workers).page
     except LidarOpsError as error:
-        tell(error)
+        show_error(error)
         return None
 
 

@@ -16,11 +16,11 @@ from lidarops.cli.app import (
     OutOption,
     add_row,
     app,
-    leave,
+    exit_with_status,
     make_table,
-    plainly,
     progress_bar,
     show,
+    with_plain_errors,
 )
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def runs(
     campaign: CampaignFile,
     out: OutOption = None,
@@ -70,7 +70,7 @@ def _plain(run: Run) -> dict[str, Any]:
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def verify(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -115,4 +115,4 @@ def verify(
             add_row(table, file.what, file.path, file.problem)
         show(table)
         typer.echo(f"{checked} files read, {len(mismatches)} not as recorded")
-    leave(failed=bool(mismatches))
+    exit_with_status(failed=bool(mismatches))

@@ -13,12 +13,12 @@ from lidarops.cli.app import (
     JsonOption,
     add_row,
     app,
-    leave,
+    exit_with_status,
     make_table,
     no_url,
-    plainly,
     progress_bar,
     show,
+    with_plain_errors,
 )
 from lidarops.errors import CampaignError
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def bench(
     what: Annotated[str, typer.Argument(help="accuracy, throughput or stability", metavar="WHAT")],
     files: Annotated[
@@ -86,7 +86,7 @@ def bench(
     page = None if out is None else registry.write_benchmark(finding, Path(out))
     if as_json:
         typer.echo(json.dumps(results.plain(finding.result), indent=1))
-        leave(failed=_failed(finding))
+        exit_with_status(failed=_failed(finding))
         return
     for part in finding.report.parts:
         for content in part.tables:
@@ -96,7 +96,7 @@ def bench(
             show(table)
     if page is not None:
         typer.echo(f"report: {page}")
-    leave(failed=_failed(finding))
+    exit_with_status(failed=_failed(finding))
 
 
 def _refuse(options: dict[str, object]) -> None:

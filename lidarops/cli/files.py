@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import JsonOption, app, plainly, show
+from lidarops.cli.app import JsonOption, app, show, with_plain_errors
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def report(
     run: Annotated[
         Path, typer.Argument(help="Report folder of a run, or its run.json.", metavar="RUN")
@@ -32,7 +32,7 @@ def report(
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def inspect(
     file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
     provenance: Annotated[

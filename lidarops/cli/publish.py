@@ -8,11 +8,18 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import CampaignFile, CatalogOption, JsonOption, OutOption, app, plainly
+from lidarops.cli.app import (
+    CampaignFile,
+    CatalogOption,
+    JsonOption,
+    OutOption,
+    app,
+    with_plain_errors,
+)
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def publish(
     campaign: CampaignFile,
     url: Annotated[

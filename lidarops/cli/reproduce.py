@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import JsonOption, app, leave, plainly
+from lidarops.cli.app import JsonOption, app, exit_with_status, with_plain_errors
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def reproduce(
     product: Annotated[Path, typer.Argument(help="A product.", metavar="PRODUCT")],
     archive: Annotated[
@@ -44,4 +44,4 @@ def reproduce(
 
     result = reproduce_product(product, archive=archive, ancillary=ancillary, catalog=catalog)
     typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
-    leave(failed=not result.identical)
+    exit_with_status(failed=not result.identical)

@@ -6,11 +6,18 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import ArchiveOption, CampaignFile, OutOption, app, plainly, progress_bar
+from lidarops.cli.app import (
+    ArchiveOption,
+    CampaignFile,
+    OutOption,
+    app,
+    progress_bar,
+    with_plain_errors,
+)
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def simulate(
     campaign: CampaignFile,
     archive: ArchiveOption = None,

@@ -13,16 +13,16 @@ from lidarops.cli.app import (
     JsonOption,
     add_row,
     app,
-    leave,
+    exit_with_status,
     make_table,
-    plainly,
     progress_bar,
     show,
+    with_plain_errors,
 )
 
 
 @app.command()
-@plainly
+@with_plain_errors
 def site(
     out: Annotated[
         Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
@@ -59,4 +59,4 @@ def site(
             add_row(table, problem.path, problem.reason)
         show(table)
         typer.echo(f"{made.products} products, {made.made} pages made\nsite: {made.index}")
-    leave(failed=bool(made.problems))
+    exit_with_status(failed=bool(made.problems))

@@ -25,7 +25,7 @@ from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import run_page, run_record
 from lidarops.run.executor import (
     EndedScene,
-    Stop,
+    StopRequest,
     local_client,
     process_jobs,
     process_one_by_one,
@@ -273,13 +273,13 @@ class _Pass:
             for day in sorted(signatures.keys() - set(days))
             if day in verdicts and any(verdicts[day][1:])
         ]
-        self._forget(self._store.tried_on_others(signatures))
+        self._forget(self._store.scenes_of_other_days(signatures))
         status, caught = RunStatus.FINISHED, 0
         if days:
             if self._options.workers > 1 and not self._options.cluster and client is None:
                 # The modules load while this process judges the scenes.
                 preload_modules(_WORKER_MODULES)
-            with Stop() as stop:
+            with StopRequest() as stop:
                 self._process(days, client, stop)
                 caught = stop.signal
                 if stop:
@@ -321,7 +321,7 @@ class _Pass:
 
     # Processing
 
-    def _process(self, days: Sequence[int], client: Client | None, stop: Stop) -> None:
+    def _process(self, days: Sequence[int], client: Client | None, stop: StopRequest) -> None:
         jobs = self._jobs(days, client)
         first = next(jobs, None)
         if first is None and not self._suspects:
@@ -344,7 +344,7 @@ class _Pass:
                 if used_client is not None:
                     self._enter_suspects(used_client, stop)
 
-    def _enter_suspects(self, client: Client, stop: Stop) -> None:
+    def _enter_suspects(self, client: Client, stop: StopRequest) -> None:
         for job in self._suspects:
             self._take(job)
         self._enter(process_one_by_one(self._suspects, client=client, stop=stop), stop)
@@ -353,7 +353,7 @@ class _Pass:
         self,
         start: Callable[[], AbstractContextManager[Client]],
         stack: ExitStack,
-        stop: Stop,
+        stop: StopRequest,
     ) -> Client | None:
         """Start or reach a cluster; None if a signal came first, which then ends the run."""
         # A queue may take an hour; a signal must not wait for it.
@@ -371,7 +371,7 @@ class _Pass:
             return options.cluster()
         return local_client(options.workers, memory=options.memory)
 
-    def _enter(self, ended: Iterator[EndedScene], stop: Stop) -> None:
+    def _enter(self, ended: Iterator[EndedScene], stop: StopRequest) -> None:
         session = self._running()
         for scene in ended:
             judged = self._judgements.pop(scene.job.scene.id)
@@ -550,7 +550,7 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
     removed = 0
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         lock.acquire()
-        with store.all_made() as made:
+        with store.all_products() as made:
             runs = {product.path: product.run for product in made}
         paths = [orphan.path for orphan in removable if runs.get(orphan.path) == orphan.run]
         for name in paths:

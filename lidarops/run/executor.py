@@ -74,7 +74,7 @@ class EndedScene:
     """Whether another try on the same inputs would end the same way."""
 
 
-class Stop:
+class StopRequest:
     """A request to stop, by a signal or by a call of `now`.
 
     After the first SIGINT or SIGTERM running scenes may end; the second abandons them. Within
@@ -193,7 +193,7 @@ def process_jobs(
     jobs: Iterable[Job],
     *,
     client: Client | None = None,
-    stop: Stop | None = None,
+    stop: StopRequest | None = None,
     taken: Callable[[Job], None] | None = None,
 ) -> Iterator[EndedScene]:
     """Process jobs and yield the scenes in the order in which they end.
@@ -204,7 +204,7 @@ def process_jobs(
         Consumed one by one, only a few more than there are workers.
     client : distributed.Client, optional
         Cluster to run on; None processes in this process.
-    stop : Stop, optional
+    stop : StopRequest, optional
         Checked before every scene.
     taken : callable, optional
         Called with a job before it starts.
@@ -213,7 +213,7 @@ def process_jobs(
     ------
     Ended
     """
-    stop = Stop() if stop is None else stop
+    stop = StopRequest() if stop is None else stop
     if client is None:
         yield from _process_here(jobs, stop, taken)
     else:
@@ -221,7 +221,7 @@ def process_jobs(
 
 
 def _process_here(
-    jobs: Iterable[Job], stop: Stop, taken: Callable[[Job], None] | None
+    jobs: Iterable[Job], stop: StopRequest, taken: Callable[[Job], None] | None
 ) -> Iterator[EndedScene]:
     keep_memory()
     for job in jobs:
@@ -232,14 +232,16 @@ def _process_here(
         yield EndedScene(job, *attempt(job))
 
 
-def process_one_by_one(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[EndedScene]:
+def process_one_by_one(
+    jobs: Sequence[Job], *, client: Client, stop: StopRequest
+) -> Iterator[EndedScene]:
     """Process scenes that may kill their worker, one at a time, to know which one does.
 
     Parameters
     ----------
     jobs : sequence of Job
     client : distributed.Client
-    stop : Stop
+    stop : StopRequest
 
     Yields
     ------
@@ -312,7 +314,7 @@ class _Workers:
             self._check_missing(now)
         return self._threads
 
-    def ready(self, stop: Stop) -> None:
+    def ready(self, stop: StopRequest) -> None:
         """Wait for a worker that dask would replace if it died."""
         while not stop:
             self._recount = -math.inf
@@ -340,7 +342,9 @@ class _Workers:
 class _ClusterQueue:
     """Keeps a cluster busy with a few scenes per worker, whatever the number of scenes."""
 
-    def __init__(self, client: Client, stop: Stop, taken: Callable[[Job], None] | None) -> None:
+    def __init__(
+        self, client: Client, stop: StopRequest, taken: Callable[[Job], None] | None
+    ) -> None:
         self._client = client
         self._stop = stop
         self._taken = taken

@@ -10,7 +10,7 @@ from functools import cached_property
 
 from lidarops.campaign.model import Campaign
 from lidarops.campaign.product_settings import Products
-from lidarops.catalog.ledger import Made
+from lidarops.catalog.ledger import RecordedProduct
 from lidarops.plan import product_dependence
 from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.plan.signal_rules import GLUED, StepName
@@ -60,13 +60,13 @@ class Fates:
         self,
         cut: Cut,
         refused: Callable[[], Iterable[Granule]],
-        signals: Callable[[Made], Iterable[InputRecord]],
+        signals: Callable[[RecordedProduct], Iterable[InputRecord]],
     ) -> None:
         self._cut = cut
         self._refused = refused
         self._signals = signals
 
-    def of(self, made: Made) -> Fate:
+    def of(self, made: RecordedProduct) -> Fate:
         """Return the fate of the files of a product; if some are left, the fate of these."""
         signals = list(self._signals(made))
         if any(used.path in self._in_scenes or used.sha256 in self._in_scenes for used in signals):
@@ -126,18 +126,18 @@ def _of_networks_alone(scene: Scene, campaign: Campaign) -> list[str]:
 
 def orphaned_products(
     planned: Sequence[Planned],
-    made: Iterable[Made],
+    made: Iterable[RecordedProduct],
     campaign: Campaign,
-    other_files: Callable[[Made, Scene], bool],
-    fate: Callable[[Made], Fate],
-) -> list[tuple[Made, Orphan]]:
+    other_files: Callable[[RecordedProduct, Scene], bool],
+    fate: Callable[[RecordedProduct], Fate],
+) -> list[tuple[RecordedProduct, Orphan]]:
     """Return the products that would not be made again, and why.
 
     Parameters
     ----------
     planned : sequence of (Scene, Plan)
         All scenes of some days.
-    made : iterable of Made
+    made : iterable of RecordedProduct
         The products of those days.
     campaign : Campaign
     other_files : callable
@@ -147,7 +147,7 @@ def orphaned_products(
 
     Returns
     -------
-    list of (Made, Orphan)
+    list of (RecordedProduct, Orphan)
     """
     scenes = {scene.id: (scene, plan) for scene, plan in planned}
     requested = {
@@ -175,7 +175,7 @@ def orphaned_products(
     return orphans
 
 
-def _requests(campaign: Campaign, product: Made) -> bool:
+def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
     """Return whether the campaign requests a product of its instrument or network."""
     name, _ = parse_scene_id(product.scene)
     if name in campaign.networks:
@@ -190,7 +190,7 @@ def _requests(campaign: Campaign, product: Made) -> bool:
     return product.channel in settings.channels
 
 
-def _why_left_out(plan: Plan, product: Made) -> str:
+def _why_left_out(plan: Plan, product: RecordedProduct) -> str:
     """Return why a plan leaves out a requested product."""
     reasons = dict.fromkeys(
         left.reason
@@ -200,7 +200,9 @@ def _why_left_out(plan: Plan, product: Made) -> str:
     return "; ".join(reasons) or "its plan leaves it out"
 
 
-def _missing_members(product: Made, planned: Sequence[Planned], campaign: Campaign) -> str:
+def _missing_members(
+    product: RecordedProduct, planned: Sequence[Planned], campaign: Campaign
+) -> str:
     """Return which instruments of a network have no files left; empty if this is not the cause."""
     name, start = parse_scene_id(product.scene)
     if name not in campaign.networks:

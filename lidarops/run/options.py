@@ -83,7 +83,7 @@ class Result:
         return {orphan.path: orphan.reason for orphan in self.orphans if orphan.lost}
 
     @property
-    def troubled(self) -> bool:
+    def has_failures(self) -> bool:
         """Whether anything is refused, failed, empty or lost, now or since an earlier run."""
         return bool(
             self.summary.refused

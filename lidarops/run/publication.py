@@ -32,7 +32,7 @@ def publish_products(campaign: Campaign, url: str) -> Published:
     """
     with (
         Store(campaign.catalog_url, campaign.name, create=False) as store,
-        store.all_made() as made,
+        store.all_products() as made,
     ):
         products = {product.path: product.sha256 for product in made}
     # One journal per store.

@@ -14,7 +14,7 @@ from typing import Final
 from lidarops import __version__
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import versions
-from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
+from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.netcdf.provenance import code_version
@@ -108,7 +108,7 @@ class Session:
             As entered; failed if its product files are missing or changed.
         """
         new, outcome = self._new_products(judged, outcome)
-        entry = Entry(
+        entry = SceneEntry(
             outcome=outcome,
             day=judged.day,
             key=self._judge.key(judged),

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign, as_settings
-from lidarops.catalog.ledger import Dependence, Made, Tried
+from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
@@ -73,7 +73,7 @@ class Selection:
             day for day in days if (first is None or day >= first) and (last is None or day <= last)
         ]
 
-    def product(self, made: Made, campaign: Campaign) -> bool:
+    def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
         """Return whether a product is selected; its scene may no longer exist."""
         instrument, start = parse_scene_id(made.scene)
         owner = campaign.instruments.get(instrument)
@@ -102,7 +102,7 @@ class Stale:
     kind: ProductKind
     channel: str
     reason: str
-    before: Made | None = None
+    before: RecordedProduct | None = None
     """Its ledger entry, if it was made before."""
 
 
@@ -224,7 +224,7 @@ class Judge:
         root = str(self._campaign.products_root)
         products: dict[int, Any] = defaultdict(hashlib.sha256)
         broken: set[int] = set()
-        with self._store.all_made() as rows:
+        with self._store.all_products() as rows:
             for made in rows:
                 products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
                 if not _looks_right(root, made):
@@ -276,8 +276,8 @@ class Judge:
         """
         first, last, judged_days = days[0], days[-1], set(days)
         cut = self._cut(first, last, judged_days)
-        tried = self._store.tried(first, last)
-        products = self._store.made(first, last)
+        tried = self._store.last_tries(first, last)
+        products = self._store.products_of_days(first, last)
         made = {product.key: product for product in products if product.day in judged_days}
         touched: dict[str, int] = {}
         judgements = [self._scene(scene, made, tried, touched) for scene in cut.scenes]
@@ -319,7 +319,7 @@ class Judge:
             digests=digests,
         )
 
-    def _healed(self, judged: Judgement, tried: Mapping[str, Tried]) -> bool:
+    def _healed(self, judged: Judgement, tried: Mapping[str, LastTry]) -> bool:
         """Return whether a failed scene is complete again, e.g. because a file came back."""
         last = tried.get(judged.scene.id)
         complete = not (judged.stale or judged.held or self._selection.kinds)
@@ -341,8 +341,8 @@ class Judge:
     def _scene(
         self,
         scene: Scene,
-        made: Mapping[tuple[str, str, str], Made],
-        tried: Mapping[str, Tried],
+        made: Mapping[tuple[str, str, str], RecordedProduct],
+        tried: Mapping[str, LastTry],
         touched: dict[str, int],
     ) -> Judgement:
         whole = plan_scene(scene, self._campaign)
@@ -448,7 +448,7 @@ class Judge:
         scene: Scene,
         whole: Plan,
         product: ProductKey,
-        known: Made | None,
+        known: RecordedProduct | None,
         touched: dict[str, int],
     ) -> str:
         """Return why a product is stale; empty if it is fresh."""
@@ -469,7 +469,7 @@ class Judge:
             return _difference(self._store.inputs_of(known.path), used)
         return self._file_reason(known, touched)
 
-    def _file_reason(self, made: Made, touched: dict[str, int]) -> str:
+    def _file_reason(self, made: RecordedProduct, touched: dict[str, int]) -> str:
         path = self._campaign.products_root / made.path
         try:
             status = path.stat()
@@ -509,12 +509,12 @@ class Judge:
                 digest = None
         return digest or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
-    def _other_files(self, made: Made, scene: Scene) -> bool:
+    def _other_files(self, made: RecordedProduct, scene: Scene) -> bool:
         return {used.sha256 for used in self._signals(made)} != {
             self._content(granule) for granule in scene.granules
         }
 
-    def _signals(self, made: Made) -> list[InputRecord]:
+    def _signals(self, made: RecordedProduct) -> list[InputRecord]:
         """Return the signal files that a product was made from."""
         return [used for used in self._store.inputs_of(made.path) if used.role is Role.SIGNAL]
 
@@ -529,7 +529,7 @@ class Judge:
         return self._profiles[name]
 
 
-def _looks_right(root: str, made: Made) -> bool:
+def _looks_right(root: str, made: RecordedProduct) -> bool:
     try:
         status = os.stat(f"{root}/{made.path}")  # noqa: PTH116 - a Path takes five times as long
     except OSError:

@@ -331,7 +331,7 @@ def test_a_damaged_catalog_says_that_a_new_one_can_be_made(damage: str, campaign
         damaged.granules()
 
 
-def _deadly(read: headers.Headers, due: headers.Due) -> GranuleRow:
+def _deadly(read: headers.Headers, due: headers.UnreadFile) -> GranuleRow:
     """Kill any process but the main one."""
     if multiprocessing.parent_process() is not None and due.file.path == "coast/h13":
         os._exit(9)

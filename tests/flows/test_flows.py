@@ -231,7 +231,7 @@ def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
     assert page.is_file()
     assert [scene.error for scene in record.scenes] == [""]
     assert [granule.path for granule in record.refused] == ["coast/h9"]
-    assert result.troubled
+    assert result.has_failures
     assert len(list(Path(record.products).rglob("*.nc"))) == 1
     again, no_page = reprocess(str(campaign_file))
     assert again.record is None
@@ -314,7 +314,7 @@ def test_a_run_reports_channels_that_no_file_holds(
     (campaign_file.parent / "raw" / "coast" / "h9").unlink()
     campaign = load_campaign(campaign_file)
     result = bring_up_to_date(campaign)
-    assert result.troubled
+    assert result.has_failures
     monkeypatch.setattr(flows.reprocess, "get_run_logger", lambda: logging.getLogger("night"))
     with caplog.at_level(logging.WARNING, "night"):
         message = flows.reprocess._log_problems(campaign, result)
@@ -359,8 +359,10 @@ def test_a_run_with_failures_counts_as_completed() -> None:
     assert event in plain[1].trigger.expect
     assert event not in plain[0].trigger.expect
     automations = notifications.automations(uuid4(), within=within, failures=True)
-    (troubled,) = [each for each in automations if each.name == notifications.TROUBLED]
-    assert troubled.trigger.expect == {event}
+    (has_failures,) = [
+        each for each in automations if each.name == notifications.COMPLETED_WITH_FAILURES
+    ]
+    assert has_failures.trigger.expect == {event}
 
 
 def claimed(client: SyncPrefectClient, state: State, *tags: str) -> UUID:

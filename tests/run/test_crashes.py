@@ -61,7 +61,7 @@ def test_kills_at_random_points_do_no_damage(tmp_path: Path) -> None:
             assert crash_archive.wrong_rows(folder) == []
             assert crash_archive.visible_partial(folder, whole) == []
         result = bring_up_to_date(campaign)
-        assert not result.troubled
+        assert not result.has_failures
         assert crash_archive.products(folder) == whole
         assert crash_archive.wrong_rows(folder) == []
         assert bring_up_to_date(campaign).record is None
@@ -88,7 +88,7 @@ def test_a_run_that_gets_a_signal_finishes_its_scene_and_reports(
         assert run.status is RunStatus.INTERRUPTED
         assert 0 < run.scenes < crash_archive.SCENES
         assert lock.holder() is None
-    assert not bring_up_to_date(campaign).troubled
+    assert not bring_up_to_date(campaign).has_failures
 
 
 def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_disk_that_fills_up_is_reported_and_the_next_run_recovers(
         assert store.failures()
         assert store.runs()[0].status is RunStatus.STOPPED
         assert store.runs()[0].scenes < 8
-    assert not bring_up_to_date(campaign).troubled
+    assert not bring_up_to_date(campaign).has_failures
     assert crash_archive.products(folder) == crash_archive.products(calm)
 
 
@@ -169,11 +169,11 @@ def test_a_full_file_system_is_reported_and_nothing_is_damaged(
     campaign = crash_archive.make(tmp_path, scenes=8).model_copy(update={"output": str(tiny_disk)})
     # Either a product fails its scene, or the catalog needs the space first.
     with suppress(CatalogError):
-        assert bring_up_to_date(campaign).troubled
+        assert bring_up_to_date(campaign).has_failures
     for path in (tiny_disk / "products").rglob("*"):
         assert path.is_dir() or path.suffix == ".nc", path
     subprocess.run(["mount", "-o", "remount,size=60m", str(tiny_disk)], check=True)
-    assert not bring_up_to_date(campaign).troubled
+    assert not bring_up_to_date(campaign).has_failures
     assert len(list((tiny_disk / "products").rglob("*.nc"))) == 24
 
 
@@ -183,7 +183,7 @@ def test_a_target_that_cannot_be_written_is_reported(tmp_path: Path, tiny_disk: 
     with pytest.raises(CatalogError, match=r"read-only|unable to open"):
         bring_up_to_date(campaign)
     subprocess.run(["mount", "-o", "remount,rw,size=60m", str(tiny_disk)], check=True)
-    assert not bring_up_to_date(campaign).troubled
+    assert not bring_up_to_date(campaign).has_failures
 
 
 def test_a_second_run_is_refused_with_the_name_of_the_first(tmp_path: Path) -> None:

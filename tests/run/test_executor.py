@@ -26,7 +26,7 @@ from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
 from lidarops.run.executor import (
     EndedScene,
-    Stop,
+    StopRequest,
     local_client,
     process_jobs,
     process_one_by_one,
@@ -68,7 +68,7 @@ def test_a_signal_while_workers_start_leaves_no_cluster_behind(
 
     monkeypatch.setattr(Nanny, "instantiate", interrupted)
     others = set(SpecCluster._instances)
-    with Stop() as stop:
+    with StopRequest() as stop:
         with stop.idle(), local_client(1):
             raise AssertionError
         assert stop.signal == signal.SIGINT
@@ -190,7 +190,7 @@ def test_lost_local_workers_are_not_waited_for(
         with pytest.raises(SceneError, match="workers on this machine are gone"):
             list(process_jobs(jobs, client=client))
         with pytest.raises(SceneError, match="workers on this machine are gone"):
-            list(process_one_by_one(jobs, client=client, stop=Stop()))
+            list(process_one_by_one(jobs, client=client, stop=StopRequest()))
 
 
 class GrowingCluster:
@@ -253,7 +253,7 @@ def test_a_worker_with_other_code_makes_nothing(
 
 def test_a_request_to_stop_leaves_the_remaining_scenes_for_the_next_run(archive: Archive) -> None:
     campaign = archive.write()
-    stop = Stop()
+    stop = StopRequest()
     ended = []
     for each in process_jobs(scene_jobs(campaign), stop=stop):
         ended.append(each)
@@ -287,6 +287,6 @@ def test_a_suspect_scene_waits_for_a_running_worker(
             return next(counted)
 
     monkeypatch.setattr(executor.time, "sleep", waited.append)
-    executor._Workers(Cluster()).ready(Stop())
+    executor._Workers(Cluster()).ready(StopRequest())
     assert not list(counted)
     assert waited[-1] == executor.START_DELAY

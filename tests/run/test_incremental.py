@@ -314,11 +314,11 @@ def test_refused_files_are_reported_by_a_run_with_nothing_to_do(archive: Archive
     (archive.folder / "raw/rich/h-broken").write_bytes(b"broken")
     archive.raw("poor/h-twin", 600, seed=1)
     first = bring_up_to_date(archive.write())
-    assert first.troubled
+    assert first.has_failures
     before = archive.contents()
     again = bring_up_to_date(archive.write())
     assert again.record is None
-    assert again.troubled
+    assert again.has_failures
     assert (again.summary.refused, list(again.set_aside)) == (1, ["poor/h00"])
     assert archive.contents() == before
 
@@ -342,7 +342,7 @@ def test_unusable_scenes_are_reported_by_a_run_with_nothing_to_do(
     again = bring_up_to_date(campaign)
     assert again.record is None
     assert set(again.unusable) == scenes - {rows[poorest]["scene"]}
-    assert again.troubled
+    assert again.has_failures
 
 
 def test_the_run_that_makes_an_unusable_scene_reports_it(
@@ -378,7 +378,7 @@ def test_orphaned_products_are_not_reported_as_unusable(archive: Archive) -> Non
         result = bring_up_to_date(archive.write())
         assert result.orphans
         assert not result.unusable
-        assert not result.troubled
+        assert not result.has_failures
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -401,7 +401,7 @@ def test_a_signal_ends_the_wait_for_a_cluster_at_once(archive: Archive, number: 
     assert time.monotonic() - began < 30.0
     assert ended == [True]
     assert (result.signal, result.status) == (number, RunStatus.INTERRUPTED)
-    assert result.troubled
+    assert result.has_failures
     assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
@@ -440,13 +440,13 @@ def test_a_scene_that_failed_for_good_is_not_tried_until_something_changes(
     assert again.record is None
     assert len(again.failures) == 2
     assert "air.csv" in next(iter(again.failures.values()))
-    assert again.troubled
+    assert again.has_failures
     assert archive.contents() == before
     from support.small_archive import SOUNDING
 
     (archive.folder / "air.csv").write_text(SOUNDING)
     healed = bring_up_to_date(archive.write())
-    assert not healed.troubled
+    assert not healed.has_failures
     assert healed.status is RunStatus.FINISHED
 
 

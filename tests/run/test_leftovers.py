@@ -188,7 +188,7 @@ def test_unused_files_of_some_days_are_named_and_the_others_counted(
     assert len(bring_up_to_date(campaign).set_aside) == 4
     monkeypatch.setattr(pipeline, "MOST_DAYS_JUDGED_AGAIN", 3)
     again = bring_up_to_date(campaign)
-    assert (len(again.set_aside), again.more_unused, again.troubled) == (3, 1, True)
+    assert (len(again.set_aside), again.more_unused, again.has_failures) == (3, 1, True)
 
 
 # Forgotten -----------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def test_failures_are_removed_with_the_last_files_of_their_day(archive: Archive)
     for _ in range(2):
         result = bring_up_to_date(archive.write())
         assert not result.failures
-        assert not result.troubled
+        assert not result.has_failures
 
 
 # Removed -------------------------------------------------------------------------------------
@@ -338,7 +338,7 @@ def test_products_without_raw_file_are_failures_until_they_are_removed(
     campaign = archive.write()
     for _ in range(2):
         result = bring_up_to_date(campaign)
-        assert result.troubled
+        assert result.has_failures
         assert set(result.lost) == {each.path for each in result.orphans}
         assert len(result.lost) == 8
     command = ["reprocess", str(archive.file)]
@@ -369,7 +369,7 @@ def test_products_whose_files_became_unusable_are_kept(archive: Archive, how: st
         (orphan,) = {(each.reason, each.requested, each.lost) for each in result.orphans}
         assert orphan == ("its raw files are refused, or belong to no scene", True, False)
         assert len(result.orphans) == 2
-        assert result.troubled
+        assert result.has_failures
         assert not result.lost
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
     assert shown.exit_code == 1
@@ -383,7 +383,7 @@ def test_products_of_scenes_that_are_cut_differently_are_not_reported_as_lost(
     result = bring_up_to_date(archive.write())
     assert {each.reason for each in result.orphans} == {"its files belong to other scenes now"}
     assert len(result.orphans) == 24
-    assert not result.troubled
+    assert not result.has_failures
 
 
 def test_nothing_is_removed_if_the_archive_is_missing(archive: Archive) -> None:

@@ -104,7 +104,7 @@ def test_lidars_used_only_by_a_network_are_no_failure(net: Net) -> None:
         result = bring_up_to_date(net.write())
         assert (result.record is not None) == bool(made)
         assert not result.empty_scenes
-        assert not result.troubled
+        assert not result.has_failures
     code, summary = net.command()
     assert (code, summary["empty_scenes"]) == (0, {})
     shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"]).stdout
@@ -167,7 +167,7 @@ def test_a_product_whose_network_lost_members_is_kept(net: Net, lost: list[str],
     assert "could not be made again" in CliRunner().invoke(app, ["reprocess", str(net.file)]).stdout
     net.find(*lost)
     again = bring_up_to_date(net.write())
-    assert (again.record, again.orphans, again.troubled) == (None, (), False)
+    assert (again.record, again.orphans, again.has_failures) == (None, (), False)
 
 
 def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:

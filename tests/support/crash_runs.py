@@ -15,11 +15,11 @@ def run(folder: Path, mode: str) -> int:
         from flows.reprocess import reprocess
 
         result, _ = reprocess(str(folder / "campaign.yaml"), wait=60.0)
-        return int(result.troubled)
+        return int(result.has_failures)
     campaign = load_campaign(folder / "campaign.yaml")
     workers = 2 if mode == "cluster" else 1
     result = bring_up_to_date(campaign, options=Options(workers=workers, wait=60.0))
-    return 128 + result.signal if result.signal else int(result.troubled)
+    return 128 + result.signal if result.signal else int(result.has_failures)
 
 
 if __name__ == "__main__":
