@@ -83,7 +83,7 @@ class Path:
 CLEAR: Final = Path()
 
 
-# Solvers --------------------------------------------------------------------------
+# Solvers ------------------------------------------------------------------------------------
 
 
 def solve_path(**arguments: Any) -> Answer:
@@ -120,7 +120,7 @@ def scattered(path: Path, **arguments: Any) -> Answer:
     return Answer(values, answer.quality)
 
 
-# Exact root -----------------------------------------------------------------------------------
+# Exact root ---------------------------------------------------------------------------------
 
 
 def exact_root(power: Array, range_: Array, lag: int) -> float:
@@ -154,7 +154,7 @@ def exact_root(power: Array, range_: Array, lag: int) -> float:
         return float(x)
 
 
-# Cases of the study ------------------------------------------------------------------------
+# Cases of the study -------------------------------------------------------------------------
 
 _THIN: Final = Path(start=10500.0, length=100.0, background=7e5)
 _DEEP: Final = Path(background=1e11)
@@ -312,7 +312,7 @@ def _study() -> tuple[StiffCase, ...]:
     )  # fmt: skip
 
 
-# Unsolvable cases, and invariances ----------------------------------------------
+# Unsolvable cases, and invariances ----------------------------------------------------------
 
 
 def _flat(value: float) -> dict[str, Any]:

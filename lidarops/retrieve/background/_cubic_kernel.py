@@ -28,7 +28,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 SOLVED: Final = 0
 MISSING: Final = 1
 CONSTANT: Final = 2
-LOST: Final = 3
+UNSOLVED: Final = 3
 
 STATUS, BACKGROUND, VARIANCE, CONTRAST, CURVATURE_SHIFT = range(5)
 COLUMNS: Final = 5
@@ -234,7 +234,7 @@ def _solve_profile(
         p[i] -= x
     s = _coefficients(p, v, t, unit)
     row[BACKGROUND] = centre + scale * (x - s.constant / s.linear)
-    row[STATUS] = SOLVED if s.linear > 0.0 and math.isfinite(row[BACKGROUND]) else LOST
+    row[STATUS] = SOLVED if s.linear > 0.0 and math.isfinite(row[BACKGROUND]) else UNSOLVED
     row[CONTRAST] = s.linear / s.noise
     _gradient(p, v, t, unit, gradient)
     variance = 0.0

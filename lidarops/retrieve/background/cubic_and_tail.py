@@ -30,7 +30,7 @@ _UNIFORM: Final = 2.0**-22
 _QUALITY_OF_STATUS: Final = {
     _cubic_kernel.MISSING: Quality.INPUT_MISSING,
     _cubic_kernel.CONSTANT: Quality.NO_SIGNAL,
-    _cubic_kernel.LOST: Quality.NO_REAL_SOLUTION,
+    _cubic_kernel.UNSOLVED: Quality.NO_REAL_SOLUTION,
 }
 
 
@@ -198,9 +198,9 @@ def solve_cubic(
     quality[moved] |= np.int32(Quality.LOW_SIGNAL)
     if bins < FEWEST_BINS:
         quality[status != _cubic_kernel.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
-    lost = status == _cubic_kernel.LOST
-    background = np.where(lost, np.nan, out[:, _cubic_kernel.BACKGROUND])
-    error = np.sqrt(np.where(lost, np.nan, out[:, _cubic_kernel.VARIANCE]))
+    unsolved = status == _cubic_kernel.UNSOLVED
+    background = np.where(unsolved, np.nan, out[:, _cubic_kernel.BACKGROUND])
+    error = np.sqrt(np.where(unsolved, np.nan, out[:, _cubic_kernel.VARIANCE]))
     return BackgroundResult(background, error, quality), gradients
 
 

@@ -351,8 +351,8 @@ def _result(
         poor = (np.abs(curvature) > limits[1]) | (waves > limits[0])
         negative = out[:, _shape_fit.AMPLITUDE] < -NEGATIVE * amplitude_error
     condition = out[:, _shape_fit.CONDITION]
-    lost = (bins > 0) & ~np.isfinite(out[:, _shape_fit.BACKGROUND])
-    singular = (condition > LARGEST_CONDITION) | lost
+    unsolved = (bins > 0) & ~np.isfinite(out[:, _shape_fit.BACKGROUND])
+    singular = (condition > LARGEST_CONDITION) | unsolved
     quality = np.zeros(len(out), dtype=np.int32)
     quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
     quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)

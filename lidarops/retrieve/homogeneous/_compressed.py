@@ -116,7 +116,7 @@ class _Scratch(NamedTuple):
     scalars: Array
     fit: Array
     row: Array
-    left: Array
+    remainder: Array
     powers: Array
     root: Any
     envelope: Any
@@ -380,9 +380,9 @@ def _measure_misfit(tables: Tables, s: _Scratch) -> None:
             project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         energy = 0.0
         for j in range(tables.size):
-            s.left[j] = s.y[p, j] - size * row[j]
+            s.remainder[j] = s.y[p, j] - size * row[j]
         for j in range(CURVATURES):
-            energy += s.left[j] * s.left[j]
+            energy += s.remainder[j] * s.remainder[j]
         s.fit[_CURVATURE, p] = energy - _INTERPOLATED * size * size
         matrix = tables.squares.ctypes.data + 8 * terms * lanes * s.cell[p]
         if lanes == 8:
@@ -391,7 +391,7 @@ def _measure_misfit(tables: Tables, s: _Scratch) -> None:
             project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         along = 0.0
         for j in range(tables.size):
-            along += s.left[j] * row[j]
+            along += s.remainder[j] * row[j]
         s.fit[_SQUARE, p] = abs(along) - math.sqrt(_INTERPOLATED) * size
 
 

@@ -283,8 +283,8 @@ def _solve_profile(
 ) -> None:
     is_variance, background, rounding, kind, extinction = mode
     last = _last_valid(power, noise, is_variance)
-    given = not math.isnan(background)
-    reference = background if given else np.float64(power[last])
+    fixed = not math.isnan(background)
+    reference = background if fixed else np.float64(power[last])
     row[BINS] = 0 if last < 0 else _load(power, noise, is_variance, reference, s)
     if row[BINS] < 4:
         row[STATUS] = EMPTY if last < 0 else TOO_SHORT
@@ -300,7 +300,7 @@ def _solve_profile(
     scale = power_of_two(largest)
     scale_in_place(s.z, 1.0 / scale)
     row[STATUS] = FITTED
-    _fit(g, s, 0.0 if given else 1.0, kind, extinction * g.length, row)
+    _fit(g, s, 0.0 if fixed else 1.0, kind, extinction * g.length, row)
     unscale(g, reference, scale, unit, row)
 
 

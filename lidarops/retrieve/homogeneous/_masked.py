@@ -237,26 +237,26 @@ def _take_roots(values: Array, roots: Array) -> None:
 @_compiled
 def _group(g: Plan, s: _Scratch) -> tuple[float, float]:
     """Sum weights and weighted values over the groups; return both sums over all bins."""
-    whole = value = 0.0
+    total_weight = value = 0.0
     for k in range(g.edges.size - 1):
         group_weight = group_value = 0.0
         for i in range(g.edges[k], g.edges[k + 1]):
             group_weight += s.w[i]
             group_value += s.w[i] * s.z[i]
         s.weights[k], s.values[k] = group_weight, group_value
-        whole += group_weight
+        total_weight += group_weight
         value += group_value
-    return whole, value
+    return total_weight, value
 
 
 @_compiled
-def _seek(g: Plan, s: _Scratch, whole: float, value: float, count: float) -> _Fit:
+def _seek(g: Plan, s: _Scratch, total_weight: float, value: float, count: float) -> _Fit:
     """Return the best node on the groups, moved to the peak of a parabola through it."""
     groups, out = g.edges.size - 1, s.sums.ctypes.data
     weights, values, after = s.weights.ctypes.data, s.values.ctypes.data, g.x.ctypes.data
     project_1_32(weights, 8, g.powers.ctypes.data, groups, out, after, 0)
     project_1_16(values, 8, g.shapes.ctypes.data, groups, out + 16 * NODES, after, 0)
-    _energies(s.sums, s.lengths, value, whole, _LEAST * whole / count)
+    _energies(s.sums, s.lengths, value, total_weight, _LEAST * total_weight / count)
     best = 0
     for j in range(NODES):
         if s.lengths[j] > s.lengths[best]:
@@ -265,18 +265,23 @@ def _seek(g: Plan, s: _Scratch, whole: float, value: float, count: float) -> _Fi
         # The next node holds no information, or has decayed before the first valid bin.
         return _Fit(0.0, math.nan, math.nan, 0.0, 0.0)
     tau = _vertex(g, s, best)
-    one, norm = s.sums[0, best] / whole, s.sums[1, best] - s.sums[0, best] ** 2 / whole
-    amplitude = (s.sums[2, best] - one * value) / norm
-    return _Fit(value / whole - amplitude * one, amplitude, tau, one, 0.0)
+    mean, norm = (
+        s.sums[0, best] / total_weight,
+        s.sums[1, best] - s.sums[0, best] ** 2 / total_weight,
+    )
+    amplitude = (s.sums[2, best] - mean * value) / norm
+    return _Fit(value / total_weight - amplitude * mean, amplitude, tau, mean, 0.0)
 
 
 @_compiled
-def _energies(sums: Array, energies: Array, value: float, whole: float, least: float) -> None:
+def _energies(
+    sums: Array, energies: Array, value: float, total_weight: float, least: float
+) -> None:
     """Fill the energy of the profile along the shape of each node."""
     ones, twos, products = sums[0], sums[1], sums[2]
     for j in range(energies.size):
-        norm = twos[j] - ones[j] * ones[j] / whole
-        length = products[j] - ones[j] * value / whole
+        norm = twos[j] - ones[j] * ones[j] / total_weight
+        length = products[j] - ones[j] * value / total_weight
         energies[j] = length * length / norm if norm > least else 0.0
 
 
@@ -294,40 +299,44 @@ def _vertex(g: Plan, s: _Scratch, best: int) -> float:
 
 
 @_compiled
-def _normal(sums: tuple[float, ...], whole: float) -> tuple[float, float, float, float, float]:
+def _normal(
+    sums: tuple[float, ...], total_weight: float
+) -> tuple[float, float, float, float, float]:
     """Return the normal equation of the slope, with level and shape projected out.
 
     These are its norm and right-hand side, its products with level and shape, and the norm of
     the shape.
     """
     d, dd, g, gd, gg, _, _, rg, _ = sums
-    shape = dd - d * d / whole
-    of_level = g / whole
-    of_shape = (gd - d * of_level) / shape
-    norm = gg - g * of_level - of_shape * of_shape * shape
-    right = rg - of_level * sums[5] - of_shape * (sums[6] - d * sums[5] / whole)
-    return norm, right, of_level, of_shape, shape
+    shape = dd - d * d / total_weight
+    slope_on_level = g / total_weight
+    slope_on_shape = (gd - d * slope_on_level) / shape
+    norm = gg - g * slope_on_level - slope_on_shape * slope_on_shape * shape
+    right = rg - slope_on_level * sums[5] - slope_on_shape * (sums[6] - d * sums[5] / total_weight)
+    return norm, right, slope_on_level, slope_on_shape, shape
 
 
 @_compiled
-def _step(fit: _Fit, sums: tuple[float, ...], whole: float, bounds: tuple[float, float]) -> _Fit:
+def _step(
+    fit: _Fit, sums: tuple[float, ...], total_weight: float, bounds: tuple[float, float]
+) -> _Fit:
     """Return the fit after one Newton step."""
     d, dd, _, gd, _, r, rd, _, rgx = sums
-    norm, right, of_level, of_shape, shape = _normal(sums, whole)
-    linear = (rd - d * r / whole) / shape
+    norm, right, slope_on_level, slope_on_shape, shape = _normal(sums, total_weight)
+    linear = (rd - d * r / total_weight) / shape
     amplitude = fit.amplitude + linear
     curved = norm - rgx / amplitude
     slope = right / (curved if curved > 0.3 * norm else norm)
     tau = min(max(fit.tau - 0.5 * slope / amplitude, bounds[0]), bounds[1])
     moved = tau - fit.tau
     slope = -2.0 * amplitude * moved
-    along = linear - of_shape * slope
-    level = (r - d * along) / whole - of_level * slope
+    along = linear - slope_on_shape * slope
+    level = (r - d * along) / total_weight - slope_on_level * slope
     return _Fit(
         fit.level + level - along * fit.mean,
         (fit.amplitude + along) * math.exp(2.0 * fit.centre * moved),
         tau,
-        fit.mean + d / whole,
+        fit.mean + d / total_weight,
         fit.centre + gd / (dd + fit.mean * d),
     )
 
@@ -340,82 +349,89 @@ def _decays(g: Plan, tau: float) -> tuple[float, float]:
 
 @_compiled
 def _describe(
-    g: Plan, before: _Fit, after: _Fit, sums: tuple[float, ...], whole: float, row: Array
+    g: Plan, before: _Fit, after: _Fit, sums: tuple[float, ...], total_weight: float, row: Array
 ) -> None:
     """Write parameters and variances, in the scaled variables."""
-    norm, _, of_level, of_shape, shape = _normal(sums, whole)
+    norm, _, slope_on_level, slope_on_shape, shape = _normal(sums, total_weight)
     energy = after.amplitude * after.amplitude * shape
     extinction = 1.0 / (4.0 * after.amplitude * after.amplitude * norm)
-    mean = before.mean + sums[0] / whole
+    mean = before.mean + sums[0] / total_weight
     # Effect of the slope on the level, with the shape adjusted.
-    level = of_level - of_shape * mean
-    lever = 2.0 * (g.start / g.length + before.centre + of_shape)
+    level = slope_on_level - slope_on_shape * mean
+    lever = 2.0 * (g.start / g.length + before.centre + slope_on_shape)
     row[BACKGROUND] = after.level
     row[AMPLITUDE] = after.amplitude
     row[EXTINCTION] = after.tau
     row[SIGNAL_ENERGY] = energy
     row[EXTINCTION_VARIANCE] = extinction
-    row[BACKGROUND_VARIANCE] = 1.0 / whole + mean * mean / shape + level * level / norm
+    row[BACKGROUND_VARIANCE] = 1.0 / total_weight + mean * mean / shape + level * level / norm
     row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / energy + lever * lever * extinction
 
 
 @_compiled
 def _remainder(
-    product: float, a: tuple[float, float, float], b: tuple[float, float, float], whole: float
+    product: float,
+    a: tuple[float, float, float],
+    b: tuple[float, float, float],
+    total_weight: float,
 ) -> float:
     """Return the part of a product orthogonal to level, shape and slope.
 
     `a` and `b` are the components of both vectors in units of their norms.
     """
-    return product - (a[0] * b[0] / whole + a[1] * b[1] + a[2] * b[2])
+    return product - (a[0] * b[0] / total_weight + a[1] * b[1] + a[2] * b[2])
 
 
 @_compiled
 def _components(
-    one: float, d: float, g: float, sums: tuple[float, ...], whole: float
+    constant: float, d: float, g: float, sums: tuple[float, ...], total_weight: float
 ) -> tuple[float, float, float]:
     """Return the products of a vector with level, and with normed shape and slope."""
-    norm, _, of_level, of_shape, shape = _normal(sums, whole)
-    along = d - sums[0] * one / whole
-    across = g - of_level * one - of_shape * along
-    return one, along / math.sqrt(shape), across / math.sqrt(norm)
+    norm, _, slope_on_level, slope_on_shape, shape = _normal(sums, total_weight)
+    along = d - sums[0] * constant / total_weight
+    across = g - slope_on_level * constant - slope_on_shape * along
+    return constant, along / math.sqrt(shape), across / math.sqrt(norm)
 
 
 @_compiled
 def _describe_bend(
-    before: _Fit, sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array
+    before: _Fit, sums: tuple[float, ...], bent: tuple[float, ...], total_weight: float, row: Array
 ) -> None:
     """Write the effect of a bent signal on the fit, as `_misfit.describe_bend`."""
-    norm, _, of_level, of_shape, shape = _normal(sums, whole)
-    one, along, across = _components(bent[0], bent[1], bent[2], sums, whole)
+    norm, _, slope_on_level, slope_on_shape, shape = _normal(sums, total_weight)
+    constant, along, across = _components(bent[0], bent[1], bent[2], sums, total_weight)
     along, across = along / math.sqrt(shape), across / math.sqrt(norm)
-    mean = before.mean + sums[0] / whole
-    row[BACKGROUND_BEND] = one / whole - along * mean - across * (of_level - of_shape * mean)
+    mean = before.mean + sums[0] / total_weight
+    row[BACKGROUND_BEND] = (
+        constant / total_weight - along * mean - across * (slope_on_level - slope_on_shape * mean)
+    )
     row[EXTINCTION_BEND] = 0.5 - before.centre - 0.5 * across
 
 
 @_compiled
-def _trend(sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array) -> None:
+def _trend(
+    sums: tuple[float, ...], bent: tuple[float, ...], total_weight: float, row: Array
+) -> None:
     """Write the misfit, and the energy of the residuals in two shapes that the model lacks.
 
     One is backscatter that bends along the path, the other a nonlinear detector, as in
     `lidarops.retrieve.homogeneous._misfit`.
     """
-    p = _components(bent[0], bent[1], bent[2], sums, whole)
-    q = _components(bent[3], bent[4], bent[5], sums, whole)
+    p = _components(bent[0], bent[1], bent[2], sums, total_weight)
+    q = _components(bent[3], bent[4], bent[5], sums, total_weight)
     # Components that the last step removed from the residuals.
-    r = _components(sums[5], sums[6], sums[7], sums, whole)
-    row[MISFIT], row[LARGEST] = _remainder(bent[11], r, r, whole), math.sqrt(bent[12])
-    pulled = _remainder(bent[9], p, r, whole)
+    r = _components(sums[5], sums[6], sums[7], sums, total_weight)
+    row[MISFIT], row[LARGEST] = _remainder(bent[11], r, r, total_weight), math.sqrt(bent[12])
+    pulled = _remainder(bent[9], p, r, total_weight)
     energy = count = shared = 0.0
-    norm = _remainder(bent[6], p, p, whole)
+    norm = _remainder(bent[6], p, p, total_weight)
     if norm > DEPENDENT * bent[6]:
         energy += pulled * pulled / norm
         count += 1.0
-        shared = _remainder(bent[7], p, q, whole) / norm
-    rest = _remainder(bent[8], q, q, whole) - shared * shared * norm
+        shared = _remainder(bent[7], p, q, total_weight) / norm
+    rest = _remainder(bent[8], q, q, total_weight) - shared * shared * norm
     if rest > DEPENDENT * bent[8]:
-        along = _remainder(bent[10], q, r, whole) - shared * pulled
+        along = _remainder(bent[10], q, r, total_weight) - shared * pulled
         energy += along * along / rest
         count += 1.0
     row[TREND], row[TREND_COUNT] = energy, count
@@ -428,9 +444,9 @@ def _second_differences(residual: Array, used: Array) -> tuple[float, float]:
     used_last, used_middle = used[2:], used[1:]
     for i in range(last.size):
         difference = last[i] - 2.0 * middle[i] + residual[i]
-        whole = used_last[i] * used_middle[i] * used[i]
-        total += whole * difference * difference
-        terms += whole
+        valid = used_last[i] * used_middle[i] * used[i]
+        total += valid * difference * difference
+        terms += valid
     return total, terms
 
 
@@ -462,8 +478,8 @@ def _take_residuals(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
 @_compiled
 def _fit(g: Plan, s: _Scratch, count: float, want_differences: bool, row: Array) -> bool:
     """Fit one loaded profile; return whether the fit succeeded."""
-    whole, value = _group(g, s)
-    after = _seek(g, s, whole, value, count)
+    total_weight, value = _group(g, s)
+    after = _seek(g, s, total_weight, value, count)
     bounds = g.nodes[0], g.nodes[-1]
     before, sums = after, (0.0,) * 9
     arrays = g.x.ctypes.data, s.w.ctypes.data, s.z.ctypes.data, g.envelope.ctypes.data
@@ -476,22 +492,22 @@ def _fit(g: Plan, s: _Scratch, count: float, want_differences: bool, row: Array)
         before, last = after, moved
         e1, e4 = _decays(g, before.tau)
         sums = step_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
-        after = _step(before, sums, whole, bounds)
+        after = _step(before, sums, total_weight, bounds)
         moved = abs(after.tau - before.tau)
         size = abs(after.tau) + g.scale
         # A step about a stray centre is small at any distance from the solution.
         strayed = abs(after.centre - before.centre) > 0.1 * (1.0 + abs(after.centre))
         settled = moved < CONVERGED * size and last < CLOSE * size and not strayed
-    _describe(g, before, after, sums, whole, row)
+    _describe(g, before, after, sums, total_weight, row)
     e1, e4 = _decays(g, before.tau)
     bent = bend_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
-    _trend(sums, bent, whole, row)
-    _describe_bend(before, sums, bent, whole, row)
+    _trend(sums, bent, total_weight, row)
+    _describe_bend(before, sums, bent, total_weight, row)
     row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
     if want_differences:
         _take_residuals(g, s, after, row)
-    row[MEAN_RANGE] = _mean_range(g, s, whole)
-    row[ROUNDING] = whole
+    row[MEAN_RANGE] = _mean_range(g, s, total_weight)
+    row[ROUNDING] = total_weight
     row[BOUNDED] = 1.0 if after.tau <= bounds[0] or after.tau >= bounds[1] else 0.0
     first = 0
     while s.used[first] == 0.0:
@@ -503,11 +519,11 @@ def _fit(g: Plan, s: _Scratch, count: float, want_differences: bool, row: Array)
 
 
 @_summing
-def _mean_range(g: Plan, s: _Scratch, whole: float) -> float:
+def _mean_range(g: Plan, s: _Scratch, total_weight: float) -> float:
     total = 0.0
     for i in range(s.w.size):
         total += s.w[i] * g.x[i]
-    return total / whole
+    return total / total_weight
 
 
 @_compiled

@@ -54,21 +54,21 @@ def _second_differences(s: ProjectionScratch) -> tuple[float, float]:
     used_last, used_middle = s.used[2:], s.used[1:]
     for i in range(last.size):
         difference = last[i] - 2.0 * middle[i] + s.residual[i]
-        whole = used_last[i] * used_middle[i] * s.used[i]
-        total += whole * difference * difference
-        terms += whole
+        valid = used_last[i] * used_middle[i] * s.used[i]
+        total += valid * difference * difference
+        terms += valid
     return total, terms
 
 
 @summing
 def _model_products(weighted: Array, g: Grid, phi: Array, p: Point) -> tuple[float, float, float]:
     """Return the products of a weighted vector with the orthogonal shapes of the model."""
-    one = shape = slope = 0.0
+    level = shape = slope = 0.0
     for i in range(weighted.size):
-        one += weighted[i]
+        level += weighted[i]
         shape += weighted[i] * (phi[i] - p.mean_phi)
         slope += weighted[i] * (-2.0 * (g.x[i] - p.centroid) * phi[i] - p.mean_t)
-    return one, shape, slope
+    return level, shape, slope
 
 
 @compiled
@@ -101,18 +101,18 @@ def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, f
     square_products = _model_products(weighted_square, g, s.phi, p)
     residual_products = _model_products(s.pull, g, s.phi, p)
     energy = count = shared = 0.0
-    whole = product(bent, weighted_bent)
-    norm = _remainder(whole, bent_products, bent_products, p, w0)
+    square_norm = product(bent, weighted_bent)
+    norm = _remainder(square_norm, bent_products, bent_products, p, w0)
     pulled = _remainder(product(bent, s.pull), bent_products, residual_products, p, w0)
-    if norm > DEPENDENT * whole:
+    if norm > DEPENDENT * square_norm:
         energy += pulled * pulled / norm
         count += 1.0
         shared = (
             _remainder(product(bent, weighted_square), bent_products, square_products, p, w0) / norm
         )
-    whole = product(square, weighted_square)
-    norm = _remainder(whole, square_products, square_products, p, w0) - shared * shared * norm
-    if norm > DEPENDENT * whole:
+    square_norm = product(square, weighted_square)
+    norm = _remainder(square_norm, square_products, square_products, p, w0) - shared * shared * norm
+    if norm > DEPENDENT * square_norm:
         along = (
             _remainder(product(square, s.pull), square_products, residual_products, p, w0)
             - shared * pulled
@@ -125,14 +125,14 @@ def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, f
 @summing
 def _bent_signal_products(g: Grid, s: ProjectionScratch, p: Point) -> tuple[float, float, float]:
     """Return the products of ``phi (x - centroid)^2`` with the orthogonal shapes of the model."""
-    one = shape = slope = 0.0
+    level = shape = slope = 0.0
     for i in range(g.x.size):
         lever = g.x[i] - p.centroid
         weighted = s.w[i] * s.phi[i] * lever * lever
-        one += weighted
+        level += weighted
         shape += weighted * (s.phi[i] - p.mean_phi)
         slope += weighted * (-2.0 * lever * s.phi[i] - p.mean_t)
-    return one, shape, slope
+    return level, shape, slope
 
 
 @compiled
@@ -144,9 +144,9 @@ def describe_bend(
     Parabolas about different ranges differ by shapes of the model only: the background is the
     same, and the extinction is converted to the middle of the section.
     """
-    one, shape, slope = _bent_signal_products(g, s, p)
+    level, shape, slope = _bent_signal_products(g, s, p)
     across = slope / p.slope_norm
-    row[BACKGROUND_BEND] = free * one / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
+    row[BACKGROUND_BEND] = free * level / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
     row[EXTINCTION_BEND] = across + 0.5 - p.centroid
 
 

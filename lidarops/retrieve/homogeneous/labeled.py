@@ -425,6 +425,6 @@ def _one_chunk(array: xr.DataArray) -> xr.DataArray:
     return array
 
 
-def _set_units(result: xr.Dataset, units: Mapping[str, str], own: str) -> None:
+def _set_units(result: xr.Dataset, units: Mapping[str, str], power_unit: str) -> None:
     for name, pattern in units.items():
-        result[name].attrs["units"] = pattern.format(own).removeprefix("1 ")
+        result[name].attrs["units"] = pattern.format(power_unit).removeprefix("1 ")
