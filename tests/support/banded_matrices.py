@@ -1,4 +1,4 @@
-"""Banded matrices in full, for comparison."""
+"""Banded matrices in dense form, for comparison."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def dense(bands):
-    """Symmetric matrix from its diagonal and two upper off-diagonals."""
+    """Return the symmetric matrix of its diagonal and two upper off-diagonals."""
     matrix = np.diag(bands[0])
     for step in range(1, min(3, bands.shape[1])):
         above = np.diag(bands[step][: bands.shape[1] - step], step)

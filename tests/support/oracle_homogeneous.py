@@ -1,4 +1,4 @@
-"""Independent oracles of the homogeneous path: the model, its information, slow exact solvers."""
+"""Independent reference of the homogeneous path: model, information, slow exact solvers."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def lowest_errors(r, height, extinction, weights=None):
     weights = np.ones_like(r) if weights is None else weights
     covariance = np.linalg.inv(jacobian.T @ (weights[:, np.newaxis] * jacobian))
     # d ln B = d ln(height) + 2 R_0 d(extinction)
-    of_logarithm = np.array([0.0, 1.0 / height, 2.0 * r[0]])
-    return np.sqrt([covariance[0, 0], of_logarithm @ covariance @ of_logarithm, covariance[2, 2]])
+    gradient = np.array([0.0, 1.0 / height, 2.0 * r[0]])
+    return np.sqrt([covariance[0, 0], gradient @ covariance @ gradient, covariance[2, 2]])
 
 
 def iterated_fit(r, power, weights, bounds):
@@ -57,7 +57,7 @@ def iterated_fit(r, power, weights, bounds):
     losses = [np.sum(linear(candidate)[1] ** 2) for candidate in candidates]
     k = int(np.argmin(losses))
     low, high = candidates[max(k - 1, 0)], candidates[min(k + 1, candidates.size - 1)]
-    found = least_squares(
+    solution = least_squares(
         lambda t: linear(t[0] / length)[1],
         [0.5 * (low + high) * length],
         bounds=([low * length], [high * length]),
@@ -65,7 +65,7 @@ def iterated_fit(r, power, weights, bounds):
         ftol=1e-15,
         gtol=1e-15,
     )
-    extinction = found.x[0] / length
+    extinction = solution.x[0] / length
     (background, height), _ = linear(extinction)
     return background, height, extinction
 
@@ -102,8 +102,8 @@ def real_roots(coefficients):
 def linear_step(r, power, weights, prior, centre):
     """Return background, amplitude and extinction after one linear step from a prior.
 
-    The normal equations of potapova2023, weighted, solved by a general routine; the centroid is
-    found as the origin at which shape and slope, cleared of the background, are orthogonal.
+    By the weighted normal equations of potapova2023 and a general routine. The centroid is the
+    origin at which shape and slope, cleared of the background, are orthogonal.
     """
     root = np.sqrt(weights)
 
@@ -148,8 +148,8 @@ def table_profiles(start, length, count, seed):
 def brute_force(r, power, bounds, count=1201):
     """Return the least sum of squares on a dense grid of extinctions, and its extinction.
 
-    Background and amplitude are eliminated at every node; about the best one, the grid is made
-    dense three times more.
+    Background and amplitude are eliminated at every node; the grid is refined three times about
+    the best node.
     """
     length = r[-1] - r[0]
     low, high = np.array(bounds) * length
@@ -164,8 +164,8 @@ def brute_force(r, power, bounds, count=1201):
 
     depths = np.sinh(np.linspace(np.arcsinh(low / 0.3), np.arcsinh(high / 0.3), count)) * 0.3
     for _ in range(4):
-        found = losses(depths)
-        k = int(np.argmin(found))
-        least, best = found[k], depths[k] / length
+        squares = losses(depths)
+        k = int(np.argmin(squares))
+        least, best = squares[k], depths[k] / length
         depths = np.linspace(depths[max(k - 1, 0)], depths[min(k + 1, depths.size - 1)], 101)
     return least, best

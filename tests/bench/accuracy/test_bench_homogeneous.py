@@ -1,4 +1,4 @@
-"""The benchmark of the homogeneous path: its bounds, its peers and what it writes are right."""
+"""The benchmark of the homogeneous path: bounds, peers, results and pages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e
 
 
 @pytest.fixture(scope="module")
-def found() -> homogeneous.Accuracy:
+def accuracy() -> homogeneous.Accuracy:
     return homogeneous.measure_homogeneous(quick=True, date="2024-01-01", profiles=200)
 
 
@@ -47,7 +47,7 @@ def timed() -> retrievals.SolverThroughput:
 
 
 def _bound_by_mpmath(path: Scenario) -> dict[str, float]:
-    """Invert the Fisher matrix of (P*, B, extinction) as it stands, with 60 digits."""
+    """Invert the Fisher matrix of (P*, B, extinction) directly, in 60 digits."""
     with mpmath.workdps(60):
         sigma, amplitude = mpmath.mpf(path.extinction), mpmath.mpf(path.amplitude)
         fisher = mpmath.zeros(3)
@@ -89,27 +89,27 @@ def test_the_bound_follows_from_finite_differences_of_the_signal():
     assert bound["extinction"] == pytest.approx(math.sqrt(covariance[2, 2]), rel=1e-5)
 
 
-def test_the_second_order_bias_is_what_least_squares_has():
+def test_the_second_order_bias_is_that_of_least_squares():
     path = Scenario(2500.0, 4000.0, 3e-5, 40.0)
     count = 40_000
-    found = methods()["direct"](path.powers(count, 3), path)
-    error = found.values["background"] - path.background
+    solution = methods()["direct"](path.powers(count, 3), path)
+    error = solution.values["background"] - path.background
     expected = background_bias(path)
     spread = error.std() / math.sqrt(count)
     assert abs(expected) > 8 * spread
-    # Terms of fourth order in the noise are left out of the expectation.
+    # The expectation neglects terms of fourth order in the noise.
     assert error.mean() == pytest.approx(expected, abs=4 * spread + 0.1 * abs(expected))
 
 
-def test_scenarios_span_what_can_be_solved():
-    every = scenarios()
-    assert len(every) >= 40
-    assert len(set(every)) == len(every)
-    assert {path.start for path in every} == {2500.0, 10500.0}
-    assert max(difficulty(path) for path in every) <= 0.1
-    assert max(difficulty(path) for path in every) > 0.05
+def test_scenarios_span_the_solvable_paths():
+    paths = scenarios()
+    assert len(paths) >= 40
+    assert len(set(paths)) == len(paths)
+    assert {path.start for path in paths} == {2500.0, 10500.0}
+    assert max(difficulty(path) for path in paths) <= 0.1
+    assert max(difficulty(path) for path in paths) > 0.05
     assert len(scenarios(quick=True)) == 8
-    assert set(scenarios(quick=True)) < set(every)
+    assert set(scenarios(quick=True)) < set(paths)
 
 
 def test_profiles_are_the_model_and_unit_noise_and_repeat():
@@ -124,20 +124,20 @@ def test_profiles_are_the_model_and_unit_noise_and_repeat():
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.label)
-def test_every_peer_agrees_with_solve(path):
+def test_every_peer_agrees_with_the_direct_fit(path):
     power = path.powers(20)
-    ours = methods()["direct"](power, path)
+    direct = methods()["direct"](power, path)
     bound = least_errors(path)
     for name, way in iterative_peers().items():
-        theirs = way(power, path)
+        peer = way(power, path)
         for quantity in QUANTITIES:
-            apart = np.abs(theirs.values[quantity] - ours.values[quantity]) / bound[quantity]
-            assert apart.max() < 1e-3, (name, quantity)
-            ratio = theirs.standard_errors[quantity] / ours.standard_errors[quantity]
+            distance = np.abs(peer.values[quantity] - direct.values[quantity]) / bound[quantity]
+            assert distance.max() < 1e-3, (name, quantity)
+            ratio = peer.standard_errors[quantity] / direct.standard_errors[quantity]
             assert np.abs(ratio - 1).max() < 1e-3, (name, quantity)
 
 
-def test_the_compiled_fit_takes_what_cannot_converge():
+def test_the_compiled_fit_rejects_profiles_that_cannot_converge():
     power = PATH.powers(3)
     power[1] = np.nan
     solved = iterative_peers()[JIT](power, PATH)
@@ -171,20 +171,20 @@ def test_scores_of_known_errors():
     assert score.bias.error == pytest.approx(math.sqrt(8 / 3 / 3), rel=1e-6)
     assert score.coverage.value == pytest.approx(2 / 3)
     assert outcome.scores["background"].coverage.value == pytest.approx(1.0)
-    assert set(outcome.scores) == {"extinction", "background"}, "what was given has no score"
+    assert set(outcome.scores) == {"extinction", "background"}, "a given value has no score"
     assert (outcome.flagged, outcome.rejected) == (0.6, 0.4)
     assert outcome.distances["extinction"] == 0.0
 
 
-def test_least_squares_reaches_the_bound(found):
-    for case in found.cases:
+def test_least_squares_reaches_the_bound(accuracy):
+    for case in accuracy.cases:
         for outcome in case.outcomes:
             if outcome.way in {"compressed", "direct", JIT}:
                 for quantity, score in outcome.scores.items():
                     assert abs(score.rmse.value - 1) < 5 * score.rmse.error + 0.02, quantity
                     assert score.coverage.value > 0.85
                     assert outcome.distances[quantity] < 0.05
-    assert {o.way for o in found.cases[0].outcomes} == set(methods()) | set(iterative_peers())
+    assert {o.way for o in accuracy.cases[0].outcomes} == set(methods()) | set(iterative_peers())
 
 
 def test_lag_1_is_biased_as_published_and_least_squares_is_not():
@@ -207,12 +207,12 @@ def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
         read = group[retrievals.READ]
         assert read.reads == 1.0
         assert set(group) >= {"compressed", "direct"}
-        for one in group.values():
-            assert one.reads == pytest.approx(one.nanoseconds / read.nanoseconds)
+        for speed in group.values():
+            assert speed.reads == pytest.approx(speed.nanoseconds / read.nanoseconds)
     assert {t.way for t in timed.threads} == set(retrievals.THREADED)
 
 
-def test_ways_take_turns_and_the_least_time_counts(monkeypatch):
+def test_calls_alternate_and_the_least_time_counts(monkeypatch):
     clock = iter([0.0, 5.0, 0.0, 7.0, 0.0, 4.0, 0.0, 9.0])
     calls: list[str] = []
     monkeypatch.setattr("time.process_time", lambda: next(clock))
@@ -226,20 +226,20 @@ def test_threads_pass_errors_on():
         in_threads(lambda part: 1 / part, 2)
 
 
-def test_results_survive_json(found, timed, tmp_path):
-    for result in (found, timed):
+def test_results_survive_json(accuracy, timed, tmp_path):
+    for result in (accuracy, timed):
         path = results.save(result, tmp_path / "sub" / "result.json")
         assert results.load(type(result), path) == result
     path.write_text("{}")
     with pytest.raises(CatalogError, match="run the benchmark again"):
         results.load(homogeneous.Accuracy, path)
     with pytest.raises(CatalogError, match="cannot be written"):
-        results.save(found, path / "result.json")
+        results.save(accuracy, path / "result.json")
 
 
-def test_pages_hold_tables_and_figures(found, timed, tmp_path):
+def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
     reports = {
-        "accuracy": homogeneous_report.homogeneous_accuracy_report(found, "result.json"),
+        "accuracy": homogeneous_report.homogeneous_accuracy_report(accuracy, "result.json"),
         "throughput": homogeneous_report.homogeneous_throughput_report(timed, "result.json"),
     }
     for name, report in reports.items():
@@ -262,7 +262,7 @@ def test_pages_hold_tables_and_figures(found, timed, tmp_path):
         build_benchmark_page(report, tmp_path / "file")
 
 
-def test_the_pareto_front_holds_what_nothing_beats():
+def test_the_pareto_front_holds_the_unbeaten_points():
     points = [(3.0, 1.0), (1.0, 4.0), (2.0, 4.0), (2.0, 2.0), (4.0, 1.0), (1.0, 5.0)]
     assert pareto(points) == ((1.0, 4.0), (2.0, 2.0), (3.0, 1.0))
     assert pareto(points, gain=0.4) == ((1.0, 4.0), (3.0, 1.0))
@@ -270,7 +270,7 @@ def test_the_pareto_front_holds_what_nothing_beats():
 
 
 @pytest.mark.parametrize(
-    ("what", "case", "files", "error", "said"),
+    ("quantity", "case", "files", "error", "message"),
     [
         ("luck", None, [], CampaignError, "throughput"),
         ("accuracy", "weather", [], CampaignError, "pipeline or reader"),
@@ -279,24 +279,24 @@ def test_the_pareto_front_holds_what_nothing_beats():
         ("throughput", "reader", [], RawFormatError, "at least one file"),
     ],
 )
-def test_wrong_use_is_told(what, case, files, error, said):
-    with pytest.raises(error, match=said):
-        registry.run_benchmark(what, case, files, Effort())
+def test_wrong_use_is_refused(quantity, case, files, error, message):
+    with pytest.raises(error, match=message):
+        registry.run_benchmark(quantity, case, files, Effort())
 
 
-def test_the_command_prints_writes_and_dates(monkeypatch, found, tmp_path):
-    asked = {}
+def test_the_command_prints_writes_and_dates(monkeypatch, accuracy, tmp_path):
+    passed = {}
 
     def measure(**arguments):
-        asked.update(arguments)
-        return found
+        passed.update(arguments)
+        return accuracy
 
     monkeypatch.setattr(homogeneous, "measure_homogeneous", measure)
     words = ["bench", "accuracy", "--case", "homogeneous", "--quick", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
-    assert asked["quick"]
-    assert len(asked["date"]) == len("2024-01-01")
+    assert passed["quick"]
+    assert len(passed["date"]) == len("2024-01-01")
     assert "compressed" in result.stdout
     assert "index.html" in result.stdout.replace("\n", "")
     printed = CliRunner().invoke(app, [*words, "--json"])

@@ -1,4 +1,4 @@
-"""Molecules of the air: published values, an independent source, and units that are not ours."""
+"""Molecular atmosphere: published values, an independent source, and wrong units."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ LEVELS = np.array([100.0, 800.0, 1500.0, 3000.0, 5500.0, 9000.0, 12_000.0])
 
 
 def _sounding(levels=LEVELS):
-    """A day warmer than the standard by some degrees, with a ground inversion."""
+    """Return a sounding some degrees warmer than the standard, with a ground inversion."""
     pressure, temperature = us_standard(levels)
     return pressure * 1.01, temperature + np.linspace(4.0, 9.0, levels.size)
 
 
-def _profile(**told):
+def _profile(**arguments):
     pressure, temperature = _sounding()
-    return MolecularProfile.from_profile(LEVELS, pressure, temperature, **told)
+    return MolecularProfile.from_profile(LEVELS, pressure, temperature, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_beyond_the_levels_may_be_refused():
 
 
 @pytest.mark.parametrize("altitude", [np.nan, -np.inf, -6e3])
-def test_no_molecule_is_told_where_none_is_known(altitude):
+def test_altitudes_outside_the_standard_are_refused(altitude):
     for call in (STANDARD.at, STANDARD.number_density, lambda z: STANDARD.column(z, 9e3)):
         with pytest.raises(RetrievalInputError):
             call(altitude)
@@ -156,14 +156,14 @@ def test_no_molecule_is_told_where_none_is_known(altitude):
 
 @pytest.mark.parametrize("station", [-300.0, 0.0, 850.0, 2400.0])
 @pytest.mark.parametrize("weather", [0.92, 1.0, 1.06])
-def test_pressure_units_are_found(station, weather):
+def test_pressure_units_are_detected(station, weather):
     levels = station + np.array([0.0, 1e3, 4e3])
     pressure, temperature = us_standard(levels)
     pascal, unit, hecto = (
         MolecularProfile.from_profile(
-            levels, pressure * weather * factor, temperature, pressure_unit=told
+            levels, pressure * weather * factor, temperature, pressure_unit=unit_name
         )
-        for factor, told in ((1.0, None), (0.01, "hPa"), (0.01, None))
+        for factor, unit_name in ((1.0, None), (0.01, "hPa"), (0.01, None))
     )
     np.testing.assert_allclose(hecto.pressure, pascal.pressure, rtol=1e-14)
     np.testing.assert_array_equal(hecto.pressure, unit.pressure)
@@ -178,7 +178,7 @@ def test_other_pressures_are_refused(factor):
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("hPa", 1.0), ("Pa", 0.01)])
-def test_a_claimed_unit_is_not_believed_against_the_values(unit, factor):
+def test_a_unit_that_contradicts_the_values_is_refused(unit, factor):
     pressure, temperature = _sounding()
     other = {"hPa": "Pa", "Pa": "hPa"}[unit]
     with pytest.raises(RetrievalInputError, match=f"is {other}, not {unit}"):
@@ -187,8 +187,8 @@ def test_a_claimed_unit_is_not_believed_against_the_values(unit, factor):
 
 def _with(name, change):
     pressure, temperature = _sounding()
-    told = {"altitude": LEVELS, "pressure": pressure, "temperature": temperature}
-    return told | {name: change(told[name])}
+    arguments = {"altitude": LEVELS, "pressure": pressure, "temperature": temperature}
+    return arguments | {name: change(arguments[name])}
 
 
 @pytest.mark.parametrize(
@@ -209,12 +209,12 @@ def _with(name, change):
         ("pressure_unit", lambda _: "mbar", "pressure_unit", "Pa, hPa"),
     ],
 )
-def test_what_is_not_a_sounding_is_refused_by_name(name, change, field, message):
-    told = _with(name, change) if name != "pressure_unit" else _with("altitude", lambda z: z)
+def test_an_invalid_sounding_is_refused_by_field(name, change, field, message):
+    arguments = _with(name, change) if name != "pressure_unit" else _with("altitude", lambda z: z)
     if name == "pressure_unit":
-        told["pressure_unit"] = change(None)
+        arguments["pressure_unit"] = change(None)
     with pytest.raises(RetrievalInputError, match=message) as caught:
-        MolecularProfile.from_profile(**told)
+        MolecularProfile.from_profile(**arguments)
     assert caught.value.field == field
 
 

@@ -27,7 +27,7 @@ from lidarops.retrieve.air.molecular import (
         (50_000.0, 79.78, 270.65),
     ],
 )
-def test_the_tables_of_us1976_are_met(altitude, pressure, temperature):
+def test_the_tables_of_us1976_are_reproduced(altitude, pressure, temperature):
     p, t = us_standard(altitude)
     assert p == pytest.approx(pressure, rel=2e-5)
     assert t == pytest.approx(temperature, abs=6e-4)
@@ -35,7 +35,7 @@ def test_the_tables_of_us1976_are_met(altitude, pressure, temperature):
 
 @given(st.floats(-4900.0, 83_000.0))
 def test_air_is_in_hydrostatic_balance(altitude):
-    # dp/dz = -rho g with g(z) of the standard's own spherical Earth, by central difference.
+    # dp/dz = -rho g with g(z) of the spherical Earth of the standard, by central difference.
     step = 1.0
     (low, high), (here, temperature) = (
         us_standard(np.array([altitude - step, altitude + step]))[0],
@@ -63,7 +63,7 @@ def test_an_altitude_outside_the_standard_is_refused(altitude):
     [(355e-9, 2.759e-30, 0.5940), (532e-9, 5.167e-31, 0.1113), (1064e-9, 3.130e-32, 0.00674)],
 )
 def test_rayleigh_scattering_of_the_column(wavelength, cross_section, depth):
-    # The check values at 1064 nm are of the fit of bodhaine1999, which is 0.08 % high there.
+    # The check values at 1064 nm are from the fit of bodhaine1999, which is 0.08 % high there.
     infrared = wavelength > 1e-6
     relative = 1.5e-3 if infrared else 5e-4
     assert rayleigh_cross_section(wavelength) == pytest.approx(cross_section, rel=relative)
@@ -83,7 +83,7 @@ def test_the_fit_of_bodhaine_agrees(micrometres):
 
 
 def test_the_column_follows_from_surface_pressure():
-    # Molecules above a square metre = p / (m g), but for the fall of gravity with height.
+    # Molecules above a square metre = p / (m g), except for the decrease of gravity with height.
     z = np.linspace(0.0, 80e3, 20_001)
     above = np.trapezoid(number_density(*us_standard(z)), z)
     expected = 101_325.0 * 6.02214076e23 / (0.0289644 * 9.80665)

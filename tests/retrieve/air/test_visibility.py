@@ -40,7 +40,7 @@ def test_meteorological_optical_range_is_the_default():
     )
 
 
-def test_interval_is_that_of_extinction_turned_over():
+def test_interval_follows_from_that_of_extinction():
     result = visibility_from_extinction([2e-3, 2e-3, 2e-3], [1e-5, 1e-3, 3e-3])
     assert result.asymmetric.tolist() == [False, True, True]
     assert result.unbounded.tolist() == [False, False, True]
@@ -58,7 +58,7 @@ def test_linear_error_agrees_with_simulated_scatter_where_small_and_interval_whe
     result = visibility_from_extinction(2e-3, 0.03 * 2e-3)
     scatter = np.std(visibility_from_extinction(draws).visibility)
     assert result.visibility_standard_error == pytest.approx(scatter, rel=0.01)
-    # The interval holds 68 percent of what a noisy extinction gives, however asymmetric.
+    # The interval holds 68 percent of the values from noisy extinction, however asymmetric.
     draws = 2e-3 * (1 + 0.3 * rng.standard_normal(200_000))
     result = visibility_from_extinction(2e-3, 0.3 * 2e-3)
     values = visibility_from_extinction(draws).visibility
@@ -68,13 +68,13 @@ def test_linear_error_agrees_with_simulated_scatter_where_small_and_interval_whe
     assert abs(symmetric.mean() - 0.6827) > 0.01
 
 
-def test_no_visibility_is_invented_where_extinction_is_not_positive_or_missing():
+def test_visibility_is_missing_where_extinction_is_not_positive_or_missing():
     result = visibility_from_extinction(
         [np.nan, 0.0, -1e-4, -2e-4, np.inf], [1e-4, 1e-4, 3e-4, 1e-4, 1.0]
     )
     assert np.isnan(result.visibility).all()
     assert np.isnan(result.visibility_standard_error).all()
-    # A lower end can be told of an extinction that is zero within its error.
+    # An extinction that is zero within its error has a lower end of visibility.
     assert np.isfinite(result.visibility_lower[1:3]).all()
     assert np.isnan(result.visibility_lower[[0, 3]]).all()
     assert result.unbounded.tolist() == [False, True, True, True, False]
@@ -98,17 +98,17 @@ def exact_kruse(extinction, wavelength):
         def near(v):
             return v - plain * ratio ** (-mp.mpf("0.585") * mp.cbrt(v / 1000))
 
-        found = []
+        solutions = []
         grid = [mp.mpf(10) ** (mp.mpf(i) / 20) for i in range(-20, 76)] + [mp.mpf(6000)]
         grid = sorted(v for v in grid if v <= 6000)
         for low, high in itertools.pairwise(grid):
             if near(low) * near(high) < 0:
-                found.append(mp.findroot(near, (low, high), solver="anderson"))
+                solutions.append(mp.findroot(near, (low, high), solver="anderson"))
         for q, start, stop in ((mp.mpf("1.3"), 6000, 50_000), (mp.mpf("1.6"), 50_000, mp.inf)):
             v = plain * ratio**-q
             if start <= v < stop:
-                found.append(v)
-        return [float(mp.log(50) / v) for v in found]
+                solutions.append(v)
+        return [float(mp.log(50) / v) for v in solutions]
 
 
 @settings(max_examples=60, deadline=None)
@@ -128,7 +128,7 @@ def test_kruse_obeys_its_implicit_equation(exponent, wavelength):
 def test_kruse_is_monotonic_beyond_550_nm_and_ambiguous_only_below():
     extinction = np.geomspace(1e-6, 1e-2, 4001)
     infrared = at_reference_wavelength(extinction, wavelength=1064e-9, law="kruse")
-    # Constant across a jump, but for rounding.
+    # Constant across a jump, except for rounding.
     assert np.all(np.diff(infrared.extinction) >= -1e-15 * infrared.extinction[1:])
     assert not infrared.ambiguous.any()
     ultraviolet = at_reference_wavelength(extinction, wavelength=355e-9, law="kruse")

@@ -1,4 +1,4 @@
-"""The background: the cubic against exact arithmetic, its noise against simulations."""
+"""The cubic against exact arithmetic and simulated noise; the tail mean."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KM = 1e-3
 
 
 def without_noise(power, r, lag=None):
-    """Return the cubic's background with nothing subtracted for noise."""
+    """Return the background by the cubic, without correction for noise."""
     return cubic(power, r, lag=lag, variance=0.0)
 
 
@@ -72,7 +72,7 @@ def test_root_keeps_its_digits_on_random_sections():
         with mp.workdps(45):
             exact = real_roots(quartic_derivative(r, power, lag))[-1]
             error = abs(mp.mpf(float(without_noise(power, r, lag).background)) - exact)
-        # Of a power rounded to float64, the root can only be so near as the rounding of itself.
+        # The root of a power rounded to float64 is exact only within its own rounding.
         assert error < (1e-12 if ratio < 1e4 else 1e-10) + np.spacing(ratio)
 
 
@@ -84,8 +84,10 @@ def test_float32_profiles_are_solved_in_double_precision():
 
 
 def spurious_distances(r, lag, extinction):
-    """Distance of the second root of every triple below the background, and its weight."""
-    r0, r1, r2 = ([mp.mpf(x) for x in part] for part in (r[: -2 * lag], r[lag:-lag], r[2 * lag :]))
+    """Return the distance of the second root below the background, and the weight, per triple."""
+    r0, r1, r2 = (
+        [mp.mpf(x) for x in ranges] for ranges in (r[: -2 * lag], r[lag:-lag], r[2 * lag :])
+    )
     shape = [mp.e ** (-2 * extinction * x) / x**2 for x in [mp.mpf(x) for x in r]]
     distances, weights = [], []
     for i in range(len(r1)):
@@ -98,7 +100,7 @@ def spurious_distances(r, lag, extinction):
 
 def test_largest_real_root_is_the_background_and_spread_decides_the_root_class():
     rng = np.random.default_rng(1)
-    seen = {True: 0, False: 0}
+    counts = {True: 0, False: 0}
     with mp.workdps(50):
         for _ in range(1150):
             bins = int(rng.integers(7, 20))
@@ -120,10 +122,10 @@ def test_largest_real_root_is_the_background_and_spread_decides_the_root_class()
             spread = mp.sqrt(abs(square - mean * mean)) / abs(mean)
             if bins - 2 * lag > 1 and abs(spread * mp.sqrt(8) - 1) > 1e-6:
                 three = spread < 1 / mp.sqrt(8)
-                seen[bool(three)] += 1
+                counts[bool(three)] += 1
                 assert (len(roots) == 3) == three
-    assert sum(seen.values()) >= 1000
-    assert min(seen.values()) >= 100
+    assert sum(counts.values()) >= 1000
+    assert min(counts.values()) >= 100
 
 
 @settings(max_examples=200, deadline=None)
@@ -156,9 +158,9 @@ def test_only_real_root_of_a_cubic(real, middle, imaginary):
 def mean_coefficients(power, variance, triples, poisson):
     linear, constant = [], []
     for profile, noise in zip(power, variance, strict=True):
-        found = _cubic_kernel._coefficients(profile, noise, triples, poisson)
-        linear.append(found.linear)
-        constant.append(found.constant)
+        estimate = _cubic_kernel._coefficients(profile, noise, triples, poisson)
+        linear.append(estimate.linear)
+        constant.append(estimate.constant)
     return np.array([linear, constant])
 
 
@@ -186,7 +188,7 @@ def test_noise_is_subtracted_from_the_coefficients_without_bias(poisson):
     assert np.all(np.abs(score(variance, poisson)) < 4)
     assert np.all(np.abs(score(np.zeros_like(power), 0.0)) > 20)
     if poisson:
-        # Counts as their own variance need the third moment too.
+        # With the counts as variance, the third moment matters too.
         assert np.abs(score(variance, 0.0)[1]) > 20
 
 
@@ -207,27 +209,27 @@ def test_cubic_is_unbiased_and_its_standard_error_honest(
     rng = np.random.default_rng(3)
     r, count = section(start, length), 3000
     power = 370.0 + signal(r, height, extinction) + rng.normal(size=(count, r.size))
-    found = cubic(power, r, variance=variance)
+    estimate = cubic(power, r, variance=variance)
     lowest = lowest_errors(r, height, extinction)[0]
-    errors = found.background - 370.0
+    errors = estimate.background - 370.0
     assert np.sqrt(np.mean(errors**2)) < most * lowest
     assert abs(np.mean(errors)) < 0.2 * lowest
-    covered = np.abs(errors) < 1.96 * found.background_standard_error
+    covered = np.abs(errors) < 1.96 * estimate.background_standard_error
     assert 0.93 < np.mean(covered) < 0.975
-    assert np.mean(found.quality == 0) > 0.995
+    assert np.mean(estimate.quality == 0) > 0.995
 
 
 @pytest.mark.parametrize("lag", [1, 3, 10, None])
-def test_curvature_that_is_taken_for_noise_does_not_move_what_is_accepted(lag):
+def test_curvature_mistaken_for_noise_does_not_shift_unflagged_backgrounds(lag):
     kept = []
     for height in (1e6, 1e7, 1e8, 1e10):
         power = 1e3 + signal(LONG, height, 0.03 * KM)
         power = power + np.random.default_rng(9).standard_normal((300, LONG.size))
-        found = cubic(power, LONG, lag=lag)
-        off = np.abs(found.background - 1e3) / found.background_standard_error
-        good = found.quality == 0
+        estimate = cubic(power, LONG, lag=lag)
+        off = np.abs(estimate.background - 1e3) / estimate.background_standard_error
+        good = estimate.quality == 0
         assert np.max(off[good], initial=0.0) < 4.2
-        # With a variance, nothing is taken for noise.
+        # With a given variance, no curvature is mistaken for noise.
         known = cubic(power, LONG, lag=lag, variance=1.0)
         assert np.mean(known.quality == 0) == (0.0 if (lag, height) == (1, 1e6) else 1.0)
         kept.append(np.mean(good))
@@ -237,10 +239,10 @@ def test_curvature_that_is_taken_for_noise_does_not_move_what_is_accepted(lag):
 def test_counts_are_their_own_variance():
     rng = np.random.default_rng(4)
     power = rng.poisson(510.0 + signal(LONG, 5000.0, 0.03 * KM), (4000, LONG.size))
-    found = cubic(power, LONG, statistics="poisson")
-    errors = found.background - 510.0
+    estimate = cubic(power, LONG, statistics="poisson")
+    errors = estimate.background - 510.0
     assert abs(np.mean(errors)) < 4 * np.std(errors) / np.sqrt(errors.size) + 0.02 * np.std(errors)
-    covered = np.abs(errors) < 1.96 * found.background_standard_error
+    covered = np.abs(errors) < 1.96 * estimate.background_standard_error
     assert 0.93 < np.mean(covered) < 0.97
 
 
@@ -248,8 +250,8 @@ def test_lost_roots_are_flagged():
     rng = np.random.default_rng(6)
     noise = 370.0 + rng.normal(size=(3000, LONG.size))
     for height in (0.0, 20.0):
-        found = cubic(noise + signal(LONG, height, 0.03 * KM), LONG, variance=1.0)
-        assert np.mean(found.quality & Quality.LOW_SIGNAL != 0) > 0.999
+        estimate = cubic(noise + signal(LONG, height, 0.03 * KM), LONG, variance=1.0)
+        assert np.mean(estimate.quality & Quality.LOW_SIGNAL != 0) > 0.999
 
 
 def test_gradient_is_that_of_finite_differences():
@@ -297,41 +299,41 @@ def test_default_lag_leaves_a_triple(bins):
 @pytest.mark.parametrize("bins", [1, 2, 3, 4, 7])
 def test_few_bins_are_flagged(bins):
     r = np.linspace(2500.0, 10500.0, bins) if bins > 1 else np.array([2500.0])
-    found = cubic(25.0 + signal(r, 1.0, 0.03 * KM), r, variance=1e-12)
-    assert found.quality & Quality.TOO_FEW_BINS
-    assert np.isnan(found.background) == (bins < 3)
+    estimate = cubic(25.0 + signal(r, 1.0, 0.03 * KM), r, variance=1e-12)
+    assert estimate.quality & Quality.TOO_FEW_BINS
+    assert np.isnan(estimate.background) == (bins < 3)
     if bins >= 3:
-        assert found.background == pytest.approx(25.0, abs=1e-4)
+        assert estimate.background == pytest.approx(25.0, abs=1e-4)
 
 
-def test_missing_constant_and_infinite_profiles_are_flagged_and_leave_others_alone():
+def test_missing_constant_and_infinite_profiles_are_flagged_and_do_not_affect_others():
     good = 5.0 + signal(LONG, 3.0, 0.05 * KM) + 1e-3 * np.cos(np.arange(LONG.size))
     rows = np.stack([good, good, np.full_like(good, 0.1), good])
     rows[1, 100] = np.nan
     rows[3, 3] = -np.inf
-    found = cubic(rows, LONG)
-    assert found.quality.tolist() == [0, Quality.INPUT_MISSING, Quality.NO_SIGNAL, 1]
-    assert found.background[0] == cubic(good, LONG).background
-    assert found.background[2] == 0.1
-    assert np.isnan(found.background[[1, 3]]).all()
-    assert np.isnan(found.background_standard_error[[1, 3]]).all()
+    estimate = cubic(rows, LONG)
+    assert estimate.quality.tolist() == [0, Quality.INPUT_MISSING, Quality.NO_SIGNAL, 1]
+    assert estimate.background[0] == cubic(good, LONG).background
+    assert estimate.background[2] == 0.1
+    assert np.isnan(estimate.background[[1, 3]]).all()
+    assert np.isnan(estimate.background_standard_error[[1, 3]]).all()
 
 
 def test_variance_that_is_not_finite_is_missing():
     variance = np.ones(LONG.size)
     variance[7] = np.nan
-    found = cubic(5.0 + signal(LONG, 300.0, 0.05 * KM), LONG, variance=variance)
-    assert found.quality == Quality.INPUT_MISSING
+    estimate = cubic(5.0 + signal(LONG, 300.0, 0.05 * KM), LONG, variance=variance)
+    assert estimate.quality == Quality.INPUT_MISSING
 
 
 def test_shapes_follow_the_power():
     power = np.zeros((2, 3, LONG.size)) + 5.0 + signal(LONG, 3.0, 0.05 * KM)
-    found = cubic(power, LONG)
-    assert found.background.shape == found.quality.shape == (2, 3)
+    estimate = cubic(power, LONG)
+    assert estimate.background.shape == estimate.quality.shape == (2, 3)
     assert cubic(power[0, 0], LONG).background.shape == ()
     assert cubic(power[:, :0], LONG).background.shape == (2, 0)
     reverse = cubic(power[0, 0, ::-1], LONG[::-1])
-    assert reverse.background == found.background[0, 0]
+    assert reverse.background == estimate.background[0, 0]
 
 
 @pytest.mark.parametrize(
@@ -350,7 +352,7 @@ def test_shapes_follow_the_power():
         ({"power": np.full(LONG.size, "x")}, "power"),
     ],
 )
-def test_arguments_that_cannot_be_right_are_refused(arguments, field):
+def test_invalid_arguments_are_refused(arguments, field):
     given_ = {"power": 5.0 + signal(LONG, 3.0, 0.05 * KM), "range": LONG} | arguments
     with pytest.raises(RetrievalInputError) as caught:
         cubic(given_.pop("power"), given_.pop("range"), **given_)
@@ -373,12 +375,12 @@ def test_tail_mean_is_the_mean_of_the_finite_bins(bins, missing, seed, known):
     power = rng.normal(10.0, 2.0, (3, bins))
     power[rng.random(power.shape) < missing] = np.nan
     start = float(r[bins // 3])
-    found = tail_mean(power, r, start=start, variance=4.0 if known else None)
+    estimate = tail_mean(power, r, start=start, variance=4.0 if known else None)
     for row, mean, error, quality in zip(
         power,
-        found.background,
-        found.background_standard_error,
-        found.quality,
+        estimate.background,
+        estimate.background_standard_error,
+        estimate.quality,
         strict=True,
     ):
         tail = row[(r >= start) & np.isfinite(row)]
@@ -392,12 +394,12 @@ def test_tail_mean_is_the_mean_of_the_finite_bins(bins, missing, seed, known):
             assert np.isnan(mean)
 
 
-def test_tail_mean_takes_the_last_tenth():
+def test_tail_mean_uses_the_last_tenth():
     power = np.arange(100.0)
-    found = tail_mean(power, section(1000.0, 5000.0, 100))
-    assert found.background == 94.5
-    assert found.background_standard_error == pytest.approx(power[90:].std(ddof=1) / np.sqrt(10))
-    assert found.quality == 0
+    estimate = tail_mean(power, section(1000.0, 5000.0, 100))
+    assert estimate.background == 94.5
+    assert estimate.background_standard_error == pytest.approx(power[90:].std(ddof=1) / np.sqrt(10))
+    assert estimate.quality == 0
 
 
 def test_tail_mean_does_not_depend_on_its_batch():
@@ -416,16 +418,16 @@ def test_tail_must_begin_within_the_range(start):
         tail_mean(np.ones(50), section(1000.0, 5000.0, 50), start=start)
 
 
-def test_a_bin_whose_variance_says_nothing_is_not_used():
+def test_a_bin_with_an_unusable_variance_is_not_used():
     r = np.arange(100, 400) * 7.5
     power = 10.0 + 1e7 * r**-2.0 * np.exp(-2e-4 * r)
     power[150], power[-3] = 1000.0, 1000.0
     for bad in (0.0, np.inf, np.nan):
         variance = np.full(r.size, 0.01)
         variance[[150, -3]] = bad
-        found = cubic(power, r, variance=variance)
-        assert np.isnan(found.background)
-        assert found.quality == Quality.INPUT_MISSING
+        estimate = cubic(power, r, variance=variance)
+        assert np.isnan(estimate.background)
+        assert estimate.quality == Quality.INPUT_MISSING
         tail = tail_mean(power, r, variance=variance)
         keep = np.delete(power[-30:], -3)
         assert tail.background == pytest.approx(keep.mean(), rel=1e-12)

@@ -1,4 +1,4 @@
-"""Backgrounds by the molecular shape: algebra, coverage, windows, and a published data set."""
+"""Background by the molecular shape: algebra, coverage, windows, and a published data set."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ def test_shape_is_that_of_exact_integration():
     fall = np.exp(-RANGE / height)
     depth = alpha * height * (1.0 - fall)
     expected = 1e-6 * fall * np.exp(-2.0 * depth) / RANGE**2
-    found = molecular_shape(1e-6 * fall, alpha * fall, RANGE)
-    np.testing.assert_allclose(found, expected, rtol=1e-7)
-    turned = molecular_shape(1e-6 * fall[::-1], alpha * fall[::-1], RANGE[::-1])
-    np.testing.assert_array_equal(turned[::-1], found)
+    shape = molecular_shape(1e-6 * fall, alpha * fall, RANGE)
+    np.testing.assert_allclose(shape, expected, rtol=1e-7)
+    reversed_shape = molecular_shape(1e-6 * fall[::-1], alpha * fall[::-1], RANGE[::-1])
+    np.testing.assert_array_equal(reversed_shape[::-1], shape)
 
 
 @pytest.mark.parametrize("background", [0.0, 1.0, 1e4, 1e8])
 def test_the_fit_keeps_its_digits(background):
-    """Against least squares in 60 digits, at a background 1e8 times the signal too."""
+    """Compare with least squares in 60 digits, up to a background of 1e8 times the signal."""
     rng = np.random.default_rng(1)
     shape = air()[400:]
     power = background + 3.0 * shape + rng.normal(0.0, 0.1, shape.size)
     variance = 0.01 + 0.1 * rng.random(shape.size)
-    found = fit_known_shape(power, RANGE[400:], shape, variance=variance, start=0.0)
+    fit = fit_known_shape(power, RANGE[400:], shape, variance=variance, start=0.0)
     with mp.workdps(60):
         w = [1 / mp.mpf(float(v)) for v in variance]
         phi, p = [mp.mpf(float(x)) for x in shape], [mp.mpf(float(x)) for x in power]
@@ -71,23 +71,23 @@ def test_the_fit_keeps_its_digits(background):
         det = a * c - b * b
         exact = [(c * d - b * e) / det, (a * e - b * d) / det, c / det, a / det, -b / det]
     grain = max(background, 1.0) * 1e-14
-    assert abs(found.background - float(exact[0])) < grain
-    assert abs(found.amplitude - float(exact[1])) < 10 * grain
-    assert found.background_standard_error**2 == pytest.approx(float(exact[2]), rel=1e-10)
-    assert found.amplitude_standard_error**2 == pytest.approx(float(exact[3]), rel=1e-10)
-    assert found.covariance == pytest.approx(float(exact[4]), rel=1e-10)
+    assert abs(fit.background - float(exact[0])) < grain
+    assert abs(fit.amplitude - float(exact[1])) < 10 * grain
+    assert fit.background_standard_error**2 == pytest.approx(float(exact[2]), rel=1e-10)
+    assert fit.amplitude_standard_error**2 == pytest.approx(float(exact[3]), rel=1e-10)
+    assert fit.covariance == pytest.approx(float(exact[4]), rel=1e-10)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.floats(-30, 30))
 @settings(max_examples=60, deadline=None)
-def test_without_noise_both_come_back(seed, background, amplitude, exponent):
+def test_without_noise_background_and_amplitude_are_exact(seed, background, amplitude, exponent):
     scale = 10.0**exponent
     shape = air()
     power = background + amplitude * shape
     power[np.random.default_rng(seed).random(1000) < 0.3] = np.nan
-    found = fit_known_shape(power, RANGE, shape * scale, start=4000.0)
-    assert found.background == pytest.approx(background, abs=1e-11 * (1e3 + amplitude))
-    assert found.amplitude * scale == pytest.approx(amplitude, rel=1e-9, abs=1e-11 * 1e3)
+    fit = fit_known_shape(power, RANGE, shape * scale, start=4000.0)
+    assert fit.background == pytest.approx(background, abs=1e-11 * (1e3 + amplitude))
+    assert fit.amplitude * scale == pytest.approx(amplitude, rel=1e-9, abs=1e-11 * 1e3)
 
 
 # Statistics ---------------------------------------------------------------------------------
@@ -100,31 +100,31 @@ def test_standard_errors_cover_the_scatter(start, known):
     shape = air()
     noise = 0.3 if not known else 0.1 + 0.4 * np.exp(-RANGE / 4000.0)
     power = 20.0 + 5.0 * shape + noise * rng.normal(size=(3000, 1000))
-    found = fit_known_shape(power, RANGE, shape, variance=noise**2 if known else None, start=start)
-    off = (found.background - 20.0) / found.background_standard_error
-    scale = (found.amplitude - 5.0) / found.amplitude_standard_error
+    fit = fit_known_shape(power, RANGE, shape, variance=noise**2 if known else None, start=start)
+    off = (fit.background - 20.0) / fit.background_standard_error
+    scale = (fit.amplitude - 5.0) / fit.amplitude_standard_error
     assert off.std() == pytest.approx(1.0, abs=0.06)
     assert scale.std() == pytest.approx(1.0, abs=0.06)
     assert off.mean() == pytest.approx(0.0, abs=0.08)
     if start is None:
         return  # windows of different length have different correlations
-    correlation = np.corrcoef(found.background, found.amplitude)[0, 1]
-    both = found.background_standard_error * found.amplitude_standard_error
-    assert correlation == pytest.approx(np.mean(found.covariance / both), abs=0.05)
+    correlation = np.corrcoef(fit.background, fit.amplitude)[0, 1]
+    both = fit.background_standard_error * fit.amplitude_standard_error
+    assert correlation == pytest.approx(np.mean(fit.covariance / both), abs=0.05)
     if known:
-        assert np.mean(found.chi2 / found.degrees_of_freedom) == pytest.approx(1.0, abs=0.01)
+        assert np.mean(fit.chi2 / fit.degrees_of_freedom) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("background", [0.0, 0.05, 2.0])
 @pytest.mark.parametrize("start", [None, 4500.0])
 def test_counts_are_weighed_without_bias(background, start):
-    """Few counts a bin, where weights made of the counts themselves are worst."""
+    """Few counts per bin, where weights from the counts themselves are worst."""
     rng = np.random.default_rng(3)
     shape, shots = air(), 20.0
     power = rng.poisson(shots * (background + 2.0 * shape), (4000, 1000)) / shots
-    found = fit_known_shape(power, RANGE, shape, exposure=shots, start=start)
-    off = found.background - background
-    error = found.background_standard_error
+    fit = fit_known_shape(power, RANGE, shape, exposure=shots, start=start)
+    off = fit.background - background
+    error = fit.background_standard_error
     assert abs(off.mean()) < 0.1 * error.mean()
     assert (off / error).std() == pytest.approx(1.0, abs=0.12 if background == 0.0 else 0.06)
     realised = fit_known_shape(
@@ -150,7 +150,7 @@ def test_model_weights_reach_the_error_of_the_true_ones():
     )
 
 
-def of_few_bins(bins, profiles, variance):
+def fit_few_bins(bins, profiles, variance):
     """Return fits of a shape, 1 where it is largest, with noise of 1 over bins to 30 km."""
     range_ = np.linspace(4500.0, 30000.0, bins)
     shape = np.exp(-range_ / 8000.0) / range_**2
@@ -161,49 +161,49 @@ def of_few_bins(bins, profiles, variance):
 
 @pytest.mark.parametrize("bins", [8, 12, 20])
 def test_errors_of_short_windows_hold_where_the_noise_is_estimated(bins):
-    known = of_few_bins(bins, 100_000, 1.0)
-    found = of_few_bins(bins, 100_000, None)
+    known = fit_few_bins(bins, 100_000, 1.0)
+    fit = fit_few_bins(bins, 100_000, None)
     freedom = bins - 2
     student = stats.t.isf(stats.norm.sf(4.0), freedom) / 4.0
     usual = student * np.sqrt(stats.chi2.median(freedom) / freedom)
     for name, truth in (("background", 5.0), ("amplitude", 50.0)):
-        error = getattr(found, f"{name}_standard_error")
-        assert np.mean(np.abs(getattr(found, name) - truth) > 4.0 * error) < 2e-4
+        error = getattr(fit, f"{name}_standard_error")
+        assert np.mean(np.abs(getattr(fit, name) - truth) > 4.0 * error) < 2e-4
         ratio = np.median(error / getattr(known, f"{name}_standard_error"))
         assert ratio == pytest.approx(usual, rel=0.02)
-    both = found.background_standard_error * found.amplitude_standard_error
-    assert np.ptp(found.covariance / both) < 1e-9
+    both = fit.background_standard_error * fit.amplitude_standard_error
+    assert np.ptp(fit.covariance / both) < 1e-9
 
 
 @pytest.mark.parametrize("bins", [16, 40, 100])
-def test_noise_that_is_estimated_raises_no_more_false_alarms(bins):
-    assert of_few_bins(bins, 60_000, None).poor_fit.sum() <= 16
+def test_estimated_noise_raises_no_more_false_alarms(bins):
+    assert fit_few_bins(bins, 60_000, None).poor_fit.sum() <= 16
 
 
 # Windows ------------------------------------------------------------------------------------
 
 
-def test_false_alarms_are_as_rare_as_promised():
+def test_false_alarms_are_as_rare_as_designed():
     rng = np.random.default_rng(5)
     shape = air()
     power = 3.0 + shape + rng.normal(0.0, 0.05, (20000, 1000))
-    found = fit_known_shape(power, RANGE, shape, variance=0.05**2, start=5000.0)
-    assert found.poor_fit.sum() <= 8
-    assert (np.abs(found.curvature) > 1.96).mean() == pytest.approx(0.05, abs=0.006)
-    assert found.waves.mean() == pytest.approx(14.0, abs=0.3)
+    fit = fit_known_shape(power, RANGE, shape, variance=0.05**2, start=5000.0)
+    assert fit.poor_fit.sum() <= 8
+    assert (np.abs(fit.curvature) > 1.96).mean() == pytest.approx(0.05, abs=0.006)
+    assert fit.waves.mean() == pytest.approx(14.0, abs=0.3)
     unknown = fit_known_shape(power[:5000], RANGE, shape, start=5000.0)
     assert unknown.poor_fit.sum() <= 4
 
 
 @pytest.mark.parametrize("variance", [0.05**2, None])
-def test_a_cloud_in_the_window_is_seen(variance):
+def test_a_cloud_in_the_window_is_detected(variance):
     rng = np.random.default_rng(6)
     shape = air()
     cloud = 1.0 + 0.5 * np.exp(-(((RANGE - 8000.0) / 300.0) ** 2))
     power = 3.0 + 5.0 * shape * cloud + rng.normal(0.0, 0.05, (200, 1000))
-    found = fit_known_shape(power, RANGE, shape, variance=variance, start=5000.0)
-    assert found.poor_fit.all()
-    assert ((found.quality & Quality.NOT_HOMOGENEOUS) != 0).all()
+    fit = fit_known_shape(power, RANGE, shape, variance=variance, start=5000.0)
+    assert fit.poor_fit.all()
+    assert ((fit.quality & Quality.NOT_HOMOGENEOUS) != 0).all()
     chosen = fit_known_shape(power, RANGE, shape, variance=variance)
     assert (chosen.start > 8000.0).all()
     assert chosen.poor_fit.mean() < 0.01
@@ -216,30 +216,30 @@ def test_the_window_begins_above_the_aerosol():
     for top in (3000.0, 5000.0, 7000.0):
         truth = 10.0 + with_layer(shape, top=top) * 50.0
         power = truth + rng.normal(0.0, 0.3, (300, 1000))
-        found = fit_known_shape(power, RANGE, shape, variance=0.09)
-        off = (found.background - 10.0) / found.background_standard_error
-        assert (found.start >= top).all()
+        fit = fit_known_shape(power, RANGE, shape, variance=0.09)
+        off = (fit.background - 10.0) / fit.background_standard_error
+        assert (fit.start >= top).all()
         assert np.sqrt(np.mean(off**2)) < 1.2
-        assert found.poor_fit.mean() < 0.01
+        assert fit.poor_fit.mean() < 0.01
 
 
-def test_clean_air_is_used_from_near():
+def test_clean_air_is_used_from_the_nearest_start():
     rng = np.random.default_rng(8)
     shape = air()
     power = 10.0 + shape + rng.normal(0.0, 0.3, (500, 1000))
-    found = fit_known_shape(power, RANGE, shape, variance=0.09)
-    assert (found.start == RANGE[np.searchsorted(RANGE, 0.3 * RANGE[-1])]).mean() > 0.95
+    fit = fit_known_shape(power, RANGE, shape, variance=0.09)
+    assert (fit.start == RANGE[np.searchsorted(RANGE, 0.3 * RANGE[-1])]).mean() > 0.95
 
 
-def test_where_no_window_is_clean_the_farthest_is_taken_and_says_so():
+def test_without_a_clean_window_the_farthest_is_used_and_flagged():
     shape = air()
     power = 3.0 + 5.0 * shape * (1.0 + 0.5 * np.sin(RANGE / 300.0))
-    found = fit_known_shape(power, RANGE, shape, variance=1e-6)
-    assert found.start == RANGE[np.searchsorted(RANGE, 0.7 * RANGE[-1])]
-    assert found.poor_fit
+    fit = fit_known_shape(power, RANGE, shape, variance=1e-6)
+    assert fit.start == RANGE[np.searchsorted(RANGE, 0.7 * RANGE[-1])]
+    assert fit.poor_fit
 
 
-def test_windows_end_with_what_is_usable_and_where_told():
+def test_windows_end_at_the_last_usable_bin_or_at_stop():
     rng = np.random.default_rng(9)
     shape = air()
     power = 3.0 + shape + rng.normal(0.0, 0.01, (4, 1000))
@@ -247,37 +247,37 @@ def test_windows_end_with_what_is_usable_and_where_told():
     mask = np.ones((4, 1000), dtype=bool)
     mask[1, 600:] = False
     stops = [2e4, 2e4, 10000.0, 2e4]
-    found = fit_known_shape(power, RANGE, shape, variance=1e-4, start=4000.0, stop=stops, mask=mask)
-    np.testing.assert_array_equal(found.stop, [RANGE[799], RANGE[599], 9997.5, RANGE[-1]])
-    np.testing.assert_array_equal(found.start, RANGE[RANGE >= 4000.0][0])
+    fit = fit_known_shape(power, RANGE, shape, variance=1e-4, start=4000.0, stop=stops, mask=mask)
+    np.testing.assert_array_equal(fit.stop, [RANGE[799], RANGE[599], 9997.5, RANGE[-1]])
+    np.testing.assert_array_equal(fit.start, RANGE[RANGE >= 4000.0][0])
     for k, last in enumerate((800, 600, 667, 1000)):
         alone = fit_known_shape(
             power[k, :last], RANGE[:last], shape[:last], variance=1e-4, start=4000.0
         )
-        assert found.background[k] == alone.background
+        assert fit.background[k] == alone.background
 
 
-# What cannot be solved ----------------------------------------------------------------------
+# Unsolvable cases ---------------------------------------------------------------------------
 
 
 def test_a_shape_that_is_constant_is_singular():
     power = np.random.default_rng(10).normal(5.0, 1.0, (2, 200))
     shape = np.stack([np.ones(200), 1.0 + 1e-3 * np.linspace(0.0, 1.0, 200)])
-    found = fit_known_shape(power, RANGE[:200], shape, variance=1.0, start=0.0)
-    assert found.singular.all()
-    assert np.isinf(found.condition[0])
-    assert np.isnan(found.background[0])
-    assert found.condition[1] > 1000.0
-    assert abs(found.background[1] - 5.0) < 5.0 * found.background_standard_error[1]
+    fit = fit_known_shape(power, RANGE[:200], shape, variance=1.0, start=0.0)
+    assert fit.singular.all()
+    assert np.isinf(fit.condition[0])
+    assert np.isnan(fit.background[0])
+    assert fit.condition[1] > 1000.0
+    assert abs(fit.background[1] - 5.0) < 5.0 * fit.background_standard_error[1]
 
 
-def test_condition_is_the_price_of_the_second_unknown():
+def test_condition_is_the_error_increase_by_the_second_unknown():
     shape = air()
     long = fit_known_shape(np.ones(1000), RANGE, shape, variance=1.0, start=2000.0)
     short = fit_known_shape(np.ones(1000), RANGE, shape, variance=1.0, start=14000.0)
-    for found in (long, short):
-        bins = found.degrees_of_freedom + 2
-        assert found.condition == pytest.approx(found.background_standard_error * np.sqrt(bins))
+    for fit in (long, short):
+        bins = fit.degrees_of_freedom + 2
+        assert fit.condition == pytest.approx(fit.background_standard_error * np.sqrt(bins))
     assert 1.0 < long.condition < 1.3
     assert short.condition > 10.0
     assert not long.singular
@@ -288,18 +288,18 @@ def test_missing_profiles_stay_missing():
     power[1] = np.nan
     power[2, 303:] = np.nan
     shape = air()
-    found = fit_known_shape(power, RANGE, shape, variance=1.0, start=RANGE[300])
-    assert np.isnan(found.background[1])
-    assert np.isnan(found.start[1])
-    assert found.quality[1] == Quality.INPUT_MISSING
-    assert found.quality[2] & Quality.TOO_FEW_BINS
-    assert found.degrees_of_freedom[2] == 1
+    fit = fit_known_shape(power, RANGE, shape, variance=1.0, start=RANGE[300])
+    assert np.isnan(fit.background[1])
+    assert np.isnan(fit.start[1])
+    assert fit.quality[1] == Quality.INPUT_MISSING
+    assert fit.quality[2] & Quality.TOO_FEW_BINS
+    assert fit.degrees_of_freedom[2] == 1
     none = fit_known_shape(np.full((2, 1000), np.nan), RANGE, shape)
     assert np.isnan(none.background).all()
     assert fit_known_shape(np.empty((0, 1000)), RANGE, shape).background.shape == (0,)
 
 
-def test_a_recorder_that_stands_still_is_flagged():
+def test_a_constant_signal_is_flagged():
     for options in ({}, {"variance": 1.0}):
         assert (
             fit_known_shape(np.full(1000, 7.0), RANGE, air(), **options).quality & Quality.NO_SIGNAL
@@ -311,9 +311,9 @@ def test_a_recorder_that_stands_still_is_flagged():
     assert dark.background_standard_error >= 1.0 / (100.0 * bins)
 
 
-def test_a_signal_upside_down_is_flagged():
-    found = fit_known_shape(10.0 - air(), RANGE, air(), variance=1e-4, start=4000.0)
-    assert found.quality & Quality.NEGATIVE_AMPLITUDE
+def test_an_inverted_signal_is_flagged():
+    fit = fit_known_shape(10.0 - air(), RANGE, air(), variance=1e-4, start=4000.0)
+    assert fit.quality & Quality.NEGATIVE_AMPLITUDE
 
 
 def test_no_bit_depends_on_batch_order_or_layout():
@@ -326,8 +326,8 @@ def test_no_bit_depends_on_batch_order_or_layout():
         alone = [fit_known_shape(row, RANGE, shape, **options).background for row in power]
         np.testing.assert_array_equal(whole.background.ravel(), alone)
         other = np.asfortranarray(power.astype(">f8"))[:, ::-1]
-        turned = fit_known_shape(other, RANGE[::-1], shape[::-1], **options)
-        np.testing.assert_array_equal(turned.background, alone)
+        reversed_fit = fit_known_shape(other, RANGE[::-1], shape[::-1], **options)
+        np.testing.assert_array_equal(reversed_fit.background, alone)
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def test_no_bit_depends_on_batch_order_or_layout():
         ({"start_shares": (0.5, 1.0)}, "start_shares"),
     ],
 )
-def test_impossible_arguments_are_refused(change, field):
+def test_invalid_arguments_are_refused(change, field):
     arguments = {"power": np.ones(1000), "range": RANGE, "shape": air()} | change
     with pytest.raises(RetrievalInputError) as error:
         fit_known_shape(**arguments)
@@ -384,22 +384,22 @@ def _published(folder, wavelength):
 
 
 @pytest.mark.parametrize("wavelength", [355, 532, 1064])
-def test_published_backgrounds_are_met(data_root, wavelength):
+def test_published_backgrounds_are_reproduced(data_root, wavelength):
     """Boeckmann et al. (2004): within a count, and within 3 standard errors at every level."""
     levels = 0
     for level, power, clean, shape, range_ in _published(
         data_root / "synthetic" / "boeckmann", wavelength
     ):
-        # The scale of a file is known to 1e-5 only: its truth is the fit of the true shape.
+        # The scale of a file is known to 1e-5 only: the truth is the fit of the true shape.
         truth = fit_known_shape(
             power, range_, clean, variance=(clean + level) / SHOTS, start=range_[60]
         )
-        found = fit_known_shape(power, range_, shape, exposure=SHOTS)
-        off = found.background - truth.background
-        assert abs(off) < 3.0 * found.background_standard_error
+        fit = fit_known_shape(power, range_, shape, exposure=SHOTS)
+        off = fit.background - truth.background
+        assert abs(off) < 3.0 * fit.background_standard_error
         assert level > 1e5 or abs(off) <= 1.0
-        assert not found.poor_fit
-        assert found.quality == 0
+        assert not fit.poor_fit
+        assert fit.quality == 0
         flat = fit_known_shape(power, range_, shape)
         assert level > 1e5 or abs(flat.background - truth.background) <= 1.0
         if level <= 1e4:

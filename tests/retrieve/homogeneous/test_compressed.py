@@ -1,4 +1,4 @@
-"""The compressed solver against the family itself, converged least squares and plain loops."""
+"""The compressed solver against exact shapes, converged least squares and plain loops."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def tables(r, size, weights=None):
 
 @pytest.mark.parametrize(("size", "loss"), [(11, 2e-6), (7, 7.5e-3)])
 @pytest.mark.parametrize(("start", "length"), GEOMETRIES)
-def test_basis_holds_what_a_profile_says_of_extinction(start, length, size, loss):
+def test_basis_holds_the_information_of_a_profile_on_extinction(start, length, size, loss):
     r = section(start, length)
     table = tables(r, size)
     columns = table.columns[:, : size + 1] * np.append(np.full(size, table.unit**0.5), 1.0)
@@ -52,16 +52,16 @@ def test_basis_holds_what_a_profile_says_of_extinction(start, length, size, loss
         kept = []
         for project in (np.eye(r.size), basis @ basis.T):
             one, level, slope = (
-                project @ part for part in (shape, np.ones(r.size), -2.0 * x * shape)
+                project @ values for values in (shape, np.ones(r.size), -2.0 * x * shape)
             )
             others = np.column_stack([one, level])
-            left = slope - others @ np.linalg.lstsq(others, slope, rcond=None)[0]
-            kept.append(left @ left)
+            remainder = slope - others @ np.linalg.lstsq(others, slope, rcond=None)[0]
+            kept.append(remainder @ remainder)
         assert kept[1] >= (1.0 - loss) * kept[0]
 
 
 @pytest.mark.parametrize("room", [1, 500, 10**9])
-def test_tables_do_not_depend_on_how_much_is_made_at_a_time(monkeypatch, room):
+def test_tables_do_not_depend_on_the_block_size(monkeypatch, room):
     r, weights = LONG, np.linspace(1.0, 2.0, LONG.size)
     whole = _functional_tables._make(r, weights, bounds(r), 11)
     monkeypatch.setattr(_functional_tables, "_ROOM", room)
@@ -69,19 +69,19 @@ def test_tables_do_not_depend_on_how_much_is_made_at_a_time(monkeypatch, room):
         np.testing.assert_array_equal(one, other)
 
 
-def test_long_profiles_are_solved_without_tables_alike(monkeypatch):
+def test_long_profiles_are_solved_without_tables(monkeypatch):
     r = 2500.0 + 2.0 * np.arange(_dense.MOST_BINS + 1.0)
     power = signal(r, 100.0, 3e-5) + np.random.default_rng(8).standard_normal((3, r.size))
     made = []
-    monkeypatch.setattr(_dense, "make_tables", lambda *given: made.append(given))
-    found, direct = (
-        fit_homogeneous_path(power, r, variance=1.0, method=way) for way in ("auto", "direct")
+    monkeypatch.setattr(_dense, "make_tables", lambda *arguments: made.append(arguments))
+    fit, direct = (
+        fit_homogeneous_path(power, r, variance=1.0, method=name) for name in ("auto", "direct")
     )
     assert not made
     np.testing.assert_allclose(
-        found.extinction, direct.extinction, atol=1e-3 * direct.extinction_standard_error.min()
+        fit.extinction, direct.extinction, atol=1e-3 * direct.extinction_standard_error.min()
     )
-    np.testing.assert_array_equal(found.quality, direct.quality)
+    np.testing.assert_array_equal(fit.quality, direct.quality)
 
 
 def test_tables_are_made_once():
@@ -118,22 +118,22 @@ def plainly(values, matrix):
 
 @njit
 def in_registers(values, matrix, out):
-    here, width = values.ctypes.data, 8 * values.shape[1]
+    address, width = values.ctypes.data, 8 * values.shape[1]
     if values.shape[0] == 6:
         _vector_loops.project_6_8(
-            here, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, here, 8
+            address, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, address, 8
         )
     elif values.shape[0] == 4:
         _vector_loops.project_4_12(
-            here, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, here, 8
+            address, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, address, 8
         )
     elif matrix.shape[1] == 8:
         _vector_loops.project_1_8(
-            here, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, here, 8
+            address, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, address, 8
         )
     else:
         _vector_loops.project_1_4(
-            here, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, here, 8
+            address, width, matrix.ctypes.data, matrix.shape[0], out.ctypes.data, address, 8
         )
 
 
@@ -148,7 +148,7 @@ def test_projection_has_the_bits_of_a_plain_loop(rows, columns, terms):
 
 
 @njit
-def look_back(row, tail, envelope, root, decay, amplitude, background, out):
+def take_residuals(row, tail, envelope, root, decay, amplitude, background, out):
     steps = envelope.size // 16
     e2 = decay * decay
     e4 = e2 * e2
@@ -181,7 +181,7 @@ def test_residuals_are_those_of_the_model(dtype, bins):
     tail = np.full(16, 3.0, dtype)
     tail[:rest] = row[bins - rest :]
     out = np.empty(padded, dtype)
-    energy, largest = look_back(row, tail, envelope, root, 0.98, 5.0, 3.0, out)
+    energy, largest = take_residuals(row, tail, envelope, root, 0.98, 5.0, 3.0, out)
     model = 3.0 + 5.0 * 0.98 ** np.arange(bins) * envelope[:bins].astype(float)
     expected = (row.astype(float) - model) * root[:bins]
     close = {"rtol": 1e-5, "atol": 1e-5} if dtype == np.float32 else {"rtol": 1e-12}
@@ -204,9 +204,9 @@ def test_noise_free_extinction_is_exact(start, length, bins, level, method):
     r = np.linspace(start, start + length, bins)
     truth = np.geomspace(1e-5, 50.0 / length, 300)[:, np.newaxis]
     power = level + np.exp(-2.0 * truth * (r - start)) * (start / r) ** 2
-    found = fit_homogeneous_path(power, r, method=method)
-    np.testing.assert_allclose(found.extinction, truth[:, 0], rtol=1e-9)
-    assert np.max(np.abs(found.background - level)) < 1e-9
+    fit = fit_homogeneous_path(power, r, method=method)
+    np.testing.assert_allclose(fit.extinction, truth[:, 0], rtol=1e-9)
+    assert np.max(np.abs(fit.background - level)) < 1e-9
     if bins == 225:
         rounded = fit_homogeneous_path(power.astype(np.float32), r, method=method)
         apart = np.abs(rounded.extinction / truth[:, 0] - 1.0)
@@ -227,22 +227,20 @@ def test_result_is_that_of_converged_least_squares(start, length, known, method,
     power += 370.0 + random.normal(size=power.shape)
     variance = 1.0 if known else None
     exact = fit_homogeneous_path(power, r, variance=variance, method="direct")
-    found = fit_homogeneous_path(power, r, variance=variance, method=method)
-    doubt = Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND
-    stands = (exact.quality & int(doubt)) == 0
-    assert stands.sum() > 1000
+    fit = fit_homogeneous_path(power, r, variance=variance, method=method)
+    undetermined = Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND
+    valid = (exact.quality & int(undetermined)) == 0
+    assert valid.sum() > 1000
     for name in ("extinction", "background", "amplitude"):
-        error = getattr(exact, f"{name}_standard_error")[stands]
-        difference = np.abs(getattr(found, name) - getattr(exact, name))[stands]
+        error = getattr(exact, f"{name}_standard_error")[valid]
+        difference = np.abs(getattr(fit, name) - getattr(exact, name))[valid]
         assert np.max(difference / error) < apart
-        ratio = getattr(found, f"{name}_standard_error")[stands] / error
+        ratio = getattr(fit, f"{name}_standard_error")[valid] / error
         np.testing.assert_allclose(ratio, 1.0, rtol=5e-3 if method == "compressed" else 0.2)
-    same = (found.quality & int(doubt)) == (exact.quality & int(doubt))
+    same = (fit.quality & int(undetermined)) == (exact.quality & int(undetermined))
     assert np.mean(same) > 0.998
-    if not np.isnan(found.reduced_chi2).all():
-        np.testing.assert_allclose(
-            found.reduced_chi2[stands], exact.reduced_chi2[stands], rtol=1e-3
-        )
+    if not np.isnan(fit.reduced_chi2).all():
+        np.testing.assert_allclose(fit.reduced_chi2[valid], exact.reduced_chi2[valid], rtol=1e-3)
 
 
 # Statistics ---------------------------------------------------------------------------------
@@ -264,14 +262,14 @@ def test_scatter_is_the_least_possible_and_stated(start, length, height, extinct
     count = 10_000
     power = 370.0 + signal(r, height, extinction * KM)
     power = power + np.random.default_rng(3).normal(size=(count, r.size))
-    found = fit_homogeneous_path(power, r, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, r, variance=1.0, method=method)
     lowest = lowest_errors(r, height, extinction * KM)
     amplitude = height * start**2 * np.exp(2.0 * extinction * KM * start)
     truths = {"background": 370.0, "extinction": extinction * KM, "amplitude": amplitude}
     for name, truth in truths.items():
-        pull = (getattr(found, name) - truth) / getattr(found, f"{name}_standard_error")
+        pull = (getattr(fit, name) - truth) / getattr(fit, f"{name}_standard_error")
         assert 0.94 <= np.mean(np.abs(pull) < 1.96) <= 0.96
-    error = found.extinction - extinction * KM
+    error = fit.extinction - extinction * KM
     assert np.sqrt(np.mean(error**2)) < 1.04 * lowest[2]
     assert abs(np.mean(error)) < 0.05 * lowest[2]
 
@@ -281,21 +279,21 @@ def test_scatter_is_the_least_possible_and_stated(start, length, height, extinct
 def test_curvature_misfit_is_chi_square(height, method):
     power = 370.0 + signal(LONG, height, 0.03 * KM)
     power = power + np.random.default_rng(4).normal(size=(20_000, 225))
-    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     dof = _compressed.CURVATURES - 2
-    assert np.mean(found.curvature_misfit) == pytest.approx(dof, rel=0.02)
-    assert stats.kstest(found.curvature_misfit, stats.chi2(dof).cdf).pvalue > 1e-4
+    assert np.mean(fit.curvature_misfit) == pytest.approx(dof, rel=0.02)
+    assert stats.kstest(fit.curvature_misfit, stats.chi2(dof).cdf).pvalue > 1e-4
 
 
 def test_common_weights_serve_counts():
     shots = 51
     mean = 10.0 + signal(LONG, 20.0, 0.03 * KM)
     power = np.random.default_rng(5).poisson(shots * mean, (10_000, 225)) / shots
-    found = fit_homogeneous_path(power, LONG, variance=mean / shots, method="compressed")
+    fit = fit_homogeneous_path(power, LONG, variance=mean / shots, method="compressed")
     direct = fit_homogeneous_path(power[:300], LONG, variance=mean / shots, method="direct")
-    apart = np.abs(found.extinction[:300] - direct.extinction)
+    apart = np.abs(fit.extinction[:300] - direct.extinction)
     assert np.max(apart / direct.extinction_standard_error) < 0.01
-    pull = (found.extinction - 0.03 * KM) / found.extinction_standard_error
+    pull = (fit.extinction - 0.03 * KM) / fit.extinction_standard_error
     assert 0.94 <= np.mean(np.abs(pull) < 1.96) <= 0.96
 
 
@@ -312,15 +310,15 @@ def test_bits_do_not_depend_on_size_or_start_of_the_batch(dtype, variance, metho
     power[400] = 5.0
     whole = fit_homogeneous_path(power, LONG, variance=variance, method=method)
     for size in (*range(1, 100), *range(100, 1000, 37)):
-        part = fit_homogeneous_path(power[:size], LONG, variance=variance, method=method)
-        np.testing.assert_array_equal(part.extinction, whole.extinction[:size])
+        batch = fit_homogeneous_path(power[:size], LONG, variance=variance, method=method)
+        np.testing.assert_array_equal(batch.extinction, whole.extinction[:size])
     for start in range(1, 120, 7):
-        part = fit_homogeneous_path(
+        batch = fit_homogeneous_path(
             power[start : start + 60], LONG, variance=variance, method=method
         )
         for name in FIELDS:
             np.testing.assert_array_equal(
-                getattr(part, name), getattr(whole, name)[start : start + 60], err_msg=name
+                getattr(batch, name), getattr(whole, name)[start : start + 60], err_msg=name
             )
 
 
@@ -330,12 +328,12 @@ def test_scale_of_the_power_does_not_matter(scale, method):
     power = 370.0 + signal(LONG, 100.0, 0.1 * KM)
     power = power + np.random.default_rng(7).normal(size=(20, 225))
     expected = fit_homogeneous_path(power, LONG, method=method)
-    found = fit_homogeneous_path(power * scale, LONG, method=method)
-    # Beyond 1e140 the squares leave the floats, and the direct fit takes over.
+    fit = fit_homogeneous_path(power * scale, LONG, method=method)
+    # Beyond 1e140 the squares leave the float range, and the direct fit takes over.
     close = 1e-9 if 1e-50 < scale < 1e50 else 1e-2
-    np.testing.assert_allclose(found.extinction, expected.extinction, rtol=close)
-    np.testing.assert_allclose(found.background, expected.background * scale, rtol=close)
-    np.testing.assert_array_equal(found.quality, expected.quality)
+    np.testing.assert_allclose(fit.extinction, expected.extinction, rtol=close)
+    np.testing.assert_allclose(fit.background, expected.background * scale, rtol=close)
+    np.testing.assert_array_equal(fit.quality, expected.quality)
     if 1e-38 < scale < 1e30:
         single = fit_homogeneous_path((power * scale).astype(np.float32), LONG, method=method)
         np.testing.assert_allclose(single.extinction, expected.extinction, rtol=1e-2)
@@ -343,16 +341,16 @@ def test_scale_of_the_power_does_not_matter(scale, method):
 
 
 @pytest.mark.parametrize("method", SOLVERS)
-def test_what_has_no_tables_is_solved_all_the_same(method):
+def test_profiles_without_tables_are_solved_by_the_direct_fit(method):
     uneven = LONG + np.linspace(0.0, 3.0, 225) ** 2
     thin = section(10_500.0, 50.0)
     short = LONG[:20]
     for r in (uneven, thin, short):
         power = 370.0 + signal(r, 1e4, 0.1 * KM)
         power = power + np.random.default_rng(8).normal(size=(3, r.size))
-        found = fit_homogeneous_path(power, r, variance=1.0, method=method)
+        fit = fit_homogeneous_path(power, r, variance=1.0, method=method)
         exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
-        np.testing.assert_array_equal(found.extinction, exact.extinction)
+        np.testing.assert_array_equal(fit.extinction, exact.extinction)
 
 
 @pytest.mark.parametrize(
@@ -365,15 +363,13 @@ def test_what_has_no_tables_is_solved_all_the_same(method):
         (10_000.0, 110.0, 2.5, 3e-5, 1e6),
     ],
 )
-def test_a_thin_section_settles_far_from_where_it_starts(
-    start, length, step, extinction, amplitude
-):
+def test_a_thin_section_settles_far_from_its_start(start, length, step, extinction, amplitude):
     r = np.arange(start, start + length, step)
     shape = (start / r) ** 2 * np.exp(-2.0 * extinction * (r - start))
     noise = np.random.default_rng(5).normal(size=(400, r.size))
     power = 50.0 + amplitude * shape + noise
     for method in ("auto", "fast"):
-        found = fit_homogeneous_path(power, r, variance=1.0, method=method)
+        fit = fit_homogeneous_path(power, r, variance=1.0, method=method)
         exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
-        off = np.abs(found.extinction - exact.extinction) / exact.extinction_standard_error
+        off = np.abs(fit.extinction - exact.extinction) / exact.extinction_standard_error
         assert off.max() < (0.01 if method == "auto" else 0.1)

@@ -1,4 +1,4 @@
-"""The methods of the homogeneous path: their formulas, and errors that say how far off they are."""
+"""The methods of the homogeneous path: their formulas and their stated errors."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ def truth_of(r, height, extinction, dark=370.0):
     return dict(zip(NAMES, (dark, amplitude(r, height, extinction), extinction), strict=True))
 
 
-def coverage(found, name, truth):
-    errors = getattr(found, name) - truth
-    return float(np.mean(np.abs(errors) <= 1.96 * getattr(found, f"{name}_standard_error")))
+def coverage(fit, name, truth):
+    errors = getattr(fit, name) - truth
+    return float(np.mean(np.abs(errors) <= 1.96 * getattr(fit, f"{name}_standard_error")))
 
 
-def same(one, other):
+def same(fit, other):
     for name in FIELDS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(fit, name), getattr(other, name), err_msg=name)
 
 
-def rows_of(found, rows):
-    return HomogeneousResult(**{name: getattr(found, name)[rows] for name in FIELDS})
+def rows_of(fit, rows):
+    return HomogeneousResult(**{name: getattr(fit, name)[rows] for name in FIELDS})
 
 
 # One linear step ----------------------------------------------------------------------------
@@ -66,25 +66,25 @@ def test_linear_step_solves_the_normal_equations(centre, weighted):
     weights = rng.uniform(0.2, 5.0, 225) if weighted else np.ones(225)
     weights[:30] = 0.0 if weighted else 1.0
     prior = 0.03 * KM * rng.uniform(0.5, 1.5, 30)
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         power, LONG, weights=weights, method="linearized", extinction=prior, centre=centre
     )
     for k in range(30):
         expected = linear_step(LONG, power[k], weights, prior[k], centre)
-        assert found.background[k] == pytest.approx(expected[0], rel=1e-9)
-        assert found.amplitude[k] == pytest.approx(expected[1], rel=1e-6)
-        assert found.extinction[k] == pytest.approx(expected[2], rel=1e-6)
+        assert fit.background[k] == pytest.approx(expected[0], rel=1e-9)
+        assert fit.amplitude[k] == pytest.approx(expected[1], rel=1e-6)
+        assert fit.extinction[k] == pytest.approx(expected[2], rel=1e-6)
 
 
 @pytest.mark.parametrize("centre", ["centroid", "zero"])
 def test_linear_step_from_the_truth_is_exact_without_noise(centre):
     extinction = np.geomspace(0.01 * KM, 5.0 * KM, 60)
     power = 25.0 + signal(LONG, 1.0, extinction)
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         power, LONG, method="linearized", extinction=extinction, centre=centre
     )
-    np.testing.assert_allclose(found.extinction, extinction, rtol=1e-9)
-    np.testing.assert_allclose(found.background, 25.0, rtol=1e-12)
+    np.testing.assert_allclose(fit.extinction, extinction, rtol=1e-9)
+    np.testing.assert_allclose(fit.background, 25.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("centre", ["centroid", "zero"])
@@ -92,11 +92,11 @@ def test_linear_step_from_the_truth_is_exact_without_noise(centre):
     ("height", "extinction", "share"),
     [(107.0, 0.03, 1.0), (1e3, 0.03, 0.9), (1e3, 0.03, 0.7), (107.0, 1.0, 0.95), (1e4, 0.1, 0.95)],
 )
-def test_linear_step_covers_the_truth_from_a_prior_that_is_off(height, extinction, share, centre):
+def test_linear_step_covers_the_truth_from_a_wrong_prior(height, extinction, share, centre):
     extinction *= KM
     power = clean(3000, height, extinction, seed=2)
     for variance in (1.0, None):
-        found = fit_homogeneous_path(
+        fit = fit_homogeneous_path(
             power,
             LONG,
             variance=variance,
@@ -105,20 +105,20 @@ def test_linear_step_covers_the_truth_from_a_prior_that_is_off(height, extinctio
             centre=centre,
         )
         for name, true in truth_of(LONG, height, extinction).items():
-            # The neglected term is estimated from the step, which about zero is itself off.
+            # The neglected term is estimated from the step, which is itself wrong about zero.
             least = {"centroid": 0.9, "zero": 0.8}[centre] if share < 1.0 else 0.935
-            assert coverage(found, name, true) > least, name
+            assert coverage(fit, name, true) > least, name
             if share == 1.0:
-                assert coverage(found, name, true) < 0.965, name
+                assert coverage(fit, name, true) < 0.965, name
 
 
-def test_centroid_keeps_the_error_of_second_order_small_where_the_path_is_turbid():
+def test_centroid_keeps_the_second_order_error_small_on_a_turbid_path():
     extinction = 1.0 * KM
     power = clean(2000, 107.0, extinction, seed=3)
     lowest = lowest_errors(LONG, 107.0, extinction)[2]
 
     def scatter(centre):
-        found = fit_homogeneous_path(
+        fit = fit_homogeneous_path(
             power,
             LONG,
             variance=1.0,
@@ -126,7 +126,7 @@ def test_centroid_keeps_the_error_of_second_order_small_where_the_path_is_turbid
             extinction=0.8 * extinction,
             centre=centre,
         )
-        return np.sqrt(np.mean((found.extinction - extinction) ** 2)) / lowest
+        return np.sqrt(np.mean((fit.extinction - extinction) ** 2)) / lowest
 
     assert scatter("centroid") == pytest.approx(1.6, abs=0.15)
     assert scatter("zero") == pytest.approx(9.6, abs=0.5)
@@ -135,10 +135,10 @@ def test_centroid_keeps_the_error_of_second_order_small_where_the_path_is_turbid
 def test_linear_step_from_far_off_is_flagged():
     power = clean(200, 1e4, 0.1 * KM)
     for centre in ("centroid", "zero"):
-        found = fit_homogeneous_path(
+        fit = fit_homogeneous_path(
             power, LONG, variance=1.0, method="linearized", extinction=0.5 * KM, centre=centre
         )
-        assert np.all(found.quality != 0)
+        assert np.all(fit.quality != 0)
 
 
 # Two unknowns -------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ def test_linear_step_from_far_off_is_flagged():
 def test_known_background_is_the_fit_of_two_unknowns():
     power = clean(20, 300.0, seed=4)
     variance = np.linspace(0.5, 2.0, 225)
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         power, LONG, variance=variance, method="known_background", background=370.2
     )
     for k in range(20):
@@ -158,28 +158,28 @@ def test_known_background_is_the_fit_of_two_unknowns():
             return (profile - model) / np.sqrt(variance)
 
         expected = least_squares(residuals, (300.0, 0.24), x_scale="jac", xtol=1e-15, ftol=1e-15)
-        assert found.extinction[k] * 8000.0 == pytest.approx(expected.x[1], rel=1e-6)
-        assert found.reduced_chi2[k] == pytest.approx(2 * expected.cost / 223, rel=1e-6)
+        assert fit.extinction[k] * 8000.0 == pytest.approx(expected.x[1], rel=1e-6)
+        assert fit.reduced_chi2[k] == pytest.approx(2 * expected.cost / 223, rel=1e-6)
         spread = np.sqrt(np.linalg.inv(expected.jac.T @ expected.jac)[1, 1]) / 8000.0
-        assert found.extinction_standard_error[k] == pytest.approx(spread, rel=1e-2)
-    assert np.all(found.background == 370.2)
-    assert np.all(found.background_standard_error == 0.0)
+        assert fit.extinction_standard_error[k] == pytest.approx(spread, rel=1e-2)
+    assert np.all(fit.background == 370.2)
+    assert np.all(fit.background_standard_error == 0.0)
 
 
 def test_known_background_scatters_less_than_three_unknowns():
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         clean(3000, 107.0, seed=5), LONG, variance=1.0, method="known_background", background=370.0
     )
-    ratio = np.std(found.extinction) / lowest_errors(LONG, 107.0, 0.03 * KM)[2]
+    ratio = np.std(fit.extinction) / lowest_errors(LONG, 107.0, 0.03 * KM)[2]
     assert 0.25 < ratio < 0.4
     for name in ("amplitude", "extinction"):
-        assert 0.935 < coverage(found, name, truth_of(LONG, 107.0, 0.03 * KM)[name]) < 0.965
+        assert 0.935 < coverage(fit, name, truth_of(LONG, 107.0, 0.03 * KM)[name]) < 0.965
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_error_of_a_given_background_is_propagated(known):
     given = 370.0 + 0.5 * np.random.default_rng(6).normal(size=3000)
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         clean(3000, 300.0, seed=6),
         LONG,
         variance=1.0 if known else None,
@@ -188,17 +188,17 @@ def test_error_of_a_given_background_is_propagated(known):
         background_standard_error=0.5,
     )
     for name, true in truth_of(LONG, 300.0, 0.03 * KM).items():
-        assert 0.935 < coverage(found, name, true) < 0.965, name
-    np.testing.assert_array_equal(found.background, given)
+        assert 0.935 < coverage(fit, name, true) < 0.965, name
+    np.testing.assert_array_equal(fit.background, given)
 
 
 def test_background_at_known_extinction_is_the_published_formula():
     power = clean(20, seed=7)
-    found = fit_homogeneous_path(power, LONG, method="known_extinction", extinction=0.03 * KM)
+    fit = fit_homogeneous_path(power, LONG, method="known_extinction", extinction=0.03 * KM)
     expected = [published_background(LONG, profile, 0.03 * KM) for profile in power]
-    np.testing.assert_allclose(found.background, expected, rtol=1e-11)
-    assert np.all(found.extinction == 0.03 * KM)
-    assert np.all(found.extinction_standard_error == 0.0)
+    np.testing.assert_allclose(fit.background, expected, rtol=1e-11)
+    assert np.all(fit.extinction == 0.03 * KM)
+    assert np.all(fit.extinction_standard_error == 0.0)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -208,43 +208,43 @@ def test_errors_at_known_extinction_are_honest(height, extinction, known):
     power = 370.0 + signal(LONG, height, extinction * KM)
     power = power + np.sqrt(variance) * noise(3000, seed=8)
     arguments = {"variance": variance} if known else {"weights": 3.0 / variance}
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         power, LONG, method="known_extinction", extinction=extinction * KM, **arguments
     )
     truth = truth_of(LONG, height, extinction * KM)
     for name in ("background", "amplitude"):
-        assert 0.935 < coverage(found, name, truth[name]) < 0.965, name
-    assert np.mean(found.quality == 0) > 0.995
+        assert 0.935 < coverage(fit, name, truth[name]) < 0.965, name
+    assert np.mean(fit.quality == 0) > 0.995
 
 
 def test_wrong_known_extinction_is_flagged():
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         clean(200), LONG, variance=1.0, method="known_extinction", extinction=0.1 * KM
     )
-    assert np.all(found.quality & Quality.POOR_FIT)
+    assert np.all(fit.quality & Quality.POOR_FIT)
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_tail_is_biased_by_its_signal_and_states_its_scatter(known):
     r = section(2500.0, 8000.0)
     power = clean(3000, 107.0, seed=9)
-    found = fit_homogeneous_path(power, r, variance=1.0 if known else None, method="tail_mean")
+    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None, method="tail_mean")
     left = np.mean(signal(r, 107.0, 0.03 * KM)[-22:])
-    assert np.mean(found.background) - 370.0 == pytest.approx(left, abs=0.02)
+    assert np.mean(fit.background) - 370.0 == pytest.approx(left, abs=0.02)
     np.testing.assert_allclose(
-        found.background, cubic_and_tail.tail_mean(power, r).background, rtol=1e-13
+        fit.background, cubic_and_tail.tail_mean(power, r).background, rtol=1e-13
     )
     for name in NAMES:
-        # To first order about a fit that is off: the amplitude scatters somewhat less.
-        stated = np.median(getattr(found, f"{name}_standard_error"))
-        assert np.std(getattr(found, name)) == pytest.approx(stated, rel=0.12), name
-    assert np.mean(found.extinction) > 0.03 * KM + 10 * np.std(found.extinction)
+        # To first order about a biased fit: the amplitude scatters somewhat less.
+        stated = np.median(getattr(fit, f"{name}_standard_error"))
+        assert np.std(getattr(fit, name)) == pytest.approx(stated, rel=0.12), name
+    assert np.mean(fit.extinction) > 0.03 * KM + 10 * np.std(fit.extinction)
 
 
 def test_tail_without_signal_is_as_good_as_any():
     r = section(2500.0, 8000.0)
     extinction = 1.5 * KM
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         clean(3000, 1e3, extinction, seed=10, r=r),
         r,
         variance=1.0,
@@ -252,21 +252,19 @@ def test_tail_without_signal_is_as_good_as_any():
         tail_start=7000.0,
     )
     for name, true in truth_of(r, 1e3, extinction).items():
-        assert 0.935 < coverage(found, name, true) < 0.965, name
-    assert np.mean(found.quality == 0) > 0.995
+        assert 0.935 < coverage(fit, name, true) < 0.965, name
+    assert np.mean(fit.quality == 0) > 0.995
 
 
-def test_tail_leaves_out_what_is_missing():
+def test_tail_skips_missing_bins():
     power = clean(5)
     power[1, 210:] = np.nan
     power[2, 200:] = np.nan
-    found = fit_homogeneous_path(
-        power, LONG, variance=1.0, method="tail_mean", tail_start=LONG[203]
-    )
-    assert found.background[1] == pytest.approx(power[1, 203:210].mean(), rel=1e-13)
-    assert found.quality[1] & Quality.TOO_FEW_BINS
-    assert found.quality[2] & Quality.INPUT_MISSING
-    assert np.isnan(found.extinction[2])
+    fit = fit_homogeneous_path(power, LONG, variance=1.0, method="tail_mean", tail_start=LONG[203])
+    assert fit.background[1] == pytest.approx(power[1, 203:210].mean(), rel=1e-13)
+    assert fit.quality[1] & Quality.TOO_FEW_BINS
+    assert fit.quality[2] & Quality.INPUT_MISSING
+    assert np.isnan(fit.extinction[2])
 
 
 # Counts -------------------------------------------------------------------------------------
@@ -289,7 +287,7 @@ def test_every_method_is_right_for_counts(method, given, dark, height, shots):
     rng = np.random.default_rng(11)
     expected = dark + signal(LONG, height, 0.03 * KM)
     power = rng.poisson(expected * shots, (3000, 225)) / shots
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         power,
         LONG,
         variance=mean_profile_variance(power, shots),
@@ -299,11 +297,11 @@ def test_every_method_is_right_for_counts(method, given, dark, height, shots):
         **{name: dark if value == "dark" else value for name, value in given.items()},
     )
     for name, true in truth_of(LONG, height, 0.03 * KM, dark).items():
-        errors = getattr(found, name) - true
-        assert 0.93 < coverage(found, name, true) <= 1.0, name
+        errors = getattr(fit, name) - true
+        assert 0.93 < coverage(fit, name, true) <= 1.0, name
         assert abs(np.mean(errors)) <= 0.12 * np.std(errors), name
     # A background that is known to a hundredth of its scatter cannot be said to be poor.
-    assert np.mean(found.quality == 0) > 0.99
+    assert np.mean(fit.quality == 0) > 0.99
 
 
 def test_counts_reach_the_least_possible_scatter():
@@ -311,14 +309,14 @@ def test_counts_reach_the_least_possible_scatter():
     for dark, height, most in ((510.0, 1020.0, 1.03), (10.0, 1e5, 1.05)):
         expected = dark + signal(LONG, height, 0.03 * KM)
         power = rng.poisson(expected, (4000, 225))
-        found = fit_homogeneous_path(power, LONG, variance=mean_profile_variance(power))
+        fit = fit_homogeneous_path(power, LONG, variance=mean_profile_variance(power))
         lowest = lowest_errors(LONG, height, 0.03 * KM, 1.0 / expected)
         for name, scale in zip(NAMES, lowest, strict=True):
             true = truth_of(LONG, height, 0.03 * KM, dark)[name]
             least = scale * true if name == "amplitude" else scale
-            errors = getattr(found, name) - true
+            errors = getattr(fit, name) - true
             assert np.sqrt(np.mean(errors**2)) < most * least, name
-            assert 0.935 < coverage(found, name, true) < 0.965, name
+            assert 0.935 < coverage(fit, name, true) < 0.965, name
 
 
 def test_variance_of_a_mean_profile():
@@ -327,7 +325,7 @@ def test_variance_of_a_mean_profile():
     one = mean_profile_variance(rng.poisson(expected, (400, 225)))
     assert one.shape == (225,)
     np.testing.assert_allclose(one, expected, rtol=0.05)
-    # Where a few profiles tell little, neighbours help; where they tell enough, none is asked.
+    # Weak bins of few profiles are averaged with their neighbours; strong bins are not.
     few = mean_profile_variance(rng.poisson(expected, (3, 225)))
     assert np.std(few[-100:] / expected[-100:]) < 0.06
     np.testing.assert_allclose(few[0], expected[0], rtol=0.01)
@@ -354,11 +352,11 @@ def test_cubic_of_mean_counts_per_shot():
     shots = np.array([1.0, 8.0])[:, np.newaxis, np.newaxis]
     expected = 510.0 + signal(LONG, 3000.0, 0.03 * KM)
     power = rng.poisson(expected * shots, (2, 2000, 225)) / shots
-    found = cubic_and_tail.cubic(power, LONG, statistics="poisson", shots=shots[..., 0])
-    for row, error in zip(found.background - 510.0, found.background_standard_error, strict=True):
+    fit = cubic_and_tail.cubic(power, LONG, statistics="poisson", shots=shots[..., 0])
+    for row, error in zip(fit.background - 510.0, fit.background_standard_error, strict=True):
         assert abs(np.mean(row)) < 0.1 * np.std(row)
         assert 0.93 < np.mean(np.abs(row) < 1.96 * error) < 0.97
-    ratio = np.median(found.background_standard_error, axis=1)
+    ratio = np.median(fit.background_standard_error, axis=1)
     assert ratio[0] / ratio[1] == pytest.approx(np.sqrt(8.0), rel=0.1)
 
 
@@ -370,18 +368,18 @@ def test_published_bias_is_that_of_the_noise_and_the_fit_has_none(length, expect
     r, power = table_profiles(2500.0, length, 2000, seed=15)
     published = cubic_and_tail.cubic(power, r, lag=1, variance=0.0).background
     assert np.mean(published) - 370.0 == pytest.approx(expected, abs=0.3)
-    found = fit_homogeneous_path(power, r, variance=1.0)
-    errors = found.background - 370.0
+    fit = fit_homogeneous_path(power, r, variance=1.0)
+    errors = fit.background - 370.0
     spread = np.std(errors) / np.sqrt(errors.size)
     # The fit is not linear: where the background is poorly determined its distribution is
     # skewed, by up to a fifth of its scatter, about a median that is right.
     assert abs(np.mean(errors)) < 0.2 * np.std(errors)
     if length > 1000.0:
         assert abs(np.median(errors)) < 3 * 1.2533 * spread
-        assert 0.93 < coverage(found, "background", 370.0) < 0.97
+        assert 0.93 < coverage(fit, "background", 370.0) < 0.97
         assert abs(np.mean(errors)) < 0.05 * (np.mean(published) - 370.0)
     else:
-        assert np.all(found.quality & Quality.rejecting())
+        assert np.all(fit.quality & Quality.rejecting())
 
 
 @pytest.mark.parametrize("length", [500.0, 1000.0, 2000.0, 2500.0])
@@ -397,23 +395,23 @@ def test_published_bias_vanishes_far_away(length):
 def test_sections_are_solved_on_their_own():
     power, sections = clean(6).reshape(2, 3, 225), [(2500.0, 6000.0), (4000.0, 9000.0), (0.0, 1e5)]
     variance = np.random.default_rng(17).uniform(0.5, 2.0, power.shape)
-    found = fit_homogeneous_path(power, LONG, variance=variance, sections=sections)
-    assert found.extinction.shape == (2, 3, 3)
+    fit = fit_homogeneous_path(power, LONG, variance=variance, sections=sections)
+    assert fit.extinction.shape == (2, 3, 3)
     for k, (near, far) in enumerate(sections):
         inside = (near <= LONG) & (far > LONG)
         one = fit_homogeneous_path(power[..., inside], LONG[inside], variance=variance[..., inside])
         for name in FIELDS:
-            np.testing.assert_array_equal(getattr(found, name)[..., k], getattr(one, name))
+            np.testing.assert_array_equal(getattr(fit, name)[..., k], getattr(one, name))
     turned = fit_homogeneous_path(
         power[..., ::-1], LONG[::-1], variance=variance[..., ::-1], sections=tuple(sections)
     )
-    same(turned, found)
+    same(turned, fit)
     one = fit_homogeneous_path(power, LONG, sections=sections[:1])
     assert one.quality.shape == (2, 3, 1)
 
 
 @pytest.mark.parametrize("sections", [[(1.0,)], [(3000.0, 2000.0)], [(11000.0, 12000.0)], [], 3])
-def test_sections_that_cannot_be_right_are_refused(sections):
+def test_invalid_sections_are_refused(sections):
     with pytest.raises(RetrievalInputError) as caught:
         fit_homogeneous_path(clean(1), LONG, sections=sections)
     assert caught.value.field == "sections"
@@ -423,32 +421,30 @@ def test_sections_that_cannot_be_right_are_refused(sections):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_robust_passes_leave_out_a_cloud(known):
+def test_robust_passes_exclude_a_cloud(known):
     power = clean(1500, seed=18)
     without = power.copy()
     without[:, 100:104] = np.nan
     power[:, 100:104] += 200.0
     variance = 1.0 if known else None
-    found = fit_homogeneous_path(power, LONG, variance=variance, robust_passes=2)
+    fit = fit_homogeneous_path(power, LONG, variance=variance, robust_passes=2)
     expected = fit_homogeneous_path(without, LONG, variance=variance)
-    assert np.all(found.quality & Quality.OUTLIER)
-    assert np.mean((found.quality & ~Quality.OUTLIER) == 0) > 0.995
-    alike = np.abs(found.extinction - expected.extinction) < 0.05 * found.extinction_standard_error
-    assert np.mean(alike) > 0.95
-    assert 0.935 < coverage(found, "extinction", 0.03 * KM) < 0.965
-    assert np.median(found.valid_bins) == 221
+    assert np.all(fit.quality & Quality.OUTLIER)
+    assert np.mean((fit.quality & ~Quality.OUTLIER) == 0) > 0.995
+    similar = np.abs(fit.extinction - expected.extinction) < 0.05 * fit.extinction_standard_error
+    assert np.mean(similar) > 0.95
+    assert 0.935 < coverage(fit, "extinction", 0.03 * KM) < 0.965
+    assert np.median(fit.valid_bins) == 221
 
 
-def test_robust_passes_leave_clean_profiles_alone():
+def test_robust_passes_keep_clean_profiles():
     power = clean(1500, seed=19)
-    plain, found = (
-        fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=k) for k in (0, 2)
-    )
-    untouched = found.valid_bins == 225
+    plain, fit = (fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=k) for k in (0, 2))
+    untouched = fit.valid_bins == 225
     # One profile in 71 has a bin beyond 4 standard deviations.
     assert 0.97 < np.mean(untouched) < 1.0
-    same(rows_of(found, untouched), rows_of(plain, untouched))
-    assert np.all(found.quality[~untouched] & Quality.OUTLIER)
+    same(rows_of(fit, untouched), rows_of(plain, untouched))
+    assert np.all(fit.quality[~untouched] & Quality.OUTLIER)
     noiseless = 25.0 + signal(LONG, 1.0, np.geomspace(0.01 * KM, 1.0 * KM, 30))
     assert np.all(fit_homogeneous_path(noiseless, LONG, robust_passes=3).valid_bins == 225)
 
@@ -456,15 +452,15 @@ def test_robust_passes_leave_clean_profiles_alone():
 def test_robust_passes_do_not_hide_that_a_path_is_not_homogeneous():
     wave = 1.0 + 0.3 * np.sin(np.pi * (LONG - LONG[0]) / 1500.0)
     power = 370.0 + signal(LONG, 1e3, 0.03 * KM) * wave + noise(300, seed=20)
-    found = fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=3)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=3)
     rejecting = int(Quality.rejecting())
-    assert np.all(found.quality & rejecting)
-    assert np.all(found.valid_bins > 112)
+    assert np.all(fit.quality & rejecting)
+    assert np.all(fit.valid_bins > 112)
 
 
-# Each profile on its own, and no silent error ------------------------------------------------
+# Each profile on its own, and no silent error -----------------------------------------------
 
-WAYS = {
+CALLS = {
     "direct": {},
     "cubic": {"lag": 70},
     "linearized": {"extinction": "near"},
@@ -475,15 +471,15 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_no_method_depends_on_the_batch(way, dtype):
+def test_no_method_depends_on_the_batch(call, dtype):
     rng = np.random.default_rng(22)
     power = clean(60, seed=22).astype(dtype)
     power[rng.random(60) < 0.2, 30:60] = np.nan
     power[[3, 11]], power[12] = np.nan, 5.0
     values = {"near": 0.03 * KM * rng.uniform(0.9, 1.1, 60), "given": rng.normal(370.0, 0.2, 60)}
-    chosen = {"method": way} | WAYS[way]
+    chosen = {"method": call} | CALLS[call]
 
     def solved(rows):
         arguments = {
@@ -499,10 +495,10 @@ def test_no_method_depends_on_the_batch(way, dtype):
 
 
 @pytest.mark.parametrize(
-    "way", [way for way in WAYS if way not in ("tail_mean", "known_extinction")]
+    "call", [call for call in CALLS if call not in ("tail_mean", "known_extinction")]
 )
 @pytest.mark.parametrize(("start", "length"), GEOMETRIES)
-def test_what_is_accepted_is_right_within_its_error(way, start, length):
+def test_unflagged_values_are_right_within_their_errors(call, start, length):
     rng = np.random.default_rng(23)
     r, count = section(start, length), 4000
     extinction = 10 ** rng.uniform(-5.5, np.log10(10.0 / length), count)
@@ -511,24 +507,24 @@ def test_what_is_accepted_is_right_within_its_error(way, start, length):
     values = {"near": extinction * 2 ** rng.uniform(-1.0, 1.0, count), "given": 370.0}
     chosen = {
         name: values.get(value, value) if isinstance(value, str) else value
-        for name, value in ({"method": way} | WAYS[way]).items()
+        for name, value in ({"method": call} | CALLS[call]).items()
         if name != "lag"
     }
-    found = fit_homogeneous_path(power, r, variance=1.0, **chosen)
-    accepted = found.quality == 0
-    assert np.mean(accepted) > (0.03 if way == "linearized about zero" else 0.15)
-    off = np.abs(found.extinction - extinction) > 4 * found.extinction_standard_error
-    assert np.mean(off[accepted]) < (0.06 if way == "linearized about zero" else 2e-3)
+    fit = fit_homogeneous_path(power, r, variance=1.0, **chosen)
+    accepted = fit.quality == 0
+    assert np.mean(accepted) > (0.03 if call == "linearized about zero" else 0.15)
+    off = np.abs(fit.extinction - extinction) > 4 * fit.extinction_standard_error
+    assert np.mean(off[accepted]) < (0.06 if call == "linearized about zero" else 2e-3)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_no_method_accepts_noise(way):
+@pytest.mark.parametrize("call", CALLS)
+def test_no_method_accepts_noise(call):
     for start, length in GEOMETRIES:
         r = section(start, length)
         power = 370.0 + noise(4000, seed=24)
         chosen = {
             name: {"near": 0.03 * KM, "given": 370.0}.get(value, value)
-            for name, value in ({"method": way} | WAYS[way]).items()
+            for name, value in ({"method": call} | CALLS[call]).items()
         }
         for variance in (1.0, None):
             assert not np.any(
@@ -536,22 +532,22 @@ def test_no_method_accepts_noise(way):
             )
 
 
-# Reported apart -----------------------------------------------------------------------------
+# Model error and signal-to-noise ------------------------------------------------------------
 
 
 def test_model_error_and_signal_to_noise_are_reported():
     power = clean(2000, 30.0, seed=21)
-    found = fit_homogeneous_path(power, LONG, variance=1.0, model_error=0.1)
-    slope = 0.1 * (np.abs(found.extinction) + 1.0 / LONG.mean())
-    assert np.all(found.extinction_model_error > slope)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0, model_error=0.1)
+    slope = 0.1 * (np.abs(fit.extinction) + 1.0 / LONG.mean())
+    assert np.all(fit.extinction_model_error > slope)
     half = fit_homogeneous_path(power, LONG, variance=1.0)
     twice = 2.0 * half.extinction_model_error
-    np.testing.assert_allclose(found.extinction_model_error, twice, rtol=1e-12)
+    np.testing.assert_allclose(fit.extinction_model_error, twice, rtol=1e-12)
     same_error = half.extinction_standard_error
-    np.testing.assert_array_equal(found.extinction_standard_error, same_error)
+    np.testing.assert_array_equal(fit.extinction_standard_error, same_error)
     shape = signal(LONG, 1.0, 0.03 * KM)
     expected = 30.0 * np.sqrt(np.sum((shape - shape.mean()) ** 2))
-    assert np.mean(found.signal_to_noise) == pytest.approx(expected, rel=0.02)
+    assert np.mean(fit.signal_to_noise) == pytest.approx(expected, rel=0.02)
     upside_down = fit_homogeneous_path(740.0 - power, LONG, variance=1.0)
     assert np.mean(upside_down.signal_to_noise < 0) > 0.99
     assert np.isnan(fit_homogeneous_path(np.ones(225), LONG).extinction_model_error)
@@ -593,7 +589,7 @@ def test_model_error_and_signal_to_noise_are_reported():
         ({"model_error": np.nan}, "model_error"),
     ],
 )
-def test_arguments_that_a_method_cannot_use_are_refused(arguments, field):
+def test_arguments_that_a_method_does_not_accept_are_refused(arguments, field):
     given = {"power": clean(2)} | arguments
     with pytest.raises(RetrievalInputError) as caught:
         fit_homogeneous_path(given.pop("power"), LONG, **given)

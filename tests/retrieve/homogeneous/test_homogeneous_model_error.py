@@ -1,4 +1,4 @@
-"""Systematic errors of the homogeneous path: what a fit makes of a signal that bends."""
+"""Model errors of the homogeneous path, against fits of bent signals."""
 
 from __future__ import annotations
 
@@ -13,84 +13,84 @@ LONG = section(2500.0, 8000.0)
 
 
 def bent(r, extinction, model_error, height=1000.0, slopes=(-1.0, 1.0)):
-    """Return a profile whose logarithmic slope departs by a share at both ends."""
+    """Return a profile whose logarithmic slope departs from the model at both ends."""
     departure = 2.0 * model_error * (np.abs(extinction) + 1.0 / r.mean())
-    place = (r - r[0]) / (r[-1] - r[0])
-    turn = slopes[0] * place + 0.5 * (slopes[1] - slopes[0]) * place**2
+    position = (r - r[0]) / (r[-1] - r[0])
+    turn = slopes[0] * position + 0.5 * (slopes[1] - slopes[0]) * position**2
     return 370.0 + signal(r, height, extinction) * np.exp(departure * (r[-1] - r[0]) * turn)
 
 
 @pytest.mark.parametrize("length", [1700.0, 8000.0])
 @pytest.mark.parametrize("extinction", [-0.005 * KM, 0.03 * KM, 1.0 * KM])
-@pytest.mark.parametrize("way", ["compressed", "fast", "gaps", "weights", "direct"])
-def test_model_error_is_what_a_fit_makes_of_a_bent_signal(way, extinction, length):
+@pytest.mark.parametrize("kind", ["compressed", "fast", "gaps", "weights", "direct"])
+def test_model_error_is_the_effect_of_a_bent_signal(kind, extinction, length):
     r = section(2500.0, length)
     weights = np.ones(r.size)
-    if way == "gaps":
+    if kind == "gaps":
         weights[20:60] = 0.0
-    elif way == "weights":
+    elif kind == "weights":
         weights = np.linspace(3.0, 0.2, r.size)
-    method = "compressed" if way in {"gaps", "weights"} else way
+    method = "compressed" if kind in {"gaps", "weights"} else kind
     bounds = -0.3 / r[-1], 60.0 / length
-    # Middle range is what the retrieval takes it for: that of the weights.
+    # The mean range of the retrieval is weighted.
     share = 1e-3 * (np.abs(extinction) + 1.0 / np.average(r, weights=weights))
     share /= np.abs(extinction) + 1.0 / r.mean()
     refit = iterated_fit(r, bent(r, extinction, share), weights, bounds)
     straight = bent(r, extinction, 0.0)[np.newaxis]
-    found = fit_homogeneous_path(
+    fit = fit_homogeneous_path(
         straight, r, weights=weights[np.newaxis], method=method, model_error=1e-3
     )
     moved = abs(refit[0] - 370.0)
     assert moved > 1e-4
-    assert found.background_model_error[0] == pytest.approx(moved, rel=0.02)
+    assert fit.background_model_error[0] == pytest.approx(moved, rel=0.02)
     slope = 1e-3 * (np.abs(extinction) + 1.0 / np.average(r, weights=weights))
     off = np.hypot(slope, refit[2] - extinction)
-    assert found.extinction_model_error[0] == pytest.approx(off, rel=0.01)
+    assert fit.extinction_model_error[0] == pytest.approx(off, rel=0.01)
 
 
 def test_model_error_by_other_methods():
     for extinction in (0.0, 0.03 * KM, 0.2 * KM):
         straight, curved = (bent(LONG, extinction, share)[np.newaxis] for share in (0.0, 1e-4))
         slope = 1e-4 * (extinction + 1.0 / LONG.mean())
-        for given in (
+        for arguments in (
             {"method": "cubic"},
             {"method": "linearized", "extinction": extinction},
             {"method": "linearized", "extinction": extinction, "centre": "zero"},
             {"method": "known_background", "background": 370.0},
         ):
-            found = fit_homogeneous_path(straight, LONG, variance=1.0, model_error=1e-4, **given)
-            moved = fit_homogeneous_path(curved, LONG, variance=1.0, **given)
-            off = np.abs(moved.background - found.background)
-            np.testing.assert_allclose(found.background_model_error, off, rtol=0.02)
-            off = np.hypot(slope, moved.extinction - found.extinction)
-            np.testing.assert_allclose(found.extinction_model_error, off, rtol=0.01)
+            fit = fit_homogeneous_path(straight, LONG, variance=1.0, model_error=1e-4, **arguments)
+            moved = fit_homogeneous_path(curved, LONG, variance=1.0, **arguments)
+            off = np.abs(moved.background - fit.background)
+            np.testing.assert_allclose(fit.background_model_error, off, rtol=0.02)
+            off = np.hypot(slope, moved.extinction - fit.extinction)
+            np.testing.assert_allclose(fit.extinction_model_error, off, rtol=0.01)
 
 
-def test_model_error_of_the_background_at_a_given_extinction_holds_a_slope_too():
-    given = {"variance": 1.0, "method": "known_extinction", "extinction": 0.03 * KM}
-    found = fit_homogeneous_path(bent(LONG, 0.03 * KM, 0.0), LONG, model_error=1e-4, **given)
+def test_model_error_of_the_background_at_a_known_extinction_includes_a_slope():
+    arguments = {"variance": 1.0, "method": "known_extinction", "extinction": 0.03 * KM}
+    fit = fit_homogeneous_path(bent(LONG, 0.03 * KM, 0.0), LONG, model_error=1e-4, **arguments)
     moved = [
         float(
             fit_homogeneous_path(
-                bent(LONG, 0.03 * KM, 1e-4, slopes=slopes), LONG, **given
+                bent(LONG, 0.03 * KM, 1e-4, slopes=slopes), LONG, **arguments
             ).background
         )
         - 370.0
         for slopes in ((-1.0, 1.0), (1.0, 1.0))
     ]
-    assert found.background_model_error == pytest.approx(np.hypot(*moved), rel=0.02)
+    assert fit.background_model_error == pytest.approx(np.hypot(*moved), rel=0.02)
 
 
 def test_model_error_of_the_background_scales_with_signal_and_share():
     noise = np.random.default_rng(31).normal(size=(500, LONG.size))
     power = 370.0 + signal(LONG, 300.0, 0.03 * KM) + noise
-    found = fit_homogeneous_path(power, LONG, variance=1.0)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
     double = fit_homogeneous_path(power, LONG, variance=1.0, model_error=0.1)
     np.testing.assert_allclose(
-        double.background_model_error, 2.0 * found.background_model_error, rtol=1e-12
+        double.background_model_error, 2.0 * fit.background_model_error, rtol=1e-12
     )
     larger = fit_homogeneous_path(1e3 * power, LONG, variance=1e6)
     np.testing.assert_allclose(
-        larger.background_model_error, 1e3 * found.background_model_error, rtol=1e-9
+        larger.background_model_error, 1e3 * fit.background_model_error, rtol=1e-9
     )
     assert np.isnan(fit_homogeneous_path(np.ones(225), LONG).background_model_error)

@@ -1,4 +1,4 @@
-"""Tests of a homogeneous path for shapes that its model lacks, on their own terms."""
+"""Quality tests of a homogeneous path for shapes that the model lacks."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ ENERGY = stats.chi2.isf(0.5 * FALSE_ALARM, 5)
 SQUARE = stats.norm.isf(0.25 * FALSE_ALARM)
 
 
-def along_square(r, power, found):
-    """Return the residuals along what three tangents leave over of the squared shape."""
+def along_square(r, power, fit):
+    """Return the residuals along the part of the squared shape orthogonal to three tangents."""
     out = []
-    for values, extinction in zip(power, found.extinction, strict=True):
+    for values, extinction in zip(power, fit.extinction, strict=True):
         shape = signal(r, 1.0, extinction)
         x = (r - r[0]) / np.ptp(r)
         model = np.linalg.qr(np.stack([np.ones_like(r), shape, shape * x], axis=1))[0]
         square = shape**2
         for _ in range(2):
             square = square - model @ (model.T @ square)
-        fit = np.linalg.lstsq(np.stack([np.ones_like(r), shape], axis=1), values, rcond=None)[0]
-        residual = values - fit[0] - fit[1] * shape
+        line = np.linalg.lstsq(np.stack([np.ones_like(r), shape], axis=1), values, rcond=None)[0]
+        residual = values - line[0] - line[1] * shape
         out.append(residual @ square / np.linalg.norm(square))
     return np.array(out)
 
@@ -47,14 +47,14 @@ def cut(r, height, extinction, top, count, seed):
         (8000.0, 50.0, 6.0 * KM, 0.8),
     ],
 )
-def test_the_bit_is_that_of_energy_and_square(length, height, extinction, top):
+def test_the_bit_is_raised_by_energy_or_square(length, height, extinction, top):
     r = section(2500.0, length)
     power = cut(r, height, extinction, top, 400, seed=11)
-    found = fit_homogeneous_path(power, r, variance=1.0)
-    square = np.abs(along_square(r, power, found))
+    fit = fit_homogeneous_path(power, r, variance=1.0)
+    square = np.abs(along_square(r, power, fit))
     clear = np.abs(square - SQUARE) > 0.02
-    raised = (found.quality & BIT) != 0
-    expected = (found.curvature_misfit > ENERGY) | (square > SQUARE)
+    raised = (fit.quality & BIT) != 0
+    expected = (fit.curvature_misfit > ENERGY) | (square > SQUARE)
     np.testing.assert_array_equal(raised[clear], expected[clear])
     assert 0.05 < np.mean(raised) < 0.95
 
@@ -64,15 +64,15 @@ def test_the_bit_is_that_of_energy_and_square(length, height, extinction, top):
 def test_false_alarms_of_both_are_as_rare_as_those_of_one(variance, extinction):
     r = section(2500.0, 8000.0)
     power = cut(r, 100.0, extinction, np.inf, 40_000, seed=12)
-    found = fit_homogeneous_path(power, r, variance=variance)
-    assert 1e-4 < np.mean((found.quality & BIT) != 0) < 8e-4
+    fit = fit_homogeneous_path(power, r, variance=variance)
+    assert 1e-4 < np.mean((fit.quality & BIT) != 0) < 8e-4
 
 
-def test_a_top_that_is_cut_off_is_seen_more_often_than_by_energy():
+def test_a_signal_that_is_cut_off_is_detected_more_often_than_by_energy():
     r = section(2500.0, 8000.0)
     power = cut(r, 50.0, 6.0 * KM, 0.8, 4000, seed=13)
-    found = fit_homogeneous_path(power, r, variance=1.0)
-    by_energy = np.mean(found.curvature_misfit > stats.chi2.isf(FALSE_ALARM, 5))
-    seen = np.mean((found.quality & BIT) != 0)
+    fit = fit_homogeneous_path(power, r, variance=1.0)
+    by_energy = np.mean(fit.curvature_misfit > stats.chi2.isf(FALSE_ALARM, 5))
+    detected = np.mean((fit.quality & BIT) != 0)
     assert by_energy > 0.05
-    assert seen > 2.0 * by_energy
+    assert detected > 2.0 * by_energy

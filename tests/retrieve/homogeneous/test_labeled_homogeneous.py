@@ -1,4 +1,4 @@
-"""The xarray layer: the same bits as numpy, whatever the chunks; units and dimensions checked."""
+"""The xarray layer: the same bits as numpy for any chunks; units and dimensions are checked."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ def in_section(array, near, far):
 
 
 def test_result_is_that_of_numpy_for_each_section(power):
-    found = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=1.0)
-    assert found["extinction"].dims == ("channel", "time", "section")
+    fit = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=1.0)
+    assert fit["extinction"].dims == ("channel", "time", "section")
     for k, edges in enumerate(SECTIONS):
         expected = path_fit.fit_homogeneous_path(*in_section(power, *edges), variance=1.0)
         for name in VALUES:
-            np.testing.assert_array_equal(found[name][..., k], getattr(expected, name))
-        np.testing.assert_array_equal(found["quality_flag"][..., k], expected.quality)
-    np.testing.assert_allclose(found["extinction"].median("time")[:, 0], 5e-5, rtol=0.02)
+            np.testing.assert_array_equal(fit[name][..., k], getattr(expected, name))
+        np.testing.assert_array_equal(fit["quality_flag"][..., k], expected.quality)
+    np.testing.assert_allclose(fit["extinction"].median("time")[:, 0], 5e-5, rtol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -80,17 +80,17 @@ def test_any_chunking_gives_the_same_bits_lazily(power, chunks, method):
     expected = labeled.fit_homogeneous_path(
         power, sections=SECTIONS, variance=variance, quality=quality, method=method
     )
-    found = labeled.fit_homogeneous_path(
+    fit = labeled.fit_homogeneous_path(
         power.chunk(chunks),
         sections=SECTIONS,
         variance=variance.chunk({"time": 4}),
         quality=quality,
         method=method,
     )
-    assert all(dask.is_dask_collection(found[name]) for name in found.data_vars)
-    xr.testing.assert_identical(found.compute(scheduler="synchronous"), expected)
-    assert found["quality_flag"].dtype == expected["quality_flag"].dtype == np.int32
-    assert found["valid_bins"].dtype == np.int32
+    assert all(dask.is_dask_collection(fit[name]) for name in fit.data_vars)
+    xr.testing.assert_identical(fit.compute(scheduler="synchronous"), expected)
+    assert fit["quality_flag"].dtype == expected["quality_flag"].dtype == np.int32
+    assert fit["valid_bins"].dtype == np.int32
 
 
 def test_threads_give_the_same_bits(power):
@@ -101,7 +101,7 @@ def test_threads_give_the_same_bits(power):
     )
 
 
-def test_bad_bins_are_left_out_and_their_bits_carried(power):
+def test_bad_bins_are_excluded_and_their_bits_carried(power):
     quality = xr.zeros_like(power, dtype=np.int32)
     quality[0, 0, 60:90] = Quality.SATURATED
     quality[0, 1, 60:70] = Quality.INCOMPLETE_OVERLAP
@@ -109,23 +109,23 @@ def test_bad_bins_are_left_out_and_their_bits_carried(power):
     quality[0, 4, 60:90] = Quality.PILE_UP
     spoiled = xr.where(quality & labeled.EXCLUDED, 1e6, power).transpose(*power.dims)
     spoiled["range"].attrs = power["range"].attrs
-    found = labeled.fit_homogeneous_path(
+    fit = labeled.fit_homogeneous_path(
         spoiled, sections=SECTIONS[:2], variance=1.0, quality=quality
     )
     clean = labeled.fit_homogeneous_path(power, sections=SECTIONS[:2], variance=1.0)
 
     masked = np.where((quality & labeled.EXCLUDED) != 0, np.nan, power)
     expected = path_fit.fit_homogeneous_path(*in_section(masked, *SECTIONS[0]), variance=1.0)
-    np.testing.assert_array_equal(found["extinction"][..., 0], expected.extinction)
-    carried = found["quality_flag"][0, :, 0] & labeled.CARRIED
+    np.testing.assert_array_equal(fit["extinction"][..., 0], expected.extinction)
+    carried = fit["quality_flag"][0, :, 0] & labeled.CARRIED
     assert carried[0] == Quality.SATURATED
     assert carried[1] == Quality.INCOMPLETE_OVERLAP
     assert carried[2] == 0
     assert carried[4] == Quality.PILE_UP
-    assert found["extinction"][0, 4, 0] == clean["extinction"][0, 4, 0]
+    assert fit["extinction"][0, 4, 0] == clean["extinction"][0, 4, 0]
     # The second section begins beyond the spoiled bins.
-    np.testing.assert_array_equal(found["extinction"][..., 1], clean["extinction"][..., 1])
-    assert not np.any(found["quality_flag"][0, :3, 1] & labeled.CARRIED)
+    np.testing.assert_array_equal(fit["extinction"][..., 1], clean["extinction"][..., 1])
+    assert not np.any(fit["quality_flag"][0, :3, 1] & labeled.CARRIED)
 
 
 @pytest.mark.parametrize("dims", [("range",), ("time", "range"), ("time",), ("channel", "time")])
@@ -135,29 +135,29 @@ def test_variance_may_lack_dimensions(power, dims):
     variance = xr.DataArray(values, dims=dims)
     full = variance.broadcast_like(power).transpose(*power.dims)
     expected = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=full)
-    found = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=variance)
-    # A variance that all profiles share is solved another way, to the same end.
+    fit = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=variance)
+    # A variance common to all profiles uses another solver, with the same result.
     for name in ("background", "amplitude", "extinction"):
-        apart = abs(found[name] - expected[name])
+        apart = abs(fit[name] - expected[name])
         error = expected[f"{name}_standard_error"]
         assert (apart < 0.01 * error).where(error.notnull(), other=True).all()
     chunked = labeled.fit_homogeneous_path(
         power.chunk({"time": 3}), sections=SECTIONS, variance=variance.chunk()
     )
-    xr.testing.assert_identical(chunked.compute(scheduler="synchronous"), found)
+    xr.testing.assert_identical(chunked.compute(scheduler="synchronous"), fit)
 
 
 def test_coordinates_and_units_describe_the_sections(power):
-    found = labeled.fit_homogeneous_path(power, sections=SECTIONS)
-    assert found["section"].to_numpy().tolist() == [0, 1, 2]
-    assert found["section_range"].to_numpy().tolist() == [3750.0, 7500.0, 7500.0]
-    np.testing.assert_array_equal(found["section_bounds"], SECTIONS)
-    assert found["section_bounds"].dims == ("section", "nv")
-    units = {name: found[name].attrs["units"] for name in VALUES[:-1]}
+    fit = labeled.fit_homogeneous_path(power, sections=SECTIONS)
+    assert fit["section"].to_numpy().tolist() == [0, 1, 2]
+    assert fit["section_range"].to_numpy().tolist() == [3750.0, 7500.0, 7500.0]
+    np.testing.assert_array_equal(fit["section_bounds"], SECTIONS)
+    assert fit["section_bounds"].dims == ("section", "nv")
+    units = {name: fit[name].attrs["units"] for name in VALUES[:-1]}
     assert units["background"] == units["background_standard_error"] == "mV"
     assert units["amplitude"] == "mV m2"
     assert units["extinction_standard_error"] == "m-1"
-    assert {"time", "channel"} <= set(found.coords)
+    assert {"time", "channel"} <= set(fit.coords)
     plain = power.copy()
     plain.attrs = {}
     assert (
@@ -167,15 +167,15 @@ def test_coordinates_and_units_describe_the_sections(power):
 
 def test_single_profile_and_descending_range(power):
     one = power.isel(channel=0, time=0)
-    found = labeled.fit_homogeneous_path(one, sections=SECTIONS, variance=1.0)
-    assert found["extinction"].dims == ("section",)
+    fit = labeled.fit_homogeneous_path(one, sections=SECTIONS, variance=1.0)
+    assert fit["extinction"].dims == ("section",)
     turned = labeled.fit_homogeneous_path(one[::-1], sections=SECTIONS, variance=1.0)
-    np.testing.assert_array_equal(found["extinction"], turned["extinction"])
+    np.testing.assert_array_equal(fit["extinction"], turned["extinction"])
 
 
 def test_near_is_inside_and_far_is_not(power):
-    found = labeled.fit_homogeneous_path(power, sections=[(1500.0, 3000.0)])
-    assert found["valid_bins"].max() == 50
+    fit = labeled.fit_homogeneous_path(power, sections=[(1500.0, 3000.0)])
+    assert fit["valid_bins"].max() == 50
 
 
 def with_units(power, units):
@@ -202,7 +202,7 @@ def with_units(power, units):
         (lambda p: p, {"quality": "extra"}, "quality", "dimensions"),
     ],
 )
-def test_arguments_that_cannot_be_right_are_refused(power, change, arguments, field, words):
+def test_invalid_arguments_are_refused(power, change, arguments, field, words):
     arguments = {"sections": SECTIONS} | arguments
     if arguments.get("variance") == "misaligned":
         arguments["variance"] = xr.ones_like(power).assign_coords(time=np.arange(13) + 1)
@@ -215,19 +215,19 @@ def test_arguments_that_cannot_be_right_are_refused(power, change, arguments, fi
 
 @pytest.mark.parametrize("chunked", [False, True])
 def test_tail_mean_is_that_of_numpy(power, chunked):
-    given = power.chunk({"time": 3, "range": 50}) if chunked else power
+    data = power.chunk({"time": 3, "range": 50}) if chunked else power
     variance = xr.full_like(power, 2.0)
-    found = labeled.tail_mean(given, start=9000.0, variance=variance)
+    fit = labeled.tail_mean(data, start=9000.0, variance=variance)
     expected = cubic_and_tail.tail_mean(power.to_numpy(), RANGE, start=9000.0, variance=2.0)
-    assert found["background"].dims == ("channel", "time")
-    assert found["background"].attrs["units"] == "mV"
-    np.testing.assert_array_equal(found["background"], expected.background)
+    assert fit["background"].dims == ("channel", "time")
+    assert fit["background"].attrs["units"] == "mV"
+    np.testing.assert_array_equal(fit["background"], expected.background)
     np.testing.assert_array_equal(
-        found["background_standard_error"], expected.background_standard_error
+        fit["background_standard_error"], expected.background_standard_error
     )
-    np.testing.assert_array_equal(found["quality_flag"], expected.quality)
+    np.testing.assert_array_equal(fit["quality_flag"], expected.quality)
     np.testing.assert_array_equal(
-        labeled.tail_mean(given)["background"],
+        labeled.tail_mean(data)["background"],
         cubic_and_tail.tail_mean(power.to_numpy(), RANGE).background,
     )
     with pytest.raises(RetrievalInputError, match="12000 m"):
@@ -238,14 +238,14 @@ def test_real_vertical_profiles_are_flagged(data_root):
     files = sorted((data_root / "pilar" / "20241002").glob("h*"))[:30]
     archive = lidarops.open_archive(files, mask_and_scale=False)
     signal_ = labeled_signal.condition(archive, "analog_532p")
-    found = labeled.fit_homogeneous_path(
+    fit = labeled.fit_homogeneous_path(
         signal_["power"],
         sections=[(1000.0, 3000.0), (1500.0, 5000.0), (2500.0, 10500.0)],
         variance=signal_["variance"],
         quality=signal_["quality"],
     ).compute(scheduler="synchronous")
-    assert found.sizes["time"] == len(files)
-    assert np.all(found["quality_flag"] != 0)
+    assert fit.sizes["time"] == len(files)
+    assert np.all(fit["quality_flag"] != 0)
 
 
 def test_one_pass_gives_the_bits_of_two(data_root):

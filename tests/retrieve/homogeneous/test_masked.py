@@ -16,7 +16,7 @@ CASES = [
     (2500.0, 1700.0, 1e4, 0.03),
     (10500.0, 2500.0, 3e4, 0.1),
 ]
-DOUBT = int(Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND)
+UNDETERMINED = int(Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND)
 
 
 def weights_of(kind, count, seed=0):
@@ -53,19 +53,19 @@ def measured(case, kind, count, seed=1):
 def test_result_is_that_of_the_direct_fit(case, kind, known):
     r, power, variance = measured(case, kind, 600)
     noise = {"variance": variance} if known else {"weights": 1.0 / variance}
-    found = fit_homogeneous_path(power, r, **noise)
+    fit = fit_homogeneous_path(power, r, **noise)
     exact = fit_homogeneous_path(power, r, **noise, method="direct")
-    stands = (exact.quality & DOUBT) == 0
-    assert stands.mean() > 0.95
+    valid = (exact.quality & UNDETERMINED) == 0
+    assert valid.mean() > 0.95
     for name in ("extinction", "background", "amplitude"):
-        error = getattr(exact, f"{name}_standard_error")[stands]
-        apart = np.abs(getattr(found, name) - getattr(exact, name))[stands]
+        error = getattr(exact, f"{name}_standard_error")[valid]
+        apart = np.abs(getattr(fit, name) - getattr(exact, name))[valid]
         assert np.max(apart / error) < 1e-4
-        ratio = getattr(found, f"{name}_standard_error")[stands] / error
+        ratio = getattr(fit, f"{name}_standard_error")[valid] / error
         np.testing.assert_allclose(ratio, 1.0, rtol=1e-4)
-    np.testing.assert_allclose(found.reduced_chi2, exact.reduced_chi2, rtol=1e-5)
-    np.testing.assert_array_equal(found.valid_bins, exact.valid_bins)
-    np.testing.assert_array_equal(found.quality[stands], exact.quality[stands])
+    np.testing.assert_allclose(fit.reduced_chi2, exact.reduced_chi2, rtol=1e-5)
+    np.testing.assert_array_equal(fit.valid_bins, exact.valid_bins)
+    np.testing.assert_array_equal(fit.quality[valid], exact.quality[valid])
 
 
 @pytest.mark.filterwarnings("ignore:divide by zero")
@@ -75,12 +75,12 @@ def test_scatter_is_the_least_that_the_bins_allow(case, kind):
     _, _, height, extinction = case
     count = 4000
     r, power, variance = measured(case, kind, count, seed=2)
-    found = fit_homogeneous_path(power, r, variance=variance)
+    fit = fit_homogeneous_path(power, r, variance=variance)
     weights = np.where(np.isfinite(power), 1.0 / variance, 0.0)
     lowest = np.mean([lowest_errors(r, height, extinction * KM, w)[2] for w in weights[:50]])
-    error = found.extinction - extinction * KM
+    error = fit.extinction - extinction * KM
     assert np.sqrt(np.mean(error**2)) < 1.05 * lowest
-    pull = error / found.extinction_standard_error
+    pull = error / fit.extinction_standard_error
     assert 0.935 < np.mean(np.abs(pull) < 1.96) < 0.965
 
 
@@ -92,26 +92,26 @@ def test_noise_free_extinction_is_exact(start, length, level, kind):
     truth = np.geomspace(1e-5, 20.0 / length, 120)[:, np.newaxis]
     power = level + np.exp(-2.0 * truth * (r - start)) * (start / r) ** 2
     weights = weights_of(kind, truth.size)
-    found = fit_homogeneous_path(power, r, weights=weights)
+    fit = fit_homogeneous_path(power, r, weights=weights)
     if kind in ("near", "all"):
-        # What is gone before the first bin that is left cannot be told.
-        stands = truth[:, 0] * (r[20] - start) < 3.0
+        # A signal that has decayed before the first valid bin holds no information.
+        valid = truth[:, 0] * (r[20] - start) < 3.0
     else:
-        stands = np.ones(truth.size, bool)
-    np.testing.assert_allclose(found.extinction[stands], truth[stands, 0], rtol=2e-9)
+        valid = np.ones(truth.size, bool)
+    np.testing.assert_allclose(fit.extinction[valid], truth[valid, 0], rtol=2e-9)
 
 
-def test_profiles_that_do_not_work_out_go_to_the_direct_fit():
+def test_profiles_without_convergence_are_left_to_the_direct_fit():
     r = section(2500.0, 8000.0)
     power = np.random.default_rng(3).normal(size=(40, 225))
     power[:10] += 370.0 + signal(r, 1e4, 0.1 * KM)
     power[10:20] = 5.0
     power[20:30, 7:] = np.nan
     power[:, 100] = np.nan
-    found = fit_homogeneous_path(power, r, variance=1.0)
+    fit = fit_homogeneous_path(power, r, variance=1.0)
     exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
-    np.testing.assert_array_equal(found.quality[:30], exact.quality[:30])
-    np.testing.assert_array_equal(found.background[10:30], exact.background[10:30])
+    np.testing.assert_array_equal(fit.quality[:30], exact.quality[:30])
+    np.testing.assert_array_equal(fit.background[10:30], exact.background[10:30])
     plan = _masked.make_plan(r, (-0.3 / r[-1], 60.0 / 8000.0))
     solved, table = np.empty(40, bool), np.empty((40, len(COLUMNS)))
     _masked.solve_masked(power, np.ones((1, 225)), False, 1e-16, plan, table, solved)
@@ -123,9 +123,9 @@ def test_bits_do_not_depend_on_the_batch():
     r, power, variance = measured(CASES[0], "all", 60)
     whole = fit_homogeneous_path(power, r, variance=variance)
     for rows in (slice(0, 1), slice(7, 50), slice(None, None, -1)):
-        part = fit_homogeneous_path(power[rows], r, variance=variance[rows])
-        np.testing.assert_array_equal(part.extinction, whole.extinction[rows])
-        np.testing.assert_array_equal(part.quality, whole.quality[rows])
+        batch = fit_homogeneous_path(power[rows], r, variance=variance[rows])
+        np.testing.assert_array_equal(batch.extinction, whole.extinction[rows])
+        np.testing.assert_array_equal(batch.quality, whole.quality[rows])
 
 
 def test_a_step_that_is_small_by_chance_does_not_end_the_search():
@@ -136,7 +136,7 @@ def test_a_step_that_is_small_by_chance_does_not_end_the_search():
         noise = np.random.default_rng(seed).normal(size=(4000, r.size))
         power = 1e6 + 54_205.0 * shape + noise
         power[:, :35] = np.nan
-        found = fit_homogeneous_path(power, r, variance=1.0)
+        fit = fit_homogeneous_path(power, r, variance=1.0)
         exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
-        off = np.abs(found.extinction - exact.extinction) / exact.extinction_standard_error
+        off = np.abs(fit.extinction - exact.extinction) / exact.extinction_standard_error
         assert off.max() < 0.01

@@ -1,4 +1,4 @@
-"""The homogeneous path: exact without noise, efficient and honest with it, flagged otherwise."""
+"""The homogeneous path: exact without noise, efficient with honest errors, else flagged."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def clean(count=1000, height=1000.0, extinction=0.03 * KM, seed=0, r=LONG):
     return 370.0 + signal(r, height, extinction) + noise(count, r.size, seed)
 
 
-def share(found, bits):
-    return float(np.mean((found.quality & bits) != 0))
+def share(fit, bits):
+    return float(np.mean((fit.quality & bits) != 0))
 
 
 def same(one, other):
@@ -47,13 +47,13 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-def alike(found, expected):
-    """The same up to what other sums and single-precision residuals leave, in standard errors."""
+def alike(fit, expected):
+    """Compare up to the rounding of other sums and single precision, in standard errors."""
     for name in ("background", "amplitude", "extinction"):
-        apart = np.abs(getattr(found, name) - getattr(expected, name))
+        apart = np.abs(getattr(fit, name) - getattr(expected, name))
         assert np.all(apart < 0.01 * getattr(expected, f"{name}_standard_error"))
-    np.testing.assert_allclose(found.reduced_chi2, expected.reduced_chi2, rtol=1e-3)
-    np.testing.assert_array_equal(found.quality, expected.quality)
+    np.testing.assert_allclose(fit.reduced_chi2, expected.reduced_chi2, rtol=1e-3)
+    np.testing.assert_array_equal(fit.quality, expected.quality)
 
 
 # Exactness ----------------------------------------------------------------------------------
@@ -76,12 +76,12 @@ def gaps(kind):
 def test_extinction_is_exact_without_noise(start, length, ratio, kind):
     r = section(start, length)
     extinction = np.geomspace(0.01 * KM, 50.0 / length, 300)
-    found = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r, weights=gaps(kind))
-    assert np.max(np.abs(found.extinction / extinction - 1.0)) < 1e-9
+    fit = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r, weights=gaps(kind))
+    assert np.max(np.abs(fit.extinction / extinction - 1.0)) < 1e-9
     if kind == "none":
-        assert np.max(np.abs(found.background - ratio)) < 1e-10
+        assert np.max(np.abs(fit.background - ratio)) < 1e-10
         expected = amplitude(r, 1.0, extinction)
-        assert np.max(np.abs(found.amplitude / expected - 1.0)) < 1e-8
+        assert np.max(np.abs(fit.amplitude / expected - 1.0)) < 1e-8
 
 
 def test_spacing_and_order_of_bins_do_not_matter_without_noise():
@@ -89,28 +89,28 @@ def test_spacing_and_order_of_bins_do_not_matter_without_noise():
     r = np.sort(rng.uniform(2500.0, 10500.0, 225))
     extinction = np.geomspace(0.01 * KM, 5.0 * KM, 100)
     power = 10.0 + signal(r, 1.0, extinction)
-    found = fit_homogeneous_path(power, r)
-    assert np.max(np.abs(found.extinction / extinction - 1.0)) < 1e-9
-    same(fit_homogeneous_path(power[:, ::-1], r[::-1]), found)
+    fit = fit_homogeneous_path(power, r)
+    assert np.max(np.abs(fit.extinction / extinction - 1.0)) < 1e-9
+    same(fit_homogeneous_path(power[:, ::-1], r[::-1]), fit)
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-12, 1e12, 1e30])
 def test_unit_of_power_does_not_matter(factor):
     power = 100.0 + signal(LONG, 1.0, 0.03 * KM)
-    found = fit_homogeneous_path(factor * power, LONG, variance=factor**2 * 1e-6)
-    assert found.extinction == pytest.approx(0.03 * KM, rel=1e-10)
-    assert found.background == pytest.approx(100.0 * factor, rel=1e-12)
+    fit = fit_homogeneous_path(factor * power, LONG, variance=factor**2 * 1e-6)
+    assert fit.extinction == pytest.approx(0.03 * KM, rel=1e-10)
+    assert fit.background == pytest.approx(100.0 * factor, rel=1e-12)
     expected = fit_homogeneous_path(power, LONG, variance=1e-6)
-    assert found.extinction_standard_error == pytest.approx(expected.extinction_standard_error)
-    assert found.reduced_chi2 == pytest.approx(expected.reduced_chi2, abs=1e-9)
+    assert fit.extinction_standard_error == pytest.approx(expected.extinction_standard_error)
+    assert fit.reduced_chi2 == pytest.approx(expected.reduced_chi2, abs=1e-9)
 
 
 @pytest.mark.parametrize("ratio", [1e4, 1e6, 1e8])
 def test_digits_are_lost_only_to_the_rounding_of_the_power(ratio):
-    found = fit_homogeneous_path(ratio + signal(LONG, 1.0, 0.03 * KM), LONG)
-    # One unit in the last place of the background, as noise, moves extinction by so much.
+    fit = fit_homogeneous_path(ratio + signal(LONG, 1.0, 0.03 * KM), LONG)
+    # The effect on extinction of noise of one unit in the last place of the background.
     allowed = 3.0 * np.spacing(ratio) * lowest_errors(LONG, 1.0, 0.03 * KM)[2]
-    assert abs(found.extinction - 0.03 * KM) < allowed
+    assert abs(fit.extinction - 0.03 * KM) < allowed
 
 
 @settings(max_examples=40, deadline=None)
@@ -164,15 +164,15 @@ def test_result_is_the_least_squares_minimum(start, length, weighted):
             weights[: 20 * (trial % 2)] = 0.0
         power = 370.0 + signal(r, height, extinction) + rng.normal(size=r.size)
         variance = np.where(weights > 0, 1.0 / np.where(weights > 0, weights, 1.0), np.nan)
-        found = fit_homogeneous_path(power, r, variance=variance)
-        if found.quality & SOLVED:
+        fit = fit_homogeneous_path(power, r, variance=variance)
+        if fit.quality & SOLVED:
             continue
         compared += 1
         expected = iterated_fit(r, power, weights, bounds)
-        assert abs(found.extinction - expected[2]) < 0.01 * found.extinction_standard_error
-        assert abs(found.background - expected[0]) < 0.01 * found.background_standard_error
-        height_found = found.amplitude * np.exp(-2 * found.extinction * r[0]) / r[0] ** 2
-        assert height_found == pytest.approx(expected[1], rel=1e-4)
+        assert abs(fit.extinction - expected[2]) < 0.01 * fit.extinction_standard_error
+        assert abs(fit.background - expected[0]) < 0.01 * fit.background_standard_error
+        fitted_height = fit.amplitude * np.exp(-2 * fit.extinction * r[0]) / r[0] ** 2
+        assert fitted_height == pytest.approx(expected[1], rel=1e-4)
     assert compared > 25
 
 
@@ -196,17 +196,17 @@ def test_scatter_is_the_least_possible_and_errors_are_honest(
 ):
     r, extinction, count = section(start, length), extinction * KM, 4000
     power = clean(count, height, extinction, seed=4, r=r)
-    found = fit_homogeneous_path(power, r, variance=1.0 if known else None)
+    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None)
     lowest = lowest_errors(r, height, extinction)
     truth = (370.0, amplitude(r, height, extinction), extinction)
     scales = (lowest[0], lowest[1] * truth[1], lowest[2])
     names = ("background", "amplitude", "extinction")
     for name, true, scale in zip(names, truth, scales, strict=True):
-        errors = getattr(found, name) - true
+        errors = getattr(fit, name) - true
         assert np.sqrt(np.mean(errors**2)) < 1.06 * scale, name
-        covered = np.abs(errors) < 1.96 * getattr(found, f"{name}_standard_error")
+        covered = np.abs(errors) < 1.96 * getattr(fit, f"{name}_standard_error")
         assert 0.93 < np.mean(covered) < 0.97, name
-    assert np.mean(found.quality == 0) > 0.995
+    assert np.mean(fit.quality == 0) > 0.995
 
 
 @pytest.mark.parametrize("kind", ["near", "middle", "random", "all"])
@@ -215,11 +215,11 @@ def test_scatter_is_the_least_possible_with_gaps(start, length, kind):
     r, height, extinction = section(start, length), 3e4, 0.05 * KM
     power, weights = clean(3000, height, extinction, seed=5, r=r), gaps(kind)
     power[:, weights == 0] = np.nan
-    found = fit_homogeneous_path(power, r, variance=1.0)
-    errors = found.extinction - extinction
+    fit = fit_homogeneous_path(power, r, variance=1.0)
+    errors = fit.extinction - extinction
     assert np.sqrt(np.mean(errors**2)) < 1.06 * lowest_errors(r, height, extinction, weights)[2]
-    assert 0.93 < np.mean(np.abs(errors) < 1.96 * found.extinction_standard_error) < 0.97
-    assert np.all(found.valid_bins == weights.sum())
+    assert 0.93 < np.mean(np.abs(errors) < 1.96 * fit.extinction_standard_error) < 0.97
+    assert np.all(fit.valid_bins == weights.sum())
 
 
 @pytest.mark.parametrize("dark", [10.0, 510.0])
@@ -228,11 +228,11 @@ def test_counts_with_common_weights(dark):
     height = 1e5 if dark == 10.0 else 1020.0
     expected = dark + signal(LONG, height, 0.03 * KM)
     power = rng.poisson(expected, (3000, 225))
-    found = fit_homogeneous_path(power, LONG, variance=power.mean(axis=0))
-    errors = found.extinction - 0.03 * KM
+    fit = fit_homogeneous_path(power, LONG, variance=power.mean(axis=0))
+    errors = fit.extinction - 0.03 * KM
     lowest = lowest_errors(LONG, height, 0.03 * KM, 1.0 / expected)[2]
     assert np.sqrt(np.mean(errors**2)) < 1.06 * lowest
-    assert 0.93 < np.mean(np.abs(errors) < 1.96 * found.extinction_standard_error) < 0.97
+    assert 0.93 < np.mean(np.abs(errors) < 1.96 * fit.extinction_standard_error) < 0.97
 
 
 @pytest.mark.parametrize(
@@ -241,10 +241,10 @@ def test_counts_with_common_weights(dark):
 )
 def test_noise_alone_is_not_accepted(arguments, bins):
     for seed, (start, length) in enumerate(GEOMETRIES):
-        found = fit_homogeneous_path(
+        fit = fit_homogeneous_path(
             noise(8000, bins, seed), section(start, length, bins), **arguments
         )
-        assert not np.any(found.quality == 0)
+        assert not np.any(fit.quality == 0)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -252,11 +252,11 @@ def test_false_alarms_are_rare(known):
     for bins in (24, 225, 600):
         r = section(2500.0, 8000.0, bins)
         power = clean(20_000 if bins < 500 else 6000, 3e3, seed=7, r=r)
-        found = fit_homogeneous_path(power, r, variance=1.0 if known else None)
+        fit = fit_homogeneous_path(power, r, variance=1.0 if known else None)
         for bit in (Quality.POOR_FIT, Quality.NOT_HOMOGENEOUS, Quality.OUTLIER):
             # 5e-4 as designed, plus three standard deviations of the count.
-            assert share(found, bit) < 5e-4 + 3 * np.sqrt(5e-4 / len(power)), (bins, bit)
-        assert share(found, SOLVED) == 0
+            assert share(fit, bit) < 5e-4 + 3 * np.sqrt(5e-4 / len(power)), (bins, bit)
+        assert share(fit, SOLVED) == 0
 
 
 def test_profiles_that_are_determined_are_accepted():
@@ -265,11 +265,11 @@ def test_profiles_that_are_determined_are_accepted():
         extinction = 0.1 * KM
         unit = lowest_errors(r, 1.0, extinction)[2]
         height = unit / (0.08 * (extinction + 1.0 / r.mean()))
-        found = fit_homogeneous_path(clean(2000, height, extinction, seed=8, r=r), r, variance=1.0)
-        assert np.mean(found.quality == 0) > 0.99
+        fit = fit_homogeneous_path(clean(2000, height, extinction, seed=8, r=r), r, variance=1.0)
+        assert np.mean(fit.quality == 0) > 0.99
 
 
-# What must be flagged -----------------------------------------------------------------------
+# Violations that must be flagged ------------------------------------------------------------
 
 
 def test_backscatter_that_varies_along_the_path_is_flagged():
@@ -280,16 +280,16 @@ def test_backscatter_that_varies_along_the_path_is_flagged():
     for height in (30.0, 1e3, 1e5):
         power = 370.0 + signal(LONG, height, 0.03 * KM) * wave + noise(2000)
         for variance in (1.0, None):
-            found = fit_homogeneous_path(power, LONG, variance=variance)
-            assert share(found, Quality.NOT_HOMOGENEOUS | Quality.POOR_FIT) == 1.0
+            fit = fit_homogeneous_path(power, LONG, variance=variance)
+            assert share(fit, Quality.NOT_HOMOGENEOUS | Quality.POOR_FIT) == 1.0
 
 
-def test_weak_bend_is_found_by_the_trend_before_chi_square():
+def test_weak_bend_is_detected_by_the_trend_before_chi_square():
     bend = 1.0 + 0.3 * ((LONG - 6500.0) / 8000.0) ** 2
     power = 370.0 + signal(LONG, 2500.0, 0.03 * KM) * bend + noise(500)
-    found = fit_homogeneous_path(power, LONG, variance=1.0)
-    assert share(found, Quality.NOT_HOMOGENEOUS) > 0.95
-    assert share(found, Quality.POOR_FIT) < 0.7
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
+    assert share(fit, Quality.NOT_HOMOGENEOUS) > 0.95
+    assert share(fit, Quality.POOR_FIT) < 0.7
 
 
 def test_vertical_atmosphere_is_flagged():
@@ -318,53 +318,53 @@ def test_dead_time_and_saturation_are_flagged():
         == 1.0
     )
     clipped = np.minimum(clean(), 370.0 + 600.0)
-    found = fit_homogeneous_path(clipped, LONG, variance=1.0)
-    assert np.all(found.quality & Quality.POOR_FIT)
-    assert np.all(found.quality & Quality.AT_BOUND)
+    fit = fit_homogeneous_path(clipped, LONG, variance=1.0)
+    assert np.all(fit.quality & Quality.POOR_FIT)
+    assert np.all(fit.quality & Quality.AT_BOUND)
     masked = fit_homogeneous_path(np.where(clipped < 969.9, clipped, np.nan), LONG, variance=1.0)
     assert np.mean(masked.quality == 0) > 0.995
     assert abs(np.median(masked.extinction) - 0.03 * KM) < 0.05e-6
 
 
-def test_incomplete_overlap_is_flagged_only_where_it_shows():
+def test_incomplete_overlap_is_flagged_only_where_it_is_visible():
     near = 370.0 + signal(LONG, 1e3, 0.03 * KM) * (1 - np.exp(-((LONG / 2000.0) ** 2)))
     assert np.all(
         fit_homogeneous_path(near + noise(100), LONG, variance=1.0).quality & Quality.POOR_FIT
     )
-    # Full overlap at 1 km leaves a bias of 1.5 standard errors that no test can see: it takes
-    # an overlap mask. The limit is documented; it is not a success.
+    # Full overlap at 1 km leaves a bias of 1.5 standard errors that no test can detect; an
+    # overlap mask is needed. This is a documented limit.
     far = 370.0 + signal(LONG, 1e3, 0.03 * KM) * (1 - np.exp(-((LONG / 1000.0) ** 2)))
-    found = fit_homogeneous_path(far + noise(1000), LONG, variance=1.0)
-    bias = (found.extinction - 0.03 * KM) / found.extinction_standard_error
+    fit = fit_homogeneous_path(far + noise(1000), LONG, variance=1.0)
+    bias = (fit.extinction - 0.03 * KM) / fit.extinction_standard_error
     assert -2.0 < np.median(bias) < -1.0
-    assert share(found, ~0) < 0.1
+    assert share(fit, ~0) < 0.1
 
 
 def test_cloud_and_outlier_are_flagged():
     cloud = clean()
     cloud[:, 100:104] += 200.0
-    found = fit_homogeneous_path(cloud, LONG, variance=1.0)
-    assert np.all(found.quality & Quality.POOR_FIT)
-    assert np.all(found.reduced_chi2 > 100)
+    fit = fit_homogeneous_path(cloud, LONG, variance=1.0)
+    assert np.all(fit.quality & Quality.POOR_FIT)
+    assert np.all(fit.reduced_chi2 > 100)
     assert np.all(fit_homogeneous_path(cloud, LONG).quality & Quality.POOR_FIT)
     spike = clean()
     spike[:, 150] += 8.0
     for variance in (1.0, None):
-        found = fit_homogeneous_path(spike, LONG, variance=variance)
-        assert share(found, Quality.OUTLIER) > 0.97
-        assert abs(np.mean(found.extinction - 0.03 * KM)) < 0.3e-6
+        fit = fit_homogeneous_path(spike, LONG, variance=variance)
+        assert share(fit, Quality.OUTLIER) > 0.97
+        assert abs(np.mean(fit.extinction - 0.03 * KM)) < 0.3e-6
 
 
 @pytest.mark.parametrize("variance", [2.0, None])
 @pytest.mark.parametrize("value", [0.0, 5.0, -3.7])
 def test_constant_profile_has_no_signal(value, variance):
-    found = fit_homogeneous_path(np.full(225, value), LONG, variance=variance)
-    assert found.quality == Quality.NO_SIGNAL
-    assert (found.background, found.amplitude) == (value, 0.0)
-    assert np.isnan(found.extinction)
-    assert np.isnan(found.extinction_standard_error)
+    fit = fit_homogeneous_path(np.full(225, value), LONG, variance=variance)
+    assert fit.quality == Quality.NO_SIGNAL
+    assert (fit.background, fit.amplitude) == (value, 0.0)
+    assert np.isnan(fit.extinction)
+    assert np.isnan(fit.extinction_standard_error)
     if variance:
-        assert found.background_standard_error == pytest.approx(np.sqrt(2.0 / 225))
+        assert fit.background_standard_error == pytest.approx(np.sqrt(2.0 / 225))
 
 
 def test_signal_below_the_rounding_of_float32_is_no_signal():
@@ -373,11 +373,11 @@ def test_signal_below_the_rounding_of_float32_is_no_signal():
 
 
 def test_nothing_valid_is_missing():
-    found = fit_homogeneous_path(np.full((2, 225), np.nan), LONG, variance=1.0)
-    assert np.all(found.quality == Quality.INPUT_MISSING)
+    fit = fit_homogeneous_path(np.full((2, 225), np.nan), LONG, variance=1.0)
+    assert np.all(fit.quality == Quality.INPUT_MISSING)
     for name in ("background", "amplitude", "extinction", "reduced_chi2"):
-        assert np.isnan(getattr(found, name)).all()
-    assert np.all(found.valid_bins == 0)
+        assert np.isnan(getattr(fit, name)).all()
+    assert np.all(fit.valid_bins == 0)
     assert fit_homogeneous_path(clean(1), LONG, variance=np.inf).quality == Quality.INPUT_MISSING
     assert fit_homogeneous_path(clean(1), LONG, variance=0.0).quality == Quality.INPUT_MISSING
     assert fit_homogeneous_path(clean(1), LONG, weights=0.0).quality == Quality.INPUT_MISSING
@@ -391,39 +391,39 @@ def test_few_bins(bins):
     sparse[np.linspace(0, 224, bins).astype(int)] = 0.0
     sparse += 370.0 + signal(LONG, 1e3, 0.03 * KM) + 0.01 * noise(1)[0]
     for power, grid in ((whole, r), (sparse, LONG)):
-        found = fit_homogeneous_path(power, grid, variance=1e-4)
-        assert bool(found.quality & Quality.TOO_FEW_BINS) == (bins < 8)
-        assert np.isnan(found.extinction) == (bins < 4)
-        assert found.valid_bins == bins
+        fit = fit_homogeneous_path(power, grid, variance=1e-4)
+        assert bool(fit.quality & Quality.TOO_FEW_BINS) == (bins < 8)
+        assert np.isnan(fit.extinction) == (bins < 4)
+        assert fit.valid_bins == bins
         if bins >= 4:
-            assert abs(found.extinction - 0.03 * KM) < 5 * found.extinction_standard_error
+            assert abs(fit.extinction - 0.03 * KM) < 5 * fit.extinction_standard_error
 
 
 def test_inverted_profile_has_negative_amplitude():
-    found = fit_homogeneous_path(740.0 - clean(), LONG, variance=1.0)
-    assert np.all(found.quality & Quality.NEGATIVE_AMPLITUDE)
-    assert np.all(found.amplitude < 0)
+    fit = fit_homogeneous_path(740.0 - clean(), LONG, variance=1.0)
+    assert np.all(fit.quality & Quality.NEGATIVE_AMPLITUDE)
+    assert np.all(fit.amplitude < 0)
 
 
 def test_single_weak_shot_of_counts_is_flagged():
     power = np.random.default_rng(10).poisson(10.0 + signal(LONG, 20.0, 0.03 * KM), (1000, 225))
-    found = fit_homogeneous_path(power, LONG, variance=power.mean(axis=0))
-    assert np.all(found.quality & Quality.POORLY_DETERMINED)
+    fit = fit_homogeneous_path(power, LONG, variance=power.mean(axis=0))
+    assert np.all(fit.quality & Quality.POORLY_DETERMINED)
 
 
-def test_lower_bound_keeps_out_the_second_minimum():
+def test_lower_bound_excludes_the_second_minimum():
     r = section(10500.0, 8000.0)
-    found = fit_homogeneous_path(clean(3000, 15.0, 0.1 * KM, seed=11, r=r), r, variance=1.0)
+    fit = fit_homogeneous_path(clean(3000, 15.0, 0.1 * KM, seed=11, r=r), r, variance=1.0)
     lowest = lowest_errors(r, 15.0, 0.1 * KM)[2]
-    assert np.all(np.abs(found.extinction - 0.1 * KM) < 8 * lowest)
+    assert np.all(np.abs(fit.extinction - 0.1 * KM) < 8 * lowest)
 
 
-def test_extinction_stays_within_given_bounds_and_says_so():
-    found = fit_homogeneous_path(
+def test_extinction_stays_within_given_bounds_and_is_flagged():
+    fit = fit_homogeneous_path(
         clean(50), LONG, variance=1.0, extinction_bounds=(0.05 * KM, 1.0 * KM)
     )
-    assert np.all(found.extinction == 0.05 * KM)
-    assert np.all(found.quality & Quality.AT_BOUND)
+    assert np.all(fit.extinction == 0.05 * KM)
+    assert np.all(fit.quality & Quality.AT_BOUND)
     upper = fit_homogeneous_path(
         clean(50), LONG, variance=1.0, extinction_bounds=(-0.02 * KM, 0.02 * KM)
     )
@@ -435,9 +435,9 @@ def test_extinction_stays_within_given_bounds_and_says_so():
 
 def test_thin_far_section_of_float32_does_not_claim_more_than_it_knows():
     r = section(10500.0, 100.0)
-    found = fit_homogeneous_path((700.0 + signal(r, 1.0, 0.03 * KM)).astype(np.float32), r)
-    assert abs(found.extinction - 0.03 * KM) < 4 * found.extinction_standard_error
-    assert found.extinction_standard_error > 0.005 * KM
+    fit = fit_homogeneous_path((700.0 + signal(r, 1.0, 0.03 * KM)).astype(np.float32), r)
+    assert abs(fit.extinction - 0.03 * KM) < 4 * fit.extinction_standard_error
+    assert fit.extinction_standard_error > 0.005 * KM
 
 
 # One profile at a time ----------------------------------------------------------------------
@@ -453,7 +453,7 @@ def test_result_does_not_depend_on_the_batch(method, dtype):
     variance = rng.uniform(0.5, 2.0, power.shape)
     whole = fit_homogeneous_path(power, LONG, variance=variance, method=method)
 
-    def part(rows):
+    def rows_of(rows):
         return HomogeneousResult(
             **{name: getattr(whole, name)[rows] for name in HomogeneousResult.__dataclass_fields__}
         )
@@ -462,10 +462,10 @@ def test_result_does_not_depend_on_the_batch(method, dtype):
     for rows in (slice(0, 1), slice(3, 40), slice(59, 60), order, slice(None, None, -2)):
         same(
             fit_homogeneous_path(power[rows], LONG, variance=variance[rows], method=method),
-            part(rows),
+            rows_of(rows),
         )
     for k in (0, 7, 33):
-        same(fit_homogeneous_path(power[k], LONG, variance=variance[k], method=method), part(k))
+        same(fit_homogeneous_path(power[k], LONG, variance=variance[k], method=method), rows_of(k))
     cube = fit_homogeneous_path(
         power.reshape(3, 4, 5, 225), LONG, variance=variance.reshape(3, 4, 5, 225), method=method
     )
@@ -476,15 +476,15 @@ def test_result_does_not_depend_on_the_batch(method, dtype):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308, 0.0])
-def test_bad_neighbours_leave_a_profile_alone(bad):
+def test_bad_neighbours_do_not_affect_a_profile(bad):
     power = clean(9)
     expected = fit_homogeneous_path(power, LONG, variance=1.0)
     power[::2] = bad
-    found = fit_homogeneous_path(power, LONG, variance=1.0)
-    np.testing.assert_array_equal(found.extinction[1::2], expected.extinction[1::2])
-    np.testing.assert_array_equal(found.quality[1::2], expected.quality[1::2])
-    assert np.all(found.quality[::2] != 0)
-    assert np.isnan(found.extinction[::2]).all()
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
+    np.testing.assert_array_equal(fit.extinction[1::2], expected.extinction[1::2])
+    np.testing.assert_array_equal(fit.quality[1::2], expected.quality[1::2])
+    assert np.all(fit.quality[::2] != 0)
+    assert np.isnan(fit.extinction[::2]).all()
 
 
 # Forms of input -----------------------------------------------------------------------------
@@ -516,7 +516,7 @@ def test_forms_of_input():
     assert fit_homogeneous_path(power[:0], LONG).extinction.shape == (0,)
 
 
-def test_masked_bins_are_left_out():
+def test_masked_bins_are_excluded():
     power = clean(3)
     holes = np.random.default_rng(15).random(power.shape) < 0.2
     expected = fit_homogeneous_path(np.where(holes, np.nan, power), LONG, variance=1.0)
@@ -529,7 +529,7 @@ def test_masked_bins_are_left_out():
     same(fit_homogeneous_path(power, LONG, variance=np.where(holes, np.nan, 1.0)), expected)
 
 
-def test_descending_range_turns_variance_too():
+def test_descending_range_reverses_variance_too():
     power, variance = clean(3), np.linspace(0.5, 2.0, 225)
     expected = fit_homogeneous_path(power, LONG, variance=variance)
     same(fit_homogeneous_path(power[:, ::-1], LONG[::-1], variance=variance[::-1]), expected)
@@ -561,7 +561,7 @@ def test_descending_range_turns_variance_too():
         ({"extinction_bounds": (-1.0, 1.0)}, "extinction_bounds", "300"),
     ],
 )
-def test_arguments_that_cannot_be_right_are_refused(arguments, field, words):
+def test_invalid_arguments_are_refused(arguments, field, words):
     given_ = {"power": clean(2), "range": LONG} | arguments
     with pytest.raises(RetrievalInputError, match=words) as caught:
         fit_homogeneous_path(given_.pop("power"), given_.pop("range"), **given_)
@@ -593,46 +593,46 @@ def test_cubic_method_is_unbiased_and_its_errors_honest(start, length, height, e
     variance = np.linspace(0.5, 1.5, r.size)
     power = 370.0 + signal(r, height, extinction) + noise(count, seed=16) * np.sqrt(variance)
     arguments = {"variance": variance} if known else {"weights": 3.0 / variance}
-    found = fit_homogeneous_path(power, r, method="cubic", **arguments)
+    fit = fit_homogeneous_path(power, r, method="cubic", **arguments)
     truth = {
         "background": 370.0,
         "amplitude": amplitude(r, height, extinction),
         "extinction": extinction,
     }
     lowest = lowest_errors(r, height, extinction, 1.0 / variance)[2]
-    assert np.std(found.extinction) > 1.05 * lowest
+    assert np.std(fit.extinction) > 1.05 * lowest
     for name, true in truth.items():
-        errors = getattr(found, name) - true
+        errors = getattr(fit, name) - true
         assert abs(np.mean(errors)) < 0.1 * np.std(errors), name
-        covered = np.abs(errors) < 1.96 * getattr(found, f"{name}_standard_error")
+        covered = np.abs(errors) < 1.96 * getattr(fit, f"{name}_standard_error")
         assert 0.93 < np.mean(covered) < 0.97, name
     if known:
         cubic = cubic_and_tail.cubic(power, r, variance=variance)
-        np.testing.assert_array_equal(found.background, cubic.background)
+        np.testing.assert_array_equal(fit.background, cubic.background)
         np.testing.assert_allclose(
-            found.background_standard_error, cubic.background_standard_error, rtol=1e-12
+            fit.background_standard_error, cubic.background_standard_error, rtol=1e-12
         )
 
 
 def test_cubic_method_is_exact_without_noise():
     extinction = np.geomspace(0.01 * KM, 3.0 * KM, 50)
     power = 10.0 + signal(LONG, 1.0, extinction)
-    found = fit_homogeneous_path(power, LONG, variance=1e-24, method="cubic")
-    assert np.max(np.abs(found.extinction / extinction - 1.0)) < 1e-9
+    fit = fit_homogeneous_path(power, LONG, variance=1e-24, method="cubic")
+    assert np.max(np.abs(fit.extinction / extinction - 1.0)) < 1e-9
 
 
-def test_cubic_method_says_where_it_cannot():
+def test_cubic_method_flags_what_it_cannot_solve():
     power = clean(4)
     power[1, 100] = np.nan
     power[2] = 5.0
     power[3] = noise(1)[0]
-    found = fit_homogeneous_path(power, LONG, variance=1.0, method="cubic")
-    assert found.quality[0] == 0
-    assert found.quality[1] == Quality.INPUT_MISSING
-    assert np.isnan(found.extinction[1])
-    assert found.valid_bins[1] == 224
-    assert found.quality[2] == Quality.NO_SIGNAL
-    assert found.quality[3] & Quality.LOW_SIGNAL
+    fit = fit_homogeneous_path(power, LONG, variance=1.0, method="cubic")
+    assert fit.quality[0] == 0
+    assert fit.quality[1] == Quality.INPUT_MISSING
+    assert np.isnan(fit.extinction[1])
+    assert fit.valid_bins[1] == 224
+    assert fit.quality[2] == Quality.NO_SIGNAL
+    assert fit.quality[3] & Quality.LOW_SIGNAL
     with pytest.raises(RetrievalInputError, match="uniform"):
         fit_homogeneous_path(power, LONG + np.sin(np.arange(225)), method="cubic")
 
