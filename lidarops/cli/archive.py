@@ -168,8 +168,8 @@ def show_plan(
             continue
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
         if not stale:
-            estimate = f"about {times['everything']:.2g} s of CPU time"
-            show(_plan_table(f"{title}, {estimate}", judged.requested))
+            cpu_time = f"about {times['everything']:.2g} s of CPU time"
+            show(_plan_table(f"{title}, {cpu_time}", judged.requested))
         show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", judged))
     no_scene = no_scene and selects_no_scene(settings, selection)
     # With --stale, fresh scenes were not judged.

@@ -12,7 +12,7 @@ from typing import Any, Final
 import yaml
 
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
+from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.scan import scan_keys
@@ -143,7 +143,7 @@ def _granules(campaign: Campaign, instrument: str, day: int) -> Iterator[Granule
         )
 
 
-def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> Entry:
+def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> SceneEntry:
     plan = plan_scene(scene, campaign)
     files = [
         InputRecord(granule.path, Role.SIGNAL, str(granule.sha256)) for granule in scene.granules
@@ -162,7 +162,7 @@ def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> Entry:
         products=tuple(product.record for product in products),
     )
     judgement = judge.judgement(scene, plan)
-    return Entry(outcome, judgement.day, judge.key(judgement), final=True, products=products)
+    return SceneEntry(outcome, judgement.day, judge.key(judgement), final=True, products=products)
 
 
 def _product(

@@ -27,7 +27,7 @@ def test_nothing_is_stale_in_an_archive_of_stand_ins(tmp_path):
     assert (summary.files, summary.unchanged) == (SMALL.files, SMALL.files) == (1152, 1152)
     with Store(campaign.catalog_url, campaign.name) as store:
         assert store.count(status=Status.GOOD) == SMALL.files
-        with store.all_made() as products:
+        with store.all_products() as products:
             kinds = [product.kind for product in products]
     assert kinds == [ProductKind.SIGNAL.value] * SMALL.instruments * SMALL.days
     result = pipeline.bring_up_to_date(campaign)
