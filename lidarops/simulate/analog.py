@@ -236,22 +236,23 @@ def _sample_parameters(
 ) -> tuple[float, float, float, float, NDArray[np.float64], NDArray[np.complex128]]:
     """Return the parameters that all bins share, with the harmonics of a photoelectron's charge."""
     unit = recorder.gain / recorder.step / (bin_time * 1e6)
-    spread, still = recorder.excess_noise - 1.0, recorder.noise / recorder.step
-    if still < LEAST_NOISE:
+    spread, dark_noise = recorder.excess_noise - 1.0, recorder.noise / recorder.step
+    if dark_noise < LEAST_NOISE:
         raise SimulationInputError(
-            f"of {recorder.noise:g} mV is {still:g} digitiser steps, less than {LEAST_NOISE:g}",
+            f"of {recorder.noise:g} mV is {dark_noise:g} digitiser steps, less than"
+            f" {LEAST_NOISE:g}",
             field="noise",
             remedy=f"give at least {LEAST_NOISE * recorder.step:g} mV",
         )
-    most = int(sqrt(negligible / (2.0 * pi**2)) / still)
+    most = int(sqrt(negligible / (2.0 * pi**2)) / dark_noise)
     omega = 2.0 * pi * np.arange(1, most + 1)
-    gauss = np.exp(-0.5 * (omega * still) ** 2)
+    gauss = np.exp(-0.5 * (omega * dark_noise) ** 2)
     inner = 1.0 - 1j * omega * unit * spread
     power = -np.log(inner) / spread if spread > 0.0 else 1j * omega * unit
     charge = np.exp(power)
     slope = 1j * unit * charge / inner
     harmonics = np.stack([charge, slope])
-    return 1e6 * bin_time, unit, spread, still, gauss, harmonics
+    return 1e6 * bin_time, unit, spread, dark_noise, gauss, harmonics
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -260,13 +261,13 @@ def _rounded(
     dark: float,
     unit: float,
     spread: float,
-    still: float,
+    dark_noise: float,
     gauss: Any,
     harmonics: Any,
 ) -> tuple[float, float, float]:
     """Return mean and variance of a rounded sample, and its covariance with the voltage."""
     mean = unit * events + dark
-    variance = (1.0 + spread) * unit * unit * events + still * still
+    variance = (1.0 + spread) * unit * unit * events + dark_noise * dark_noise
     bias, square, product = 0.0, 1.0 / 12.0, 0.0
     sign = 1.0
     for k in range(gauss.size):
@@ -279,7 +280,7 @@ def _rounded(
         angle = events * charge.imag + 2.0 * order * dark
         real, imag = size * cos(angle), size * sin(angle)
         # d ln phi / d omega; times -i phi it is E[v exp(i omega v)].
-        along = events * harmonics[1, k].real - 2.0 * order * still * still
+        along = events * harmonics[1, k].real - 2.0 * order * dark_noise * dark_noise
         across = events * harmonics[1, k].imag + dark
         bias += sign / order * imag
         square += sign / order**2 * real
@@ -315,14 +316,14 @@ def _censored(mean: float, deviation: float, top: float) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _mixed(
-    events: float, dark: float, unit: float, spread: float, still: float, top: float
+def _mixture(
+    events: float, dark: float, unit: float, spread: float, dark_noise: float, top: float
 ) -> tuple[float, float]:
     """Return mean and variance of a clipped voltage, summed over numbers of photoelectrons."""
     mean, square = 0.0, 0.0
     chance = exp(-events)
     for number in range(int(events + 10.0 * sqrt(events)) + 12):
-        deviation = sqrt(still * still + spread * unit * unit * number)
+        deviation = sqrt(dark_noise * dark_noise + spread * unit * unit * number)
         centre, variance = _censored(dark + unit * number, deviation, top)
         mean += chance * centre
         square += chance * (variance + centre * centre)
@@ -338,13 +339,13 @@ def _clipped(
     dark: float,
     unit: float,
     spread: float,
-    still: float,
+    dark_noise: float,
     top: float,
 ) -> tuple[float, float]:
     """Return the mean of a sample clipped to 0..top, and the remaining share of its deviation."""
     reach = _FAR * sqrt(rounded)
     # Photoelectrons only add to the dark voltage.
-    above, below = mean + reach > top, dark < _FAR * still + 0.5 and mean < reach + 0.5
+    above, below = mean + reach > top, dark < _FAR * dark_noise + 0.5 and mean < reach + 0.5
     if not (above or below):
         return mean, 1.0
     if rounded <= 0.0:
@@ -352,8 +353,8 @@ def _clipped(
     if events > _MANY:
         centre, variance = _censored(mean, sqrt(rounded), top)
         return centre, sqrt(variance / rounded)
-    whole = (1.0 + spread) * unit * unit * events + still * still
-    centre, variance = _mixed(events, dark, unit, spread, still, top)
+    whole = (1.0 + spread) * unit * unit * events + dark_noise * dark_noise
+    centre, variance = _mixture(events, dark, unit, spread, dark_noise, top)
     return centre + mean - unit * events - dark, sqrt(variance / whole)
 
 
@@ -366,7 +367,7 @@ def _sum_samples(
     window: float,
     unit: float,
     spread: float,
-    still: float,
+    dark_noise: float,
     gauss: Any,
     harmonics: Any,
     shots: float,
@@ -375,13 +376,15 @@ def _sum_samples(
     total = np.empty_like(number)
     for i in range(number.size):
         events = rate[i] * window
-        mean, rounded, covariance = _rounded(events, dark[i], unit, spread, still, gauss, harmonics)
-        variance = (1.0 + spread) * unit * unit * events + still * still
+        mean, rounded, covariance = _rounded(
+            events, dark[i], unit, spread, dark_noise, gauss, harmonics
+        )
+        variance = (1.0 + spread) * unit * unit * events + dark_noise * dark_noise
         slope = covariance / variance
-        own = max(rounded - slope * covariance, 0.0) + (slope * still) ** 2
+        own = max(rounded - slope * covariance, 0.0) + (slope * dark_noise) ** 2
         charge = slope * slope * unit * unit * spread * number[i]
         light = slope * unit * (number[i] - events * shots)
-        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, still, top)
+        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, dark_noise, top)
         value = shots * centre + kept * (light + sqrt(charge + shots * own) * noise[i])
         total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
     return total
@@ -395,7 +398,7 @@ def _draw_sums(
     window: float,
     unit: float,
     spread: float,
-    still: float,
+    dark_noise: float,
     gauss: Any,
     harmonics: Any,
     shots: float,
@@ -404,8 +407,8 @@ def _draw_sums(
     total = np.empty(rate.size, np.int32)
     for i in range(rate.size):
         events = rate[i] * window
-        mean, rounded, _ = _rounded(events, dark[i], unit, spread, still, gauss, harmonics)
-        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, still, top)
+        mean, rounded, _ = _rounded(events, dark[i], unit, spread, dark_noise, gauss, harmonics)
+        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, dark_noise, top)
         value = shots * centre + kept * sqrt(rounded * shots) * noise[i]
         total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
     return total
@@ -418,13 +421,13 @@ def _moments_of(
     window: float,
     unit: float,
     spread: float,
-    still: float,
+    dark_noise: float,
     gauss: Any,
     harmonics: Any,
 ) -> Any:
     both = np.empty((2, rate.size))
     for i in range(rate.size):
         both[0, i], both[1, i], _ = _rounded(
-            rate[i] * window, dark[i], unit, spread, still, gauss, harmonics
+            rate[i] * window, dark[i], unit, spread, dark_noise, gauss, harmonics
         )
     return both

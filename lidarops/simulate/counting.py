@@ -18,7 +18,7 @@ FastCounts = NDArray[np.int32]
 _LARGEST: Final = 2**31 - 1
 """Largest signed integer of 32 bits."""
 _FAINT: Final = 1.0e-5
-"""Events per dead time; with fewer, the digits of the variance cancel."""
+"""Events per_event dead time; with fewer, the digits of the variance cancel."""
 
 
 def count_photons(
@@ -81,7 +81,7 @@ def count_photons(
         return released.number.copy()
     exposure = released.exposure * 1e-6
     counted: Counts = _count_events(
-        released.number, dead_time / exposure, _before(dead_time, released.bin_time), paralyzable,
+        released.number, dead_time / exposure, _share_in_previous(dead_time, released.bin_time), paralyzable,
         random,
     )  # fmt: skip
     return counted
@@ -131,8 +131,10 @@ def count_fast(
             remedy="take fewer shots, or use count_photons",
         )
     noise = random.standard_normal(rate.size, dtype=np.float32)
-    before = 2.0 * _before(dead_time, bin_time)
-    counts: FastCounts = _draw_counts(rate, noise, exposure, dead_time * 1e6, before, paralyzable)
+    in_previous = 2.0 * _share_in_previous(dead_time, bin_time)
+    counts: FastCounts = _draw_counts(
+        rate, noise, exposure, dead_time * 1e6, in_previous, paralyzable
+    )
     return counts
 
 
@@ -160,8 +162,8 @@ def counter_moments(
     `cox1962`.
     """
     rate = _checked(rate, bin_time, dead_time)
-    before = 2.0 * _before(dead_time, bin_time)
-    both = _moments_of(rate, bin_time * 1e6, dead_time * 1e6, before, paralyzable)
+    in_previous = 2.0 * _share_in_previous(dead_time, bin_time)
+    both = _moments_of(rate, bin_time * 1e6, dead_time * 1e6, in_previous, paralyzable)
     return both[0], both[1]
 
 
@@ -171,29 +173,29 @@ def _checked(rate: Array, bin_time: float, dead_time: float) -> Array:
     return limited_rate(rate)
 
 
-def _before(dead_time: float, bin_time: float) -> float:
+def _share_in_previous(dead_time: float, bin_time: float) -> float:
     """Return the share of the dead time before an event that lies in the previous bin."""
     return 0.5 * min(dead_time / bin_time, 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _loss(x: float, before: float, paralyzable: Any) -> tuple[float, float]:
+def _loss(x: float, in_previous: float, paralyzable: Any) -> tuple[float, float]:
     """Return the lost share of the events, and the chance of a trial to be lost."""
     if paralyzable:
         lost = -expm1(-x)
-        edge = 1.0 - 2.0 * before * (1.0 - before)
+        edge = 1.0 - 2.0 * in_previous * (1.0 - in_previous)
         return lost, lost + edge * x * x * exp(-2.0 * x) / lost
     y = 1.0 + x
     if x < _FAINT:
         return x / y, 3.0 * x
-    variance = (1.0 + before * x * (y * y + 2.0 * y + 3.0) / (3.0 * y)) / y**3
-    own = 1.0 + (1.0 - before) * x
-    left = variance * (1.0 - (before * x / own) ** 2) - 1.0 / (y * own) ** 2
+    variance = (1.0 + in_previous * x * (y * y + 2.0 * y + 3.0) / (3.0 * y)) / y**3
+    own = 1.0 + (1.0 - in_previous) * x
+    left = variance * (1.0 - (in_previous * x / own) ** 2) - 1.0 / (y * own) ** 2
     return x / y, min(max(1.0 - left * y / x, x / y), 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _busy(own: float, previous: float, share: float) -> float:
+def _load(own: float, previous: float, share: float) -> float:
     """Return -ln of the chance of no event in the dead time before, `share` of a bin."""
     low, step = min(own, previous), abs(own - previous)
     mean = -expm1(-step) / step if step > _FAINT else 1.0 - 0.5 * step
@@ -201,21 +203,23 @@ def _busy(own: float, previous: float, share: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _count_events(number: Any, per: float, before: float, paralyzable: Any, random: Any) -> Any:
+def _count_events(
+    number: Any, per_event: float, in_previous: float, paralyzable: Any, random: Any
+) -> Any:
     counted = np.empty_like(number)
     for i in range(number.size):
         released = number[i]
         counted[i] = released
-        x = per * max(released - 1, 0)
+        x = per_event * max(released - 1, 0)
         # The bin before the first is taken to be as bright as the first.
         if i > 0 and paralyzable:
-            x = _busy(x, per * number[i - 1], 2.0 * before)
+            x = _load(x, per_event * number[i - 1], 2.0 * in_previous)
         elif i > 0:
-            blind = before * min(per * counted[i - 1], 1.0)
-            x = ((1.0 - before) * x + blind) / (1.0 - blind)
+            blind = in_previous * min(per_event * counted[i - 1], 1.0)
+            x = ((1.0 - in_previous) * x + blind) / (1.0 - blind)
         if released == 0 or x <= 0.0:
             continue
-        lost, chance = _loss(x, before, paralyzable)
+        lost, chance = _loss(x, in_previous, paralyzable)
         whole = min(int(released * lost / chance + random.random()), released)
         if whole > 0:
             counted[i] -= random.binomial(whole, min(chance, 1.0))
@@ -223,36 +227,38 @@ def _count_events(number: Any, per: float, before: float, paralyzable: Any, rand
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moments(rate: float, dead_time: float, before: float, paralyzable: Any) -> tuple[float, float]:
-    """Return mean and variance of the counts per time."""
+def _moments(
+    rate: float, dead_time: float, in_previous: float, paralyzable: Any
+) -> tuple[float, float]:
+    """Return mean and variance of the counts per_event time."""
     x = rate * dead_time
     if paralyzable:
         mean = rate * exp(-x)
         # Within a window of length t, only pairs of events less than t apart count.
-        return mean, mean * (1.0 - 2.0 * x * exp(-x) * (1.0 - 0.5 * before))
+        return mean, mean * (1.0 - 2.0 * x * exp(-x) * (1.0 - 0.5 * in_previous))
     y = 1.0 + x
-    edge = before * x * (y * y + 2.0 * y + 3.0) / (6.0 * y**4)
+    edge = in_previous * x * (y * y + 2.0 * y + 3.0) / (6.0 * y**4)
     return rate / y, rate * (1.0 / y**3 + edge)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _moments_of(
-    rate: Any, exposure: float, dead_time: float, before: float, paralyzable: Any
+    rate: Any, exposure: float, dead_time: float, in_previous: float, paralyzable: Any
 ) -> Any:
     both = np.empty((2, rate.size))
     for i in range(rate.size):
-        mean, variance = _moments(rate[i], dead_time, before, paralyzable)
+        mean, variance = _moments(rate[i], dead_time, in_previous, paralyzable)
         both[0, i], both[1, i] = mean * exposure, variance * exposure
     return both
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _draw_counts(
-    rate: Any, noise: Any, exposure: float, dead_time: float, before: float, paralyzable: Any
+    rate: Any, noise: Any, exposure: float, dead_time: float, in_previous: float, paralyzable: Any
 ) -> Any:  # fmt: skip
     counts = np.empty(rate.size, np.int32)
     for i in range(rate.size):
-        mean, variance = _moments(rate[i], dead_time, before, paralyzable)
+        mean, variance = _moments(rate[i], dead_time, in_previous, paralyzable)
         value = mean * exposure + sqrt(variance * exposure) * noise[i]
         counts[i] = int(value + 0.5) if value > 0.0 else 0
     return counts

@@ -112,8 +112,8 @@ class GeometricalOverlap:
         along = shift - rings[:, None] * np.cos(angles)
         away = along**2 + (rings[:, None] * np.sin(angles)) ** 2
         spread = (0.25 * (self.beam_radius**2 + (self.divergence * distance) ** 2))[:, None, None]
-        seen = (0.5 * self.field_of_view * distance)[:, None, None] ** 2
-        share = chndtr(seen / spread, 2.0, away / spread)
+        view = (0.5 * self.field_of_view * distance)[:, None, None] ** 2
+        share = chndtr(view / spread, 2.0, away / spread)
         mean: Array = np.einsum("ijk,j->i", share, 0.5 * weights) / _ANGLES
         return mean
 

@@ -300,10 +300,10 @@ def pulsed_signal(
     grid = distance if path is None else path
     points = _points(grid, extinction, backscatter, returning_extinction)
     if isinstance(shape, SineOverlap):
-        full, seen = shape.full_overlap_range, np.empty((0, 0))
+        full, cell_overlap = shape.full_overlap_range, np.empty((0, 0))
     else:
-        full, seen = math.nan, shape(_positions(distance, cells.edges))
-    signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full, seen)
+        full, cell_overlap = math.nan, shape(_positions(distance, cells.edges))
+    signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full, cell_overlap)
     return system_constant * signal
 
 
@@ -337,11 +337,11 @@ def _points(
     ahead = path > 0.0
     if not ahead.any():
         raise SimulationInputError("has no range in front of the lidar", field="path")
-    both = extinction + (extinction if returning is None else returning)
+    two_way = extinction + (extinction if returning is None else returning)
     grid = np.concatenate([[0.0], path[ahead]])
-    both = both[ahead][np.r_[0, 0 : ahead.sum()]]
-    depth = np.concatenate([[0.0], np.cumsum(0.5 * (both[1:] + both[:-1]) * np.diff(grid))])
-    return grid, both, depth, backscatter[ahead][np.r_[0, 0 : ahead.sum()]]
+    two_way = two_way[ahead][np.r_[0, 0 : ahead.sum()]]
+    depth = np.concatenate([[0.0], np.cumsum(0.5 * (two_way[1:] + two_way[:-1]) * np.diff(grid))])
+    return grid, two_way, depth, backscatter[ahead][np.r_[0, 0 : ahead.sum()]]
 
 
 def _positions(distance: Array, edges: Array) -> Array:
@@ -362,11 +362,11 @@ def _sum_cells(
     edges: Any,
     density: Any,
     grid: Any,
-    both: Any,
+    two_way: Any,
     depth: Any,
     backscatter: Any,
     full: float,
-    seen: Any,
+    cell_overlap: Any,
 ) -> Any:
     signal = np.zeros(distance.size)
     inverse = 1.0 / (grid[1:] - grid[:-1])
@@ -391,11 +391,15 @@ def _sum_cells(
             x = r - grid[k]
             share = min(x * inverse[k], 1.0)
             inside = min(x, grid[k + 1] - grid[k])
-            slope = both[k + 1] - both[k]
-            tau = depth[k] + inside * (both[k] + 0.5 * slope * share) + (x - inside) * both[k + 1]
+            slope = two_way[k + 1] - two_way[k]
+            tau = (
+                depth[k]
+                + inside * (two_way[k] + 0.5 * slope * share)
+                + (x - inside) * two_way[k + 1]
+            )
             value = backscatter[k] + (backscatter[k + 1] - backscatter[k]) * share
-            if seen.size:
-                value *= seen[j, i]
+            if cell_overlap.size:
+                value *= cell_overlap[j, i]
             elif r < full:
                 value *= math.sin(0.5 * math.pi * r / full) ** 2
             total += density[i] * weight * value * math.exp(-tau)

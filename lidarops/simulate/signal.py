@@ -142,12 +142,12 @@ def backscatter_signal(
     _checks.profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
     if returning_extinction is not None:
         _checks.profile("returning_extinction", returning_extinction, distance.shape, "m-1")
-    both_ways = extinction + (extinction if returning_extinction is None else returning_extinction)
+    two_way = extinction + (extinction if returning_extinction is None else returning_extinction)
     positive = distance > 0.0
     safe = np.where(positive, distance, 1.0)
     overlap = overlap or SineOverlap(full_overlap_range)
     gathered = overlap(distance) * backscatter / safe**2
-    transmitted = np.exp(-optical_depth(distance, both_ways))
+    transmitted = np.exp(-optical_depth(distance, two_way))
     return np.where(positive, system_constant * gathered * transmitted, 0.0)
 
 
