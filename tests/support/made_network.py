@@ -1,4 +1,4 @@
-"""Averaged signals of three lidars whose beams form a triangle."""
+"""Averaged signals of three lidars with beams that form a triangle, for tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ START = np.datetime64("2025-06-01T20:00:00", "ns")
 
 
 def network() -> geometry.Network:
-    """The beams of the lidars."""
+    """Return the network of the three beams."""
     return geometry.build_network(
         [
             geometry.Beam(*station, azimuth=azimuth, elevation=0.0)
@@ -39,7 +39,7 @@ def network() -> geometry.Network:
 def beam(
     number: int, *, intervals: int = 6, noise: float = 0.002, seed: int = 0, **changes: Any
 ) -> BeamAverages:
-    """One beam in homogeneous air over a background of 0.1 MHz."""
+    """Return one beam in homogeneous air with a background of 0.1 MHz."""
     random = np.random.default_rng((seed, number))
     clean = 1e7 * (1.0 + number) * EXTINCTION * np.exp(-2 * EXTINCTION * RANGE) / RANGE**2
     spread = np.hypot(noise * clean, 1e-6)
@@ -61,7 +61,7 @@ def beam(
             ),
         },
     )
-    told: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "averages": averages,
         "interval": np.arange(100, 100 + intervals),
         "instrument": f"lidar-{number}",
@@ -73,18 +73,18 @@ def beam(
         "zenith_angle": 90.0,
         "azimuth": AZIMUTHS[number],
     }
-    return BeamAverages(**(told | changes))
+    return BeamAverages(**(defaults | changes))
 
 
 def product(intervals: int = 6, **settings: Any) -> xr.Dataset:
-    """The product of all three."""
-    told = {"block_intervals": 72, "visibility": Definition(wavelength=532e-9)} | settings
+    """Return the product of all three beams."""
+    values = {"block_intervals": 72, "visibility": Definition(wavelength=532e-9)} | settings
     beams = [beam(number, intervals=intervals) for number in range(3)]
-    return retrieve_network(beams, network(), NetworkSettings(**told))
+    return retrieve_network(beams, network(), NetworkSettings(**values))
 
 
-def without(found: BeamAverages, rows: slice) -> BeamAverages:
-    """The beam with bins of some intervals flagged as missing."""
-    bits = found.averages["quality"].copy()
+def without(averages: BeamAverages, rows: slice) -> BeamAverages:
+    """Return the beam with the bins of some intervals flagged as missing."""
+    bits = averages.averages["quality"].copy()
     bits[rows] = int(Quality.INPUT_MISSING)
-    return replace(found, averages=found.averages.assign(quality=bits))
+    return replace(averages, averages=averages.averages.assign(quality=bits))

@@ -1,4 +1,4 @@
-"""Signals of lidars that look into a known field of extinction, and the paper's triangle."""
+"""Networks of lidars in known fields of extinction, and their signals, for tests."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def homogeneous(extinction=2e-3):
 
 
 def gradient(x, y, z):
-    """Fall off with height: the spread over the crossings of the triangle is 14 percent."""
+    """Return a field that decreases with height: 14 percent spread over the triangle."""
     return 2e-3 * np.exp(-(z - 600.0) / 1010.0 + 0.0 * x)
 
 
 def plume(x, y, z, east=-40.0):
-    """Stand 1.5 per km, with a plume of 3.5 per km."""
+    """Return 1.5 per km with a plume of 3.5 per km."""
     return 1.5e-3 + 2e-3 * np.exp(-((x - east) ** 2 + (z - 650.0) ** 2) / (2 * 110.0**2))
 
 
 def fan(positions, elevations, **settings):
-    """Return the network of lidars on a line, at positions in m, that look up in its plane."""
+    """Return a network of lidars on a line at positions in m, with beams in one vertical plane."""
     origin, direction = [], []
     for x, angles in zip(positions, elevations, strict=True):
         for angle in angles:
@@ -50,25 +50,25 @@ def grid(net, step=5.0, start=100.3):
 
 def signals(net, range_, field, exponent=1.0):
     """Return (beam, bin) power of unit constants: Gauss-Legendre quadrature of optical depth."""
-    out = np.empty((net.beams, range_.size))
+    power = np.empty((net.beams, range_.size))
     edges = np.concatenate([[0.0], range_])
     for beam in range(net.beams):
 
         def along(r, beam=beam):
             return field(*(net.origin[beam][:, None] + net.direction[beam][:, None] * r))
 
-        # The first cell is long: cut it as finely as the others.
+        # The first cell is long: divide it as finely as the others.
         cut = np.union1d(np.linspace(0.0, range_[0], 40), edges)
         middle, half = (cut[1:] + cut[:-1]) / 2, (cut[1:] - cut[:-1]) / 2
         points = (middle + half * NODES[:, None]).ravel()
         cells = (along(points).reshape(4, -1) * WEIGHTS[:, None]).sum(axis=0) * half
         depth = np.interp(range_, cut, np.concatenate([[0.0], np.cumsum(cells)]))
-        out[beam] = along(range_) ** (1 / exponent) * np.exp(-2 * depth) / range_**2
-    return out
+        power[beam] = along(range_) ** (1 / exponent) * np.exp(-2 * depth) / range_**2
+    return power
 
 
 def noisy(net, range_, power, relative, profiles, seed=1, additive=0.01):
-    """Return (profile, beam, bin) power, and variances: relative noise, and 1 % of the start."""
+    """Return (profile, beam, bin) power and variances: relative noise, and 1 % of the start."""
     first = [net.on_beam(beam)[1][0] for beam in range(net.beams)]
     level = np.array([np.interp(r, range_, p) for r, p in zip(first, power, strict=True)])
     deviation = np.hypot(relative * power, additive * level[:, None])
@@ -80,11 +80,11 @@ def at_crossings(net, field):
     return field(*net.crossing.T)
 
 
-def optical_depths(net, walk, field):
+def optical_depths(net, cycle, field):
     """Return (row,) signed optical depths of a cycle."""
-    out = np.empty(walk.beam.size)
-    for j, beam in enumerate(walk.beam):
-        r = np.linspace(walk.start_range[j], walk.end_range[j], 4001)
+    out = np.empty(cycle.beam.size)
+    for j, beam in enumerate(cycle.beam):
+        r = np.linspace(cycle.start_range[j], cycle.end_range[j], 4001)
         along = field(*(net.origin[beam][:, None] + net.direction[beam][:, None] * r))
         out[j] = np.sum((along[1:] + along[:-1]) / 2 * np.diff(r))
     return out
@@ -92,7 +92,7 @@ def optical_depths(net, walk, field):
 
 FIELDS = {"homogeneous": homogeneous(), "gradient": gradient, "plume": plume}
 QUIET = 1e-12
-"""A relative variance that is hardly noise."""
+"""Relative variance of almost no noise."""
 
 
 def without_noise(net, field, *, step=5.0, method="cycle", **settings):

@@ -235,9 +235,8 @@ def _exponents(exponent: npt.ArrayLike, beams: int) -> Array:
     return np.broadcast_to(array, (beams,)).copy()
 
 
-def _blocks(
-    blocks: npt.ArrayLike | None, leading: tuple[int, ...], field: str = "blocks"
-) -> tuple[Indices, int]:
+def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Indices, int]:
+    """Return (profile,) block numbers and the number of blocks."""
     count = int(np.prod(leading, dtype=np.int64))
     if blocks is None:
         return np.zeros(count, dtype=np.intp), min(count, 1)
@@ -245,7 +244,7 @@ def _blocks(
     if labels.shape != leading or labels.dtype.kind not in "iuUS":
         raise RetrievalInputError(
             f"has the shape {labels.shape} of {labels.dtype}",
-            field=field,
+            field="blocks",
             remedy=f"give one whole number or name per profile, {leading}",
         )
     names, inverse = np.unique(labels.reshape(count), return_inverse=True)

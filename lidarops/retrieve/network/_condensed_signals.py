@@ -335,7 +335,7 @@ def _bridge_outliers(
     """
     power, variance, log_factor = signal
     logs, noise, codes = beam_row
-    scaled, scaled_variance, deviations, nodes, shares = work
+    scaled, scaled_variance, deviations, nodes, weights = work
     first, low, stop, last = span
     for outer_span in ((first, low), (stop, last)):
         _take_outer_logarithms(
@@ -368,13 +368,13 @@ def _bridge_outliers(
             (first, last, end),
             without_outliers[2],
             nodes,
-            shares,
+            weights,
         )
         # Without good neighbours the beam has no value.
         return (end, number) if first_unbridged == end else (low, 1)
     if number > 0:
         end = outlying_bins.replace_outliers(
-            logs, noise, exponent, grid, (first, last, end), codes, nodes, shares
+            logs, noise, exponent, grid, (first, last, end), codes, nodes, weights
         )
     number = 0
     for g in range(low, end):

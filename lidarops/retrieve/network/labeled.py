@@ -155,7 +155,7 @@ def retrieve_network(
     signals = _gather_signals(beams, intervals, network)
     solver = _Solver(beams, network, settings, signals, intervals)
     result = solver.solve(signals.power)
-    errors = _Errors.of(solver, result, settings)
+    errors = _Errors.estimate(solver, result, settings)
     near = np.flatnonzero(network.near_crossing)
     extinction = result.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
@@ -286,11 +286,14 @@ class _Solver:
         self.network, self.signals = network, signals
         self.exponent = np.array([beam.exponent for beam in beams])
         names = [beam.instrument for beam in beams]
-        together = list(dict.fromkeys(names))
+        instruments = list(dict.fromkeys(names))
         self.beam_groups = (
             [[index] for index in range(len(beams))]
             if len(beams) <= _MOST_SEPARATE_BEAMS
-            else [[r for r, name in enumerate(names) if name == one] for one in together]
+            else [
+                [index_of_beam for index_of_beam, name in enumerate(names) if name == instrument]
+                for instrument in instruments
+            ]
         )
         """Beams that are changed together."""
         self._arguments: dict[str, Any] = {
@@ -357,7 +360,10 @@ class _Errors:
     """Relative change of extinction over relative change of signals at the near ends of beams."""
 
     @staticmethod
-    def of(solver: _Solver, result: MultiPositionResult, settings: NetworkSettings) -> _Errors:
+    def estimate(
+        solver: _Solver, result: MultiPositionResult, settings: NetworkSettings
+    ) -> _Errors:
+        """Return the errors from noise and background, and from the systematic effects."""
         signals = solver.signals
         background_error = np.nan_to_num(signals.background_error)[..., np.newaxis]
         random = _root_sum_square(

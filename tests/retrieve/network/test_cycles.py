@@ -20,7 +20,7 @@ from lidarops.retrieve.network.cycles import (
 
 
 def rows(rng, count, k, depth=0.3, spread=0.3, signs=None):
-    """Draw exact rows of any field: signal, signal, integral, and the answer."""
+    """Return exact random rows: start, end, integral, reciprocal extinction, signed depth."""
     reciprocal = np.exp(rng.normal(0.0, spread, (count, k)))
     depths = rng.uniform(0.05, depth, (count, k))
     if signs is None:
@@ -65,9 +65,9 @@ def test_sensitivities_agree_with_exact_derivatives(k, multiplier, unbiased):
         a, e, b = (
             [
                 mp.mpf(float(x)) * mp.e**y
-                for x, y in zip(part[n], logs[i * k : i * k + k], strict=True)
+                for x, y in zip(chunk[n], logs[i * k : i * k + k], strict=True)
             ]
-            for i, part in enumerate((starts, ends, integrals))
+            for i, chunk in enumerate((starts, ends, integrals))
         )
         lam, numerator, product, determinant = mp.mpf(multiplier), mp.mpf(0), mp.mpf(1), mp.mpf(1)
         for j in range(k):
@@ -92,7 +92,7 @@ def test_sensitivities_agree_with_exact_derivatives(k, multiplier, unbiased):
                     assert abs(result.sensitivities[n, j, i] - slope) < 1e-12 * scale
 
 
-def test_variance_is_that_of_independent_relative_errors():
+def test_variance_follows_independent_relative_errors():
     rng = np.random.default_rng(8)
     starts, ends, integrals, _, _ = rows(rng, 1, 3, depth=0.6)
     relative = np.full((3, 3), 1e-8) * rng.uniform(0.5, 2.0, (3, 3))
@@ -109,12 +109,12 @@ def test_result_does_not_depend_on_the_other_cycles():
     starts, ends, integrals, _, _ = rows(np.random.default_rng(2), 257, 3)
     variance = np.random.default_rng(3).uniform(0, 1e-3, (257, 3, 3))
     whole = solve_cycle(starts, ends, integrals, relative_variance=variance)
-    for part in (slice(0, 1), slice(100, 157), slice(256, 257)):
+    for chunk in (slice(0, 1), slice(100, 157), slice(256, 257)):
         piece = solve_cycle(
-            starts[part], ends[part], integrals[part], relative_variance=variance[part]
+            starts[chunk], ends[chunk], integrals[chunk], relative_variance=variance[chunk]
         )
-        assert np.array_equal(piece.value, whole.value[part])
-        assert np.array_equal(piece.variance, whole.variance[part])
+        assert np.array_equal(piece.value, whole.value[chunk])
+        assert np.array_equal(piece.variance, whole.variance[chunk])
 
 
 # The lambda family --------------------------------------------------------------------------
@@ -171,13 +171,13 @@ def test_values_of_the_papers_second_figure():
             assert systematic_error(folded, 0.8) == pytest.approx(absolute, abs=6e-4)
     for angle, expected in zip(range(15, 76, 10), signed, strict=True):
         net = triangle(float(angle))
-        walk = geometry.build_cycle(net)
-        depths = optical_depths(net, walk, homogeneous())
+        cycle = geometry.build_cycle(net)
+        depths = optical_depths(net, cycle, homogeneous())
         assert systematic_error(depths, 0.8) == pytest.approx(expected, abs=6e-4)
 
 
 def corrected_lengths(second, l13, l23=500.0, first=120.0, third=90.0):
-    """Equation 19 with its third label and denominator put right."""
+    """Return equation 19 of the paper with its third label and denominator corrected."""
     a1, a2, a3 = np.radians([first, second, third])
     l12 = (l13 + l23) * np.sin(a2) / np.sin(a1 - a2) - l13 * np.sin(a3) / np.sin(a1 - a3)
     far = l23 * np.sin(a3) / np.sin(a3 - a2) - (l13 + l23) * np.sin(a1) / np.sin(a1 - a2)
@@ -188,8 +188,8 @@ def corrected_lengths(second, l13, l23=500.0, first=120.0, third=90.0):
 @pytest.mark.parametrize("angle", [50.0, 60.0, 75.0])
 def test_equation_19_with_its_misprints_corrected_is_the_geometry(angle):
     net = triangle(angle)
-    walk = geometry.build_cycle(net)
-    lengths = walk.end_range - walk.start_range
+    cycle = geometry.build_cycle(net)
+    lengths = cycle.end_range - cycle.start_range
     np.testing.assert_allclose(lengths * [1, 1, -1], corrected_lengths(angle, 300.0), rtol=1e-12)
 
 
@@ -198,12 +198,12 @@ def test_equation_19_with_its_misprints_corrected_is_the_geometry(angle):
 
 def paper_rows(angle=60.0, extinction=2e-3, relative=0.05):
     net = triangle(angle)
-    walk = geometry.build_cycle(net)
-    depths = optical_depths(net, walk, homogeneous(extinction))[np.newaxis]
+    cycle = geometry.build_cycle(net)
+    depths = optical_depths(net, cycle, homogeneous(extinction))[np.newaxis]
     starts = np.ones((1, 3))
     ends = np.exp(-2 * depths)
     integrals = (starts - ends) / extinction
-    # Of 7 bins at a crossing, and of all bins of 5 m between.
+    # From 7 bins at a crossing, and all bins of 5 m in between.
     variance = np.zeros((1, 3, 3, 3))
     variance[..., 0, 0] = variance[..., 1, 1] = relative**2 / 7
     variance[..., 2, 2] = relative**2 / 40
@@ -227,7 +227,7 @@ def test_closed_multiplier_is_within_1_percent_of_the_best(relative, angle):
     assert 0.5 < closed < 1.0
 
 
-def test_grid_takes_over_where_noise_is_loud():
+def test_the_grid_is_used_at_high_noise():
     data = paper_rows(relative=0.2)
     chosen = _multiplier.optimal_multiplier(*data, np.array([True]))[0]
     grid = min(total_error(x, data) for x in np.linspace(0.0, 1.0, 2001))
@@ -247,11 +247,11 @@ def test_slope_of_sensitivities_agrees_with_finite_differences():
         np.testing.assert_allclose(slope, exact, rtol=1e-7, atol=1e-8 * np.abs(exact).max())
 
 
-# What is refused and flagged ----------------------------------------------------------------
+# Errors and flags ---------------------------------------------------------------------------
 
 
-def test_pole_is_refused():
-    # Walked towards the lidars: Q = e^0.6, and 0.9^2 Q > 1.
+def test_no_value_beyond_the_pole():
+    # Towards the lidars: Q = e^0.6, and 0.9^2 Q > 1.
     ends = np.exp([[0.2, 0.2, 0.2]])
     starts = np.ones((1, 3))
     integrals = starts - ends
@@ -266,7 +266,7 @@ def test_pole_is_refused():
     assert not exact.pole[0]
 
 
-def test_singular_cycle_is_flagged_at_once():
+def test_singular_cycle_is_flagged():
     starts, ends = np.ones((1, 3)), np.array([[0.8, 1.0, 1.25]])
     result = solve_cycle(starts, ends, starts - ends, relative_variance=np.full((3, 3), 1e-4))
     assert result.attenuation[0] == 1.0
@@ -276,7 +276,7 @@ def test_singular_cycle_is_flagged_at_once():
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
 @pytest.mark.parametrize("place", [0, 1])
-def test_no_plain_number_comes_out_of_a_bad_signal(bad, place):
+def test_a_bad_signal_is_always_flagged(bad, place):
     starts, ends, integrals, _, _ = rows(np.random.default_rng(1), 1, 3)
     (starts, ends)[place][0, 1] = bad
     for multiplier in (1.0, 0.5):
@@ -294,7 +294,7 @@ def test_no_plain_number_comes_out_of_a_bad_signal(bad, place):
         ((["a"], ["b"], ["c"]), "start"),
     ],
 )
-def test_wrong_rows_are_refused_by_name(arguments, field):
+def test_invalid_rows_raise_with_the_field_name(arguments, field):
     with pytest.raises(RetrievalInputError) as raised:
         solve_cycle(*arguments)
     assert raised.value.field == field
@@ -310,19 +310,19 @@ def test_wrong_rows_are_refused_by_name(arguments, field):
         ({"relative_variance": np.ones((4, 3))}, "relative_variance"),
     ],
 )
-def test_wrong_settings_are_refused_by_name(settings_, field):
+def test_invalid_settings_raise_with_the_field_name(settings_, field):
     with pytest.raises(RetrievalInputError) as raised:
         solve_cycle(np.ones((2, 3)), np.full((2, 3), 0.8), np.ones((2, 3)), **settings_)
     assert raised.value.field == field
 
 
-def test_first_value_of_another_shape_is_refused():
+def test_first_value_of_another_shape_raises():
     with pytest.raises(RetrievalInputError) as raised:
         substitute_back(np.ones((2, 3)), np.full((2, 3), 0.8), np.ones((2, 3)), np.ones(3))
     assert raised.value.field == "first"
 
 
-def test_wrong_depths_are_refused_by_name():
+def test_invalid_depths_raise_with_the_field_name():
     for depths, multiplier, field in (
         (0.1, 0.5, "optical_depth"),
         ([0.1, 0.2, 0.3], -0.5, "multiplier"),

@@ -1,4 +1,4 @@
-"""Networks of lidars, from signals to extinction: accuracy, flags and extreme cases."""
+"""Extinction from the signals of networks of lidars: accuracy, blocks, weak signals, checks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_homogeneous_triangle_is_exact_at_any_step(step, extinction, method):
         if method == "network"
         else without_noise(triangle(), homogeneous(extinction), step=step, method=method)
     )
-    # Of an optical depth of 24, a cycle tells the crossing behind the first to 6 digits only.
+    # At an optical depth of 24, a cycle gives the second crossing to 6 digits only.
     reported = slice(0, 1 if extinction > 0.05 and method == "cycle" else 2)
     np.testing.assert_allclose(result.extinction[reported], extinction, rtol=1e-10)
     assert np.isnan(result.extinction[2])
@@ -70,15 +70,15 @@ def test_plume_converges_with_the_step():
 @pytest.mark.parametrize("name", FIELDS)
 def test_bias_of_the_multiplier_is_as_predicted_for_any_exponent(exponent, name):
     net, field = triangle(), FIELDS[name]
-    walk = geometry.build_cycle(net)
+    cycle = geometry.build_cycle(net)
     exact = without_noise(net, field, step=1.0, exponent=exponent)
     for multiplier in (0.0, 0.5, 0.9):
         biased = without_noise(
             net, field, step=1.0, exponent=exponent, method="multiplier", multiplier=multiplier
         )
-        crossing = walk.crossing[0]
+        crossing = cycle.crossing[0]
         measured = 1.0 - exact.extinction[crossing] / biased.extinction[crossing]
-        predicted = systematic_error(exponent * optical_depths(net, walk, field), multiplier)
+        predicted = systematic_error(exponent * optical_depths(net, cycle, field), multiplier)
         assert measured == pytest.approx(float(predicted), abs=1e-4)
 
 
@@ -120,8 +120,8 @@ def test_constants_of_lidars_cancel():
     for method in ("cycle", "network"):
         first = retrieve_network(power, r, net, method=method, variance=1e-6 * power**2,
                       full_overlap_range=100.0)  # fmt: skip
-        second = retrieve_network(gains * power, r, net, method=method, variance=1e-6 * (gains * power) ** 2,
-                       full_overlap_range=100.0)  # fmt: skip
+        second = retrieve_network(gains * power, r, net, method=method,
+                       variance=1e-6 * (gains * power) ** 2, full_overlap_range=100.0)  # fmt: skip
         np.testing.assert_allclose(second.extinction, first.extinction, rtol=1e-9)
 
 
@@ -175,7 +175,7 @@ def test_network_is_far_better_than_the_exact_triangle(name, relative, bound, ex
     assert result.flags.flagged[:, 0].mean() < 0.02
     closed = with_noise(net, field, relative, method="cycle")
     assert root_mean_square(relative_errors(closed, truth))[0] > exact
-    # And what it says of its error is true.
+    # The stated error is correct.
     score = (result.extinction[:, :2] - truth[:2]) / result.extinction_standard_error[:, :2]
     assert np.mean(np.abs(score) < 3) >= 0.98
 
@@ -209,7 +209,7 @@ def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
     assert usable[50:, 0].mean() > 0.9
-    # Two beams reach behind the plume of the first block: they tell of it, but not how large.
+    # Two beams reach behind the plume of the first block: they show it, but not its size.
     assert np.all(result.degrees_of_freedom[:50] < 0)
     assert result.flags.flagged[:50].all()
 
@@ -230,8 +230,8 @@ def test_long_chains_are_not_biased():
     assert 0.8 < np.mean(result.reduced_chi_square) < 1.2
 
 
-def test_prior_that_the_beams_contradict_is_weakened_or_given_up():
-    # A plume over 60 crossings is no gradient: the prior would shift them all by 2 errors.
+def test_a_prior_that_the_beams_contradict_is_weakened_or_dropped():
+    # A plume over 60 crossings is no gradient: the prior would shift all by 2 errors.
     net = fan(
         np.linspace(-600, 600, 5),
         [(40, 52, 64), (55, 68, 81), (75, 90, 105), (99, 112, 125), (116, 128, 140)],
@@ -247,18 +247,20 @@ def test_prior_that_the_beams_contradict_is_weakened_or_given_up():
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
     assert abs(np.mean(score)) < 0.5
-    # In homogeneous air it stands.
+    # In homogeneous air the prior is kept.
     power, variance = noisy(net, r, signals(net, r, homogeneous(1e-3)), 0.05, 20, additive=0.002)
     settings["variance"] = variance
-    calm = retrieve_network(power, r, net, **settings)
-    assert np.all(calm.prior_deviation < 0.05)
-    alone = retrieve_network(power, r, net, prior="none", **settings)
-    errors = [root_mean_square(relative_errors(x, 1e-3)) for x in (calm, alone)]
+    homogeneous_result = retrieve_network(power, r, net, **settings)
+    assert np.all(homogeneous_result.prior_deviation < 0.05)
+    without_prior = retrieve_network(power, r, net, prior="none", **settings)
+    errors = [
+        root_mean_square(relative_errors(x, 1e-3)) for x in (homogeneous_result, without_prior)
+    ]
     assert np.nanmedian(errors[0]) < 0.7 * np.nanmedian(errors[1])
 
 
-def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
-    """Each profile tells little without the prior; all together tell that it is wrong."""
+def test_a_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_dropped():
+    """A single profile cannot contradict the prior; all profiles together can."""
 
     def steep(x, y, z):
         return 1e-3 * np.exp(-z / 350.0)
@@ -273,8 +275,8 @@ def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
     assert weaker.all()
 
 
-def scores_where_far_crossings_fade(scale, relative, net):
-    """Return the result and errors over stated ones where the field falls off with height."""
+def scores_with_weak_far_crossings(scale, relative, net):
+    """Return the result and errors over stated ones in a field that decreases with height."""
     r = grid(net)
 
     def field(_, __, z):
@@ -291,17 +293,17 @@ def scores_where_far_crossings_fade(scale, relative, net):
     [(200.0, 0.06, triangle()), (175.0, 0.03, three_by_two()), (150.0, 0.03, three_by_two()),
      (100.0, 0.03, three_by_two())],
 )  # fmt: skip
-def test_a_prior_that_nothing_tests_is_not_reported_as_a_measurement(scale, relative, net):
-    """All values were without a flag, half of them off by more than 4 errors."""
-    result, score = scores_where_far_crossings_fade(scale, relative, net)
+def test_values_from_an_untested_prior_are_flagged(scale, relative, net):
+    """All values were once unflagged, and half of them off by more than 4 errors."""
+    result, score = scores_with_weak_far_crossings(scale, relative, net)
     assert np.median(result.degrees_of_freedom) < 0
     kept = ~result.flags.flagged & np.isfinite(result.extinction)
     assert np.mean((np.abs(score) > 4.0)[:, net.near_crossing] & kept[:, net.near_crossing]) < 0.01
 
 
-def test_a_field_that_too_few_beams_see_is_told_with_wide_errors():
+def test_a_field_with_too_few_beams_has_large_errors():
     net = three_by_two()
-    result, score = scores_where_far_crossings_fade(500.0, 0.1, net)
+    result, score = scores_with_weak_far_crossings(500.0, 0.1, net)
     assert np.median(result.degrees_of_freedom) < 0
     kept = ~result.flags.flagged & np.isfinite(result.extinction)
     assert kept.sum() > 40
@@ -311,23 +313,23 @@ def test_a_field_that_too_few_beams_see_is_told_with_wide_errors():
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_beams_that_profiles_lack_cost_no_more_than_what_they_saw(name):
+def test_missing_beams_of_profiles_cost_only_their_crossings(name):
     net, field = three_by_two(), FIELDS[name]
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), 0.02, 50, seed=2)
-    lost = np.random.default_rng(2).random((50, net.beams, 1)) < 0.25
-    found = [
-        retrieve_network(one, r, net, variance=variance, full_overlap_range=100.0)
-        for one in (power, np.where(lost, np.nan, power))
+    missing = np.random.default_rng(2).random((50, net.beams, 1)) < 0.25
+    result = [
+        retrieve_network(entry, r, net, variance=variance, full_overlap_range=100.0)
+        for entry in (power, np.where(missing, np.nan, power))
     ]
-    kept = [np.isfinite(one.extinction) & ~one.flags.flagged for one in found]
-    # Of a crossing that two beams see, at best (3 / 4)^2 are without a flag.
+    kept = [np.isfinite(entry.extinction) & ~entry.flags.flagged for entry in result]
+    # At a crossing of two beams, at most (3 / 4)^2 of the values are unflagged.
     assert kept[1].sum() > 0.4 * kept[0].sum()
-    score = (found[1].extinction - at_crossings(net, field)) / found[1].extinction_standard_error
+    score = (result[1].extinction - at_crossings(net, field)) / result[1].extinction_standard_error
     assert np.all(np.abs(score[kept[1]]) < 4.0)
 
 
-def test_average_signals_before_not_solutions_afterwards():
+def test_averaged_signals_are_better_than_averaged_solutions():
     net = triangle()
     r = grid(net)
     clean = signals(net, r, homogeneous())
@@ -344,16 +346,16 @@ def test_average_signals_before_not_solutions_afterwards():
     assert root_mean_square(means - 1) > 2 * error
 
 
-def test_unknown_noise_is_told_by_the_signal():
+def test_unknown_noise_is_estimated_from_the_signal():
     net = triangle()
     r = grid(net)
     clean = signals(net, r, homogeneous())
     rng = np.random.default_rng(3)
     power = clean * (1 + 0.03 * rng.standard_normal((200, *clean.shape)))
     settings = {"full_overlap_range": 100.0, "method": "unbiased"}
-    told = retrieve_network(power, r, net, variance=(0.03 * clean) ** 2, **settings)
-    found = retrieve_network(power, r, net, **settings)
-    ratio = found.extinction_standard_error[:, 0] / told.extinction_standard_error[:, 0]
+    stated = retrieve_network(power, r, net, variance=(0.03 * clean) ** 2, **settings)
+    result = retrieve_network(power, r, net, **settings)
+    ratio = result.extinction_standard_error[:, 0] / stated.extinction_standard_error[:, 0]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
 
 
@@ -361,7 +363,7 @@ def test_unknown_noise_is_told_by_the_signal():
 
 
 @pytest.mark.parametrize("method", ["network", "multiplier", "unbiased", "slope", "klett"])
-def test_blocks_do_not_know_of_each_other(method):
+def test_blocks_are_independent(method):
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 60)
@@ -369,12 +371,12 @@ def test_blocks_do_not_know_of_each_other(method):
     settings = {"method": method, "full_overlap_range": 100.0}
     whole = retrieve_network(power, r, net, variance=variance, blocks=labels, **settings)
     shuffled = np.random.default_rng(0).permutation(60)
-    for part in (slice(0, 20), slice(20, 60), slice(20, 30)):
+    for chunk in (slice(0, 20), slice(20, 60), slice(20, 30)):
         piece = retrieve_network(
-            power[part], r, net, variance=variance, blocks=labels[part], **settings
+            power[chunk], r, net, variance=variance, blocks=labels[chunk], **settings
         )
         for name in ("extinction", "extinction_standard_error", "prior_deviation", "multiplier"):
-            a, b = getattr(whole, name)[part], getattr(piece, name)
+            a, b = getattr(whole, name)[chunk], getattr(piece, name)
             assert np.array_equal(a, b, equal_nan=True), name
     mixed = retrieve_network(
         power[shuffled], r, net, variance=variance, blocks=labels[shuffled], **settings
@@ -382,7 +384,7 @@ def test_blocks_do_not_know_of_each_other(method):
     np.testing.assert_allclose(mixed.extinction, whole.extinction[shuffled], rtol=1e-9)
 
 
-def test_odd_arrays_are_taken_and_shapes_kept():
+def test_unusual_arrays_are_accepted_and_shapes_kept():
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 6)
@@ -395,23 +397,25 @@ def test_odd_arrays_are_taken_and_shapes_kept():
     assert result.flags.flagged.shape == (2, 3, 3)
     assert result.reduced_chi_square.shape == (2, 3)
     assert np.array_equal(result.extinction.reshape(6, 3), expected.extinction, equal_nan=True)
-    turned = retrieve_network(power[..., ::-1], r[::-1], net, variance=variance[..., ::-1],
+    reversed_result = retrieve_network(power[..., ::-1], r[::-1], net, variance=variance[..., ::-1],
                    full_overlap_range=100.0)  # fmt: skip
-    assert np.array_equal(turned.extinction, expected.extinction, equal_nan=True)
+    assert np.array_equal(reversed_result.extinction, expected.extinction, equal_nan=True)
     rows = retrieve_network(power, np.tile(r, (3, 1)), net, variance=np.tile(variance, (6, 1, 1)),
                  full_overlap_range=100.0)  # fmt: skip
     assert np.array_equal(rows.extinction, expected.extinction, equal_nan=True)
-    single = retrieve_network(
+    single_precision = retrieve_network(
         power.astype(np.float32), r, net, variance=variance, full_overlap_range=100.0
     )
-    np.testing.assert_allclose(single.extinction[:, 0], expected.extinction[:, 0], rtol=1e-3)
-    one = retrieve_network(power[0], r, net, variance=variance, full_overlap_range=100.0)
-    assert one.extinction.shape == (3,)
-    none = retrieve_network(power[:0], r, net, variance=variance, full_overlap_range=100.0)
-    assert none.extinction.shape == (0, 3)
+    np.testing.assert_allclose(
+        single_precision.extinction[:, 0], expected.extinction[:, 0], rtol=1e-3
+    )
+    one_profile = retrieve_network(power[0], r, net, variance=variance, full_overlap_range=100.0)
+    assert one_profile.extinction.shape == (3,)
+    no_profile = retrieve_network(power[:0], r, net, variance=variance, full_overlap_range=100.0)
+    assert no_profile.extinction.shape == (0, 3)
 
 
-def test_beams_may_have_ranges_of_their_own():
+def test_beams_may_have_different_ranges():
     net = triangle()
     fine, coarse = grid(net, 3.75), grid(net, 7.5)
     ranges = np.full((3, fine.size), np.nan)
@@ -437,12 +441,12 @@ def test_crossings_without_full_overlap_are_not_measured():
     assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_crossing]).any()
 
 
-def apart(one, other):
-    """Return by how many of its standard errors the one differs from the other."""
-    return np.abs(one.extinction - other.extinction) / one.extinction_standard_error
+def apart(first, second):
+    """Return the difference of two results in standard errors of the first."""
+    return np.abs(first.extinction - second.extinction) / first.extinction_standard_error
 
 
-def test_weak_signals_are_left_out_and_told():
+def test_weak_signals_are_left_out_and_flagged():
     net = triangle()
     r = grid(net)
     clean = signals(net, r, homogeneous(4e-3))
@@ -455,106 +459,106 @@ def test_weak_signals_are_left_out_and_told():
 
 
 @pytest.mark.parametrize("factor", [30.0, 1e2, 1e4, 1e8, np.inf, np.nan])
-def test_one_loud_profile_costs_the_others_nothing(factor):
+def test_a_noisy_profile_does_not_change_the_others(factor):
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
-    told = np.broadcast_to(variance, power.shape).copy()
-    told[3] *= factor
-    heard = power.copy()
+    stated = np.broadcast_to(variance, power.shape).copy()
+    stated[3] *= factor
+    noisy_power = power.copy()
     if np.isfinite(factor):
         rng = np.random.default_rng(0)
-        heard[3] += np.sqrt(told[3] - variance) * rng.standard_normal(heard[3].shape)
+        noisy_power[3] += np.sqrt(stated[3] - variance) * rng.standard_normal(noisy_power[3].shape)
     clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-    found = retrieve_network(heard, r, net, variance=told, full_overlap_range=100.0)
+    result = retrieve_network(noisy_power, r, net, variance=stated, full_overlap_range=100.0)
     others, kept = np.arange(50) != 3, np.isfinite(clean.extinction)
-    np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
-    assert np.all(apart(found, clean)[others][kept[others]] < 0.05)
-    ratio = found.extinction_standard_error / clean.extinction_standard_error
+    np.testing.assert_array_equal(result.flags.flagged[others], clean.flags.flagged[others])
+    assert np.all(apart(result, clean)[others][kept[others]] < 0.05)
+    ratio = result.extinction_standard_error / clean.extinction_standard_error
     np.testing.assert_allclose(ratio[others][kept[others]], 1.0, rtol=0.02)
-    mine = np.isfinite(found.extinction[3]) & ~found.flags.flagged[3]
+    selected = np.isfinite(result.extinction[3]) & ~result.flags.flagged[3]
     if factor > 50.0 or np.isnan(factor):
-        assert not mine.any()
-        told = found.flags.weak_signal | found.flags.signal_not_positive | found.flags.outlying
-        told |= found.flags.signal_missing
-        assert told[3, net.near_crossing].all()
-    score = (found.extinction - 2e-3) / found.extinction_standard_error
-    assert np.all(np.abs(score[3][mine]) < 4.0)
+        assert not selected.any()
+        stated = result.flags.weak_signal | result.flags.signal_not_positive | result.flags.outlying
+        stated |= result.flags.signal_missing
+        assert stated[3, net.near_crossing].all()
+    score = (result.extinction - 2e-3) / result.extinction_standard_error
+    assert np.all(np.abs(score[3][selected]) < 4.0)
 
 
 def between(net, r):
-    """Return the bin of each beam in the middle of its last two crossings."""
+    """Return the bin of each beam halfway between its last two crossings."""
     last = [net.on_beam(beam)[1][-2:] for beam in range(net.beams)]
     return np.searchsorted(r, np.mean(last, axis=1))
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e12])
-def test_a_bin_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor):
-    """One bin, between crossings, took its beams from the mean: the prior then went untested."""
+def test_a_bin_of_unknown_variance_does_not_change_the_other_profiles(factor):
+    """Such a bin once removed its beams from the mean, which could not test the prior."""
     net = three_by_two()
     r = grid(net)
     clean = signals(net, r, lambda _, __, z: 1.5e-3 * np.exp(-(z - 500.0) / 250.0))
     power, variance = noisy(net, r, clean, 0.05, 60)
-    told = np.broadcast_to(variance, power.shape).copy()
-    told[7, np.arange(net.beams), between(net, r)] *= factor
+    stated = np.broadcast_to(variance, power.shape).copy()
+    stated[7, np.arange(net.beams), between(net, r)] *= factor
     settings = {"full_overlap_range": 100.0}
-    found = retrieve_network(power, r, net, variance=told, **settings)
+    result = retrieve_network(power, r, net, variance=stated, **settings)
     whole = retrieve_network(power, r, net, variance=variance, **settings)
     others = np.arange(60) != 7
-    np.testing.assert_array_equal(found.prior_deviation, whole.prior_deviation)
-    np.testing.assert_array_equal(found.flags.flagged[others], whole.flags.flagged[others])
+    np.testing.assert_array_equal(result.prior_deviation, whole.prior_deviation)
+    np.testing.assert_array_equal(result.flags.flagged[others], whole.flags.flagged[others])
     kept = ~whole.flags.flagged & np.isfinite(whole.extinction)
-    assert np.all(apart(found, whole)[others][kept[others]] < 0.05)
+    assert np.all(apart(result, whole)[others][kept[others]] < 0.05)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_bin_of_unknown_variance_costs_what_one_without_signal_does(bad):
+def test_a_bin_of_unknown_variance_counts_as_missing(bad):
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 50, seed=4)
     beam = int(np.argmax(np.bincount(net.passages.beam)))
-    bin = between(net, r)[beam]
-    told = np.broadcast_to(variance, power.shape).copy()
-    told[7, beam, bin] = bad
-    lost = power.copy()
-    lost[7, beam, bin] = np.nan
-    found = retrieve_network(power, r, net, variance=told, full_overlap_range=100.0)
-    other = retrieve_network(lost, r, net, variance=variance, full_overlap_range=100.0)
-    for one in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
-        np.testing.assert_allclose(getattr(found, one)[7], getattr(other, one)[7], rtol=1e-9)
+    index = between(net, r)[beam]
+    stated = np.broadcast_to(variance, power.shape).copy()
+    stated[7, beam, index] = bad
+    missing = power.copy()
+    missing[7, beam, index] = np.nan
+    result = retrieve_network(power, r, net, variance=stated, full_overlap_range=100.0)
+    other = retrieve_network(missing, r, net, variance=variance, full_overlap_range=100.0)
+    for name in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
+        np.testing.assert_allclose(getattr(result, name)[7], getattr(other, name)[7], rtol=1e-9)
     crossings = net.on_beam(beam)[0]
-    assert found.flags.signal_missing[7, crossings[-1]]
-    assert not found.flags.signal_missing[7, crossings[0]]
-    assert np.delete(found.flags.signal_missing, 7, axis=0).sum() == 0
+    assert result.flags.signal_missing[7, crossings[-1]]
+    assert not result.flags.signal_missing[7, crossings[0]]
+    assert np.delete(result.flags.signal_missing, 7, axis=0).sum() == 0
 
 
-def test_a_beam_without_noise_is_left_out_and_told():
+def test_a_beam_without_noise_is_left_out_and_flagged():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
-    told = np.broadcast_to(variance, power.shape).copy()
-    told[3, 0] = 0.0
-    found = retrieve_network(power, r, net, variance=told, full_overlap_range=100.0)
+    stated = np.broadcast_to(variance, power.shape).copy()
+    stated[3, 0] = 0.0
+    result = retrieve_network(power, r, net, variance=stated, full_overlap_range=100.0)
     clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-    mine = np.zeros_like(found.flags.weak_signal)
-    mine[3, net.on_beam(0)[0]] = True
-    np.testing.assert_array_equal(found.flags.weak_signal, mine)
-    assert found.degrees_of_freedom[3] < clean.degrees_of_freedom[3]
-    wider = found.extinction_standard_error[3] > 1.5 * clean.extinction_standard_error[3]
+    selected = np.zeros_like(result.flags.weak_signal)
+    selected[3, net.on_beam(0)[0]] = True
+    np.testing.assert_array_equal(result.flags.weak_signal, selected)
+    assert result.degrees_of_freedom[3] < clean.degrees_of_freedom[3]
+    wider = result.extinction_standard_error[3] > 1.5 * clean.extinction_standard_error[3]
     assert wider[net.near_crossing].any()
 
 
-def test_a_profile_of_more_energy_is_not_loud():
+def test_a_profile_of_more_energy_is_not_noisy():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
     scale = np.where(np.arange(50) == 3, 20.0, 1.0)[:, np.newaxis, np.newaxis]
     clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-    found = retrieve_network(
+    result = retrieve_network(
         scale * power, r, net, variance=scale**2 * variance, full_overlap_range=100.0
     )
-    assert not found.flags.weak_signal.any()
-    np.testing.assert_allclose(found.extinction, clean.extinction, rtol=1e-9)
+    assert not result.flags.weak_signal.any()
+    np.testing.assert_allclose(result.extinction, clean.extinction, rtol=1e-9)
 
 
 def test_visibility_follows_from_extinction():
@@ -592,7 +596,7 @@ def test_visibility_follows_from_extinction():
         ({"contrast": 2.0}, "contrast"),
     ],
 )
-def test_wrong_settings_are_refused_by_name(settings, field):
+def test_invalid_settings_raise_with_the_field_name(settings, field):
     net = triangle()
     r = np.linspace(100.0, 1200.0, 100)
     with pytest.raises(RetrievalInputError) as raised:
@@ -611,13 +615,13 @@ def test_wrong_settings_are_refused_by_name(settings, field):
         (np.full((4, 3, 100), "x"), np.linspace(100.0, 1200.0, 100), "power"),
     ],
 )
-def test_wrong_arrays_are_refused_by_name(power, range_, field):
+def test_invalid_arrays_raise_with_the_field_name(power, range_, field):
     with pytest.raises(RetrievalInputError) as raised:
         retrieve_network(power, range_, triangle(), full_overlap_range=100.0)
     assert raised.value.field == field
 
 
-def test_cycle_that_cannot_be_measured_is_refused():
+def test_a_cycle_that_cannot_be_measured_raises():
     net = triangle()
     r = np.arange(100.0, 900.0, 5.0)
     power = signals(net, r, homogeneous())
@@ -626,7 +630,7 @@ def test_cycle_that_cannot_be_measured_is_refused():
 
 
 @pytest.mark.parametrize("method", ["network", "slope", "klett"])
-def test_signals_that_reach_no_crossing_give_nothing(method):
+def test_signals_that_reach_no_crossing_have_no_values(method):
     net = triangle()
     r = np.arange(100.0, 400.0, 5.0)
     power = np.tile(1 / r**2, (4, 3, 1))
@@ -635,13 +639,13 @@ def test_signals_that_reach_no_crossing_give_nothing(method):
     assert result.flags.not_measured.all()
 
 
-def test_beams_that_do_not_meet_are_refused():
+def test_beams_that_do_not_meet_raise():
     net = fan([0.0, 100.0], [(60.0,), (60.0,)])
     r = np.arange(100.0, 400.0, 5.0)
     with pytest.raises(RetrievalInputError, match="do not meet"):
         retrieve_network(np.ones((2, r.size)), r, net, full_overlap_range=100.0)
 
 
-def test_methods_are_told_in_the_result():
+def test_the_result_states_its_method():
     for method in extinction_field.NetworkMethod:
         assert without_noise(triangle(), homogeneous(), method=method.value).method is method

@@ -1,4 +1,4 @@
-"""Where beams meet: geodesy against pyproj and exact arithmetic, crossings against trigonometry."""
+"""Geodesy against pyproj and exact arithmetic, crossings of beams against trigonometry."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def bearing(origin, target):
     return np.degrees(np.arctan2(east, north)), np.degrees(np.arctan2(up, np.hypot(east, north)))
 
 
-def test_beams_of_three_stations_meet_where_they_are_pointed():
+def test_beams_of_three_stations_meet_at_their_targets():
     stations = [(47.25, 11.30, 600.0), (47.25, 11.34, 620.0), (47.28, 11.32, 900.0)]
     targets = [(47.262, 11.315, 1500.0), (47.258, 11.325, 1900.0)]
     beams, expected = [], []
@@ -133,7 +133,7 @@ def test_passages_of_several_beams_in_one_place_are_one_crossing():
     net = fan([-500.0, 0.0, 500.0], [(45.0,), (90.0,), (135.0,)])
     assert net.crossings == 1
     assert net.passages.beam.tolist() == [0, 1, 2]
-    # Apart by 10 m, they are one within 15 m and three within 1 m.
+    # With distances of 10 m: one crossing at a tolerance of 15 m, three at 1 m.
     origin = [[-500.0, 0, 0], [10.0, 0, 0], [500.0, 0, 0]]
     direction = [[1.0, 0, 1.0], [0, 0, 1.0], [-1.0, 0, 1.0]]
     assert geometry.network_of_lines(origin, direction, tolerance=15.0).crossings == 1
@@ -148,7 +148,7 @@ def test_beams_of_one_station_and_parallel_beams_do_not_meet():
     assert met.crossings == 1
 
 
-def test_crossings_lie_before_the_lidars_and_within_reach():
+def test_crossings_lie_in_front_of_the_lidars_and_within_range():
     assert fan([-500.0, 500.0], [(135.0,), (45.0,)]).crossings == 0
     assert fan([-500.0, 500.0], [(45.0,), (135.0,)]).crossings == 1
     assert fan([-500.0, 500.0], [(45.0,), (135.0,)], nearest=720.0).crossings == 0
@@ -184,35 +184,35 @@ def test_network_does_not_depend_on_the_order_of_beams():
 
 
 @pytest.mark.parametrize("angle", [20.0, 30.0, 40.0, 50.0, 60.0, 75.0])
-def test_cycle_starts_near_and_walks_in_the_direction_of_attenuation(angle):
+def test_cycle_starts_near_and_follows_the_attenuation(angle):
     net = triangle(angle)
-    walk = geometry.build_cycle(net)
-    assert not walk.far_start
-    assert walk.sign[0] == 1.0
-    assert walk.sign[-1] == -1.0
-    assert np.sum(walk.end_range - walk.start_range) > 0
+    cycle = geometry.build_cycle(net)
+    assert not cycle.far_start
+    assert cycle.sign[0] == 1.0
+    assert cycle.sign[-1] == -1.0
+    assert np.sum(cycle.end_range - cycle.start_range) > 0
     # Consecutive beams share the crossing between them.
     for j in range(3):
-        assert walk.crossing[j] in net.on_beam(int(walk.beam[j]))[0]
-        assert walk.crossing[j] in net.on_beam(int(walk.beam[j - 1]))[0]
-    # Below the passage of beams 1 and 3, another crossing is the near one.
+        assert cycle.crossing[j] in net.on_beam(int(cycle.beam[j]))[0]
+        assert cycle.crossing[j] in net.on_beam(int(cycle.beam[j - 1]))[0]
+    # Below the crossing of beams 1 and 3, another crossing is the near one.
     passage = np.degrees(np.arctan2(300 * np.sqrt(3), 500.0))
-    on_third = net.crossing[walk.crossing[0]]
+    on_third = net.crossing[cycle.crossing[0]]
     if angle < passage:
         assert on_third[2] == pytest.approx(500.0 * np.tan(np.radians(angle)))
     else:
         assert on_third[2] == pytest.approx(300.0 * np.sqrt(3))
 
 
-def test_start_of_a_cycle_can_be_chosen_and_is_told_when_far():
+def test_start_of_a_cycle_can_be_chosen_and_may_be_far():
     net = triangle()
-    walk = geometry.build_cycle(net, start=2)
-    assert walk.crossing[0] == 2
-    assert walk.far_start
+    cycle = geometry.build_cycle(net, start=2)
+    assert cycle.crossing[0] == 2
+    assert cycle.far_start
     assert not geometry.build_cycle(net, start=1).far_start
 
 
-def test_cycle_of_a_larger_network_is_named_by_its_beams():
+def test_cycle_of_a_larger_network_is_given_by_its_beams():
     net = fan([-500.0, 0.0, 400.0], [(50, 68), (78, 103), (112, 130)], farthest=1000.0)
     with pytest.raises(RetrievalInputError, match="one cycle"):
         geometry.build_cycle(net)
@@ -228,9 +228,9 @@ def test_cycle_of_a_larger_network_is_named_by_its_beams():
         for c in range(b + 1, 6)
         if {(a, b), (b, c), (a, c)} <= set(pairs)
     )
-    walk = geometry.build_cycle(net, first)
-    assert set(walk.beam.tolist()) == set(first)
-    assert not walk.far_start
+    cycle = geometry.build_cycle(net, first)
+    assert set(cycle.beam.tolist()) == set(first)
+    assert not cycle.far_start
 
 
 def test_square_of_four_beams_is_one_cycle():
@@ -238,9 +238,9 @@ def test_square_of_four_beams_is_one_cycle():
     direction = [[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]]
     net = geometry.network_of_lines(origin, direction)
     assert net.crossings == 4
-    walk = geometry.build_cycle(net)
-    assert sorted(walk.beam.tolist()) == [0, 1, 2, 3]
-    assert sorted(walk.crossing.tolist()) == [0, 1, 2, 3]
+    cycle = geometry.build_cycle(net)
+    assert sorted(cycle.beam.tolist()) == [0, 1, 2, 3]
+    assert sorted(cycle.crossing.tolist()) == [0, 1, 2, 3]
 
 
 # Checks -------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ GOOD = {"latitude": 47.0, "longitude": 11.0, "altitude": 0.0, "azimuth": 0.0, "e
         ("elevation", "up"),
     ],
 )
-def test_wrong_beams_are_refused_by_name(field, value):
+def test_invalid_beams_raise_with_the_field_name(field, value):
     with pytest.raises(RetrievalInputError) as raised:
         geometry.build_network([Beam(**GOOD), Beam(**{**GOOD, field: value})])
     assert raised.value.field in {field, "beams"}
@@ -276,14 +276,14 @@ def test_wrong_beams_are_refused_by_name(field, value):
         ({"smallest_angle": 0.0}, "smallest_angle"),
     ],
 )
-def test_wrong_settings_are_refused_by_name(arguments, field):
+def test_invalid_settings_raise_with_the_field_name(arguments, field):
     beams = [Beam(**GOOD), Beam(**{**GOOD, "latitude": 47.01, "azimuth": 180.0})]
     with pytest.raises(RetrievalInputError) as raised:
         geometry.build_network(beams, **arguments)
     assert raised.value.field == field
 
 
-def test_no_beams_too_many_and_shapeless_lines_are_refused():
+def test_no_beams_too_many_beams_and_invalid_lines_raise():
     with pytest.raises(RetrievalInputError, match="none"):
         geometry.build_network([])
     many = np.zeros((600, 3)), np.tile([1.0, 0, 0], (600, 1))
@@ -299,12 +299,12 @@ def test_no_beams_too_many_and_shapeless_lines_are_refused():
 
 
 @pytest.mark.parametrize("beams", [[0, 1], [0, 1, 1], [0, 1, 7], [0, 1, 2, 3]])
-def test_wrong_cycles_are_refused(beams):
+def test_invalid_cycles_raise(beams):
     with pytest.raises(RetrievalInputError):
         geometry.build_cycle(triangle(), beams)
 
 
-def test_start_off_the_cycle_is_refused():
+def test_a_start_off_the_cycle_raises():
     with pytest.raises(RetrievalInputError) as raised:
         geometry.build_cycle(triangle(), start=3)
     assert raised.value.field == "start"

@@ -1,4 +1,4 @@
-"""The solution of a network: its parts against numpy, scipy and finite differences."""
+"""Joint solution of a network: its steps against numpy, scipy and finite differences."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_cholesky_agrees_with_numpy(size, seed):
     np.testing.assert_allclose(matrix @ solution, side, atol=1e-6)
 
 
-def test_singular_matrix_is_told():
+def test_a_singular_matrix_is_detected():
     assert not _joint_solution.factorise(np.ones((3, 3)), 3)
     assert not _joint_solution.factorise(np.full((2, 2), np.nan), 2)
     assert not _joint_solution.factorise(-np.eye(2), 2)
@@ -66,16 +66,18 @@ def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
     return layout, data
 
 
-def test_value_at_a_crossing_is_that_of_a_line_through_logarithms():
+def test_value_at_a_crossing_comes_from_a_line_through_logarithms():
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 1)
     layout, data = condensed(net, power, 1e-30 * variance)
-    for c, (beam, where) in enumerate(
+    for c, (beam, problem_arguments) in enumerate(
         zip(layout.passages.beam, layout.passages.range, strict=True)
     ):
-        near = np.argsort(np.abs(r - where))[:7]
-        line = np.polyfit(r[near] - where, np.log(power[0, beam, near] * r[near] ** 2), 1)
+        near = np.argsort(np.abs(r - problem_arguments))[:7]
+        line = np.polyfit(
+            r[near] - problem_arguments, np.log(power[0, beam, near] * r[near] ** 2), 1
+        )
         first = layout.first_passage[beam]
         start = layout.passages.range[first]
         near = np.argsort(np.abs(r - start))[:7]
@@ -120,11 +122,11 @@ def test_covariance_agrees_with_finite_differences(exponent):
         for g in range(r.size):
             shifted[2 * g, beam, g] *= 1 + step
             shifted[2 * g + 1, beam, g] *= 1 - step
-        _, moved = condensed(net, shifted, quiet, exponent, step=8.0)
-        # Scaled to 1 at the first crossing, integrals lose what they share with it: put it back.
+        _, shift = condensed(net, shifted, quiet, exponent, step=8.0)
+        # Integrals are scaled to 1 at the first crossing: undo this.
         scale = np.exp(first_value(layout, beam, shifted, r, exponent))
-        values = moved.log_value[:, first:last] + np.log(scale)[:, None]
-        sums = moved.integral[:, first : last - 1] * scale[:, None]
+        values = shift.log_value[:, first:last] + np.log(scale)[:, None]
+        sums = shift.integral[:, first : last - 1] * scale[:, None]
         window = slice(layout.window[first], layout.window[first] + 7)
         mend = 0.5 * exponent * relative[beam, window] @ layout.weights[first]
         centre = np.exp(first_value(layout, beam, power, r, exponent) + mend)
@@ -148,7 +150,7 @@ def first_value(layout, beam, power, r, exponent):
 
 
 class Oracle:
-    """The network's objective in dense numpy: no elimination, no packing."""
+    """Objective of a network in dense numpy, without elimination and packing."""
 
     def __init__(self, layout, data, profile, net):
         self.layout, self.net = layout, net
@@ -197,7 +199,7 @@ def case(profiles=3, relative=0.01, net=None):
 
 
 @pytest.mark.parametrize("deviation", [np.inf, 0.05])
-def test_solution_is_the_least_squares_one(deviation):
+def test_solution_agrees_with_least_squares(deviation):
     net, layout, data, problem = case()
     result = problem.solve(deviation, 60)
     assert np.all(result.status == _joint_solution.SOLVED)
@@ -216,20 +218,20 @@ def test_solution_is_the_least_squares_one(deviation):
 
         start = np.concatenate([problem.constants[n] + 0.05, result.logarithm[n] - 0.02])
         best = optimize.least_squares(objective, start, xtol=1e-15, ftol=1e-15, gtol=1e-12)
-        # Without prior, the kernel holds the level by a hundredth of its information.
+        # Without prior, the kernel adds a hundredth of information on the level.
         bound = 1e-6 if np.isfinite(deviation) else 2e-3
         np.testing.assert_allclose(best.x[net.beams :], result.logarithm[n], atol=bound)
         covariance = np.linalg.inv(best.jac.T @ best.jac)[net.beams :, net.beams :]
         np.testing.assert_allclose(np.diag(covariance), result.prior_true_variance[n], rtol=0.02)
         if np.isfinite(deviation):
-            # A field that deviates by twice the prior's standard deviation.
+            # A field that deviates by twice the standard deviation of the prior.
             doubt = covariance @ precision @ covariance
             stated = np.diag(covariance + 3.0 * doubt)
             np.testing.assert_allclose(stated, result.variance[n], rtol=0.02)
-            # What fields move the solution by that the prior rules out.
-            moved = problem.bends @ precision @ covariance
+            # Shifts of the solution by fields that the prior excludes.
+            shift = problem.bends @ precision @ covariance
             np.testing.assert_allclose(
-                np.sum(moved**2, axis=0), result.excluded_variance[n], rtol=0.02
+                np.sum(shift**2, axis=0), result.excluded_variance[n], rtol=0.02
             )
             assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
         else:
@@ -239,18 +241,17 @@ def test_solution_is_the_least_squares_one(deviation):
     assert result.degrees_of_freedom[0] == layout.passages.beam.size - net.beams - net.crossings
 
 
-def test_beams_that_contradict_tell_so_when_their_constants_run_away():
-    """With nothing told beforehand, the constant of a beam that is off goes where it counts for
-    nothing, and the equations of the beams become singular."""
+def test_contradictory_beams_are_detected_when_their_constants_diverge():
+    """Without prior, the constant of an outlying beam diverges; its equations become singular."""
     _, layout, data, problem = case(2)
     data.log_value[0, layout.first_passage[0] + 1] -= 3.0
-    found = problem.solve(np.inf, 60)
-    assert np.isnan(found.chi_square[0])
-    assert found.prior_chi_square[0] > 50.0 * found.prior_degrees_of_freedom[0]
-    assert found.prior_chi_square[1] == found.chi_square[1]
+    result = problem.solve(np.inf, 60)
+    assert np.isnan(result.chi_square[0])
+    assert result.prior_chi_square[0] > 50.0 * result.prior_degrees_of_freedom[0]
+    assert result.prior_chi_square[1] == result.chi_square[1]
 
 
-def test_likelihood_is_that_of_the_dense_linear_model():
+def test_likelihood_agrees_with_the_dense_linear_model():
     net, layout, data, problem = case(1)
     problem.solve(0.05, 60)
     fixed = problem.constants.copy()
@@ -304,19 +305,19 @@ def test_solution_does_not_depend_on_the_other_profiles():
     _, layout, data, problem = case(7)
     exponent, position = np.ones(6), problem_position()
     whole = problem.solve(0.05, 10)
-    for mine in ([0], [3, 4], [6, 1]):
-        part = _empirical_prior._Problem(
-            data.take(np.array(mine)), layout, layout.passages.crossing, exponent, position
+    for selected in ([0], [3, 4], [6, 1]):
+        chunk = _empirical_prior._Problem(
+            data.take(np.array(selected)), layout, layout.passages.crossing, exponent, position
         ).solve(0.05, 10)
-        assert np.array_equal(part.logarithm, whole.logarithm[mine])
-        assert np.array_equal(part.variance, whole.variance[mine])
+        assert np.array_equal(chunk.logarithm, whole.logarithm[selected])
+        assert np.array_equal(chunk.variance, whole.variance[selected])
 
 
 def problem_position():
     return three_by_two().crossing
 
 
-def test_crossings_that_only_lost_beams_saw_are_missing():
+def test_crossings_of_missing_beams_only_are_missing():
     net = three_by_two()
     r = grid(net)
     power = signals(net, r, homogeneous())[np.newaxis].copy()
@@ -336,39 +337,40 @@ def test_crossings_that_only_lost_beams_saw_are_missing():
 
 @pytest.mark.parametrize("deviation", [np.inf, 0.1])
 @pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
-def test_a_beam_of_singular_covariance_is_left_out(deviation, bad):
+def test_a_beam_with_singular_covariance_is_left_out(deviation, bad):
     _, layout, data, problem = case(3)
     clean = problem.afresh(deviation)
     without = data.take(np.arange(3))
     without.usable[1, : layout.first_passage[1]] = 0
     data.covariance[1, : layout.offset[1]] = bad
-    where = (layout, layout.passages.crossing, np.ones(6), problem_position())
-    found, expected = (
-        _empirical_prior._Problem(one, *where).afresh(deviation) for one in (data, without)
+    problem_arguments = (layout, layout.passages.crossing, np.ones(6), problem_position())
+    result, expected = (
+        _empirical_prior._Problem(entry, *problem_arguments).afresh(deviation)
+        for entry in (data, without)
     )
-    assert np.all(found.status == _joint_solution.SOLVED)
-    np.testing.assert_array_equal(found.degrees_of_freedom, expected.degrees_of_freedom)
-    assert np.array_equal(np.isfinite(found.logarithm), np.isfinite(expected.logarithm))
-    np.testing.assert_allclose(found.logarithm, expected.logarithm, rtol=1e-4)
-    np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-2)
-    for one in ("logarithm", "variance", "chi_square", "prior_chi_square"):
-        mine, others = getattr(found, one)[[0, 2]], getattr(clean, one)[[0, 2]]
-        np.testing.assert_array_equal(mine, others)
+    assert np.all(result.status == _joint_solution.SOLVED)
+    np.testing.assert_array_equal(result.degrees_of_freedom, expected.degrees_of_freedom)
+    assert np.array_equal(np.isfinite(result.logarithm), np.isfinite(expected.logarithm))
+    np.testing.assert_allclose(result.logarithm, expected.logarithm, rtol=1e-4)
+    np.testing.assert_allclose(result.variance, expected.variance, rtol=1e-2)
+    for entry in ("logarithm", "variance", "chi_square", "prior_chi_square"):
+        selected, others = getattr(result, entry)[[0, 2]], getattr(clean, entry)[[0, 2]]
+        np.testing.assert_array_equal(selected, others)
 
 
-def test_a_profile_of_singular_covariances_is_not_determined():
+def test_a_profile_with_singular_covariances_is_not_determined():
     _, layout, data, _ = case(3)
     data.covariance[1] = 0.0
-    where = (layout, layout.passages.crossing, np.ones(6), problem_position())
+    problem_arguments = (layout, layout.passages.crossing, np.ones(6), problem_position())
     for deviation in (np.inf, 0.1):
-        found = _empirical_prior._Problem(data, *where).afresh(deviation)
-        assert found.status.tolist() == [
+        result = _empirical_prior._Problem(data, *problem_arguments).afresh(deviation)
+        assert result.status.tolist() == [
             _joint_solution.SOLVED, _joint_solution.UNDETERMINED, _joint_solution.SOLVED
         ]  # fmt: skip
-        assert np.isnan(found.logarithm[1]).all()
+        assert np.isnan(result.logarithm[1]).all()
 
 
-def test_prior_with_an_only_crossing_is_finite():
+def test_prior_with_a_single_crossing_is_finite():
     precision, norm = _empirical_prior._free_level(
         _empirical_prior._gradient_covariance(np.zeros((1, 3))), 0.1
     )
@@ -377,41 +379,44 @@ def test_prior_with_an_only_crossing_is_finite():
 
 
 def steep(x, y, z):
-    """Fall off with height by more than the prior's gradient has it, in thin air."""
+    """Return thin air that decreases with height by more than the gradient of the prior."""
     return 1e-5 * np.exp(-(z - 500.0) / 250.0 + 0.0 * x)
 
 
-@pytest.mark.parametrize(("field", "told"), [(homogeneous(1e-3), False), (steep, True)])
-def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told):
+@pytest.mark.parametrize(("field", "detected"), [(homogeneous(1e-3), False), (steep, True)])
+def test_the_mean_of_profiles_detects_a_field_that_the_prior_excludes(field, detected):
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), 0.15, 50, additive=0.0)
     layout, data = condensed(net, power, variance)
-    where = (layout, layout.passages.crossing, np.ones(net.beams), net.crossing)
+    problem_arguments = (layout, layout.passages.crossing, np.ones(net.beams), net.crossing)
     problem, mean = (
-        _empirical_prior._Problem(data, *where),
-        _empirical_prior._mean_problem(data, *where),
+        _empirical_prior._Problem(data, *problem_arguments),
+        _empirical_prior._mean_problem(data, *problem_arguments),
     )
     sharp = problem.afresh(_empirical_prior.DEVIATIONS[0])
-    # Profiles fit by themselves, the steep ones hardly worse.
+    # Single profiles fit, even in the steep field.
     assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
-    assert _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, sharp, 1.0)) == told
+    assert (
+        _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, sharp, 1.0))
+        == detected
+    )
 
 
 def uneven(net):
-    """Return air that is another at every crossing."""
+    """Return a field with a different bump at every crossing."""
     size = 0.2 * np.sin(7.0 * np.arange(net.crossings))
 
     def field(x, y, z):
-        apart = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.crossing]
-        bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(size, apart, strict=True)]
+        separate = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.crossing]
+        bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(size, separate, strict=True)]
         return 2e-3 * np.exp(np.sum(bumps, axis=0))
 
     return field
 
 
 def fifty(field, relative, lost=0.0):
-    """Return profiles, some without some of their beams, and what a problem asks besides."""
+    """Return 50 profiles, some with missing beams, and the other arguments of a problem."""
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field(net)), relative, 50, additive=0.0)
@@ -420,11 +425,13 @@ def fifty(field, relative, lost=0.0):
     return data, (layout, layout.passages.crossing, np.ones(net.beams), net.crossing)
 
 
-def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
-    data, where = fifty(uneven, 0.05)
-    least = _empirical_prior._least_deviation(_empirical_prior._mean_problem(data, *where), 1.0)
+def test_the_mean_requires_the_deviation_of_an_uneven_field():
+    data, problem_arguments = fifty(uneven, 0.05)
+    least = _empirical_prior._least_deviation(
+        _empirical_prior._mean_problem(data, *problem_arguments), 1.0
+    )
     assert 0.03 < least < 0.4
-    problem = _empirical_prior._Problem(data, *where)
+    problem = _empirical_prior._Problem(data, *problem_arguments)
     assert _empirical_prior._likeliest_deviation(problem, 1.0, least).deviation[0] >= least
 
 
@@ -434,64 +441,73 @@ class Unsettled(_empirical_prior._Problem):
     always = False
 
     def afresh(self, deviation, strength=1.0):
-        found = super().afresh(deviation, strength)
+        solution = super().afresh(deviation, strength)
         if not (self.always or np.isinf(deviation)):
-            return found
-        return replace(found, status=np.full_like(found.status, _joint_solution.UNSETTLED))
+            return solution
+        return replace(solution, status=np.full_like(solution.status, _joint_solution.UNSETTLED))
 
 
-def test_a_prior_under_which_the_mean_does_not_settle_is_rejected():
-    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
-    mean = Unsettled(_empirical_prior._mean_profile(data, where[0]), *where)
-    result = _empirical_prior._Problem(data, *where).afresh(0.1)
+def test_a_prior_is_rejected_if_the_mean_does_not_converge():
+    data, problem_arguments = fifty(lambda _: homogeneous(1e-3), 0.1)
+    mean = Unsettled(_empirical_prior._mean_profile(data, problem_arguments[0]), *problem_arguments)
+    result = _empirical_prior._Problem(data, *problem_arguments).afresh(0.1)
     assert not _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, result, 1.0))
     mean.always = True
     assert _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, result, 1.0))
-    told = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: mean)
-    assert np.all(np.isinf(told.deviation))
+    stated = _empirical_prior._solve_block(
+        _empirical_prior._Problem(data, *problem_arguments), lambda: mean
+    )
+    assert np.all(np.isinf(stated.deviation))
 
 
-def test_a_mean_that_is_not_determined_speaks_against_no_prior():
-    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
-    mean = _empirical_prior._Problem(_empirical_prior._mean_profile(data, where[0]), *where)
+def test_an_undetermined_mean_contradicts_no_prior():
+    data, problem_arguments = fifty(lambda _: homogeneous(1e-3), 0.1)
+    mean = _empirical_prior._Problem(
+        _empirical_prior._mean_profile(data, problem_arguments[0]), *problem_arguments
+    )
     mean.data.log_value[:] = np.nan
     assert mean.afresh(np.inf).status[0] == _joint_solution.UNDETERMINED
-    told = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: mean)
-    unasked = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: None)
-    assert np.isfinite(told.deviation[0])
-    np.testing.assert_array_equal(told.logarithm, unasked.logarithm)
-    # The field may deviate by as much as the weakest prior has it, and bend.
+    stated = _empirical_prior._solve_block(
+        _empirical_prior._Problem(data, *problem_arguments), lambda: mean
+    )
+    unasked = _empirical_prior._solve_block(
+        _empirical_prior._Problem(data, *problem_arguments), lambda: None
+    )
+    assert np.isfinite(stated.deviation[0])
+    np.testing.assert_array_equal(stated.logarithm, unasked.logarithm)
+    # The errors allow a deviation as in the weakest prior, and curvature.
     more = unasked.variance - unasked.prior_true_variance
     wide = (
         unasked.prior_true_variance
         + (4.0**2 - 1.0) / (2.0**2 - 1.0) * more
         + unasked.excluded_variance
     )
-    np.testing.assert_allclose(told.variance, wide, rtol=1e-12)
+    np.testing.assert_allclose(stated.variance, wide, rtol=1e-12)
 
 
-def test_what_the_mean_leaves_open_is_told_with_the_weakest_prior(monkeypatch):
-    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
-    result = _empirical_prior._Problem(data, *where).afresh(0.1)
-    mean = _empirical_prior._mean_problem(data, *where)
-    told, free = mean.afresh(0.1), mean.afresh(np.inf)
+def test_undetermined_crossings_have_errors_of_the_weakest_prior(monkeypatch):
+    data, problem_arguments = fifty(lambda _: homogeneous(1e-3), 0.1)
+    result = _empirical_prior._Problem(data, *problem_arguments).afresh(0.1)
+    mean = _empirical_prior._mean_problem(data, *problem_arguments)
+    stated, free = mean.afresh(0.1), mean.afresh(np.inf)
     free.variance[0, 2] = np.nan
     for other in ("noise_bias_variance", "excluded_field_variance"):
         monkeypatch.setattr(_empirical_prior._block_errors, other, lambda *_: 0.0)
     factor = np.ones(result.variance.shape[1])
-    for strength, wanted in ((1.0, 5.0), (2.0, 1.0), (4.0, 1.0)):
-        factor[2] = wanted
-        found = _empirical_prior._add_block_errors(result, strength, told, free)
+    for strength, required in ((1.0, 5.0), (2.0, 1.0), (4.0, 1.0)):
+        factor[2] = required
+        solution = _empirical_prior._add_block_errors(result, strength, stated, free)
         expected = result.prior_true_variance + factor * (
             result.variance - result.prior_true_variance
         )
-        np.testing.assert_allclose(found.variance, expected, rtol=1e-12)
+        np.testing.assert_allclose(solution.variance, expected, rtol=1e-12)
 
 
-def asked(freedoms, whole=None):
-    """Return whether beams test a prior: of profiles, and of the freedom and errors of their mean.
+def can_test(freedoms, whole=None):
+    """Return whether beams can test a prior.
 
-    The last of four crossings is seen by no beam."""
+    `freedoms` are the degrees of freedom of profiles, `whole` those of their mean with its errors.
+    The last of four crossings has no beam."""
     data = SimpleNamespace(usable=np.array([[1, 1, 1, 0]], dtype=np.uint8))
     problem = SimpleNamespace(geometry=(None, None, np.arange(4)), data=data)
     status = np.full(len(freedoms), _joint_solution.SOLVED)
@@ -505,49 +521,57 @@ def asked(freedoms, whole=None):
 
 
 @pytest.mark.parametrize(
-    ("whole", "told"),
+    ("whole", "expected"),
     [((0, [0.1, 0.5, 0.9]), True), ((0, [0.1, 0.5, 1.1]), False), ((0, [0.1, np.nan, 0.1]), False),
      ((1, [0.1, 0.5, 1.1]), True), ((-1, [0.1, 0.1, 0.1]), False)],
 )  # fmt: skip
-def test_as_many_equations_as_unknowns_test_a_prior_where_they_tell_all_crossings(whole, told):
-    assert asked([-1.0] * 10, whole) == told
+def test_equal_equations_and_unknowns_test_a_prior_if_all_crossings_are_determined(whole, expected):
+    assert can_test([-1.0] * 10, whole) == expected
 
 
-@pytest.mark.parametrize(("most", "told"), [(0.7, True), (0.8, False)])
-def test_a_quarter_of_the_profiles_is_enough_to_test_a_prior(most, told):
-    number = round(50 * most)
-    assert asked([-1.0] * number + [2.0] * (50 - number)) == told
-    assert asked([-1.0] * number + [2.0] * (50 - number), (-1, [0.1, 0.1, 0.1])) == told
+@pytest.mark.parametrize(("share", "expected"), [(0.7, True), (0.8, False)])
+def test_a_quarter_of_the_profiles_is_enough_to_test_a_prior(share, expected):
+    number = round(50 * share)
+    assert can_test([-1.0] * number + [2.0] * (50 - number)) == expected
+    mean = (-1, [0.1, 0.1, 0.1])
+    assert can_test([-1.0] * number + [2.0] * (50 - number), mean) == expected
 
 
-def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
-    data, where = fifty(lambda _: homogeneous(2e-3), 0.1)
-    pooled = _empirical_prior._mean_profile(fifty(uneven, 0.1)[0], where[0])
+def test_a_mean_that_does_not_converge_requires_no_deviation(monkeypatch):
+    data, problem_arguments = fifty(lambda _: homogeneous(2e-3), 0.1)
+    pooled = _empirical_prior._mean_profile(fifty(uneven, 0.1)[0], problem_arguments[0])
     for other in ("_mean_improbable", "_off_mean_solution"):
         monkeypatch.setattr(_empirical_prior, other, lambda *_: False)
-    asked = [
+    requested = [
         _empirical_prior._solve_block(
-            _empirical_prior._Problem(data, *where), lambda mean=mean: mean
+            _empirical_prior._Problem(data, *problem_arguments), lambda mean=mean: mean
         ).deviation[0]
-        for mean in (Unsettled(pooled, *where), _empirical_prior._Problem(pooled, *where))
+        for mean in (
+            Unsettled(pooled, *problem_arguments),
+            _empirical_prior._Problem(pooled, *problem_arguments),
+        )
     ]
-    assert asked[0] < asked[1] < np.inf
+    assert requested[0] < requested[1] < np.inf
 
 
 # Profiles that lack beams --------------------------------------------------------------------
 
 
-def test_the_mean_of_profiles_is_made_beam_by_beam():
+def test_the_mean_of_profiles_is_taken_beam_by_beam():
     data, (layout, *rest) = fifty(lambda _: homogeneous(), 0.05, lost=0.25)
     assert data.usable.all(axis=1).sum() < 20
     mean = _empirical_prior._mean_profile(data, layout)
     assert mean.usable.all()
     for beam in range(6):
-        mine = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
+        selected = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
         packed = slice(layout.offset[beam], layout.offset[beam + 1])
-        seen = data.usable[:, mine].all(axis=1)
-        np.testing.assert_allclose(mean.log_value[0, mine], data.log_value[seen, mine].mean(axis=0))
-        np.testing.assert_allclose(mean.integral[0, mine], data.integral[seen, mine].mean(axis=0))
+        seen = data.usable[:, selected].all(axis=1)
+        np.testing.assert_allclose(
+            mean.log_value[0, selected], data.log_value[seen, selected].mean(axis=0)
+        )
+        np.testing.assert_allclose(
+            mean.integral[0, selected], data.integral[seen, selected].mean(axis=0)
+        )
         expected = data.covariance[seen, packed].mean(axis=0) / seen.sum()
         np.testing.assert_allclose(mean.covariance[0, packed], expected)
     whole = _empirical_prior._Problem(mean, layout, *rest).afresh(np.inf)
@@ -555,32 +579,32 @@ def test_the_mean_of_profiles_is_made_beam_by_beam():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e12, 20.0])
-def test_a_mean_leaves_out_a_beam_that_is_far_louder_than_most(bad):
+def test_a_mean_leaves_out_a_beam_that_is_far_noisier_than_most(bad):
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     quiet = data.take(np.arange(50))
     quiet.usable[7, : layout.first_passage[1]] = 0
     expected = _empirical_prior._mean_profile(quiet, layout)
-    # The variance of the beam's first integral alone.
+    # Only the variance of the first integral of the beam.
     count = layout.first_passage[1]
     data.covariance[7, 2 * count * count] *= bad
-    found = _empirical_prior._mean_profile(data, layout)
-    for one in ("log_value", "integral", "covariance", "usable", "slope"):
-        np.testing.assert_array_equal(getattr(found, one), getattr(expected, one))
+    result = _empirical_prior._mean_profile(data, layout)
+    for name in ("log_value", "integral", "covariance", "usable", "slope"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
 
 
-def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_beam():
+def test_a_mean_lacks_a_beam_with_too_few_known_profiles():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.covariance[7:, : layout.offset[1]] = np.nan
-    found = _empirical_prior._mean_profile(data, layout)
-    assert not found.usable[0, : layout.first_passage[1]].any()
-    assert found.usable[0, layout.first_passage[1] :].all()
+    result = _empirical_prior._mean_profile(data, layout)
+    assert not result.usable[0, : layout.first_passage[1]].any()
+    assert result.usable[0, layout.first_passage[1] :].all()
 
 
-def test_a_mean_of_what_nobody_sees_is_none():
+def test_no_mean_without_usable_profiles():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.usable[7:] = 0
     assert _empirical_prior._mean_profile(data, layout) is None
-    # A value at a beam's first crossing alone is none.
+    # A value at the first crossing of a beam alone does not count.
     data, _ = fifty(lambda _: homogeneous(), 0.05)
     data.usable[:] = 0
     data.usable[:, layout.first_passage[:-1]] = 1
@@ -598,5 +622,5 @@ def test_a_mean_of_what_nobody_sees_is_none():
         ([], 0),
     ],
 )
-def test_a_mean_takes_as_much_of_a_beam_as_most_values_see(reach, depth):
+def test_a_mean_extends_to_the_passage_with_most_values(reach, depth):
     assert _empirical_prior._mean_depth(np.array(reach, dtype=np.intp)) == depth

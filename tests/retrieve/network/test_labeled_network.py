@@ -1,4 +1,4 @@
-"""Networks over xarray: values, errors of both kinds, and a reason for all that is missing."""
+"""Networks on xarray data: values, random and systematic errors, reasons for missing values."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ def solved(beams, **changes):
     return retrieve_network(beams, network(), replace(PLAIN, **changes))
 
 
-def test_homogeneous_air_is_found_within_the_errors():
-    found = product(intervals=40)
-    whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
-    score = (found["extinction"] - EXTINCTION) / whole
-    assert found.sizes == {"time": 40, "crossing": 3, "nv": 2, "beam": 3}
-    assert (found["quality_flag"] == 0).all()
+def test_homogeneous_air_is_within_the_errors():
+    result = product(intervals=40)
+    whole = np.hypot(result["extinction_standard_error"], result["extinction_systematic_error"])
+    score = (result["extinction"] - EXTINCTION) / whole
+    assert result.sizes == {"time": 40, "crossing": 3, "nv": 2, "beam": 3}
+    assert (result["quality_flag"] == 0).all()
     assert (abs(score) < 3).mean() > 0.97
-    assert float(abs(found["extinction"] / EXTINCTION - 1).mean()) < 0.02
+    assert float(abs(result["extinction"] / EXTINCTION - 1).mean()) < 0.02
     np.testing.assert_allclose(
-        found["visibility_in_air"], -np.log(0.05) / found["extinction"], rtol=1e-12
+        result["visibility_in_air"], -np.log(0.05) / result["extinction"], rtol=1e-12
     )
-    assert (found["visibility_in_air_lower"] < found["visibility_in_air"]).all()
-    assert (found["visibility_in_air_upper"] > found["visibility_in_air"]).all()
+    assert (result["visibility_in_air_lower"] < result["visibility_in_air"]).all()
+    assert (result["visibility_in_air_upper"] > result["visibility_in_air"]).all()
 
 
-def test_the_interval_of_visibility_is_that_of_all_errors_turned_over():
-    found = product()
-    whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
+def test_the_interval_of_visibility_follows_from_all_errors_of_extinction():
+    result = product()
+    whole = np.hypot(result["extinction_standard_error"], result["extinction_systematic_error"])
     for end, value in (
-        ("lower", found["extinction"] + whole),
-        ("upper", found["extinction"] - whole),
+        ("lower", result["extinction"] + whole),
+        ("upper", result["extinction"] - whole),
     ):
         np.testing.assert_allclose(
-            found[f"visibility_in_air_{end}"], -np.log(0.05) / value, rtol=1e-9
+            result[f"visibility_in_air_{end}"], -np.log(0.05) / value, rtol=1e-9
         )
 
 
@@ -53,7 +53,7 @@ def test_the_interval_of_visibility_is_that_of_all_errors_turned_over():
     "setting",
     ["exponent_relative_error", "overlap_relative_error", "lidar_ratio_relative_error"],
 )
-def test_a_larger_declared_error_is_a_larger_systematic_one(setting):
+def test_a_larger_declared_error_gives_a_larger_systematic_error(setting):
     beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
     less, more = (solved(beams, **{setting: value}) for value in (0.0, 0.05))
     assert (more["extinction_systematic_error"] > less["extinction_systematic_error"]).mean() > 0.9
@@ -63,7 +63,7 @@ def test_a_larger_declared_error_is_a_larger_systematic_one(setting):
     )
 
 
-def test_an_error_of_the_overlap_is_covered_by_what_is_declared():
+def test_the_declared_error_covers_an_error_of_the_overlap():
     declared = 0.03
     beams = [beam(number) for number in range(3)]
     plain = solved(beams, overlap_relative_error=declared)
@@ -73,35 +73,35 @@ def test_an_error_of_the_overlap_is_covered_by_what_is_declared():
     )
     net = beams[0].averages["power"] - 0.1
     wrong = replace(beams[0], averages=beams[0].averages.assign(power=net * error + 0.1))
-    moved = abs(solved([wrong, *beams[1:]])["extinction"] - plain["extinction"])
-    assert float(moved.max()) > 0.5 * declared * EXTINCTION
-    assert (moved <= 1.1 * plain["extinction_systematic_error"]).all()
+    shift = abs(solved([wrong, *beams[1:]])["extinction"] - plain["extinction"])
+    assert float(shift.max()) > 0.5 * declared * EXTINCTION
+    assert (shift <= 1.1 * plain["extinction_systematic_error"]).all()
 
 
-def test_signal_left_in_the_background_is_told():
+def test_signal_left_in_the_background_is_flagged():
     short = beam(0).averages.isel(range=slice(560))
     tail = (0.9 * 4200.0, 4200.0)
     beams = [
         replace(beam(n), averages=beam(n).averages.isel(range=slice(560)), background_range=tail)
         for n in range(3)
     ]
-    found = solved(beams)
+    result = solved(beams)
     assert short.sizes["range"] == 560
-    assert (found["quality_flag"] & int(Quality.BACKGROUND_UNCERTAIN)).all()
-    whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
-    assert (abs(found["extinction"] - EXTINCTION) < 3 * whole).mean() > 0.9
+    assert (result["quality_flag"] & int(Quality.BACKGROUND_UNCERTAIN)).all()
+    whole = np.hypot(result["extinction_standard_error"], result["extinction_systematic_error"])
+    assert (abs(result["extinction"] - EXTINCTION) < 3 * whole).mean() > 0.9
 
 
-def test_a_beam_that_is_missing_leaves_a_reason():
+def test_a_missing_beam_gives_a_reason():
     beams = [beam(number) for number in range(3)]
-    found = solved([without(beams[0], slice(2, 4)), *beams[1:]])
-    lost = np.isnan(found["extinction"].values)
-    bits = found["quality_flag"].values
-    on_beam = np.isfinite(found["beam_range"].values[0])
+    result = solved([without(beams[0], slice(2, 4)), *beams[1:]])
+    missing = np.isnan(result["extinction"].values)
+    bits = result["quality_flag"].values
+    on_beam = np.isfinite(result["beam_range"].values[0])
     assert (bits[2:4, on_beam] & int(Quality.rejecting())).all()
     assert (bits[2:4] & int(Quality.PRIOR_DOMINATED)).all()
     assert (bits[[0, 1, 4, 5]] == 0).all()
-    assert ((bits & int(Quality.rejecting())) != 0)[lost].all()
+    assert ((bits & int(Quality.rejecting())) != 0)[missing].all()
 
 
 def test_intervals_are_joined_by_the_clock():
@@ -109,26 +109,26 @@ def test_intervals_are_joined_by_the_clock():
     late = replace(
         beams[2], averages=beams[2].averages.isel(time=slice(1, 4)), interval=np.arange(101, 104)
     )
-    found = solved([*beams[:2], late])
+    result = solved([*beams[:2], late])
     whole = solved(beams)
-    assert found.sizes["time"] == 6
-    np.testing.assert_array_equal(found["time"], whole["time"])
-    # Two beams do not determine three points: what remains rests on the prior, and says so.
-    doubted = (found["quality_flag"].values != 0).all(axis=1)
+    assert result.sizes["time"] == 6
+    np.testing.assert_array_equal(result["time"], whole["time"])
+    # Two beams do not determine three points: values depend on the prior and are flagged.
+    doubted = (result["quality_flag"].values != 0).all(axis=1)
     np.testing.assert_array_equal(doubted, [True, False, False, False, True, True])
 
 
 def test_pile_up_is_kept_where_the_signal_is_used():
     beams = [beam(number) for number in range(3)]
-    for far, told in ((2000.0, True), (300.0, False)):
+    for far, stated in ((2000.0, True), (300.0, False)):
         near = beams[1].averages["range"] < far
         bits = beams[1].averages["quality"] | (near * np.int32(Quality.PILE_UP))
         piled = replace(beams[1], averages=beams[1].averages.assign(quality=bits))
-        found = solved([beams[0], piled, beams[2]])
-        assert bool((found["quality_flag"] & int(Quality.PILE_UP)).any()) is told
+        result = solved([beams[0], piled, beams[2]])
+        assert bool((result["quality_flag"] & int(Quality.PILE_UP)).any()) is stated
 
 
-def test_visibility_goes_by_the_definition():
+def test_visibility_follows_the_definition():
     koschmieder = product(visibility=Definition(wavelength=532e-9, contrast=0.02))
     np.testing.assert_allclose(
         koschmieder["visibility_in_air"] * koschmieder["extinction"], -np.log(0.02)
@@ -143,7 +143,7 @@ def test_visibility_goes_by_the_definition():
         angstrom["visibility_in_air"] * angstrom["extinction"] * factor, -np.log(0.05)
     )
     assert "angstrom" in angstrom.attrs["steps"]
-    # The law's own error widens the interval, not the random error.
+    # The error of the law widens the interval, not the random error.
     ratio = angstrom["visibility_in_air_standard_error"] / angstrom["visibility_in_air"]
     np.testing.assert_allclose(
         ratio, angstrom["extinction_standard_error"] / angstrom["extinction"]
@@ -152,7 +152,7 @@ def test_visibility_goes_by_the_definition():
     assert (width > 1 + 2 * 0.2 * np.log(1064 / 550)).all()
 
 
-def test_beams_are_as_many_as_beams():
+def test_the_number_of_beams_must_match_the_network():
     with pytest.raises(RetrievalInputError, match="beams"):
         retrieve_network([beam(0)], network(), PLAIN)
 

@@ -1,4 +1,4 @@
-"""Networks of lidars: what is flagged, and extreme cases."""
+"""Networks of lidars: flags and extreme cases."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lidarops.retrieve.network.extinction_field import retrieve_network
 
 
 def pooled(relative):
-    """Return errors and flags of exact triangles of all conditions."""
+    """Return errors and flags of exact cycles of well and poorly conditioned triangles."""
     errors, flags = [], []
     for angle in (48.0, 50.0, 53.0, 57.0, 62.0, 66.0, 70.0):
         net = triangle(angle)
@@ -46,7 +46,7 @@ def pooled(relative):
 
 
 @pytest.mark.parametrize("relative", [0.01, 0.03, 0.06])
-def test_flags_find_what_is_wrong_and_leave_what_is_right(relative):
+def test_flags_reject_large_errors_and_keep_small_ones(relative):
     error, flagged = pooled(relative)
     assert flagged[error > 0.5].mean() >= 0.95
     if relative <= 0.03:
@@ -57,7 +57,7 @@ def test_flags_find_what_is_wrong_and_leave_what_is_right(relative):
 # Extreme cases ------------------------------------------------------------------------------
 
 
-def test_extreme_a_degenerate_triangle_is_flagged_always():
+def test_extreme_a_degenerate_triangle_is_always_flagged():
     net = triangle(46.1024, tolerance=1e-6)
     result = with_noise(net, homogeneous(), 0.01, 200, method="cycle")
     start = geometry.build_cycle(net).crossing[0]
@@ -71,7 +71,7 @@ def test_extreme_b_nearly_degenerate_triangle_is_flagged():
     assert result.flags.flagged[:, geometry.build_cycle(net).crossing[0]].mean() > 0.95
 
 
-def test_extreme_c_far_start_is_flagged_and_harmless_only_when_exact():
+def test_extreme_c_far_start_is_flagged_and_useful_only_if_exact():
     net = triangle(30.0)
     upper = int(np.argmax(net.crossing[:, 2]))
     middle = [v for v in range(3) if geometry.build_cycle(net, start=v).far_start]
@@ -96,7 +96,7 @@ def test_extreme_d_clear_air_is_flagged():
     assert not usable.any() or np.mean(np.abs(score[usable]) < 3) >= 0.98
 
 
-def test_extreme_e_thick_air_needs_its_near_crossing_only():
+def test_extreme_e_dense_air_is_exact_at_the_near_crossing():
     exact = without_noise(triangle(), homogeneous(2e-2))
     single = without_noise(triangle(), homogeneous(2e-2), method="multiplier", multiplier=0.0)
     assert exact.extinction[0] == pytest.approx(2e-2, rel=1e-10)
@@ -114,7 +114,7 @@ def test_extreme_g_steep_power_law():
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf, -np.inf])
 @pytest.mark.parametrize("method", ["network", "cycle", "multiplier", "unbiased", "slope", "klett"])
-def test_extreme_h_no_plain_number_comes_out_of_a_bad_signal(bad, method):
+def test_extreme_h_a_bad_signal_is_always_flagged(bad, method):
     net = triangle()
     r = grid(net)
     clean = signals(net, r, homogeneous())
@@ -126,15 +126,17 @@ def test_extreme_h_no_plain_number_comes_out_of_a_bad_signal(bad, method):
     )
     assert np.isnan(whole.extinction[5]).all()
     assert whole.flags.not_finite[5].all()
-    lost = whole.flags.signal_missing if not np.isfinite(bad) else whole.flags.signal_not_positive
-    assert lost[[3, 5], 1].all()
+    missing = (
+        whole.flags.signal_missing if not np.isfinite(bad) else whole.flags.signal_not_positive
+    )
+    assert missing[[3, 5], 1].all()
     assert whole.flags.flagged[3, 1]
-    # The others are as good as without it.
+    # The other profiles do not change.
     assert np.isfinite(whole.extinction[[0, 1, 2, 4], 0]).all()
-    assert not lost[[0, 1, 2, 4]].any()
+    assert not missing[[0, 1, 2, 4]].any()
 
 
-def test_extreme_i_too_few_beams_without_prior_are_not_determined():
+def test_extreme_i_too_few_beams_without_prior_have_no_values():
     net = fan([-500.0, 500.0], [(45.0, 55.0), (135.0,)])
     assert net.crossings == 2
     result = with_noise(net, homogeneous(), 0.01, 20, prior="none")
@@ -142,9 +144,9 @@ def test_extreme_i_too_few_beams_without_prior_are_not_determined():
     assert result.flags.not_finite.all()
 
 
-def test_extreme_j_pole_is_refused():
+def test_extreme_j_no_value_beyond_the_pole():
     net = triangle(30.0)
-    # Walked against the attenuation, through the far crossing.
+    # Against the attenuation, through the far crossing.
     forward = geometry.build_cycle(net)
     order = forward.crossing[[0, 2, 1]]
     backward = geometry.Cycle(
@@ -172,7 +174,7 @@ def test_a_crossing_reached_against_strong_attenuation_is_flagged(method, relati
     stated = result.extinction_standard_error / result.extinction
     start = int(geometry.build_cycle(net).crossing[0])
     other = [v for v in np.flatnonzero(result.near_crossing) if v != start]
-    # Values are there, and many are off by more than their linear error tells.
+    # Many values differ by more than their linear error.
     assert (np.abs(error[:, other]) > 4.0 * stated[:, other]).mean() > 0.1
     assert result.flags.ill_conditioned[:, other].mean() > 0.6
     assert result.flags.flagged[:, other].all()
@@ -180,8 +182,8 @@ def test_a_crossing_reached_against_strong_attenuation_is_flagged(method, relati
 
 
 @pytest.mark.parametrize("factor", [8.0, 20.0])
-def test_one_loud_profile_costs_the_others_nothing_where_signals_tell_the_noise(factor):
-    """Its noise was taken for that of its whole block, and for a part of its own only."""
+def test_a_noisy_profile_does_not_change_the_estimated_noise_of_others(factor):
+    """Its noise was once assigned to its whole block, and only partly to itself."""
     net = triangle()
     r = grid(net)
     clean = signals(net, r, homogeneous(2e-3))
@@ -189,31 +191,31 @@ def test_one_loud_profile_costs_the_others_nothing_where_signals_tell_the_noise(
     power = calm.copy()
     power[7] += (factor - 1.0) * (calm[7] - clean)
     settings = {"full_overlap_range": 100.0, "prior": "none"}
-    quiet, found = (
+    quiet, result = (
         retrieve_network(calm, r, net, **settings),
         retrieve_network(power, r, net, **settings),
     )
     others = np.arange(50) != 7
-    near = found.near_crossing
+    near = result.near_crossing
     np.testing.assert_allclose(
-        found.extinction_standard_error[others][:, near],
+        result.extinction_standard_error[others][:, near],
         quiet.extinction_standard_error[others][:, near], rtol=0.05,
     )  # fmt: skip
-    own = found.extinction_standard_error[7, near] / found.extinction[7, near]
-    usual = quiet.extinction_standard_error[7, near] / quiet.extinction[7, near]
-    told = np.isfinite(own)
-    assert np.all(found.flags.flagged[7, near] | (own > 0.5 * factor * usual))
+    own = result.extinction_standard_error[7, near] / result.extinction[7, near]
+    typical = quiet.extinction_standard_error[7, near] / quiet.extinction[7, near]
+    stated = np.isfinite(own)
+    assert np.all(result.flags.flagged[7, near] | (own > 0.5 * factor * typical))
     assert not (
-        told
-        & ~found.flags.flagged[7, near]
+        stated
+        & ~result.flags.flagged[7, near]
         & (
-            np.abs(found.extinction[7, near] - 2e-3)
-            > 4.0 * found.extinction_standard_error[7, near]
+            np.abs(result.extinction[7, near] - 2e-3)
+            > 4.0 * result.extinction_standard_error[7, near]
         )
     ).any()
 
 
-def test_noise_of_calm_profiles_is_pooled_as_ever():
+def test_noise_of_quiet_profiles_is_pooled_in_blocks():
     power, _ = noisy(
         triangle(),
         grid(triangle()),

@@ -50,9 +50,9 @@ _OTHER_SIDE: Final = (6, 3, 4, 3)
 _ONE_SIDED_DEGREE: Final = 2
 _AIR_DEVIATION: Final = (5e-2, 1e-3, 5e-4, 5e-4)
 """Largest relative deviation by air, for 0 to 3 neighbours on the side with fewer."""
-_JUDGES: Final = 4
+_REFERENCE_BINS: Final = 4
 """Neighbours on either side that decide which of several bins is the worst."""
-_JUDGES_DEGREE: Final = 3
+_REFERENCE_DEGREE: Final = 3
 _NOISY_BIN: Final = 0.02
 """Relative standard error of a bin beyond which logarithms are not normal in their tails."""
 _NOISY_ESTIMATED_BIN: Final = 0.05
@@ -74,7 +74,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def _fit_shares(grid: Array, at: int, nodes: Indices, count: int, degree: int, out: Array) -> None:
+def _fit_weights(grid: Array, at: int, nodes: Indices, count: int, degree: int, out: Array) -> None:
     """Fill the weights of bins in a least-squares polynomial at another bin.
 
     It uses orthogonal polynomials (`forsythe1957`). With degree count - 1, the polynomial goes
@@ -142,7 +142,7 @@ def _neighbour_counts(codes: Codes, at: int, first: int, stop: int) -> tuple[int
 
 @_compiled
 def find_neighbours(
-    grid: Array, codes: Codes, at: int, first: int, stop: int, nodes: Indices, shares: Array
+    grid: Array, codes: Codes, at: int, first: int, stop: int, nodes: Indices, weights: Array
 ) -> tuple[int, float]:
     """Fill the neighbours that predict a bin, and their weights.
 
@@ -159,13 +159,13 @@ def find_neighbours(
     count = _nearest_good_bins(codes, at, first, stop, sides, nodes)
     fewer = min(sides[0], sides[1])
     degree = count - 1 if fewer > 0 else _ONE_SIDED_DEGREE
-    _fit_shares(grid, at, nodes, count, degree, shares)
+    _fit_weights(grid, at, nodes, count, degree, weights)
     return count, _AIR_DEVIATION[fewer]
 
 
 @_compiled
 def plan_neighbours(
-    grid: Array, limits: Indices, nodes: Indices, shares: Array, air: Array
+    grid: Array, limits: Indices, nodes: Indices, weights: Array, air: Array
 ) -> None:
     """Fill the neighbours of each bin of each beam, if all bins are good.
 
@@ -177,7 +177,7 @@ def plan_neighbours(
         First usable bin, and the one behind the last.
     nodes : (beam, bin, NODES) intp
         Padded with the last neighbour.
-    shares : (beam, bin, NODES) float64
+    weights : (beam, bin, NODES) float64
         Weights of the neighbours, padded with 0.
     air : (beam, bin) float64
         Largest relative deviation by air; NaN where neighbours are too few.
@@ -187,12 +187,12 @@ def plan_neighbours(
         first, stop = limits[beam, 0], limits[beam, 1]
         for g in range(first, stop):
             count, allowed = find_neighbours(
-                grid[beam], codes, g, first, stop, nodes[beam, g], shares[beam, g]
+                grid[beam], codes, g, first, stop, nodes[beam, g], weights[beam, g]
             )
             air[beam, g] = allowed if count > 0 else math.nan
             for i in range(count, NODES):
                 nodes[beam, g, i] = nodes[beam, g, max(count - 1, 0)]
-                shares[beam, g, i] = 0.0
+                weights[beam, g, i] = 0.0
 
 
 def neighbour_plan(grid: Array, limits: Indices) -> tuple[Indices, Array, Array]:
@@ -247,7 +247,7 @@ def _deviation(
     relative: bool,
     at: int,
     nodes: Indices,
-    shares: Array,
+    weights: Array,
     count: int,
     air: float,
 ) -> float:
@@ -262,8 +262,8 @@ def _deviation(
     prediction = spread = 0.0
     if largest_noise < ((_NOISY_ESTIMATED_BIN if relative else _NOISY_BIN) * exponent) ** 2:
         for i in range(count):
-            prediction += shares[i] * logs[nodes[i]]
-            spread += shares[i] * shares[i] * noise[nodes[i]]
+            prediction += weights[i] * logs[nodes[i]]
+            spread += weights[i] * weights[i] * noise[nodes[i]]
         gap = abs(logs[at] - prediction) - air * exponent
         spread += noise[at]
     elif relative:
@@ -271,8 +271,8 @@ def _deviation(
         return 0.0
     else:
         for i in range(count):
-            prediction += shares[i] * scaled[nodes[i]]
-            spread += shares[i] * shares[i] * scaled_variance[nodes[i]]
+            prediction += weights[i] * scaled[nodes[i]]
+            spread += weights[i] * weights[i] * scaled_variance[nodes[i]]
         gap = abs(scaled[at] - prediction) - air * abs(prediction)
         spread += scaled_variance[at]
     return gap / math.sqrt(spread) if gap > 0.0 and spread > 0.0 else 0.0
@@ -291,7 +291,7 @@ def _measure_deviations(
 ) -> None:
     """Fill the deviations of bins from `start` to `end`."""
     first, stop, start, end = span
-    nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
+    nodes, weights = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     for g in range(start, end):
         deviations[g] = 0.0
         if codes[g] != GOOD:
@@ -312,9 +312,9 @@ def _measure_deviations(
                 neighbour_plan[2][g],
             )
         else:
-            count, air = find_neighbours(grid, codes, g, first, stop, nodes, shares)
+            count, air = find_neighbours(grid, codes, g, first, stop, nodes, weights)
             if count > 0:
-                deviations[g] = _deviation(row, exponent, relative, g, nodes, shares, count, air)
+                deviations[g] = _deviation(row, exponent, relative, g, nodes, weights, count, air)
 
 
 @_compiled
@@ -332,16 +332,16 @@ def _worst_bin(
 
     An outlying bin makes its neighbours deviate too; more neighbours reduce this effect.
     """
-    nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
+    nodes, weights = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     worst, largest = suspect, 0.0
     for g in range(max(first, suspect - _SIDE), min(stop, suspect + _SIDE + 1)):
         if codes[g] != GOOD:
             continue
-        count = _nearest_good_bins(codes, g, first, stop, (_JUDGES, _JUDGES), nodes)
+        count = _nearest_good_bins(codes, g, first, stop, (_REFERENCE_BINS, _REFERENCE_BINS), nodes)
         if count < _SIDE:
             continue
-        _fit_shares(grid, g, nodes, count, min(_JUDGES_DEGREE, count - 2), shares)
-        deviation = _deviation(row, exponent, relative, g, nodes, shares, count, 0.0)
+        _fit_weights(grid, g, nodes, count, min(_REFERENCE_DEGREE, count - 2), weights)
+        deviation = _deviation(row, exponent, relative, g, nodes, weights, count, 0.0)
         if deviation > largest:
             worst, largest = g, deviation
     return worst
@@ -397,24 +397,24 @@ def _all_isolated(
 
 @_compiled
 def _exceeds(
-    values: Array, variances: Array, at: int, shares: Array, air: tuple[float, float]
+    values: Array, variances: Array, at: int, weights: Array, air: tuple[float, float]
 ) -> bool:
     """Return whether a bin deviates from the three on either side, without a square root.
 
     `air` holds the absolute and the relative deviation that air may cause.
     """
     prediction = (
-        shares[at, 0] * values[at - 3] + shares[at, 1] * values[at - 2]
-        + shares[at, 2] * values[at - 1] + shares[at, 3] * values[at + 1]
-        + shares[at, 4] * values[at + 2] + shares[at, 5] * values[at + 3]
+        weights[at, 0] * values[at - 3] + weights[at, 1] * values[at - 2]
+        + weights[at, 2] * values[at - 1] + weights[at, 3] * values[at + 1]
+        + weights[at, 4] * values[at + 2] + weights[at, 5] * values[at + 3]
     )  # fmt: skip
     spread = variances[at] + (
-        shares[at, 0] * shares[at, 0] * variances[at - 3]
-        + shares[at, 1] * shares[at, 1] * variances[at - 2]
-        + shares[at, 2] * shares[at, 2] * variances[at - 1]
-        + shares[at, 3] * shares[at, 3] * variances[at + 1]
-        + shares[at, 4] * shares[at, 4] * variances[at + 2]
-        + shares[at, 5] * shares[at, 5] * variances[at + 3]
+        weights[at, 0] * weights[at, 0] * variances[at - 3]
+        + weights[at, 1] * weights[at, 1] * variances[at - 2]
+        + weights[at, 2] * weights[at, 2] * variances[at - 1]
+        + weights[at, 3] * weights[at, 3] * variances[at + 1]
+        + weights[at, 4] * weights[at, 4] * variances[at + 2]
+        + weights[at, 5] * weights[at, 5] * variances[at + 3]
     )
     gap = abs(values[at] - prediction) - (air[0] + air[1] * abs(prediction))
     return gap > 0.0 and not gap * gap <= OUTLYING_SIGMAS * OUTLYING_SIGMAS * spread
@@ -555,7 +555,7 @@ def replace_outliers(
     span: tuple[int, int, int],
     codes: Codes,
     nodes: Indices,
-    shares: Array,
+    weights: Array,
 ) -> int:
     """Interpolate marked bins from their neighbours; return the first bin without any.
 
@@ -572,23 +572,23 @@ def replace_outliers(
     codes : (bin,) uint8
     nodes : (bin, NODES) intp
         Out, for bridged bins: their neighbours, padded with the first one.
-    shares : (bin, NODES) float64
+    weights : (bin, NODES) float64
         Out: weights of the neighbours, padded with 0.
     """
     first, stop, end = span
     for g in range(first, end):
         if codes[g] != BRIDGED:
             continue
-        count, _ = find_neighbours(grid, codes, g, first, stop, nodes[g], shares[g])
+        count, _ = find_neighbours(grid, codes, g, first, stop, nodes[g], weights[g])
         if count == 0:
             return g
         for i in range(count, NODES):
-            nodes[g, i], shares[g, i] = nodes[g, 0], 0.0
+            nodes[g, i], weights[g, i] = nodes[g, 0], 0.0
         value = spread = 0.0
         for i in range(count):
             k = nodes[g, i]
-            value += shares[g, i] * (logs[k] + 0.5 * noise[k] / exponent)
-            spread += shares[g, i] * shares[g, i] * noise[k]
+            value += weights[g, i] * (logs[k] + 0.5 * noise[k] / exponent)
+            spread += weights[g, i] * weights[g, i] * noise[k]
         logs[g], noise[g] = value - 0.5 * spread / exponent, spread
     return end
 
@@ -601,7 +601,7 @@ def transfer_derivatives(
     span: tuple[int, int],
     codes: Codes,
     nodes: Indices,
-    shares: Array,
+    weights: Array,
 ) -> None:
     """Transfer the derivatives by bridged bins to the neighbours they come from."""
     for g in range(span[0], span[1]):
@@ -612,6 +612,6 @@ def transfer_derivatives(
                 continue
             for i in range(NODES):
                 k = nodes[g, i]
-                gradients[q, k] += shares[g, i] * gradients[q, g]
+                gradients[q, k] += weights[g, i] * gradients[q, g]
                 bounds[q, 0], bounds[q, 1] = min(bounds[q, 0], k), max(bounds[q, 1], k + 1)
             gradients[q, g] = 0.0

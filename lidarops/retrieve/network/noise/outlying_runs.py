@@ -262,8 +262,8 @@ def draw_lines(
         if stop - start > _SHORT:
             _draw_line(logs, noise, grid, codes, (start, stop), ends)
         start = stop + 1
-    nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
+    nodes, weights = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     for g in range(ends[0], ends[1]):
         # Beside a run at an end of the beam, too few good bins are left for a polynomial.
-        if codes[g] == BRIDGED and find_neighbours(grid, codes, g, *ends, nodes, shares)[0] == 0:
+        if codes[g] == BRIDGED and find_neighbours(grid, codes, g, *ends, nodes, weights)[0] == 0:
             _draw_line(logs, noise, grid, codes, (g, g + 1), ends)

@@ -1,4 +1,4 @@
-"""Single bins of a network's beams that lie off their neighbours: found, bridged, or told."""
+"""Outlying bins of the beams of a network: detection, bridging and flags."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ BINS = 7
 
 
 def narrow(x, y, z):
-    """Return a plume of 50 m, of four times the air about it, below layers of 300 m."""
-    apart = ((x + 40.0) ** 2 + (z - 650.0) ** 2) / (2 * 50.0**2)
-    return 1e-3 * (1 + 3 * np.exp(-apart)) * np.exp(-z / 300.0)
+    """Return a plume of 50 m, four times its surroundings, in air with a scale height of 300 m."""
+    separate = ((x + 40.0) ** 2 + (z - 650.0) ** 2) / (2 * 50.0**2)
+    return 1e-3 * (1 + 3 * np.exp(-separate)) * np.exp(-z / 300.0)
 
 
 ALL = {**FIELDS, "narrow plume": narrow}
@@ -46,107 +46,118 @@ def condensed(net, r, power, variance, *, screened=True, relative=False, nearest
     return data, layout
 
 
-def hit(power, variance, profile, beam, bin, size):
-    """Return power with bins of a beam moved by so many standard errors."""
+def hit(power, variance, profile, beam, index, size):
+    """Return power with bins of a beam changed by `size` standard errors."""
     out = power.copy()
-    out[profile, beam, bin] += size * np.sqrt(np.broadcast_to(variance, power.shape[1:])[beam, bin])
+    out[profile, beam, index] += size * np.sqrt(
+        np.broadcast_to(variance, power.shape[1:])[beam, index]
+    )
     return out
 
 
-def bin_at(r, where):
-    return int(np.argmin(np.abs(r - where)))
+def bin_at(r, distance):
+    return int(np.argmin(np.abs(r - distance)))
 
 
-def apart(one, other):
-    """Return by how many of its standard errors the one differs from the other."""
-    return np.abs(one.extinction - other.extinction) / one.extinction_standard_error
+def apart(first, second):
+    """Return the difference of two results in standard errors of the first."""
+    return np.abs(first.extinction - second.extinction) / first.extinction_standard_error
 
 
-# Where nothing is wrong ---------------------------------------------------------------------
+# Without outlying bins ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", list(ALL))
 @pytest.mark.parametrize("step", [5.0, 7.5])
-def test_air_and_noise_are_left_alone_to_the_bit(name, step):
+def test_air_and_noise_do_not_change_at_all(name, step):
     for relative in (1e-3, 0.02, 0.1, 0.3):
         net, r, power, variance = scene(ALL[name], relative, 60, step)
         screened, _ = condensed(net, r, power, variance)
-        plain, _ = condensed(net, r, power, variance, screened=False)
+        unscreened, _ = condensed(net, r, power, variance, screened=False)
         assert not screened.bridged.any()
-        for one in ("log_value", "integral", "usable", "covariance", "slope", "status"):
-            np.testing.assert_array_equal(getattr(screened, one), getattr(plain, one))
+        for quantity in ("log_value", "integral", "usable", "covariance", "slope", "status"):
+            np.testing.assert_array_equal(
+                getattr(screened, quantity), getattr(unscreened, quantity)
+            )
 
 
 @pytest.mark.parametrize("relative", [2e-3, 0.01, 0.05, 0.2])
-def test_what_is_left_of_bins_is_normal(relative):
-    """So that the threshold means what it says: beyond 6, once in 5e8 bins."""
+def test_deviations_of_bins_are_normal(relative):
+    """The threshold of 6 is then exceeded once in 5e8 bins."""
     rng = np.random.default_rng(5)
     rows, count = 400, 200
     slope = -0.01 * np.arange(count)
-    plain = np.exp(slope) * (1 + relative * rng.standard_normal((rows, count)))
+    power = np.exp(slope) * (1 + relative * rng.standard_normal((rows, count)))
     codes, limits = np.zeros(count, dtype=np.uint8), np.array([[0, count]])
     ranges = 5.0 * np.arange(1.0, count + 1)
-    planned = np.zeros((1, count, 6), np.intp), np.zeros((1, count, 6)), np.zeros((1, count))
-    outlying_bins.plan_neighbours(ranges[None], limits, *planned)
-    nodes, shares, air = (one[0] for one in planned)
-    off = np.empty((rows, count))
+    plan = np.zeros((1, count, 6), np.intp), np.zeros((1, count, 6)), np.zeros((1, count))
+    outlying_bins.plan_neighbours(ranges[None], limits, *plan)
+    nodes, weights, air = (array[0] for array in plan)
+    deviations = np.empty((rows, count))
     for n in range(rows):
-        noise = (relative * np.exp(slope) / plain[n]) ** 2
-        row = np.log(np.maximum(plain[n], 1e-9)), noise, plain[n], (relative * np.exp(slope)) ** 2
+        noise = (relative * np.exp(slope) / power[n]) ** 2
+        row = np.log(np.maximum(power[n], 1e-9)), noise, power[n], (relative * np.exp(slope)) ** 2
         outlying_bins._measure_deviations(
-            row, 1.0, False, ranges, codes, (0, count, 0, count), (nodes, shares, 0.0 * air), off[n]
+            row,
+            1.0,
+            False,
+            ranges,
+            codes,
+            (0, count, 0, count),
+            (nodes, weights, 0.0 * air),
+            deviations[n],
         )
-    for many, chance in ((2.0, 4.55e-2), (3.0, 2.7e-3), (4.0, 6.3e-5)):
-        expected = chance * off.size
-        # A bin of noise shows in 7 of them: so many fewer are independent.
-        assert abs(np.sum(off > many) - expected) < 4 * np.sqrt(7 * expected) + 3
-    assert off.max() < outlying_bins.OUTLYING_SIGMAS
+    for sigmas, chance in ((2.0, 4.55e-2), (3.0, 2.7e-3), (4.0, 6.3e-5)):
+        expected = chance * deviations.size
+        # The noise of a bin is in 7 deviations: fewer are independent.
+        assert abs(np.sum(deviations > sigmas) - expected) < 4 * np.sqrt(7 * expected) + 3
+    assert deviations.max() < outlying_bins.OUTLYING_SIGMAS
 
 
-def test_counts_at_low_light_are_not_taken_for_outliers():
+def test_low_photon_counts_are_no_outliers():
     rng = np.random.default_rng(6)
     net = triangle()
     r = grid(net)
     level = signals(net, r, ALL["homogeneous"])
     counts = rng.poisson(np.maximum(60 * level / level[:, [60]], 15), (300, *level.shape))
-    found = solved(net, r, counts.astype(float), counts.astype(float))
-    assert not found.flags.bridged.any()
-    assert not found.flags.outlying.any()
+    result = solved(net, r, counts.astype(float), counts.astype(float))
+    assert not result.flags.bridged.any()
+    assert not result.flags.outlying.any()
 
 
-# Where bins are hit ------------------------------------------------------------------------
+# With outlying bins ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relative", [1e-3, 0.02, 0.1])
 @pytest.mark.parametrize("size", [15.0, 40.0, 1e3, 1e9])
-def test_a_spike_at_a_crossing_is_bridged_and_told(relative, size):
+def test_a_spike_at_a_crossing_is_bridged_and_flagged(relative, size):
     net, r, power, variance = scene(relative=relative)
     at = bin_at(r, net.on_beam(0)[1][0])
     clean = solved(net, r, power, variance)
-    found = solved(net, r, hit(power, variance, 7, 0, at, size), variance)
-    mine = net.on_beam(0)[0]
-    assert found.flags.bridged[7, mine].all()
-    assert not found.flags.bridged[np.arange(50) != 7].any()
-    np.testing.assert_array_equal(found.flags.flagged, clean.flags.flagged)
-    assert np.nanmax(apart(found, clean)[7]) < 1.0
+    result = solved(net, r, hit(power, variance, 7, 0, at, size), variance)
+    selected = net.on_beam(0)[0]
+    assert result.flags.bridged[7, selected].all()
+    assert not result.flags.bridged[np.arange(50) != 7].any()
+    np.testing.assert_array_equal(result.flags.flagged, clean.flags.flagged)
+    assert np.nanmax(apart(result, clean)[7]) < 1.0
     np.testing.assert_allclose(
-        found.extinction_standard_error[7], clean.extinction_standard_error[7], rtol=0.3
+        result.extinction_standard_error[7], clean.extinction_standard_error[7], rtol=0.3
     )
 
 
 @pytest.mark.parametrize("size", [-20.0, 15.0, 100.0])
-def test_a_spike_in_the_middle_of_a_long_beam_costs_nothing(size):
+def test_a_spike_in_the_middle_of_a_long_beam_changes_nothing(size):
     net, r, power, variance = scene(relative=0.02)
     low, high = net.on_beam(1)[1][[0, -1]]
     at = bin_at(r, (low + high) / 2)
     clean = solved(net, r, power, variance)
-    found = solved(net, r, hit(power, variance, 3, 1, at, size), variance)
-    np.testing.assert_array_equal(found.flags.flagged, clean.flags.flagged)
-    assert np.nanmax(apart(found, clean)[3]) < 0.3
+    result = solved(net, r, hit(power, variance, 3, 1, at, size), variance)
+    np.testing.assert_array_equal(result.flags.flagged, clean.flags.flagged)
+    assert np.nanmax(apart(result, clean)[3]) < 0.3
 
 
 def spiked(net, r, power, variance, sizes):
-    """Put spikes side by side on the first beam of all profiles, where beams meet."""
+    """Return power with adjacent spikes on the first beam of all profiles, at a crossing."""
     at = bin_at(r, net.on_beam(0)[1][0])
     for k, size in enumerate(sizes):
         power = hit(power, variance, slice(None), 0, at + k, size)
@@ -154,20 +165,20 @@ def spiked(net, r, power, variance, sizes):
 
 
 @pytest.mark.parametrize("sizes", [(40.0, 40.0), (90.0, 30.0), (25.0, -25.0), (60.0, 0.0, 60.0)])
-def test_spikes_that_lie_together_are_told_and_left(sizes):
-    """They may be the edge of a layer, which is air."""
+def test_adjacent_spikes_are_flagged_and_left_in_place(sizes):
+    """They may be the edge of a layer of air."""
     net, r, power, variance = scene(relative=0.02)
     damaged = spiked(net, r, power, variance, sizes)
-    found, _ = condensed(net, r, damaged, variance)
-    plain, _ = condensed(net, r, damaged, variance, screened=False)
-    assert found.bridged[:, 0].mean() > 0.95
-    left = np.all(found.log_value == plain.log_value, axis=1)
+    result, _ = condensed(net, r, damaged, variance)
+    unscreened, _ = condensed(net, r, damaged, variance, screened=False)
+    assert result.bridged[:, 0].mean() > 0.95
+    left = np.all(result.log_value == unscreened.log_value, axis=1)
     assert left.mean() > 0.95
 
 
 @pytest.mark.parametrize("place", ["first", "last"])
-def test_the_ends_of_a_beam_are_looked_at_too(place):
-    """Beyond the last crossing a bin is missing; before the first there are none."""
+def test_the_ends_of_a_beam_are_tested_too(place):
+    """A bin is missing beyond the last crossing; there are no bins before the first."""
     net, r, power, variance = scene(relative=0.02)
     ranges = net.on_beam(0)[1]
     first, last = bin_at(r, ranges[0]), bin_at(r, ranges[-1])
@@ -177,40 +188,40 @@ def test_the_ends_of_a_beam_are_looked_at_too(place):
         at, nearest = last + 3, 100.0
         power[:, 0, last + 4 :] = np.nan
     clean = solved(net, r, power, variance, full_overlap_range=nearest)
-    found = solved(
+    result = solved(
         net, r, hit(power, variance, 9, 0, at, 120.0), variance, full_overlap_range=nearest
     )
-    assert (found.flags.bridged | found.flags.outlying)[9, net.on_beam(0)[0]].any()
-    kept = ~found.flags.flagged & ~clean.flags.flagged & np.isfinite(found.extinction)
-    assert (apart(found, clean)[9][kept[9]] < 1.5).all()
+    assert (result.flags.bridged | result.flags.outlying)[9, net.on_beam(0)[0]].any()
+    kept = ~result.flags.flagged & ~clean.flags.flagged & np.isfinite(result.extinction)
+    assert (apart(result, clean)[9][kept[9]] < 1.5).all()
 
 
-def test_gaps_among_neighbours_are_passed_over():
+def test_gaps_among_neighbours_are_skipped():
     net, r, power, variance = scene(relative=0.02)
     last = bin_at(r, net.on_beam(0)[1][-1])
     power[:, 0, last + 5] = np.nan
     clean = solved(net, r, power, variance)
-    found = solved(net, r, hit(power, variance, 9, 0, last + 3, 60.0), variance)
-    assert found.flags.bridged[9, net.on_beam(0)[0]].all()
-    assert np.nanmax(apart(found, clean)[9]) < 1.0
+    result = solved(net, r, hit(power, variance, 9, 0, last + 3, 60.0), variance)
+    assert result.flags.bridged[9, net.on_beam(0)[0]].all()
+    assert np.nanmax(apart(result, clean)[9]) < 1.0
 
 
-def test_a_crowd_of_spikes_is_told_and_left():
+def test_many_adjacent_spikes_are_flagged_and_left_in_place():
     net, r, power, variance = scene(relative=0.01)
     ranges = net.on_beam(0)[1]
     at = bin_at(r, (ranges[0] + ranges[-1]) / 2)
     rng = np.random.default_rng(1)
     damaged = power.copy()
     damaged[4, 0, at : at + 6] *= rng.uniform(0.3, 3.0, 6)
-    found, _ = condensed(net, r, damaged, variance)
-    plain, _ = condensed(net, r, damaged, variance, screened=False)
-    assert found.bridged[4, 0]
-    assert found.bridged.sum() == 1
-    np.testing.assert_array_equal(found.integral, plain.integral)
+    result, _ = condensed(net, r, damaged, variance)
+    unscreened, _ = condensed(net, r, damaged, variance, screened=False)
+    assert result.bridged[4, 0]
+    assert result.bridged.sum() == 1
+    np.testing.assert_array_equal(result.integral, unscreened.integral)
 
 
 def run(net, r, power, variance, after, bins, size=40.0):
-    """Move bins side by side on the first beam of all profiles, so many behind where beams meet."""
+    """Return power with a run of changed bins on the first beam, `after` bins behind a crossing."""
     at = bin_at(r, net.on_beam(0)[1][0]) + after
     for k in range(bins):
         power = hit(power, variance, slice(None), 0, at + k, size)
@@ -218,58 +229,58 @@ def run(net, r, power, variance, after, bins, size=40.0):
 
 
 @pytest.mark.parametrize(("after", "bins"), [(-3, 6), (-6, 12), (9, 12), (5, 20), (0, 30)])
-def test_a_run_of_wild_bins_is_part_of_the_standard_error(after, bins):
-    """Only its edges show: those in the middle lie on one curve."""
+def test_a_run_of_outlying_bins_is_part_of_the_standard_error(after, bins):
+    """Only its edges show: the bins in the middle fit each other."""
     net, r, power, variance = scene(relative=0.02)
     damaged = run(net, r, power, variance, after, bins)
-    told, layout = condensed(net, r, damaged, variance)
-    plain, _ = condensed(net, r, damaged, variance, screened=False)
+    reported, layout = condensed(net, r, damaged, variance)
+    unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
-    np.testing.assert_array_equal(told.integral, plain.integral)
-    np.testing.assert_array_equal(told.log_value, plain.log_value)
-    assert told.bridged[:, 0].all()
-    added = (told.covariance - plain.covariance)[:, : layout.offset[1]].reshape(-1, 3, 3)
-    moved = plain.log_value[:, 1] - clean.log_value[:, 1]
+    np.testing.assert_array_equal(reported.integral, unscreened.integral)
+    np.testing.assert_array_equal(reported.log_value, unscreened.log_value)
+    assert reported.bridged[:, 0].all()
+    added = (reported.covariance - unscreened.covariance)[:, : layout.offset[1]].reshape(-1, 3, 3)
+    shift = unscreened.log_value[:, 1] - clean.log_value[:, 1]
     stated = np.sqrt(added[:, 0, 0] + added[:, 1, 1] - 2.0 * added[:, 0, 1])
-    assert np.all(np.abs(moved) < 1.5 * stated + 1e-9)
-    found = solved(net, r, damaged, variance)
-    score = (found.extinction - 2e-3) / found.extinction_standard_error
-    kept = ~found.flags.flagged & np.isfinite(found.extinction)
+    assert np.all(np.abs(shift) < 1.5 * stated + 1e-9)
+    result = solved(net, r, damaged, variance)
+    score = (result.extinction - 2e-3) / result.extinction_standard_error
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
     assert np.all(np.abs(score[kept]) < 3.0)
-    assert np.isfinite(found.extinction[:, found.near_crossing]).mean() > 0.9
+    assert np.isfinite(result.extinction[:, result.near_crossing]).mean() > 0.9
 
 
 def test_a_line_goes_through_the_good_bins_on_either_side():
     grid_, noise = 5.0 * np.arange(20.0), np.full(20, 0.09)
     logs, codes = 1.0 - 0.02 * grid_, np.zeros(20, dtype=np.uint8)
-    expected, wild = logs.copy(), slice(6, 15)
-    logs[wild] += 3.0
+    expected, outlying = logs.copy(), slice(6, 15)
+    logs[outlying] += 3.0
     codes[[6, 14]] = outlying_bins.BRIDGED
     outlying_runs.draw_lines(logs, noise, grid_, codes, (0, 20))
     np.testing.assert_allclose(logs, expected, atol=1e-12)
-    assert np.all(codes[wild] == outlying_bins.LOST)
+    assert np.all(codes[outlying] == outlying_bins.LOST)
     assert np.all(codes[[5, 15]] == outlying_bins.GOOD)
-    # Of two means of 3 bins: in the middle, a half of each.
+    # In the middle, half of each of two means of 3 bins.
     assert noise[10] == pytest.approx(0.09 / 6.0)
 
 
-def test_what_no_line_can_be_drawn_across_stays_as_it_is():
+def test_runs_without_a_line_do_not_change():
     logs, noise = np.arange(30.0), np.ones(30)
     for marked, expected in (
         ([2, 3], logs),
         (np.arange(30), logs),
-        # Beyond the last good bins, the signal stays as there.
+        # Beyond the last good bins, the signal keeps their mean.
         (np.arange(20, 30), np.where(logs < 20.0, logs, 18.0)),
     ):
         codes = np.zeros(30, dtype=np.uint8)
         codes[marked] = outlying_bins.BRIDGED
-        told = logs.copy()
-        outlying_runs.draw_lines(told, noise.copy(), np.arange(30.0), codes, (0, 30))
-        np.testing.assert_array_equal(told, expected)
+        stated = logs.copy()
+        outlying_runs.draw_lines(stated, noise.copy(), np.arange(30.0), codes, (0, 30))
+        np.testing.assert_array_equal(stated, expected)
 
 
-def test_of_beams_with_many_bins_off_nothing_is_told():
-    """Those on one curve may be the wild ones."""
+def test_beams_with_too_many_outlying_bins_are_rejected():
+    """The bins that fit each other may be the outlying ones."""
     marked = np.arange(0, 30, 2)
     logs = np.zeros(30)
     out, codes = lined(logs, marked)
@@ -278,7 +289,7 @@ def test_of_beams_with_many_bins_off_nothing_is_told():
 
 
 def lined(logs, marked, noise=1e-4):
-    """Return logarithms across whose runs lines are drawn, and what became of the bins."""
+    """Return logarithms with lines across runs, and the codes of the bins."""
     codes = np.zeros(logs.size, dtype=np.uint8)
     codes[marked] = outlying_bins.BRIDGED
     out = logs.copy()
@@ -291,7 +302,7 @@ def lined(logs, marked, noise=1e-4):
 @pytest.mark.parametrize("rise", [-0.3, 0.3])
 @pytest.mark.parametrize("marked", [[40, 59], [39, 40, 59, 60], [40], [59]])
 def test_a_run_jumps_and_jumps_back(slope, rise, marked):
-    """Also where the slope of air hides the jump, and where but one of its edges is marked."""
+    """Also where the slope of air hides the jump, and where only one edge is marked."""
     air = slope * np.arange(100.0)
     logs = air.copy()
     logs[40:60] += rise
@@ -301,11 +312,11 @@ def test_a_run_jumps_and_jumps_back(slope, rise, marked):
     assert np.count_nonzero(codes) <= 24
 
 
-@pytest.mark.parametrize("apart", [5, 10, 25, 32])
-def test_single_bins_make_no_run(apart):
-    """However many they are: a line would take the air between them away."""
+@pytest.mark.parametrize("spacing", [5, 10, 25, 32])
+def test_single_bins_make_no_run(spacing):
+    """A line across many of them would remove the air between them."""
     logs = np.exp(-(((np.arange(200.0) - 100.0) / 22.0) ** 2))
-    marked = np.arange(4, 196, apart)
+    marked = np.arange(4, 196, spacing)
     logs[marked] += 0.3
     out, codes = lined(logs, marked)
     np.testing.assert_array_equal(out, logs)
@@ -317,7 +328,7 @@ def test_single_bins_make_no_run(apart):
 @pytest.mark.parametrize("slope", [-0.08, 0.08])
 @pytest.mark.parametrize("end", ["first", "last"])
 @pytest.mark.parametrize("more", [0, 1])
-def test_of_a_run_at_the_end_of_a_beam_the_jump_is_taken_out(bins, slope, end, more):
+def test_the_jump_of_a_run_at_the_end_of_a_beam_is_removed(bins, slope, end, more):
     """Also where two bins are marked at its only edge."""
     air = slope * np.arange(100.0)
     logs = air.copy()
@@ -337,7 +348,7 @@ def test_a_jump_far_from_the_ends_is_air():
     np.testing.assert_array_equal(out, logs)
 
 
-def test_behind_a_run_another_begins():
+def test_two_runs_behind_each_other():
     air = np.zeros(120)
     logs = air.copy()
     logs[20:40] += 0.5
@@ -356,72 +367,72 @@ def test_edges_far_apart_are_no_run():
 
 
 def layer(x, y, z):
-    """Stand 1.5 per km, with a layer of 60 m of three times the air about it."""
+    """Return 1.5 per km with a layer of 60 m of three times its surroundings."""
     return 1.5e-3 + 3e-3 * np.exp(-((z - 600.0) ** 2) / (2 * 60.0**2)) + 0.0 * x
 
 
 @pytest.mark.parametrize("step", [5.0, 2.0])
 @pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 4.0), (layer, 6.0)])
-def test_single_wild_bins_in_curved_air_cost_little(field, most, step):
-    """Lines from one to the next would take the plume away, and state errors for it."""
+def test_single_outlying_bins_in_curved_air_change_little(field, most, step):
+    """Lines from one to the next would remove the plume and raise the errors."""
     net = three_by_two()
     r = grid(net, step)
     power, variance = noisy(net, r, signals(net, r, field), 0.01, 60, 3, 0.003)
     clean = solved(net, r, power, variance)
     rng = np.random.default_rng(5)
-    wild = np.zeros(power.shape, dtype=bool)
-    for beam in wild.reshape(-1, r.size):
+    outlying = np.zeros(power.shape, dtype=bool)
+    for beam in outlying.reshape(-1, r.size):
         beam[rng.integers(5, 25) : -4 : 25] = True
-    found = solved(net, r, power + wild * 30.0 * np.sqrt(variance), variance)
-    near = found.near_crossing
-    dearer = (found.extinction_standard_error / clean.extinction_standard_error)[:, near]
-    assert np.nanmedian(dearer) < most
+    result = solved(net, r, power + outlying * 30.0 * np.sqrt(variance), variance)
+    near = result.near_crossing
+    error_ratio = (result.extinction_standard_error / clean.extinction_standard_error)[:, near]
+    assert np.nanmedian(error_ratio) < most
 
 
 @pytest.mark.parametrize("share", [0.02, 0.04])
 @pytest.mark.parametrize("step", [5.0, 2.0])
 @pytest.mark.parametrize("field", [ALL["plume"], layer])
-def test_wild_bins_in_curved_air_leave_values_within_their_errors(field, step, share):
+def test_outlying_bins_in_curved_air_leave_values_within_their_errors(field, step, share):
     net = three_by_two()
     r = grid(net, step)
     power, variance = noisy(net, r, signals(net, r, field), 0.01, 150, 3, 0.003)
     rng = np.random.default_rng(50)
-    wild = 30.0 * (rng.random(power.shape) < share)
-    found = solved(
-        net, r, power + wild * np.sqrt(variance), variance, blocks=np.arange(150) // 50
+    outlying = 30.0 * (rng.random(power.shape) < share)
+    result = solved(
+        net, r, power + outlying * np.sqrt(variance), variance, blocks=np.arange(150) // 50
     )  # fmt: skip
-    near = found.near_crossing
-    kept = (~found.flags.flagged & np.isfinite(found.extinction))[:, near]
-    score = (found.extinction - field(*net.crossing.T)) / found.extinction_standard_error
+    near = result.near_crossing
+    kept = (~result.flags.flagged & np.isfinite(result.extinction))[:, near]
+    score = (result.extinction - field(*net.crossing.T)) / result.extinction_standard_error
     assert kept.mean() > 0.95
     assert np.mean(np.abs(score[:, near][kept]) > 4.0) <= 7e-3
 
 
 @pytest.mark.parametrize("step", [0.3, 1.1, 4.0])
-def test_an_edge_of_a_layer_is_no_crowd(step):
+def test_an_edge_of_a_layer_does_not_change(step):
     net, r, power, variance = scene(relative=0.01)
     ranges = net.on_beam(0)[1]
     beyond = r > (ranges[0] + ranges[-1]) / 2
     power[:, 0, beyond] *= step
     variance[0, beyond] *= step**2
-    found, _ = condensed(net, r, power, variance)
-    plain, _ = condensed(net, r, power, variance, screened=False)
-    np.testing.assert_array_equal(found.integral, plain.integral)
+    result, _ = condensed(net, r, power, variance)
+    unscreened, _ = condensed(net, r, power, variance, screened=False)
+    np.testing.assert_array_equal(result.integral, unscreened.integral)
 
 
 @pytest.mark.parametrize("step", [0.1, 0.5, 3.0, 20.0])
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_an_edge_inside_a_bin_stays_as_it_is(step, share):
+def test_an_edge_inside_a_bin_does_not_change(step, share):
     net, r, power, variance = scene(relative=0.01)
     at = bin_at(r, net.on_beam(0)[1][0]) + 1
     scale = np.where(np.arange(r.size) > at, step, 1.0)
     scale[at] = 1.0 + share * (step - 1.0)
     power[:, 0] *= scale
     variance[0] *= scale**2
-    found, _ = condensed(net, r, power, variance)
-    plain, _ = condensed(net, r, power, variance, screened=False)
-    np.testing.assert_array_equal(found.integral, plain.integral)
-    np.testing.assert_array_equal(found.log_value, plain.log_value)
+    result, _ = condensed(net, r, power, variance)
+    unscreened, _ = condensed(net, r, power, variance, screened=False)
+    np.testing.assert_array_equal(result.integral, unscreened.integral)
+    np.testing.assert_array_equal(result.log_value, unscreened.log_value)
 
 
 def test_a_layer_may_fill_one_wide_bin():
@@ -430,37 +441,37 @@ def test_a_layer_may_fill_one_wide_bin():
     at = r[wide].size // 3
     layer = power[..., wide].copy()
     layer[:, 0, at] *= 5.0
-    found, _ = condensed(net, r[wide], layer, variance[..., wide])
-    assert not found.bridged.any()
+    result, _ = condensed(net, r[wide], layer, variance[..., wide])
+    assert not result.bridged.any()
 
 
-def test_noise_far_above_what_is_stated_is_told():
+def test_noise_far_above_the_stated_one_is_flagged():
     net, r, power, variance = scene(relative=0.05)
-    found = solved(net, r, power, variance / 400.0)
-    used = np.isfinite(found.extinction)
-    assert (found.flags.outlying | found.flags.poor_fit | ~used).all()
+    result = solved(net, r, power, variance / 400.0)
+    used = np.isfinite(result.extinction)
+    assert (result.flags.outlying | result.flags.poor_fit | ~used).all()
 
 
 @pytest.mark.parametrize("variance", [0.0, None])
-def test_noise_that_is_not_stated_alarms_nobody(variance):
+def test_noise_that_is_not_stated_sets_no_flag(variance):
     net, r, power, _ = scene(ALL["plume"], relative=0.02)
-    found = solved(net, r, power, variance)
-    assert not found.flags.bridged.any()
-    assert not found.flags.outlying.any()
+    result = solved(net, r, power, variance)
+    assert not result.flags.bridged.any()
+    assert not result.flags.outlying.any()
 
 
-def test_spikes_are_seen_where_signals_tell_the_noise():
+def test_spikes_are_detected_with_estimated_noise():
     net, r, power, variance = scene(relative=0.01, additive=0.0)
     at = bin_at(r, net.on_beam(0)[1][0])
     clean = solved(net, r, power, None)
-    found = solved(net, r, hit(power, variance, 7, 0, at, 60.0), None)
-    assert found.flags.bridged[7, net.on_beam(0)[0]].all()
-    assert np.nanmax(apart(found, clean)[7]) < 1.0
+    result = solved(net, r, hit(power, variance, 7, 0, at, 60.0), None)
+    assert result.flags.bridged[7, net.on_beam(0)[0]].all()
+    assert np.nanmax(apart(result, clean)[7]) < 1.0
 
 
-@pytest.mark.parametrize(("wild", "left"), [((0, 1, -2, -1), True), ((0, 1), False)])
-def test_a_beam_nothing_good_is_left_of_is_not_believed(wild, left):
-    """Between wild bins at either end of a short beam, all may be wild; nothing lies beyond."""
+@pytest.mark.parametrize(("outlying", "left"), [((0, 1, -2, -1), True), ((0, 1), False)])
+def test_a_beam_without_good_bins_is_rejected(outlying, left):
+    """Between outlying bins at both ends of a short beam, all bins may be outlying."""
     net = fan([-30.0, 0.0, 40.0], [(60,), (90,), (120,)])
     r = np.arange(20.0, 140.0, 4.0)
     field = ALL["homogeneous"]
@@ -469,47 +480,47 @@ def test_a_beam_nothing_good_is_left_of_is_not_believed(wild, left):
     used = np.arange(bin_at(r, ends[0]) - 3, bin_at(r, ends[1]) + 4)
     power[:, 0, used[-1] + 1 :] = np.nan
     nearest = np.array([r[used[0]] - 1.0, 20.0, 20.0])
-    damaged = hit(power, variance, 4, 0, used[list(wild)], 60.0)
+    damaged = hit(power, variance, 4, 0, used[list(outlying)], 60.0)
     data, layout = condensed(net, r, damaged, variance, nearest=nearest)
-    mine = slice(layout.first_passage[0], layout.first_passage[1])
+    selected = slice(layout.first_passage[0], layout.first_passage[1])
     others = np.arange(50) != 4
-    assert (data.usable[others, mine] == 1).all()
+    assert (data.usable[others, selected] == 1).all()
     assert not data.bridged[others].any()
     assert data.bridged[4, 0]
     assert (data.status[4, 0] == _condensed_signals.OUTLYING) == left
-    assert (data.usable[4, mine] == 0).all() == left
-    found = solved(net, r, damaged, variance, full_overlap_range=nearest)
-    assert found.flags.outlying[4, net.on_beam(0)[0]].all() == left
-    assert not found.flags.outlying[others].any()
+    assert (data.usable[4, selected] == 0).all() == left
+    result = solved(net, r, damaged, variance, full_overlap_range=nearest)
+    assert result.flags.outlying[4, net.on_beam(0)[0]].all() == left
+    assert not result.flags.outlying[others].any()
 
 
-# Honesty ------------------------------------------------------------------------------------
+# Stated errors ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("where", ["crossing", "between"])
 @pytest.mark.parametrize("relative", [0.01, 0.2])
-def test_variances_of_bridged_beams_are_those_of_many_draws(where, relative):
+def test_variances_of_bridged_beams_agree_with_their_scatter(where, relative):
     net, r, power, variance = scene(relative=relative, profiles=3000)
     ranges = net.on_beam(0)[1]
     at = bin_at(r, ranges[0] if where == "crossing" else (ranges[0] + ranges[-1]) / 2)
     damaged = hit(power, variance, slice(None), 0, [at, at + 5], 100.0)
     data, layout = condensed(net, r, damaged, variance)
-    plain, _ = condensed(net, r, damaged, variance, screened=False)
+    unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     assert data.bridged[:, 0].all()
-    left = np.all(data.integral == plain.integral, axis=1)
+    left = np.all(data.integral == unscreened.integral, axis=1)
     assert left.mean() < 0.1
     first, last = layout.first_passage[:2]
     count = last - first
     size = 2 * count - 1
-    told = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
+    stated = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
     good = (data.usable[:, first:last] == 1).all(axis=1) & ~left
     truth, _ = condensed(
         net, r, signals(net, r, ALL["homogeneous"])[None], variance, screened=False
     )
     for c in range(1, count):
-        # The far value less the near one, and the integral, in units of the near value.
+        # The far value and the integral, relative to the near value.
         difference = data.log_value[good, first + c] - truth.log_value[0, first + c]
-        spread = told[good, c, c] + told[good, 0, 0] - 2 * told[good, 0, c]
+        spread = stated[good, c, c] + stated[good, 0, 0] - 2 * stated[good, 0, c]
         assert np.std(difference / np.sqrt(spread)) == pytest.approx(1.0, abs=0.08)
         assert (
             abs(np.mean(difference))
@@ -517,78 +528,79 @@ def test_variances_of_bridged_beams_are_those_of_many_draws(where, relative):
         )
 
 
-def test_shares_are_those_of_polynomials():
+def test_weights_agree_with_polynomials():
     rng = np.random.default_rng(2)
     x = np.cumsum(rng.uniform(3.0, 9.0, 9))
-    nodes, shares = np.array([0, 1, 3, 5, 6, 8, 0, 0]), np.empty(8)
+    nodes, weights = np.array([0, 1, 3, 5, 6, 8, 0, 0]), np.empty(8)
     y = rng.standard_normal(9)
-    outlying_bins._fit_shares(x, 4, nodes, 6, 5, shares)
+    outlying_bins._fit_weights(x, 4, nodes, 6, 5, weights)
     through = BarycentricInterpolator(x[nodes[:6]], y[nodes[:6]])(x[4])
-    assert shares[:6] @ y[nodes[:6]] == pytest.approx(through, rel=1e-10)
-    outlying_bins._fit_shares(x, 4, nodes, 6, 3, shares)
+    assert weights[:6] @ y[nodes[:6]] == pytest.approx(through, rel=1e-10)
+    outlying_bins._fit_weights(x, 4, nodes, 6, 3, weights)
     fitted = np.polynomial.Polynomial.fit(x[nodes[:6]], y[nodes[:6]], 3)(x[4])
-    assert shares[:6] @ y[nodes[:6]] == pytest.approx(fitted, rel=1e-10)
+    assert weights[:6] @ y[nodes[:6]] == pytest.approx(fitted, rel=1e-10)
 
 
-def test_results_do_not_depend_on_what_else_is_solved():
+def test_results_do_not_depend_on_other_profiles():
     net, r, power, variance = scene(relative=0.05, profiles=24)
     rng = np.random.default_rng(8)
     damaged = power + (rng.random(power.shape) < 0.02) * 50 * np.sqrt(variance)
     together = solved(net, r, damaged, variance, prior="none")
     assert together.flags.bridged.any()
     for n in (0, 11, 23):
-        alone = solved(net, r, damaged[n], variance, prior="none")
-        np.testing.assert_array_equal(alone.extinction, together.extinction[n])
-        np.testing.assert_array_equal(alone.flags.bridged, together.flags.bridged[n])
-    turned = solved(net, r, damaged[::-1], variance, prior="none")
-    np.testing.assert_array_equal(turned.extinction[::-1], together.extinction)
+        single = solved(net, r, damaged[n], variance, prior="none")
+        np.testing.assert_array_equal(single.extinction, together.extinction[n])
+        np.testing.assert_array_equal(single.flags.bridged, together.flags.bridged[n])
+    reversed_result = solved(net, r, damaged[::-1], variance, prior="none")
+    np.testing.assert_array_equal(reversed_result.extinction[::-1], together.extinction)
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.6])
-def test_one_percent_of_wild_bins_leaves_values_within_their_errors(exponent):
+def test_one_percent_of_outlying_bins_leaves_values_within_their_errors(exponent):
     net = fan([-500.0, 0.0, 400.0], [(50, 68), (78, 103), (112, 130)], farthest=1000.0)
     r = grid(net)
     clean = signals(net, r, ALL["homogeneous"], exponent)
     power, variance = noisy(net, r, clean, 0.02, 150)
     rng = np.random.default_rng(9)
-    wild = (rng.random(power.shape) < 0.01) * rng.uniform(5.0, 100.0, power.shape)
-    found = solved(
-        net, r, power + wild * np.sqrt(variance), variance, exponent=exponent,
+    outlying = (rng.random(power.shape) < 0.01) * rng.uniform(5.0, 100.0, power.shape)
+    result = solved(
+        net, r, power + outlying * np.sqrt(variance), variance, exponent=exponent,
         blocks=np.arange(150) // 50,
     )  # fmt: skip
-    kept = ~found.flags.flagged & np.isfinite(found.extinction)
-    score = ((found.extinction - 2e-3) / found.extinction_standard_error)[kept]
-    assert kept[:, found.near_crossing].mean() > 0.9
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = ((result.extinction - 2e-3) / result.extinction_standard_error)[kept]
+    assert kept[:, result.near_crossing].mean() > 0.9
     assert np.mean(np.abs(score) > 4.0) <= 3e-3
 
 
 @pytest.mark.parametrize("sizes", [(40.0, 40.0), (90.0, 30.0), (60.0, 0.0, 60.0)])
-def test_spikes_that_are_left_are_part_of_the_standard_error(sizes):
+def test_spikes_left_in_place_are_part_of_the_standard_error(sizes):
     net, r, power, variance = scene(relative=0.02)
     damaged = spiked(net, r, power, variance, sizes)
-    found, layout = condensed(net, r, damaged, variance)
-    plain, _ = condensed(net, r, damaged, variance, screened=False)
+    result, layout = condensed(net, r, damaged, variance)
+    unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
     size = 2 * int(layout.first_passage[1]) - 1
-    told, own = (
-        each.covariance[:, : layout.offset[1]].reshape(-1, size, size) for each in (found, plain)
+    reported, own = (
+        entry.covariance[:, : layout.offset[1]].reshape(-1, size, size)
+        for entry in (result, unscreened)
     )
-    left = (found.bridged[:, 0] == 1) & np.all(found.log_value == plain.log_value, axis=1)
+    left = (result.bridged[:, 0] == 1) & np.all(result.log_value == unscreened.log_value, axis=1)
     assert left.all()
-    added = (told - own)[left]
-    # One direction, by as much as the spikes have moved the beam, but for noise.
+    added = (reported - own)[left]
+    # One direction, by the shift of the beam through the spikes, except for noise.
     assert np.all(np.linalg.matrix_rank(added, tol=1e-9 * np.abs(added).max()) == 1)
-    moved = (plain.log_value - clean.log_value)[left, 1]
+    shift = (unscreened.log_value - clean.log_value)[left, 1]
     stated = np.sqrt(added[:, 0, 0] + added[:, 1, 1] - 2.0 * added[:, 0, 1])
-    np.testing.assert_allclose(stated, np.abs(moved), rtol=0.3)
-    assert not np.allclose(told[left], own[left], rtol=0.1)
+    np.testing.assert_allclose(stated, np.abs(shift), rtol=0.3)
+    assert not np.allclose(reported[left], own[left], rtol=0.1)
 
 
-def test_beams_that_show_nothing_keep_their_covariance():
+def test_beams_without_outlying_bins_keep_their_covariance():
     net, r, power, variance = scene(ALL["narrow plume"], relative=0.02)
-    found, _ = condensed(net, r, power, variance)
-    plain, _ = condensed(net, r, power, variance, screened=False)
-    quiet = found.bridged == 0
+    result, _ = condensed(net, r, power, variance)
+    unscreened, _ = condensed(net, r, power, variance, screened=False)
+    quiet = result.bridged == 0
     assert quiet.mean() > 0.99
     whole = quiet.all(axis=1)
-    np.testing.assert_array_equal(found.covariance[whole], plain.covariance[whole])
+    np.testing.assert_array_equal(result.covariance[whole], unscreened.covariance[whole])
