@@ -18,7 +18,7 @@ FastCounts = NDArray[np.int32]
 _LARGEST: Final = 2**31 - 1
 """Largest signed integer of 32 bits."""
 _FAINT: Final = 1.0e-5
-"""Events per_event dead time; with fewer, the digits of the variance cancel."""
+"""Events per dead time; with fewer, the digits of the variance cancel."""
 
 
 def count_photons(
@@ -80,10 +80,10 @@ def count_photons(
     if released.shots == 0 or dead_time == 0.0:
         return released.number.copy()
     exposure = released.exposure * 1e-6
+    in_previous = _share_in_previous(dead_time, released.bin_time)
     counted: Counts = _count_events(
-        released.number, dead_time / exposure, _share_in_previous(dead_time, released.bin_time), paralyzable,
-        random,
-    )  # fmt: skip
+        released.number, dead_time / exposure, in_previous, paralyzable, random
+    )
     return counted
 
 
@@ -230,7 +230,7 @@ def _count_events(
 def _moments(
     rate: float, dead_time: float, in_previous: float, paralyzable: Any
 ) -> tuple[float, float]:
-    """Return mean and variance of the counts per_event time."""
+    """Return mean and variance of the counts per time."""
     x = rate * dead_time
     if paralyzable:
         mean = rate * exp(-x)
