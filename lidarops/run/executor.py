@@ -211,7 +211,7 @@ def process_jobs(
 
     Yields
     ------
-    Ended
+    EndedScene
     """
     stop = StopRequest() if stop is None else stop
     if client is None:
@@ -245,7 +245,7 @@ def process_one_by_one(
 
     Yields
     ------
-    Ended
+    EndedScene
         A scene that kills its worker every time ends as failed.
     """
     workers = _Workers(client)

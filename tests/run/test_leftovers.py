@@ -117,7 +117,7 @@ def test_a_report_names_empty_scenes(archive: Archive, monkeypatch: pytest.Monke
     assert "section 50000-60000 m extends beyond the last bin" in page
     assert "poor_20260303T000000" in page
     assert "1 more without product" in page
-    assert "4 scenes can give no product" in page
+    assert "4 scenes without product" in page
 
 
 def _misspelt_product(archive: Archive) -> None:

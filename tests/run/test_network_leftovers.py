@@ -107,7 +107,9 @@ def test_lidars_used_only_by_a_network_are_no_failure(net: Net) -> None:
         assert not result.has_failures
     code, summary = net.command()
     assert (code, summary["empty_scenes"]) == (0, {})
-    shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"]).stdout
+    # Wide, so that the reason is not folded.
+    wide = {"COLUMNS": "200"}
+    shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"], env=wide).stdout
     assert "used only by network valley" in shown
 
 
