@@ -66,7 +66,7 @@ def test_the_small_campaign_counts_its_files(small):
             lambda t: _coast(t)["acquisition"].update(shots=600_000, repetition_rate=10_000),
             "32 bits",
         ),
-        (lambda t: _coast(t)["aerosol_extinction"].update(maximum=200), "per km"),
+        (lambda t: _coast(t)["aerosol_extinction"].update(maximum=200), "km-1"),
         (lambda t: _coast(t)["detectors"][0].update(signal_rate=float("nan")), "signal_rate"),
         (lambda t: _coast(t)["detectors"].append(_coast(t)["detectors"][0]), "share wavelength"),
         (
