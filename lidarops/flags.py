@@ -147,7 +147,7 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.NOT_LEVEL: (
         Severity.REJECT,
         (
-            "the altitude of the path changes by more than 100 m along the section; a vertical "
+            "the altitude of the path changes by more than 100 m along the section, so a vertical "
             "gradient of backscatter would mimic extinction"
         ),
     ),
@@ -159,19 +159,19 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
         Severity.REJECT,
         (
             "there is no range in which the analog and the photon-counting signal are both "
-            "linear; they are not glued"
+            "linear, so they are not glued"
         ),
     ),
     Quality.CLOUD: (
         Severity.CARE,
         (
-            "in a cloud, or behind one as seen from the start of the inversion; the lidar ratio "
-            "of aerosol does not hold there"
+            "in a cloud, or behind one as seen from the start of the inversion, where the lidar "
+            "ratio of aerosol does not hold"
         ),
     ),
     Quality.NO_REFERENCE: (
         Severity.REJECT,
-        "no range window passes the tests for aerosol-free air; the profile is not calibrated",
+        ("no range window passes the tests for aerosol-free air, so the profile is not calibrated"),
     ),
     Quality.UNSTABLE_INVERSION: (
         Severity.REJECT,
@@ -204,7 +204,7 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
         Severity.CARE,
         (
             "the scan covers one side of the zenith only, so a horizontal gradient cannot be "
-            "detected; its systematic error is stated separately"
+            "detected and its systematic error is stated separately"
         ),
     ),
     Quality.LOW_LEVERAGE: (

@@ -44,7 +44,7 @@ def locate_product(
 
     Parameters
     ----------
-    source : Intake
+    source : CheckedInput
     layout : Layout
     context : Context
 

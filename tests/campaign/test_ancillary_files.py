@@ -57,7 +57,7 @@ def test_units_in_brackets_are_turned_into_si(
     assert digest == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
 
 
-def test_columns_that_nobody_asks_for_may_hold_anything(tmp_path: Path) -> None:
+def test_unused_columns_may_hold_anything(tmp_path: Path) -> None:
     (tmp_path / "o.csv").write_text("note,overlap,range [km]\nnear,0.25,0.2\n,1,0.4\n")
     found, _ = overlap_profile(tmp_path, "o.csv")
     np.testing.assert_allclose(found.range, [200.0, 400.0])
@@ -176,7 +176,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("make", "words"), REFUSED)
-def test_what_is_no_overlap_function_is_refused_by_name(
+def test_invalid_overlap_functions_are_refused_by_name(
     tmp_path: Path, make: Callable[[Path], str], words: str
 ) -> None:
     folder = tmp_path / "campaign"

@@ -163,7 +163,7 @@ def test_windows(window: str, seconds: float | None) -> None:
 
 
 @pytest.mark.parametrize("window", ["7h", "10s", "fortnight", "2d"])
-def test_odd_windows_are_refused(window: str) -> None:
+def test_invalid_windows_are_refused(window: str) -> None:
     raw = yaml.safe_load(MINIMAL) | {"scenes": {"window": window}}
     with pytest.raises(ValueError, match="window"):
         Campaign.model_validate(raw)
@@ -185,7 +185,7 @@ def _elastic(**settings: object) -> ElasticSettings:
     return found
 
 
-def test_elastic_defaults_are_those_of_a_scientist() -> None:
+def test_elastic_defaults() -> None:
     found = _elastic()
     assert found.average == timedelta(minutes=30)
     assert (found.lidar_ratio, found.lidar_ratio_standard_error) == (50.0, 10.0)
@@ -234,9 +234,7 @@ def test_averages(text: object, seconds: float) -> None:
         ({"reference": {"relative_error": -0.1}}, "relative_error"),
     ],
 )
-def test_elastic_settings_that_cannot_be_right_are_refused(
-    settings: dict[str, object], words: str
-) -> None:
+def test_invalid_elastic_settings_are_refused(settings: dict[str, object], words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         _elastic(**settings)
 
@@ -248,7 +246,7 @@ def test_lags(lag: object) -> None:
 
 
 @pytest.mark.parametrize("lag", [101, -101, "guess", float("nan"), float("inf")])
-def test_odd_lags_are_refused(lag: object) -> None:
+def test_invalid_lags_are_refused(lag: object) -> None:
     with pytest.raises(ValidationError, match="lag"):
         _with_facts({"channels": {"analog_532o": {"lag": lag}}})
 

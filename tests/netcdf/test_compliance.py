@@ -45,7 +45,7 @@ def test_products_comply(kind: ProductKind, shape: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", list(MAKERS))
-def test_a_product_of_nothing_but_missing_values_complies(kind: ProductKind, tmp_path: Path):
+def test_a_product_of_missing_values_only_complies(kind: ProductKind, tmp_path: Path):
     path = tmp_path / "product.nc"
     of = context(kind, mode=DetectionMode.ANALOG, wavelength=float("nan"))
     data = missing(kind)
@@ -57,7 +57,7 @@ def test_a_product_of_nothing_but_missing_values_complies(kind: ProductKind, tmp
         assert "wavelength" not in product
 
 
-def test_the_checker_would_find_a_fault(tmp_path: Path):
+def test_the_checker_detects_an_error(tmp_path: Path):
     product = build_product(homogeneous(), context())
     product["extinction"].attrs["units"] = "kg"
     product["extinction"].attrs["standard_name"] = "altitude"

@@ -17,13 +17,13 @@ DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
 
 
 def unshuffled(data: bytes, dtype: np.dtype, chunk: tuple[int, ...]) -> np.ndarray:
-    """Inflate by the standard library, and put the bytes of each element together again."""
+    """Return the values of a chunk, inflated by the standard library."""
     raw = np.frombuffer(zlib.decompress(data), np.uint8)
     return np.ascontiguousarray(raw.reshape(dtype.itemsize, -1).T).view(dtype).reshape(chunk)
 
 
 def assembled(values: np.ndarray, chunk: tuple[int, ...], fill_value) -> np.ndarray:
-    """The array that the chunks make, with what lies beyond its edges."""
+    """Return the array of all chunks, including the parts beyond its edges."""
     grid = [-(-size // step) * step for size, step in zip(values.shape, chunk, strict=True)]
     whole = np.zeros(grid, values.dtype)
     seen = set()
@@ -59,7 +59,7 @@ def test_chunks_hold_the_array_and_beyond_its_edge_the_fill_value(cut):
 
 @settings(deadline=None)
 @given(cut=cut_arrays())
-def test_inflated_is_what_was_deflated(cut):
+def test_inflating_restores_the_values(cut):
     values, chunk = cut
     for offset, data in deflate_chunks(values, chunk, values.dtype.type(77)):
         whole = inflate_chunk(data, chunk, values.dtype)
@@ -82,7 +82,7 @@ def test_damaged_chunks_are_refused(damage):
         inflate_chunk(damaged[damage], (1000,), values.dtype)
 
 
-def test_text_is_cut_as_numbers_are():
+def test_text_is_cut_into_chunks_like_numbers():
     text = np.frombuffer(b"provenance" * 7, "S1")
     whole = assembled(text, (64,), b"\0")
     assert whole.tobytes() == text.tobytes() + bytes(128 - 70)
@@ -123,7 +123,7 @@ def test_bytes_do_not_depend_on_what_was_compressed_before():
 
 
 @pytest.mark.parametrize("bits", [8, 12, 23])
-def test_noise_that_was_rounded_is_as_small_as_zlib_makes_it(bits: int):
+def test_rounded_noise_compresses_as_well_as_with_zlib(bits: int):
     values = np.random.default_rng(4).normal(1e6, 1e4, (64, 4096)).astype("f4")
     step = np.uint32(1 << (23 - bits))
     rounded = (values.view("u4") // step * step).view("f4")

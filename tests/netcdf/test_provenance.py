@@ -140,7 +140,7 @@ def test_identifiers_differ_where_content_may():
     ]
     identifiers = {product_id(other) for other in (base, *others)}
     assert len(identifiers) == len(others) + 1
-    # Where a file lies is not what it holds.
+    # The path of a file is not part of its content.
     moved = tuple(replace(record, path=f"moved/{record.path}") for record in base.inputs)
     assert product_id(provenance(inputs=moved)) == product_id(base)
 
@@ -201,7 +201,7 @@ def test_only_sources_that_compute_change_the_code_version(sources: Path, name: 
     assert (_digest(sources) != before) == matters
 
 
-def test_code_version_sees_moved_lines_and_not_line_ends(sources: Path):
+def test_code_version_depends_on_lines_and_not_on_line_ends(sources: Path):
     before = _digest(sources)
     (sources / "flags.py").write_bytes(b"# flags.py\r\n")
     assert _digest(sources) == before

@@ -54,7 +54,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("kind", MAKERS)
-def test_every_variable_of_every_kind_is_as_xarray_has_it(kind: ProductKind, tmp_path: Path):
+def test_every_variable_of_every_kind_is_read_as_by_xarray(kind: ProductKind, tmp_path: Path):
     path = tmp_path / "product.nc"
     write_product(build_product(MAKERS[kind](), context(kind)), path)
     known = by_xarray(path)
@@ -94,7 +94,7 @@ KEYS = st.one_of(
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
 @given(time=KEYS, bins=st.one_of(st.integers(0, 1999), slices(2000)))
-def test_any_part_is_that_part_of_the_whole(chunked: Path, time: object, bins: object):
+def test_any_slice_equals_that_slice_of_the_whole(chunked: Path, time: object, bins: object):
     with open_product(chunked, ["signal", "quality_flag"]) as product:
         whole = product["signal"].values
         part = product["signal"].isel(time=time, range=bins)
@@ -120,13 +120,13 @@ def test_only_requested_values_are_read(chunked: Path, monkeypatch: pytest.Monke
     assert len(inflated) == 1
 
 
-def test_what_a_product_does_not_have_is_left_out(chunked: Path):
+def test_absent_variables_are_left_out(chunked: Path):
     with open_product(chunked, ["signal", "nothing", "nv"]) as product:
         assert set(product.variables) == {"signal"}
 
 
 class TestOfOtherWriters:
-    """Read by HDF5 itself, and decoded as xarray would."""
+    """Files that HDF5 reads, decoded as by xarray."""
 
     @pytest.mark.parametrize(
         "encoding",
@@ -164,7 +164,7 @@ class TestOfOtherWriters:
         with open_product(path, ["time"]) as product:
             np.testing.assert_array_equal(product["time"], np.repeat([1.0, 7.0], [100, 9900]))
 
-    def test_name_of_a_dimension_that_it_does_not_have(self, tmp_path: Path):
+    def test_variable_with_the_name_of_another_dimension(self, tmp_path: Path):
         path = tmp_path / "named.nc"
         xr.Dataset({"y": ("time", np.arange(3.0)), "x": ("y", np.arange(4.0))}).drop_vars(
             "y"
@@ -178,7 +178,7 @@ class TestOfOtherWriters:
             assert product["y"].dims == ("time",)
             assert product["x"].dims == ("y",)
 
-    def test_times_without_sense(self, tmp_path: Path):
+    def test_invalid_times(self, tmp_path: Path):
         path = tmp_path / "times.nc"
         units = {"units": "fortnights since the flood"}
         xr.Dataset({"time": ("time", np.arange(3.0), units)}).to_netcdf(path)
@@ -241,7 +241,7 @@ class TestDamage:
 
 
 @pytest.mark.parametrize("skipped", [1, 3])
-def test_chunks_stored_without_some_filters_are_as_hdf5_has_them(
+def test_chunks_stored_without_some_filters_are_read_as_by_hdf5(
     chunked: Path, tmp_path: Path, skipped: int
 ):
     path = tmp_path / "other.nc"

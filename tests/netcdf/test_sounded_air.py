@@ -37,7 +37,7 @@ def cartesian(latitude: float, longitude: float, altitude: float) -> np.ndarray:
     azimuth=st.floats(0, 360),
     up=st.floats(-1e3, 60e3),
 )
-def test_places_lie_on_the_straight_beam(latitude, longitude, altitude, ahead, azimuth, up):
+def test_positions_lie_on_the_straight_beam(latitude, longitude, altitude, ahead, azimuth, up):
     found = beam_positions(latitude, longitude, altitude, *map(np.float64, (ahead, azimuth, up)))
     lat, lon, direction = np.deg2rad([latitude, longitude, azimuth])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
@@ -56,7 +56,7 @@ def test_places_lie_on_the_straight_beam(latitude, longitude, altitude, ahead, a
     assert -180 <= found[1] <= 180
 
 
-def test_north_and_east_are_what_they_are():
+def test_north_and_east_have_the_right_sign():
     east = np.array([0.0, 90.0])
     latitude, longitude = beam_positions(0.0, 179.99, 0.0, np.float64(10e3), east, np.float64(0))
     assert latitude[0] > 0.09
@@ -65,7 +65,7 @@ def test_north_and_east_are_what_they_are():
 
 
 @pytest.mark.parametrize("kind", [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS])
-def test_bins_of_slanting_beams_have_their_own_place(kind: ProductKind):
+def test_bins_of_slant_beams_have_their_own_position(kind: ProductKind):
     product = build_product(MAKERS[kind](zenith=80.0, azimuth=90.0), context(kind))
     bins = product["bin_longitude"]
     along = product["range" if kind is ProductKind.SIGNAL else "section_range"]
@@ -81,7 +81,7 @@ def test_bins_of_slanting_beams_have_their_own_place(kind: ProductKind):
     assert "bin_latitude" not in product[main].attrs["coordinates"].split()
 
 
-def test_a_moving_beam_has_the_place_of_the_station_alone():
+def test_a_moving_beam_has_the_position_of_the_station_only():
     # No tool reads places that change over time and along the beam.
     angles = [0.0, 90.0, 180.0, 270.0, 0.0]
     product = build_product(
@@ -91,7 +91,7 @@ def test_a_moving_beam_has_the_place_of_the_station_alone():
     assert product["latitude"].attrs["standard_name"] == "latitude"
 
 
-def test_where_the_place_is_that_of_the_station_or_unknown_there_is_no_other():
+def test_vertical_beams_and_unknown_azimuths_have_no_bin_positions():
     for beam in ({"zenith": 90.0}, {"zenith": 3.0, "azimuth": 10.0}):
         product = build_product(MAKERS[ProductKind.SIGNAL](**beam), context(ProductKind.SIGNAL))
         assert "bin_latitude" not in product

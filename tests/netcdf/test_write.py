@@ -59,7 +59,7 @@ def truth() -> xr.Dataset:
     )
 
 
-def test_what_is_written_is_what_is_read(product: xr.Dataset, tmp_path: Path):
+def test_products_are_read_as_written(product: xr.Dataset, tmp_path: Path):
     path = tmp_path / "new" / "folder" / "product.nc"
     written = write_product(product, path)
     assert written.size == path.stat().st_size
@@ -94,7 +94,7 @@ def of_noise(profiles: int = 299, bins: int = 2000) -> xr.Dataset:
 
 
 def assert_stored(path: Path, expected: xr.Dataset) -> None:
-    """Compare bytes, as plain netCDF reads them."""
+    """Assert that two files hold the same bytes, as read by netCDF4."""
     with netCDF4.Dataset(path) as file:
         file.set_auto_mask(False)
         file.set_auto_scale(False)
@@ -106,7 +106,7 @@ def assert_stored(path: Path, expected: xr.Dataset) -> None:
             assert file[name][...].tobytes() == native.tobytes(), name
 
 
-def test_large_variables_are_read_as_they_were_by_every_library(tmp_path: Path):
+def test_every_library_reads_large_variables_as_written(tmp_path: Path):
     product = of_noise()
     path = tmp_path / "product.nc"
     write_product(product, path)
@@ -131,7 +131,7 @@ def test_tools_of_another_netcdf_read_large_variables(tmp_path: Path):
             assert stored.astype(variable.dtype).tobytes() == variable.values.tobytes(), name
 
 
-def test_files_are_hardly_larger_than_netcdf_makes_them(
+def test_files_are_hardly_larger_than_those_of_netcdf(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     product = of_noise()
@@ -141,14 +141,14 @@ def test_files_are_hardly_larger_than_netcdf_makes_them(
     assert_stored(tmp_path / "plain.nc", product)
 
 
-def test_a_file_may_be_continued(tmp_path: Path):
+def test_a_file_may_be_extended(tmp_path: Path):
     product = of_noise()
     path = tmp_path / "product.nc"
     write_product(product, path)
     with netCDF4.Dataset(path, "a") as file:
         file["time"][299:310] = 0.0
         assert file["signal"].shape == (310, 2000)
-        # The rest of the last chunk lay in the file all the time.
+        # The file already held the rest of the last chunk.
         assert file["signal"][299:].mask.all()
         assert (file["quality_flag"][299:310].filled() == netCDF4.default_fillvals["i4"]).all()
         file["signal"][305] = 1.0
@@ -182,7 +182,7 @@ def test_arrays_of_any_type_layout_and_size_are_kept(
 
 @pytest.mark.parametrize("name", ["time", "range", "сигнал", "x"])
 def test_large_variables_may_have_any_name(name: str, tmp_path: Path):
-    # A variable called like a dimension that is not its own has another name in HDF5.
+    # A variable with the name of another dimension has a different name in HDF5.
     variables = {
         "x": xr.Variable(("time", "range"), np.ones((2, 2))),
         name: xr.Variable("time", np.arange(BULK_BYTES, dtype="f8")[: 2 if name == "x" else None]),
@@ -195,7 +195,7 @@ def test_large_variables_may_have_any_name(name: str, tmp_path: Path):
     assert_stored(tmp_path / "any.nc", dataset)
 
 
-def test_what_is_defined_is_written_once(
+def test_definitions_are_written_once(
     product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     ends: list[str] = []
@@ -344,7 +344,7 @@ def test_threads_may_write_at_once_and_read_under_the_lock(tmp_path: Path):
 
 
 @pytest.mark.parametrize("failure", [OSError("no"), RuntimeError("NetCDF: HDF error")])
-def test_a_failure_leaves_what_was_there(
+def test_a_failure_leaves_the_former_file(
     failure: Exception, product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     path = tmp_path / "product.nc"
@@ -422,7 +422,7 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_that_cannot_be_is_an_error(product: xr.Dataset, tmp_path: Path):
+def test_an_impossible_folder_is_an_error(product: xr.Dataset, tmp_path: Path):
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(ProductError, match="folder can be written"):
         write_product(product, tmp_path / "file" / "product.nc")
@@ -442,7 +442,7 @@ def test_a_folder_without_permission_is_an_error(product: xr.Dataset, tmp_path: 
         tmp_path.chmod(stat.S_IRWXU)
 
 
-def test_products_have_the_permissions_that_the_user_wants(product: xr.Dataset, tmp_path: Path):
+def test_products_follow_the_umask_of_the_user(product: xr.Dataset, tmp_path: Path):
     before = os.umask(0o022)
     try:
         write_product(product, tmp_path / "product.nc")
@@ -471,13 +471,13 @@ def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
         (np.zeros(0), "empty"),
     ],
 )
-def test_what_netcdf_cannot_hold_is_refused(values, problem, tmp_path: Path):
+def test_data_that_netcdf_cannot_hold_are_refused(values, problem, tmp_path: Path):
     with pytest.raises(ProductError, match=problem):
         write_product(xr.Dataset({"x": ("n", values)}), tmp_path / "product.nc")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_plain_datasets_read_back_as_they_were(tmp_path: Path):
+def test_plain_datasets_are_read_as_written(tmp_path: Path):
     path = tmp_path / "truth.nc"
     written = write_plain(truth(), path)
     assert written.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()

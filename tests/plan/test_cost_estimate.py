@@ -55,7 +55,7 @@ def test_amounts_of_sections():
     assert Term.SIGNAL not in found
 
 
-def test_what_is_known_is_not_digested():
+def test_known_digests_cost_nothing():
     assert Term.DIGEST not in of(sha256="0" * 64)
     scene, made = planned(sha256="0" * 64)
     assert amounts(scene, made, whole=True)[Term.DIGEST] == 10 * 1000
@@ -75,7 +75,7 @@ def test_dark_files_cost_where_they_are_subtracted():
     assert of(products=photon, dark=3)[Term.FILE] == 10
 
 
-def test_a_joined_channel_reads_both():
+def test_a_glued_channel_reads_both_parts():
     up = {"zenith_angle": 0.0}
     joined = of(products={"elastic": {"channels": ["glued_532o"]}}, **up)
     alone = of(products={"elastic": {"channels": ["photon_532o"]}}, **up)
@@ -130,7 +130,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return cost_estimate.calibration_path()
 
 
-def test_a_calibration_comes_back(cache: Path):
+def test_a_calibration_is_read_as_written(cache: Path):
     seconds = {term: 0.1 * number for number, term in enumerate(Term)}
     kept = cost_estimate.save_calibration(
         Costs(seconds, processor=cost_estimate.processor(), date="2026-01-02")
@@ -142,7 +142,7 @@ def test_a_calibration_comes_back(cache: Path):
     assert [path.name for path in cache.parent.iterdir()] == [cache.name]
 
 
-def test_without_a_calibration_the_note_says_so(cache: Path):
+def test_the_note_states_a_missing_calibration(cache: Path):
     found = cost_estimate.load_calibration()
     assert found.seconds == DEFAULTS
     assert found.words.startswith("not calibrated on this machine")

@@ -22,7 +22,7 @@ CASES = [pytest.param((kind, beam), id=f"{kind}-{beam}") for kind in MAKERS for 
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str], Path]:
-    """Give the file of a kind and beam, written once."""
+    """Return a function that gives the file of a kind and pointing, written once."""
     folder = tmp_path_factory.mktemp("products")
 
     def path(kind: ProductKind, beam: str) -> Path:
@@ -36,5 +36,5 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str
 
 @pytest.fixture(scope="session", params=CASES)
 def product(request: pytest.FixtureRequest, made: Callable[[ProductKind, str], Path]) -> Path:
-    """Each of them."""
+    """The file of each kind and pointing."""
     return made(*request.param)

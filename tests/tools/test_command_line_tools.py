@@ -26,13 +26,13 @@ def call(*command: str | Path) -> subprocess.CompletedProcess[str]:
         check=True,
         capture_output=True,
         encoding="utf-8",
-        # CDO cuts names of units and stations between the bytes of a letter.
+        # CDO cuts texts in the middle of a UTF-8 character.
         errors="replace",
     )
 
 
 def measured(product: xr.Dataset) -> Iterator[str]:
-    """Names of numbers over time, which a mean is taken of."""
+    """Return the names of numeric variables over time, which are averaged."""
     for name, variable in product.data_vars.items():
         if variable.dims[:1] == ("time",) and variable.dtype.kind == "f":
             yield str(name)
@@ -55,10 +55,10 @@ def values_of(product: Path) -> list[str]:
 
 @pytest.fixture
 def for_cdo(product: Path, tmp_path: Path) -> Path:
-    """The product, or what is left of it when places are taken out that CDO cannot read.
+    """The product, without positions that CDO cannot read.
 
-    CDO 2.1 skips series whose places lie on no grid; without attribute ``coordinates`` it reads
-    them (``ncatted -a coordinates,,d,,``).
+    CDO 2.1 skips series whose positions are not on a grid. It reads them without the attribute
+    ``coordinates`` (``ncatted -a coordinates,,d,,``).
     """
     if not product.stem.startswith(ProductKind.VISIBILITY):
         return product
@@ -71,7 +71,9 @@ def for_cdo(product: Path, tmp_path: Path) -> Path:
 
 
 @needs("cdo")
-def test_cdo_says_that_it_skips_series_of_many_places(made: Callable[[ProductKind, str], Path]):
+def test_cdo_reports_that_it_skips_series_of_many_positions(
+    made: Callable[[ProductKind, str], Path],
+):
     shown = call("cdo", "showname", made(ProductKind.VISIBILITY, "horizontal"))
     assert "skipped variable visibility_in_air!" in shown.stderr
 
@@ -94,11 +96,11 @@ def test_cdo_takes_means_over_time(product: Path, for_cdo: Path, tmp_path: Path)
 
 
 @needs("cdo")
-def test_cdo_sees_every_number_and_says_which_text_it_skips(product: Path, for_cdo: Path):
+def test_cdo_reads_every_number_and_names_skipped_text(product: Path, for_cdo: Path):
     shown = call("cdo", "showname", for_cdo)
     with xr.open_dataset(product, decode_coords="all") as opened:
         numbers = {str(name) for name, each in opened.data_vars.items() if each.dtype.kind in "fi"}
-    # What has no dimension but the number of a container is no field for CDO.
+    # A scalar container variable is no field for CDO.
     assert numbers - set(shown.stdout.split()) <= {"quantization_info"}
     # CDO 2.1 has no text: the two variables are named on standard error, nothing else is lost.
     for name in ("station", "provenance"):
@@ -127,7 +129,7 @@ def test_nco_takes_means_over_time(product: Path, tmp_path: Path):
 
 
 @needs("ncrcat")
-def test_nco_joins_files_over_time_for_time_is_the_record_dimension(product: Path, tmp_path: Path):
+def test_nco_joins_files_over_time(product: Path, tmp_path: Path):
     later = tmp_path / "later.nc"
     shutil.copy(product, later)
     with netCDF4.Dataset(later, "a") as file:
@@ -150,7 +152,7 @@ def test_nco_joins_files_over_time_for_time_is_the_record_dimension(product: Pat
 
 
 @needs("ncks")
-def test_nco_cuts_variables_with_all_that_belongs_to_them(product: Path, tmp_path: Path):
+def test_nco_extracts_variables_with_their_ancillaries(product: Path, tmp_path: Path):
     names = [name for name in values_of(product) if not name.startswith("bin_")]
     call("ncks", "-v", names[0], "-d", "time,1,3", product, tmp_path / "cut.nc")
     with xr.open_dataset(product) as whole, xr.open_dataset(tmp_path / "cut.nc") as cut:
@@ -173,7 +175,7 @@ def test_ncdump_shows_one_epoch_and_the_meanings_of_flags(product: Path):
     assert "NaN" not in header
 
 
-def test_chunks_are_those_that_the_writer_declares(
+def test_chunks_have_the_declared_shape(
     made: Callable[[ProductKind, str], Path],
 ):
     # An unlimited dimension would give chunks of one profile, and aggregates 30 times slower.

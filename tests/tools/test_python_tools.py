@@ -14,7 +14,7 @@ from lidarops.netcdf.write import write_product
 
 @pytest.fixture
 def sample(product: Path) -> Path:
-    """One product a kind, and a profile in the sense of CF: these libraries are slow to read."""
+    """One product a kind, and a CF profile, because these libraries read slowly."""
     if "scan" not in product.stem and product.stem != "signal_vertical":
         pytest.skip("one beam a kind is enough")
     return product
@@ -40,7 +40,7 @@ def iris(monkeypatch: pytest.MonkeyPatch):
     def encoded(item):
         return plain(item.encode() if isinstance(item, str) else item)
 
-    # iris 3.14 hands text to xxhash, which since version 4 wants bytes: no fault of the file.
+    # iris 3.14 passes text to xxhash, whose version 4 requires bytes.
     monkeypatch.setattr(iris.common.metadata, "xxh64_hexdigest", encoded)
     return iris
 
@@ -71,7 +71,7 @@ def test_cf_python_reads_fields_without_errors(sample: Path):
         found = {field.nc_get_variable(): field for field in fields}
         assert numbers <= {*found, *ancillaries(opened)}
         main = max(fields, key=lambda field: len(field.field_ancillaries()))
-        # Of one field: cf-python takes seconds for each.
+        # One field only: cf-python takes seconds for each.
         assert set(main.dataset_compliance() or {}) <= {"CF version"}
         name = main.nc_get_variable()
         of_main = {each.nc_get_variable() for each in main.field_ancillaries().values()}
@@ -91,7 +91,7 @@ def test_cf_xarray_finds_axes_bounds_and_flags(product: Path):
         assert opened.cf.bounds["time"] == ["time_bnds"]
         assert opened.cf.axes["Z"] == ["altitude"]
         assert opened.cf.axes["T"] == ["time"]
-        # One latitude at most is that of the air.
+        # Only one latitude is that of the values.
         assert len(opened.cf.standard_names["latitude"]) == 1
         flags = opened.cf["quality_flag"]
         known = flags.attrs["flag_meanings"].split()
