@@ -1,7 +1,7 @@
-"""Scans of a clear and of a cloudy atmosphere, and their optical depths height by height.
+"""Scans of clear air and of a cloud, and optical depths of single altitudes.
 
-The estimates are made here by plain NumPy (weighted Kano-Hamilton with the inhomogeneity
-variance of DerSimonian and Laird), so that the vertical solution is tested by itself.
+The estimates come from plain NumPy (weighted Kano-Hamilton with the inhomogeneity variance of
+DerSimonian and Laird), so that the vertical solution is tested on its own.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ FEWEST_BEAMS = 3
 
 @dataclass(frozen=True)
 class Scene:
-    """A scan pattern over a truth; heights above the lidar (or the cloud base) in m."""
+    """A scan of a known atmosphere; altitudes above the lidar (or the cloud base) in m."""
 
     altitude: np.ndarray
     truth: np.ndarray
-    """(height,) or (profile, height) optical depth."""
+    """(altitude,) or (profile, altitude) optical depth."""
     secant: np.ndarray
     inhomogeneity: float
     zenith_snr: np.ndarray
-    """(height,): of the vertical beam without attenuation and distance beyond the vertical."""
+    """(altitude,): signal over noise of the vertical beam, without attenuation."""
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Optical depths of single heights and what their residuals tell."""
+    """Optical depths of single altitudes, and their residual moments."""
 
     optical_depth: np.ndarray
     information: np.ndarray
     residuals: ResidualMoments
     slope: np.ndarray
-    """(profile, height): of tan(zenith angle) on the secant, weighted."""
+    """(profile, altitude): of the weighted regression of tan(zenith angle) on the secant."""
 
 
 def clear_depth(altitude, aerosol=1.0, layer=3000.0):
-    """Molecules, haze of scale height 1.2 km and a layer; 0.157 up to 6.15 km."""
+    """Return the optical depth of air, haze and a layer aloft; 0.157 up to 6.15 km."""
     z = np.asarray(altitude, dtype=np.float64)
     molecules = 0.0131e-3 * 8000.0 * -np.expm1(-z / 8000.0)
     haze = 0.05e-3 * 1200.0 * -np.expm1(-z / 1200.0)
@@ -57,7 +57,7 @@ def clear_depth(altitude, aerosol=1.0, layer=3000.0):
 
 
 def clear(snr, *, inhomogeneity=0.03, largest=75.0, beams=12, aerosol=1.0, layer=3000.0):
-    """12 beams to 75 degree, uniform in the secant, 150-6150 m; `snr` at 1 km, vertically."""
+    """Return 12 beams to 75 degree, uniform in the secant; `snr` is at the zenith in 1 km."""
     altitude = 150.0 + 30.0 * np.arange(201)
     fine = np.arange(0.0, 7000.0, 10.0)
     backscatter = np.gradient(clear_depth(fine), fine)
@@ -72,7 +72,7 @@ def clear(snr, *, inhomogeneity=0.03, largest=75.0, beams=12, aerosol=1.0, layer
 
 
 def cloud(*, largest=30.0, beams=6, inhomogeneity=0.144):
-    """Eight layers of 50 m with 5 to 20 /km, optical depth 4.4, on 40 heights above the base."""
+    """Return a cloud of eight layers of 50 m, optical depth 4.4, on 40 altitudes above the base."""
     extinction = np.repeat([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0], 5) * 1e-3
     altitude = 10.0 * np.arange(1, 41)
     return Scene(
@@ -85,9 +85,9 @@ def cloud(*, largest=30.0, beams=6, inhomogeneity=0.144):
 
 
 def simulate(scene, profiles, rng, correlation=0.0, *, outliers=0.0):
-    """Return noisy logarithms (profile, beam, height) and the variance of their detector noise.
+    """Return noisy logarithms (profile, beam, altitude) and the variance of their detector noise.
 
-    Heights where the expected signal-to-noise ratio is below 3 are NaN, from there upwards.
+    Altitudes are NaN from the first one with an expected signal over noise below 3 upwards.
     """
     x = scene.secant[:, np.newaxis]
     truth = np.broadcast_to(scene.truth, (profiles, scene.altitude.size))[:, np.newaxis, :]
@@ -97,7 +97,7 @@ def simulate(scene, profiles, rng, correlation=0.0, *, outliers=0.0):
         noise[..., k] *= np.sqrt(1.0 - correlation**2)
         noise[..., k] += correlation * noise[..., k - 1]
     deep = scene.zenith_snr[0] > 1e8
-    # Photons are no matter in the cloud scene, whose question is its inhomogeneity.
+    # Detector noise is negligible in the cloud scene, which tests inhomogeneity.
     path = np.zeros(shape) if deep else 2.0 * x * truth
     snr = scene.zenith_snr * np.exp(-path) / x**2
     dark = np.maximum.accumulate(snr < 3.0, axis=2)
@@ -108,13 +108,13 @@ def simulate(scene, profiles, rng, correlation=0.0, *, outliers=0.0):
     if outliers:
         hit = rng.random(shape) < outliers
         logarithm += hit * rng.uniform(0.3, 1.0, shape)
-    # Of the logarithm of a normal deviate, to second order.
+    # Variance of the logarithm of a normal deviate, to second order.
     variance = np.broadcast_to(1.0 / snr**2 + 2.5 / snr**4, shape)
     return logarithm, np.where(np.isfinite(logarithm), variance, np.nan)
 
 
 def _regress(y, x, w):
-    """Weighted straight line along the beams: slope, residual, leverage, centred square sum."""
+    """Fit lines over beams; return slope, residual, leverage, centred path and its square sum."""
     total = w.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         centred = x - (w * x).sum(axis=1, keepdims=True) / total
@@ -126,7 +126,7 @@ def _regress(y, x, w):
 
 
 def _pooled(values):
-    """Sum over the block and over a window of heights (as many as there are)."""
+    """Sum over the block and over a window of altitudes, cut at the ends of the grid."""
     return np.convolve(np.nansum(values, axis=(0, 1)), np.ones(WINDOW), "same")
 
 
@@ -137,7 +137,7 @@ def _weights(variance, inhomogeneity):
 
 
 def kano_hamilton(scene, logarithm, variance):
-    """Optical depth and information height by height, of one block."""
+    """Return optical depth and information at single altitudes of one block."""
     x = scene.secant[np.newaxis, :, np.newaxis]
     y = np.where(np.isfinite(variance), logarithm, 0.0)
     start = scene.inhomogeneity**2
@@ -173,5 +173,5 @@ def retrieve_scan(conditioned, *, station_altitude, **arguments):
 
 
 def estimates(scene, profiles, rng, correlation=0.0, *, outliers=0.0):
-    """Simulate and estimate."""
+    """Return the estimates of a simulated scan."""
     return kano_hamilton(scene, *simulate(scene, profiles, rng, correlation, outliers=outliers))

@@ -16,7 +16,7 @@ ANGLES = np.degrees(np.arccos(1 / PATHS))
 
 
 def clear(bins=201):
-    """Return heights (m), extinction (m-1) and relative backscatter of a clear atmosphere."""
+    """Return altitudes (m), extinction (m-1) and relative backscatter of a clear atmosphere."""
     height = 150.0 + 30.0 * np.arange(bins)
     air = 0.0116 * PER_KM * np.exp(-height / 8000)
     haze = 0.07 * np.exp(-height / 1200) + 0.05 * np.exp(-0.5 * ((height - 3000) / 150) ** 2)
@@ -25,7 +25,7 @@ def clear(bins=201):
 
 
 def cloud(bins=40):
-    """Return heights above its base (m), extinction (m-1) and backscatter of a cloud."""
+    """Return altitudes above its base (m), extinction (m-1) and backscatter of a cloud."""
     height = 10.0 * np.arange(1, bins + 1)
     layers = np.array([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0]) * PER_KM
     extinction = np.interp(height - 5.0, 25.0 + 50.0 * np.arange(8), layers)
@@ -33,7 +33,7 @@ def cloud(bins=40):
 
 
 def depth(height, extinction):
-    """Return optical depths of layers that end at each height."""
+    """Return optical depths up to each altitude."""
     return np.cumsum(extinction * np.diff(height, prepend=0.0))
 
 
@@ -99,7 +99,7 @@ def rms(values):
 
 @dataclass(frozen=True, slots=True)
 class ScanScene:
-    """Air that is level except for scatter, and a scan of it."""
+    """An atmosphere that is horizontally homogeneous except for scatter, and a scan of it."""
 
     zenith_angle: np.ndarray
     """(angle,) degree."""

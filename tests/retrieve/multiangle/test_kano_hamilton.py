@@ -306,13 +306,13 @@ def test_beams_to_all_sides_fit_the_gradient_at_no_cost():
     for azimuths, free in (([0, 120, 240], True), ([0, 180, 180], True), ([0, 60, 120], False)):
         scan = slant_paths.make_scan(angles, height, np.repeat(azimuths, 4))
         distance = np.stack([scan.east, scan.north])
-        one, both = (
+        plain, fitted = (
             fit(y, np.ones_like(y), scan.path, distance, sides=sides)[0][0, :, 0]
             for sides in (False, True)
         )
-        assert (both[kh.SIDES] > 0) == free
+        assert (fitted[kh.SIDES] > 0) == free
         if free:
-            assert one[kh.INFORMATION] / both[kh.INFORMATION] < 1.05**2
+            assert plain[kh.INFORMATION] / fitted[kh.INFORMATION] < 1.05**2
 
 
 def test_inhomogeneity_that_changes_with_altitude_is_followed():

@@ -57,8 +57,8 @@ def scan(
 ) -> tuple[xr.Dataset, dict[str, Any]]:
     """Return conditioned profiles, and their pointing and times.
 
-    Noise is white with the standard deviation `sigma`; the backscatter of each beam and cycle is
-    off by `scatter` from altitude to altitude, and the energy of each profile by `jitter`.
+    Noise is white with the standard deviation `sigma`. The backscatter of each beam and cycle
+    deviates by `scatter` from bin to bin, and the energy of each profile by `jitter`.
     """
     rng = np.random.default_rng(seed)
     beams = len(zenith)
@@ -209,11 +209,11 @@ def test_product_has_monotone_profiles_and_chi_square():
     product = solve(*scan(16), background=FAR)
     depth, risen = product["optical_depth"].to_numpy(), product["monotone_optical_depth"].to_numpy()
     np.testing.assert_array_equal(np.isnan(depth), np.isnan(risen))
-    for one, plain in zip(risen, depth, strict=True):
-        steps = np.diff(one[np.isfinite(one)])
+    for rising_row, row in zip(risen, depth, strict=True):
+        steps = np.diff(rising_row[np.isfinite(rising_row)])
         assert np.all(steps >= 0)
-        rising = np.all(np.diff(plain[np.isfinite(plain)], prepend=0.0) >= 0)
-        assert np.array_equal(one, plain, equal_nan=True) == rising
+        rising = np.all(np.diff(row[np.isfinite(row)], prepend=0.0) >= 0)
+        assert np.array_equal(rising_row, row, equal_nan=True) == rising
     assert float(product["reduced_chi2"].mean()) == pytest.approx(1.0, abs=0.15)
 
 

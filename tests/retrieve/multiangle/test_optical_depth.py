@@ -63,8 +63,8 @@ def assert_same(first, second):
     for name in PROFILES:
         assert np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True), name
     for field in fields(MultiAngleFlags):
-        one, other = getattr(first.flags, field.name), getattr(second.flags, field.name)
-        assert np.array_equal(one, other), field.name
+        masks = getattr(first.flags, field.name), getattr(second.flags, field.name)
+        assert np.array_equal(*masks), field.name
     assert np.array_equal(first.quality, second.quality)
 
 
