@@ -106,13 +106,13 @@ def test_any_slice_equals_that_slice_of_the_whole(chunked: Path, time: object, b
 
 def test_only_requested_values_are_read(chunked: Path, monkeypatch: pytest.MonkeyPatch):
     inflated = []
-    before = read.inflated
+    before = read.inflate_chunk
 
     def counted(data: bytes, chunk: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
         inflated.append(chunk)
         return before(data, chunk, dtype)
 
-    monkeypatch.setattr(read, "inflated", counted)
+    monkeypatch.setattr(read, "inflate_chunk", counted)
     with open_product(chunked, ["signal", "quality_flag"]) as product:
         assert not inflated
         chunk = h5py.File(chunked)["signal"].chunks[0]

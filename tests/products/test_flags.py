@@ -24,16 +24,16 @@ BITS = list(Quality)
 SCENES = {
     Quality.INPUT_MISSING: "test_cubic_and_tail::test_variance_that_is_not_finite_is_missing",
     Quality.SATURATED: "test_labeled_homogeneous::"
-    "test_bad_bins_are_left_out_and_their_bits_carried",
-    Quality.PILE_UP: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
+    "test_bad_bins_are_excluded_and_their_bits_carried",
+    Quality.PILE_UP: "test_labeled_homogeneous::test_bad_bins_are_excluded_and_their_bits_carried",
     Quality.INCOMPLETE_OVERLAP: "test_labeled_homogeneous::"
-    "test_bad_bins_are_left_out_and_their_bits_carried",
+    "test_bad_bins_are_excluded_and_their_bits_carried",
     Quality.TOO_FEW_BINS: "test_path_fit::test_few_bins",
     Quality.NO_SIGNAL: "test_path_fit::test_constant_profile_has_no_signal",
     Quality.LOW_SIGNAL: "test_cubic_and_tail::test_lost_roots_are_flagged",
     Quality.POORLY_DETERMINED: "test_path_fit::test_single_weak_shot_of_counts_is_flagged",
     Quality.NEGATIVE_AMPLITUDE: "test_path_fit::test_inverted_profile_has_negative_amplitude",
-    Quality.AT_BOUND: "test_path_fit::test_extinction_stays_within_given_bounds_and_says_so",
+    Quality.AT_BOUND: "test_path_fit::test_extinction_stays_within_given_bounds_and_is_flagged",
     Quality.POOR_FIT: "test_path_fit::test_wrong_noise_variance_is_flagged",
     Quality.NOT_HOMOGENEOUS: "test_path_fit::"
     "test_backscatter_that_varies_along_the_path_is_flagged",
