@@ -226,10 +226,15 @@ def _divide(power: Any, gain: Array, air: Array, work: Array, out: Array) -> Non
 
 @_compiled
 def _propagate_noise(variance: Array, gain: Array, work: Array, out: Array) -> None:
-    inverse, total, share, others = work[INVERSE], work[TOTAL], work[OWN_SHARE], work[OTHERS]
+    inverse, total, share, other_variance = (
+        work[INVERSE],
+        work[TOTAL],
+        work[OWN_SHARE],
+        work[OTHERS],
+    )
     for i in range(out.size):
-        own = gain[i] - total[i] * share[i]
-        square = own * own * variance[i] + total[i] * total[i] * others[i]
+        own_change = gain[i] - total[i] * share[i]
+        square = own_change * own_change * variance[i] + total[i] * total[i] * other_variance[i]
         out[i] = math.sqrt(square) * inverse[i]
 
 
@@ -270,11 +275,16 @@ def _measure_certainty(
     `limits` are the least square of the denominator over its variance, and the ratio of that
     square to the variance by noise below which noise errors are skewed; these are widened.
     """
-    d, share, others, certainty = work[DENOMINATOR], work[OWN_SHARE], work[OTHERS], work[CERTAINTY]
+    d, share, other_variance, certainty = (
+        work[DENOMINATOR],
+        work[OWN_SHARE],
+        work[OTHERS],
+        work[CERTAINTY],
+    )
     by_offset, by_ratio, by_air = work[BY_OFFSET], work[BY_RATIO], work[BY_AIR]
     reference = by_reference * by_reference
     for i in range(variance.size):
-        noise = others[i] + share[i] * share[i] * variance[i]
+        noise = other_variance[i] + share[i] * share[i] * variance[i]
         noise += offset * offset * by_offset[i] * by_offset[i]
         square = noise + reference
         ratio_change = by_ratio[i] - d[i] * path[GAIN_RATIO, i]
@@ -350,8 +360,8 @@ def _scale(
     constant = d * range_[i] ** 2 / g * math.exp(reach * particles + 2.0 * path[COLUMN, i])
     # The logarithm changes by that of d plus `reach` times the change of the backscatter.
     damped = 1.0 - reach * total
-    own = damped * work[OWN_SHARE, i] + reach * g
-    noise = math.sqrt(damped * damped * work[OTHERS, i] + own * own * variance[i]) / d
+    own_change = damped * work[OWN_SHARE, i] + reach * g
+    noise = math.sqrt(damped * damped * work[OTHERS, i] + own_change * own_change * variance[i]) / d
     background = work[BY_OFFSET, i] * offset / d + reach * out[BACKGROUND, i]
     reference = by_reference / d + reach * out[REFERENCE, i]
     ratio = work[BY_RATIO, i] / d - path[GAIN_RATIO, i] + reach * out[LIDAR_RATIO, i]
@@ -371,8 +381,8 @@ def _attenuate(
     values: Array,
     errors: Array,
 ) -> None:
-    constant, noise, background, rest = scale
-    inverse, constant_error = 1.0 / constant, noise * noise + rest * rest
+    constant, noise, background, other_errors = scale
+    inverse, constant_error = 1.0 / constant, noise * noise + other_errors * other_errors
     for i in range(range_.size):
         factor = range_[i] * range_[i] * inverse
         value = factor * np.float64(power[i])

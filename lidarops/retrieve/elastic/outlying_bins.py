@@ -148,7 +148,7 @@ def _is_usable(power: float, variance: float) -> bool:
 
 
 @_compiled
-def _is_outlying(j: int, left_out: int, place: Array, q: Array, noise: Array) -> bool:
+def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -> bool:
     """Return whether a bin is outlying, with one neighbour left out of the test (-1: none)."""
     left = right = left_range = right_range = largest_variance = 0.0
     left_count = right_count = 0
@@ -157,9 +157,9 @@ def _is_outlying(j: int, left_out: int, place: Array, q: Array, noise: Array) ->
             continue
         largest_variance = max(largest_variance, noise[k])
         if k < j:
-            left, left_range, left_count = left + q[k], left_range + place[k], left_count + 1
+            left, left_range, left_count = left + q[k], left_range + ranges[k], left_count + 1
         else:
-            right, right_range, right_count = right + q[k], right_range + place[k], right_count + 1
+            right, right_range, right_count = right + q[k], right_range + ranges[k], right_count + 1
     left, left_range = left / left_count, left_range / left_count
     right, right_range = right / right_count, right_range / right_count
     step = abs(right - left)
@@ -172,9 +172,9 @@ def _is_outlying(j: int, left_out: int, place: Array, q: Array, noise: Array) ->
     low, high = np.inf, -np.inf
     for k in range(j - _HALF, j + _HALF + 1):
         if k not in (j, left_out):
-            residual = q[k] - left - slope * (place[k] - left_range)
+            residual = q[k] - left - slope * (ranges[k] - left_range)
             low, high = min(low, residual), max(high, residual)
-    own_residual = q[j] - left - slope * (place[j] - left_range)
+    own_residual = q[j] - left - slope * (ranges[j] - left_range)
     beyond = max(own_residual - high, low - own_residual)
     noise_limit = OUTLYING * np.sqrt(max(largest_variance, noise[j]))
     spread = high - low - SPREAD_BY_NOISE * np.sqrt(largest_variance)
@@ -185,36 +185,38 @@ def _is_outlying(j: int, left_out: int, place: Array, q: Array, noise: Array) ->
 def _farthest(j: int, q: Array) -> int:
     """Return the non-adjacent neighbour that is farthest from the mean of the adjacent ones."""
     middle = 0.5 * (q[j - 1] + q[j + 1])
-    farthest, most = -1, 0.0
+    farthest, largest_distance = -1, 0.0
     for k in range(j - _HALF, j + _HALF + 1):
-        if abs(k - j) > 1 and abs(q[k] - middle) > most:
-            farthest, most = k, abs(q[k] - middle)
+        if abs(k - j) > 1 and abs(q[k] - middle) > largest_distance:
+            farthest, largest_distance = k, abs(q[k] - middle)
     return farthest
 
 
 @_compiled
 def _most_equal(j: int, power: Array) -> int:
     """Return the largest number of neighbours that have the same power."""
-    most = 0
+    largest_count = 0
     for k in range(j - _HALF, j + _HALF + 1):
         equal = 0
         for other in range(j - _HALF, j + _HALF + 1):
             if j not in (k, other) and power[other] == power[k]:
                 equal += 1
-        most = max(most, equal)
-    return most
+        largest_count = max(largest_count, equal)
+    return largest_count
 
 
 @_compiled
-def _may_hold_outliers(power: Any, variance: Array, back: Array, ahead: Array) -> bool:
+def _may_hold_outliers(
+    power: Any, variance: Array, factor_below: Array, factor_above: Array
+) -> bool:
     """Return whether a bin is missing, or beyond both adjacent bins by more than noise."""
     suspects = 0
     for i in range(1, power.size - 1):
-        own = np.float64(power[i])
-        below = own - back[i] * np.float64(power[i - 1])
-        above = own - ahead[i] * np.float64(power[i + 1])
+        value = np.float64(power[i])
+        below = value - factor_below[i] * np.float64(power[i - 1])
+        above = value - factor_above[i] * np.float64(power[i + 1])
         peak = (below * above > 0.0) & (below * below > OUTLYING**2 * variance[i])
-        missing = not ((abs(own) < _HUGE) & (variance[i] >= 0.0) & (variance[i] < _HUGE))
+        missing = not ((abs(value) < _HUGE) & (variance[i] >= 0.0) & (variance[i] < _HUGE))
         suspects += 1 if peak | missing else 0
     return suspects > 0
 
@@ -224,32 +226,32 @@ def _mark_outliers(power: Any, variance: Array, range_: Array, work: Array, outl
     """Mark the outlying bins of all profiles, and return their number."""
     total = 0
     bins = range_.size
-    back, ahead = np.zeros(bins), np.zeros(bins)
-    back[1:] = (range_[:-1] / range_[1:]) ** 2
-    ahead[:-1] = (range_[1:] / range_[:-1]) ** 2
-    place, q, noise, index, value_of = work[0], work[1], work[2], work[3], work[4]
+    factor_below, factor_above = np.zeros(bins), np.zeros(bins)
+    factor_below[1:] = (range_[:-1] / range_[1:]) ** 2
+    factor_above[:-1] = (range_[1:] / range_[:-1]) ** 2
+    usable_range, q, noise, index, usable_power = work[0], work[1], work[2], work[3], work[4]
     for p in range(power.shape[0]):
         row = variance[p % variance.shape[0]]
-        if not _may_hold_outliers(power[p], row, back, ahead):
+        if not _may_hold_outliers(power[p], row, factor_below, factor_above):
             continue
         count = 0
         for i in range(bins):
-            value, own = np.float64(power[p, i]), row[i]
-            if _is_usable(value, own):
+            value, value_variance = np.float64(power[p, i]), row[i]
+            if _is_usable(value, value_variance):
                 square = range_[i] * range_[i]
-                q[count], noise[count] = value * square, own * square * square
+                q[count], noise[count] = value * square, value_variance * square * square
                 noise[count] = max(noise[count], (_ROUNDING * q[count]) ** 2)
-                place[count], index[count], value_of[count] = range_[i], i, value
+                usable_range[count], index[count], usable_power[count] = range_[i], i, value
                 count += 1
         for j in range(_HALF, count - _HALF):
             below, above = q[j] - q[j - 1], q[j] - q[j + 1]
             if below * below <= OUTLYING**2 * noise[j] or not below * above > 0.0:
                 continue
             farthest = max(index[j + _HALF] - index[j], index[j] - index[j - _HALF])
-            if farthest > _FARTHEST or _most_equal(j, value_of) > MOST_EQUAL:
+            if farthest > _FARTHEST or _most_equal(j, usable_power) > MOST_EQUAL:
                 continue
-            if _is_outlying(j, -1, place, q, noise) or _is_outlying(
-                j, _farthest(j, q), place, q, noise
+            if _is_outlying(j, -1, usable_range, q, noise) or _is_outlying(
+                j, _farthest(j, q), usable_range, q, noise
             ):
                 outlying[p, int(index[j])] = True
                 total += 1

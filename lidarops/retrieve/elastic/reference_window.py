@@ -264,8 +264,8 @@ def _rejections(
     for reason, passed in passes.items():
         rejections[~passed] |= np.int32(reason)
     # Too few bins do not define a shape; the tests of the shape do not apply.
-    few = (rejections & np.int32(Rejection.TOO_FEW_BINS)) != 0
-    rejections[few] &= np.int32(Rejection.TOO_FEW_BINS | Rejection.EXCLUDED)
+    has_few_bins = (rejections & np.int32(Rejection.TOO_FEW_BINS)) != 0
+    rejections[has_few_bins] &= np.int32(Rejection.TOO_FEW_BINS | Rejection.EXCLUDED)
     return rejections
 
 
@@ -276,8 +276,8 @@ def _pick(statistics: Array, rejections: Codes, most_deviation: float) -> npt.ND
     upper = np.where(passed, scale + most_deviation * error, np.inf)
     anchor = np.argmin(upper, axis=-1)[:, np.newaxis]
     lowest = np.take_along_axis(scale, anchor, axis=-1)
-    least = np.take_along_axis(error, anchor, axis=-1)
-    has_more_particles = passed & (scale - lowest > most_deviation * np.hypot(error, least))
+    lowest_error = np.take_along_axis(error, anchor, axis=-1)
+    has_more_particles = passed & (scale - lowest > most_deviation * np.hypot(error, lowest_error))
     rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
     precision = np.where(rejections == 0, error, np.inf)
     best = np.argmin(precision, axis=-1)

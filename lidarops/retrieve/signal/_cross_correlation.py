@@ -43,7 +43,7 @@ def add_products(
         for t in range(first.shape[1]):
             x, y = first[c, t], second[c, t]
             for p in range(edges.size - 1):
-                part = y[edges[p] : edges[p + 1]]
+                segment = y[edges[p] : edges[p + 1]]
                 for j in range(2 * reach + 1):
                     start = edges[p] + j - reach
-                    sums[c, p, j] += _product(x[start : start + part.size], part)
+                    sums[c, p, j] += _product(x[start : start + segment.size], segment)

@@ -257,7 +257,7 @@ def combine(
                 variance += (1.0 - share) ** 2 * yv
             if 0.0 < share < 1.0:
                 variance += 2.0 * correlation * share * (1.0 - share) * math.sqrt(xv * yv)
-            known = abs(mean) < HUGE
-            out[0, k, i] = mean if known else math.nan
-            out[1, k, i] = variance if known else math.nan
-            out[2, k, i] = share * share * systematic if known else math.nan
+            valid = abs(mean) < HUGE
+            out[0, k, i] = mean if valid else math.nan
+            out[1, k, i] = variance if valid else math.nan
+            out[2, k, i] = share * share * systematic if valid else math.nan

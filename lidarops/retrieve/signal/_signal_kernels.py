@@ -183,8 +183,8 @@ def _window_counts(counts: npt.NDArray[np.int64], windows: Windows, out: Array) 
 @_compiled
 def _window_sum(s: _Sums, first: np.uint32, past: np.uint32) -> float:
     after, last = first // np.uint32(BLOCK) + np.uint32(1), past // np.uint32(BLOCK)
-    whole = (s.high[last] - s.high[after]) + (s.low[last] - s.low[after])
-    return float((s.tail[first] + s.head[past]) + whole)
+    whole_blocks = (s.high[last] - s.high[after]) + (s.low[last] - s.low[after])
+    return float((s.tail[first] + s.head[past]) + whole_blocks)
 
 
 @_compiled
@@ -329,10 +329,10 @@ def _voltage(
         count = counts[i]
         value = count * step - dark[i]
         extreme = (count == _LOWEST) | (count == -_HIGHEST) | (count == _HIGHEST)
-        lost = missing | extreme | (not abs(value) < math.inf)
+        unusable = missing | extreme | (not abs(value) < math.inf)
         saturated = np.float64(count) >= full
-        power[i] = math.nan if lost | saturated else value
-        quality[i] = overlap[i] | (_MISSING if lost else 0) | (_SATURATED if saturated else 0)
+        power[i] = math.nan if unusable | saturated else value
+        quality[i] = overlap[i] | (_MISSING if unusable else 0) | (_SATURATED if saturated else 0)
 
 
 @_compiled
@@ -362,8 +362,8 @@ def voltage_profiles(
     """
     for k in range(counts.shape[0]):
         missing = (not shots[k] > 0.0) | _is_off(counts[k])
-        own = dark[k % dark.shape[0]]
-        _voltage(counts[k], missing, step[k], full[k], own, overlap, power[k], quality[k])
+        profile_dark = dark[k % dark.shape[0]]
+        _voltage(counts[k], missing, step[k], full[k], profile_dark, overlap, power[k], quality[k])
 
 
 @_compiled
@@ -431,14 +431,14 @@ def _rate(
         load = rate * counter.assumed_dead_time
         saturated = load > counter.paralysis
         piled = load / (1.0 - (counter.paralysis if saturated else load)) > counter.pile_up
-        lost = missing | (count < 0) | (count == _HIGHEST)
-        invalid = lost | saturated
+        missing_bin = missing | (count < 0) | (count == _HIGHEST)
+        invalid = missing_bin | saturated
         value = rate / (1.0 - rate * counter.dead_time)
         power[i] = math.nan if invalid else value
         s.values[i] = 0.0 if invalid else value
         s.finite[i] = 0 if invalid else 1
         valid_bins += s.finite[i]
-        bits = overlap[i] | (_MISSING if lost else 0) | (_SATURATED if saturated else 0)
+        bits = overlap[i] | (_MISSING if missing_bin else 0) | (_SATURATED if saturated else 0)
         quality[i] = bits | (_PILE_UP if piled else 0)
     return bool(valid_bins == counts.size)
 

@@ -69,6 +69,6 @@ def add_profiles(
             if g < 0 or not 0.0 < weight < HUGE:
                 continue
             group_sums = (sums[0, k, g], sums[1, k, g], sums[2, k, g], sums[3, k, g])
-            own = variance[k % variance.shape[0], t % variance.shape[1]]
-            common = shared[k % shared.shape[0], t % shared.shape[1]]
-            _add(values[k, t], own, common, weight, group_sums, count[k, g])
+            profile_variance = variance[k % variance.shape[0], t % variance.shape[1]]
+            profile_shared = shared[k % shared.shape[0], t % shared.shape[1]]
+            _add(values[k, t], profile_variance, profile_shared, weight, group_sums, count[k, g])

@@ -196,9 +196,9 @@ def _add_rounding(variance: Array, scale: _Scale) -> Array:
         unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
         measured = rows[coarse] / unit
         median = np.sort(measured, axis=-1)[:, (measured.shape[-1] - 1) // 2, np.newaxis]
-        least = np.fmin(measured, median)
-        harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(least - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
-        common = np.maximum((0.25 - least) / 3.0, harmonic)
+        noise = np.fmin(measured, median)
+        harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(noise - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
+        common = np.maximum((0.25 - noise) / 3.0, harmonic)
         raised = unit * (np.maximum(measured, 1.0 / 12.0) + shots * common)
     rows[coarse] = np.where(measured >= _FINE, rows[coarse], raised)
     return raised_variance

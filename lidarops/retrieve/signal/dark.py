@@ -139,7 +139,7 @@ def _signals(values: npt.ArrayLike) -> Array:
 
 def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Array]:
     """Return both as s since the first dark file."""
-    both = []
+    arrays = []
     for name, values in (("dark_times", dark_times), ("times", times)):
         array = np.atleast_1d(np.asarray(values))
         if array.ndim != 1 or array.dtype.kind not in "iufM":
@@ -148,18 +148,18 @@ def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Ar
                 field=name,
                 remedy="give one time for each profile, in s or as datetime64",
             )
-        both.append(array)
-    if (both[0].dtype.kind == "M") != (both[1].dtype.kind == "M"):
+        arrays.append(array)
+    if (arrays[0].dtype.kind == "M") != (arrays[1].dtype.kind == "M"):
         raise RetrievalInputError(
-            f"hold {both[0].dtype}, the times {both[1].dtype}",
+            f"hold {arrays[0].dtype}, the times {arrays[1].dtype}",
             field="dark_times",
             remedy="give both as datetime64, or both in s",
         )
-    if both[0].dtype.kind == "M":
+    if arrays[0].dtype.kind == "M":
         # Division makes NaT a NaN; a cast to float would make it a number.
-        origin = both[0][:1].astype("M8[ns]")
-        both = [(array.astype("M8[ns]") - origin) / np.timedelta64(1, "s") for array in both]
-    dark_seconds, seconds = (array.astype(np.float64) for array in both)
+        origin = arrays[0][:1].astype("M8[ns]")
+        arrays = [(array.astype("M8[ns]") - origin) / np.timedelta64(1, "s") for array in arrays]
+    dark_seconds, seconds = (array.astype(np.float64) for array in arrays)
     for name, array in (("dark_times", dark_seconds), ("times", seconds)):
         if not np.all(np.isfinite(array)):
             raise RetrievalInputError(

@@ -243,19 +243,19 @@ def _search(
     """Return first and past-the-last bin of the window of each block, (0, 0) for none."""
     analog = averaging.time_mean(x, xv, groups=block_index)
     rate = _smooth(averaging.time_mean(y, 0.0, groups=block_index).values)
-    highest = np.full(len(rate), np.inf)
-    np.minimum.at(highest, block_index, top)
+    rate_limit = np.full(len(rate), np.inf)
+    np.minimum.at(rate_limit, block_index, top)
     with np.errstate(invalid="ignore"):
         noise = np.sqrt(_smooth(analog.variance * analog.count))
         above_noise = _smooth(analog.values) >= least_snr * noise
-        usable_bins = (rate >= bottom) & (rate <= highest[:, np.newaxis]) & above_noise
+        usable_bins = (rate >= bottom) & (rate <= rate_limit[:, np.newaxis]) & above_noise
     first, past = (np.zeros(len(usable_bins), dtype=np.intp) for _ in (0, 1))
     _line_fit.longest_runs(usable_bins, first, past)
     index = np.arange(rate.shape[1])
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
-    most = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
-    least = np.where(inside, rate, np.inf).min(axis=1, initial=np.inf)
-    usable = (past - first >= FEWEST_BINS) & (most >= LEAST_FALL * least)
+    highest_rate = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
+    lowest_rate = np.where(inside, rate, np.inf).min(axis=1, initial=np.inf)
+    usable = (past - first >= FEWEST_BINS) & (highest_rate >= LEAST_FALL * lowest_rate)
     return np.where(usable, first, 0), np.where(usable, past, 0)
 
 

@@ -89,10 +89,10 @@ def condition(
         range_offset=range_offset,
         full_overlap_range=full_overlap_range,
     )
-    parts = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_SIGNAL_DTYPES)
+    arrays = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_SIGNAL_DTYPES)
     # All parts have the same coordinates; passing them avoids a comparison.
-    variables = {name: part.variable for name, part in zip(_SIGNAL_NAMES, parts, strict=True)}
-    result = xr.Dataset(variables, coords=parts[0].coords)
+    variables = {name: array.variable for name, array in zip(_SIGNAL_NAMES, arrays, strict=True)}
+    result = xr.Dataset(variables, coords=arrays[0].coords)
     result["power"].attrs = {"units": source.unit}
     result["variance"].attrs = {"units": f"{source.unit}2"}
     result["range"].attrs = source.inputs[0]["range"].attrs
@@ -136,14 +136,14 @@ def range_corrected_signals(
         range_offset=range_offset,
         full_overlap_range=full_overlap_range,
     )
-    parts = source.mapped(
+    arrays = source.mapped(
         _signals,
         ranged=3,
         plain=2,
         dtypes=_RANGE_CORRECTED_DTYPES,
         background_range=background_range,
     )
-    return _named(parts)
+    return _named(arrays)
 
 
 def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
@@ -164,7 +164,7 @@ def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, fl
         INPUT_MISSING without a background. BACKGROUND_UNCERTAIN where the bins before those are
         brighter by 4 standard errors, which means that the background contains signal.
     """
-    parts = xr.apply_ufunc(
+    arrays = xr.apply_ufunc(
         _corrected,
         *(conditioned[name] for name in _SIGNAL_NAMES),
         input_core_dims=[["range"]] * 3,
@@ -176,7 +176,7 @@ def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, fl
         dask="parallelized",
         output_dtypes=_RANGE_CORRECTED_DTYPES,
     )
-    return _named(parts)
+    return _named(arrays)
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
@@ -184,10 +184,10 @@ def channel_unit(archive: xr.Dataset, channel: str) -> str:
     return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
 
 
-def _named(parts: Sequence[xr.DataArray]) -> xr.Dataset:
+def _named(arrays: Sequence[xr.DataArray]) -> xr.Dataset:
     names = ("signal", "signal_standard_error", "quality_flag")
     along_time = ("background", "background_standard_error")
-    return xr.Dataset(dict(zip((*names, *along_time), parts, strict=True)))
+    return xr.Dataset(dict(zip((*names, *along_time), arrays, strict=True)))
 
 
 class _Source:
@@ -348,14 +348,14 @@ def _corrected(
         background_variance=tail.background_standard_error**2,
         dtype=np.float32,
     )
-    lost = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    bits = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
     falling = _still_falls(power, variance, range, background_range, tail)
-    lost |= np.where(falling, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
+    bits |= np.where(falling, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     # Noise is far above the precision of float32, which halves the memory of a day of profiles.
     return (
         result.power,
         np.sqrt(result.variance, out=result.variance),
-        quality | lost[..., np.newaxis],
+        quality | bits[..., np.newaxis],
         tail.background,
         tail.background_standard_error,
     )
@@ -385,7 +385,7 @@ def _still_falls(
 
 def _signals(
     counts: _Block,
-    *others: _Block,
+    *other_inputs: _Block,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
     **settings: Any,
@@ -393,7 +393,7 @@ def _signals(
     chunks = [
         _corrected(
             *_conditioned(
-                counts[rows], *(array[rows] for array in others), range=range, **settings
+                counts[rows], *(array[rows] for array in other_inputs), range=range, **settings
             ),
             range=range,
             background_range=background_range,

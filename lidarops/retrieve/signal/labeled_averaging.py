@@ -130,8 +130,8 @@ def _packed(
     packed: da.Array = da.blockwise(  # type: ignore[no-untyped-call]
         _averaged,
         "tpr",
-        *(part for array in arrays for part in (array, "tr")),
-        *(part for column in columns for part in (column, "t")),
+        *(argument for array in arrays for argument in (array, "tr")),
+        *(argument for column in columns for argument in (column, "t")),
         rows,
         "tr",
         new_axes={"p": 3},

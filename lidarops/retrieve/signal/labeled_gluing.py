@@ -167,8 +167,8 @@ def _shifted_quality(quality: _Block, lag: float) -> _Block:
     """Return the bits of the two bins from which a shifted bin is interpolated."""
     index = np.arange(quality.shape[-1])
     shifted = np.zeros_like(quality)
-    for place in (index + int(np.floor(lag)), index + int(np.ceil(lag))):
-        inside = (place >= 0) & (place < index.size)
-        bits = quality[..., np.clip(place, 0, index.size - 1)]
+    for source in (index + int(np.floor(lag)), index + int(np.ceil(lag))):
+        inside = (source >= 0) & (source < index.size)
+        bits = quality[..., np.clip(source, 0, index.size - 1)]
         shifted |= np.where(inside, bits, _MISSING).astype(quality.dtype)
     return shifted

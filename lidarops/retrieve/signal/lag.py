@@ -210,33 +210,33 @@ def _correlate(first: Array, second: Array, reach: int) -> Array:
 
 def _peak(total: Array, lags: npt.NDArray[np.int64]) -> tuple[Array, Array, Booleans]:
     """Return the lag, its distance to the centroid of four bins, and whether it is the largest."""
-    place = np.argmax(total[..., _MARGIN:-_MARGIN], axis=-1) + _MARGIN
+    index = np.argmax(total[..., _MARGIN:-_MARGIN], axis=-1) + _MARGIN
 
     def at(shift: int | npt.NDArray[np.int64]) -> Array:
-        return np.take_along_axis(total, np.asarray(place + shift)[..., np.newaxis], -1)[..., 0]
+        return np.take_along_axis(total, np.asarray(index + shift)[..., np.newaxis], -1)[..., 0]
 
     side = np.where(at(1) >= at(-1), 1, -1)
     peak, beside = _correct_for_high_pass(at(0), at(side))
     outside = at(-side), at(2 * side)
-    both = peak + beside
-    base = both / _HIGH_PASS
-    sum_of_four = both + outside[0] + outside[1] + 2.0 * base
+    sum_of_two = peak + beside
+    base = sum_of_two / _HIGH_PASS
+    sum_of_four = sum_of_two + outside[0] + outside[1] + 2.0 * base
     with np.errstate(invalid="ignore", divide="ignore"):
-        fraction = np.clip(beside / both, 0.0, 1.0)
+        fraction = np.clip(beside / sum_of_two, 0.0, 1.0)
         moment = beside - (outside[0] + base) + 2.0 * (outside[1] + base)
         systematic = np.minimum(np.abs(moment / sum_of_four - fraction), 1.0)
-        lag = np.where(both > 0, lags[place] + side * fraction, np.nan)
-    ends = (place == _MARGIN) | (place == lags.size - 1 - _MARGIN)
+        lag = np.where(sum_of_two > 0, lags[index] + side * fraction, np.nan)
+    ends = (index == _MARGIN) | (index == lags.size - 1 - _MARGIN)
     return lag, systematic, ends
 
 
 def _correct_for_high_pass(peak: Array, beside: Array) -> tuple[Array, Array]:
     """Return two neighbouring correlations corrected for the subtracted running mean."""
-    own, other = 1.0 - 1.0 / _HIGH_PASS, -1.0 / _HIGH_PASS - 1.0 / _HIGH_PASS**2
-    determinant = own**2 - other**2
+    peak_response, side_response = 1.0 - 1.0 / _HIGH_PASS, -1.0 / _HIGH_PASS - 1.0 / _HIGH_PASS**2
+    determinant = peak_response**2 - side_response**2
     return (
-        (own * peak - other * beside) / determinant,
-        (own * beside - other * peak) / determinant,
+        (peak_response * peak - side_response * beside) / determinant,
+        (peak_response * beside - side_response * peak) / determinant,
     )
 
 
@@ -311,12 +311,12 @@ def shift_signal(
     lags = inputs.profile_values(lag, "lag", values.shape[:-1])
     rows, noises = values.reshape(-1, values.shape[-1]), noise.reshape(-1, values.shape[-1])
     amount = np.broadcast_to(np.zeros(1) if lags is None else lags, len(rows))
-    moved, variances = _shifted(rows, noises, amount)
-    return moved.reshape(values.shape), variances.reshape(values.shape)
+    shifted, variances = _shifted(rows, noises, amount)
+    return shifted.reshape(values.shape), variances.reshape(values.shape)
 
 
 def _shifted(rows: Array, noises: Array, amount: Array) -> tuple[Array, Array]:
-    moved, variances = np.zeros(rows.shape), np.zeros(rows.shape)
+    shifted, variances = np.zeros(rows.shape), np.zeros(rows.shape)
     for value in np.unique(amount):
         selected = slice(None) if np.all(amount == value) else np.flatnonzero(amount == value)
         profiles, variances_of_profiles = rows[selected], noises[selected]
@@ -328,17 +328,17 @@ def _shifted(rows: Array, noises: Array, amount: Array) -> tuple[Array, Array]:
             if weight != 0.0:
                 _add_shifted(profiles, whole_bins + offset, weight, total)
                 _add_shifted(variances_of_profiles, whole_bins + offset, weight**2, spread)
-        moved[selected], variances[selected] = total, spread
-    missing = ~np.isfinite(moved)
-    moved[missing] = np.nan
+        shifted[selected], variances[selected] = total, spread
+    missing = ~np.isfinite(shifted)
+    shifted[missing] = np.nan
     variances[missing] = np.nan
-    return moved, variances
+    return shifted, variances
 
 
-def _add_shifted(rows: Array, whole: int, weight: float, total: Array) -> None:
+def _add_shifted(rows: Array, whole_bins: int, weight: float, total: Array) -> None:
     bins = rows.shape[1]
-    first, past = min(max(-whole, 0), bins), max(min(bins - whole, bins), 0)
+    first, past = min(max(-whole_bins, 0), bins), max(min(bins - whole_bins, bins), 0)
     total[:, :first] = np.nan
     total[:, past:] = np.nan
     if first < past:
-        total[:, first:past] += weight * rows[:, first + whole : past + whole]
+        total[:, first:past] += weight * rows[:, first + whole_bins : past + whole_bins]

@@ -404,13 +404,13 @@ def test_monte_carlo_agrees_with_the_first_order_where_errors_are_small():
 
 def test_monte_carlo_is_reproducible_and_independent_of_other_profiles():
     measured, r, _, setup = campaign(4, 14)
-    one = monte_carlo(measured, r, **setup, samples=5, seed=1)
-    again = monte_carlo(measured, r, **setup, samples=5, seed=1)
-    other = monte_carlo(measured, r, **setup, samples=5, seed=2)
+    first = monte_carlo(measured, r, **setup, samples=5, seed=1)
+    repeated = monte_carlo(measured, r, **setup, samples=5, seed=1)
+    other_seed = monte_carlo(measured, r, **setup, samples=5, seed=2)
     last = monte_carlo(measured[3], r, **setup, samples=5, seed=1)
-    np.testing.assert_array_equal(one.standard_error, again.standard_error)
-    np.testing.assert_array_equal(one.standard_error[3], last.standard_error)
-    assert not np.array_equal(one.standard_error, other.standard_error)
+    np.testing.assert_array_equal(first.standard_error, repeated.standard_error)
+    np.testing.assert_array_equal(first.standard_error[3], last.standard_error)
+    assert not np.array_equal(first.standard_error, other_seed.standard_error)
 
 
 # Bins without a value -----------------------------------------------------------------------
@@ -546,10 +546,10 @@ def test_layout_and_order_of_the_arrays_do_not_matter():
         name: value[..., ::-1] if np.shape(value)[-1:] == r.shape else value
         for name, value in setup.items()
     }
-    back = fields(
+    descending = fields(
         invert_elastic(np.asfortranarray(measured[:, ::-1]).astype(">f8"), r[::-1], **turned)
     )
-    for values, in_cube, in_back in zip(whole, cube, back, strict=True):
+    for values, in_cube, in_back in zip(whole, cube, descending, strict=True):
         np.testing.assert_array_equal(in_cube.reshape(values.shape), values)
         np.testing.assert_array_equal(in_back[..., ::-1] if values.ndim == 2 else in_back, values)
     single = invert_elastic(measured[0], r, **setup)
@@ -588,13 +588,13 @@ def test_windows_can_be_given_as_bins_or_for_each_profile():
 @given(scale=st.floats(1e-6, 1e12))
 def test_the_unit_of_the_power_does_not_matter(scale):
     setup = noisy_setup(COARSE_POWER, COARSE) | ERRORS
-    one = invert_elastic(COARSE_POWER, COARSE, **setup)
+    original = invert_elastic(COARSE_POWER, COARSE, **setup)
     setup["variance"] = setup["variance"] * scale**2
     setup["background_standard_error"] *= scale
-    other = invert_elastic(COARSE_POWER * scale, COARSE, **setup)
-    np.testing.assert_allclose(other.backscatter, one.backscatter, rtol=1e-9, atol=1e-18)
-    np.testing.assert_allclose(other.budget.total, one.budget.total, rtol=1e-9)
-    assert other.lidar_constant == pytest.approx(scale * one.lidar_constant, rel=1e-9)
+    scaled = invert_elastic(COARSE_POWER * scale, COARSE, **setup)
+    np.testing.assert_allclose(scaled.backscatter, original.backscatter, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(scaled.budget.total, original.budget.total, rtol=1e-9)
+    assert scaled.lidar_constant == pytest.approx(scale * original.lidar_constant, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -325,8 +325,8 @@ def test_the_near_range_does_not_degrade_sums_of_the_far_range(decades: int) -> 
     assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
     if decades > 0:
         # Differences of one running sum, as in the oracle, lose these digits.
-        lost = np.abs(oracle_signal.smooth(values, distance) - exact)
-        assert lost.max() > 1e-10 * size[np.argmax(lost)]
+        oracle_error = np.abs(oracle_signal.smooth(values, distance) - exact)
+        assert oracle_error.max() > 1e-10 * size[np.argmax(oracle_error)]
 
 
 def test_a_constant_signal_has_no_noise_slope() -> None:
@@ -356,12 +356,12 @@ def test_windows_do_not_reach_over_bins_that_were_left_on_disk() -> None:
     result = counts_to_signal.photon_signal(counts[:, kept], shots, distance[kept], **settings)
     whole = counts_to_signal.photon_signal(counts, shots, distance, **settings)
     np.testing.assert_array_equal(result.power, whole.power[:, kept])
-    place = 0
+    start = 0
     for part in parts:
-        here = slice(place, place + part.stop - part.start)
+        stretch = slice(start, start + part.stop - part.start)
         alone = counts_to_signal.photon_signal(counts[:, part], shots, distance[part], **settings)
-        np.testing.assert_allclose(result.variance[:, here], alone.variance, rtol=1e-12)
-        place = here.stop
+        np.testing.assert_allclose(result.variance[:, stretch], alone.variance, rtol=1e-12)
+        start = stretch.stop
     # Light falls by nine decades over the gap: a window over it would take that for noise.
     np.testing.assert_allclose(result.variance, whole.variance[:, kept], rtol=0.2)
 
@@ -535,6 +535,6 @@ def test_an_offset_of_the_electronics_makes_no_noise(offset):
     power = light + offset + rng.normal(0.0, np.sqrt(variance), (20, distance.size))
     result = counts_to_signal.difference_variance(power, distance)
     for low, high in ((1000, 2000), (3000, 5000), (8000, 12_000), (20_000, 28_000)):
-        part = (distance > low) & (distance < high)
-        ratio = np.mean(result[:, part] / variance[part])
+        bins = (distance > low) & (distance < high)
+        ratio = np.mean(result[:, bins] / variance[bins])
         assert 0.93 < ratio < 1.07
