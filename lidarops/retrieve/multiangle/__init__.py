@@ -15,3 +15,11 @@ A scan passes through these modules in order:
    the air is horizontally stratified.
 5. `labeled.retrieve_optical_depth` turns the result into the ``multiangle`` product.
 """
+
+from lidarops.retrieve.multiangle.optical_depth import (
+    MultiAngleMethod,
+    MultiAngleResult,
+    retrieve_optical_depth,
+)
+
+__all__ = ["MultiAngleMethod", "MultiAngleResult", "retrieve_optical_depth"]
