@@ -90,21 +90,21 @@ def plan_network(scene: Scene, campaign: Campaign) -> Plan:
         Steps of the channels of every member, then those of the network, whose settings name the
         beams. Without steps where the beams do not cross; `left_out` then states why.
     """
-    case = NetworkCase(scene, campaign)
+    case = _NetworkCase(scene, campaign)
     steps: list[Step] = []
     left_out: list[LeftOut] = []
     _sort(applied((PRESENT,), case), steps, left_out)
     for member in scene.members:
-        _sort(applied(MEMBER, MemberCase(member, campaign, case.settings)), steps, left_out)
+        _sort(applied(MEMBER, _MemberCase(member, campaign, case.settings)), steps, left_out)
     able = {step.instrument for step in steps}
     beams = [
         beam
         for member in scene.members
         if member.instrument in able
-        for beam in MemberCase(member, campaign, case.settings).pointings()
+        for beam in _MemberCase(member, campaign, case.settings).pointings()
     ]
     wavelengths = [step.settings["wavelength"] for step in steps if step.name == StepName.READ]
-    crossings = CrossingsCase(case, tuple(beams), tuple(wavelengths))
+    crossings = _CrossingsCase(case, tuple(beams), tuple(wavelengths))
     _sort(applied(CROSSINGS, crossings), [], left_out)
     if crossings.reason:
         return Plan(scene.id, (), tuple(left_out))
@@ -129,7 +129,7 @@ def visibility_settings(settings: VisibilitySettings) -> dict[str, Any]:
     }
 
 
-def beams_of(
+def _beams_of(
     beams: Sequence[BeamPlan], scene: Scene, campaign: Campaign
 ) -> tuple[geometry.Beam, ...]:
     """Return the position and direction of the beams."""
@@ -160,7 +160,7 @@ def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArra
     return np.asarray(middles + range_offset(ranged, facts))
 
 
-def granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
+def _granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
     """Return zenith angle and azimuth of a granule; facts of the campaign override headers."""
     zenith = granule.zenith_angle if facts.zenith_angle is None else facts.zenith_angle
     azimuth = granule.azimuth if facts.azimuth is None else facts.azimuth
@@ -170,7 +170,7 @@ def granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, f
 
 
 @dataclass(frozen=True, slots=True)
-class NetworkCase:
+class _NetworkCase:
     """A scene of a network, as the rules see it."""
 
     scene: Scene
@@ -193,7 +193,7 @@ class NetworkCase:
 
 
 @dataclass(frozen=True, slots=True)
-class MemberCase:
+class _MemberCase:
     """The scene of one member of a network, as the rules see it."""
 
     scene: Scene
@@ -242,7 +242,7 @@ class MemberCase:
         last = self.channel.bins * self.channel.bin_width
         if self.settings.background_range and self.settings.background_range[0] >= last:
             return f"background_range begins beyond the last bin, which ends at {last:g} m", last
-        if any(granule_pointing(granule, facts) is None for granule in self.scene.granules):
+        if any(_granule_pointing(granule, facts) is None for granule in self.scene.granules):
             return "neither headers nor campaign give the pointing of all beams", None
         return "", None
 
@@ -252,7 +252,7 @@ class MemberCase:
             {
                 direction
                 for granule in self.scene.granules
-                if (direction := granule_pointing(granule, self.facts)) is not None
+                if (direction := _granule_pointing(granule, self.facts)) is not None
             }
         )
         end = float(channel_ranges(self.channel, self.facts)[-1])
@@ -279,20 +279,20 @@ def _left(
     return LeftOut(StepName.VISIBILITY.value, settings.channel, reason, member, number=number)
 
 
-def _present(case: NetworkCase) -> Decisions:
+def _present(case: _NetworkCase) -> Decisions:
     present = {member.instrument for member in case.scene.members}
     for name in case.campaign.networks[case.scene.instrument].instruments:
         if name not in present:
             yield _left(case.settings, name, "no granule in the window", 0.0)
 
 
-def _fits(case: MemberCase) -> Decisions:
+def _fits(case: _MemberCase) -> Decisions:
     reason, number = case.why_not()
     if reason:
         yield _left(case.settings, case.scene.instrument, reason, number)
 
 
-def _signals(case: MemberCase) -> Decisions:
+def _signals(case: _MemberCase) -> Decisions:
     """Decide on the steps from the counts of a member to its signal, by the rules of a channel."""
     if case.why_not()[0]:
         return
@@ -316,7 +316,7 @@ def _read(case: Case, metres: float) -> Step:
     return replace(step, rule=_MEMBER_CHANNEL)
 
 
-def _background(case: MemberCase) -> Decisions:
+def _background(case: _MemberCase) -> Decisions:
     if case.why_not()[0]:
         return
     channel = case.channel
@@ -343,7 +343,7 @@ def angle_between(pointing: tuple[float, float], other: tuple[float, float]) -> 
     return math.degrees(2.0 * math.asin(min(1.0, 0.5 * math.dist(first, second))))
 
 
-def network_of(
+def _network_of(
     beams: Sequence[BeamPlan],
     scene: Scene,
     campaign: Campaign,
@@ -353,7 +353,7 @@ def network_of(
 ) -> geometry.Network:
     """Return the crossings of beams; see `lidarops.retrieve.network.geometry.build_network`."""
     return geometry.build_network(
-        beams_of(beams, scene, campaign),
+        _beams_of(beams, scene, campaign),
         tolerance=tolerance,
         nearest=[beam.nearest for beam in beams],
         farthest=[beam.farthest for beam in beams],
@@ -361,11 +361,11 @@ def network_of(
     )
 
 
-class CrossingsCase:
+class _CrossingsCase:
     """The beams of a network, as the rules see them, which determine those that cross."""
 
     def __init__(
-        self, whole: NetworkCase, beams: Sequence[BeamPlan], wavelengths: Sequence[float]
+        self, whole: _NetworkCase, beams: Sequence[BeamPlan], wavelengths: Sequence[float]
     ) -> None:
         self.whole = whole
         self.beams = tuple(beams)
@@ -377,7 +377,7 @@ class CrossingsCase:
     def crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
         """Return the crossings of beams."""
         settings = self.whole.settings
-        return network_of(
+        return _network_of(
             beams, self.whole.scene, self.whole.campaign,
             tolerance=settings.tolerance, smallest_angle=settings.smallest_angle,
         )  # fmt: skip
@@ -388,7 +388,7 @@ class CrossingsCase:
         return self.whole.without(StepName.VISIBILITY, reason, number=number)
 
 
-def _one_wavelength(case: CrossingsCase) -> Decisions:
+def _one_wavelength(case: _CrossingsCase) -> Decisions:
     wavelengths = case.wavelengths
     if wavelengths and max(wavelengths) - min(wavelengths) > _SAME_WAVELENGTH:
         listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
@@ -396,13 +396,13 @@ def _one_wavelength(case: CrossingsCase) -> Decisions:
         yield case.no_network(reason, max(wavelengths) - min(wavelengths))
 
 
-def _few_enough(case: CrossingsCase) -> Decisions:
+def _few_enough(case: _CrossingsCase) -> Decisions:
     if not case.reason and len(case.beams) > geometry.MOST_BEAMS:
         reason = f"{len(case.beams)} beams exceed the limit of {geometry.MOST_BEAMS}"
         yield case.no_network(reason, float(len(case.beams)))
 
 
-def _beams_meet(case: CrossingsCase) -> Decisions:
+def _beams_meet(case: _CrossingsCase) -> Decisions:
     """Leave out beams with fewer than two crossings, until all remaining beams have two."""
     if case.reason:
         return
@@ -421,13 +421,13 @@ def _beams_meet(case: CrossingsCase) -> Decisions:
     case.kept = tuple(kept)
 
 
-def _some_left(case: CrossingsCase) -> Decisions:
+def _some_left(case: _CrossingsCase) -> Decisions:
     if not case.reason and not case.kept:
         reason = "no beam has two crossings with other beams, between which it is attenuated"
         yield case.no_network(reason, 0.0)
 
 
-def _cycle(case: CrossingsCase) -> Decisions:
+def _cycle(case: _CrossingsCase) -> Decisions:
     method = case.whole.settings.method
     if case.reason or method not in {"cycle", "multiplier", "unbiased"}:
         return
@@ -437,7 +437,7 @@ def _cycle(case: CrossingsCase) -> Decisions:
         yield case.no_network(f"method {method}: {error}", float(len(case.kept)))
 
 
-def _range_window(case: CrossingsCase) -> Decisions:
+def _range_window(case: _CrossingsCase) -> Decisions:
     """Decide, for every instrument, which bins its crossings and its background need."""
     network = case.crossings(case.kept)
     for member in case.whole.scene.members:
@@ -445,11 +445,11 @@ def _range_window(case: CrossingsCase) -> Decisions:
         if numbers:
             farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
             yield _member_window(
-                MemberCase(member, case.whole.campaign, case.whole.settings), farthest
+                _MemberCase(member, case.whole.campaign, case.whole.settings), farthest
             )
 
 
-def _member_window(case: MemberCase, farthest: float) -> Step | LeftOut:
+def _member_window(case: _MemberCase, farthest: float) -> Step | LeftOut:
     channel = case.channel
     counts = case.channel_case(channel)
     if channel.name.startswith(GLUED) or channel.mode is not DetectionMode.PHOTON:
@@ -480,13 +480,13 @@ def _merged(stretches: Iterable[tuple[int, int]], bins: int) -> list[list[int]]:
     return kept
 
 
-def _average(case: CrossingsCase) -> Decisions:
+def _average(case: _CrossingsCase) -> Decisions:
     seconds = case.whole.settings.average.total_seconds()
     reason = "signals are averaged before the retrieval: noise biases means of retrieved values"
     yield case.whole.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
 
 
-def _prior(case: CrossingsCase) -> Decisions:
+def _prior(case: _CrossingsCase) -> Decisions:
     settings = case.whole.settings
     if settings.method != "network":
         reason = f"method {settings.method} uses no prior"
@@ -503,7 +503,7 @@ def _prior(case: CrossingsCase) -> Decisions:
         yield case.whole.step(StepName.PRIOR, reason, number=number)
 
 
-def _visibility(case: CrossingsCase) -> Decisions:
+def _visibility(case: _CrossingsCase) -> Decisions:
     """Yield the step that retrieves visibility from the beams of all members."""
     settings, network = case.whole.settings, case.crossings(case.kept)
     beams = case.kept

@@ -39,7 +39,7 @@ Profiles = Callable[[str, Sequence[Granule]], xr.Dataset]
 
 
 @dataclass(frozen=True, slots=True)
-class SectionCase:
+class _SectionCase:
     """One section of a homogeneous step, with what sampled profiles show there."""
 
     step: Step
@@ -59,23 +59,23 @@ class SectionCase:
         )
 
 
-def _dark(sight: SectionCase) -> Decisions:
-    if sight.first.significance < DARK and sight.all.significance < STILL_DARK:
-        most = max(sight.first.significance, sight.all.significance)
+def _dark(case: _SectionCase) -> Decisions:
+    if case.first.significance < DARK and case.all.significance < STILL_DARK:
+        most = max(case.first.significance, case.all.significance)
         reason = (
-            f"no signal in {sight.all.profiles} profiles at most {GAP.total_seconds() / 60:g} min"
+            f"no signal in {case.all.profiles} profiles at most {GAP.total_seconds() / 60:g} min"
             f" apart: at most {most:.1f} standard errors (limit {STILL_DARK:g})"
         )
-        yield sight.without(reason, most)
+        yield case.without(reason, most)
 
 
-def _saturated(sight: SectionCase) -> Decisions:
-    if sight.first.unsaturated == sight.all.unsaturated == 0:
+def _saturated(case: _SectionCase) -> Decisions:
+    if case.first.unsaturated == case.all.unsaturated == 0:
         reason = (
-            f"all {sight.all.profiles} profiles, at most {GAP.total_seconds() / 60:g} min apart,"
+            f"all {case.all.profiles} profiles, at most {GAP.total_seconds() / 60:g} min apart,"
             " are saturated"
         )
-        yield sight.without(reason, 0.0)
+        yield case.without(reason, 0.0)
 
 
 SECTION_DARK: Final = Rule(
@@ -148,7 +148,7 @@ def _sections(
     for section in doubtful:
         both = _merged_looks(first[section], second.get(section))
         decision = next(
-            applied(REFINEMENTS, SectionCase(step, *section, first[section], both)), None
+            applied(REFINEMENTS, _SectionCase(step, *section, first[section], both)), None
         )
         if isinstance(decision, LeftOut):
             omitted[section] = decision
