@@ -176,7 +176,7 @@ def correlated(rng: np.random.Generator, shape: tuple[int, ...], correlation: fl
 # Scenes ---------------------------------------------------------------------------------------
 
 
-def hazy_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array]:
+def _hazy_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array]:
     """Return extinction (m-1) and backscatter (m-1 sr-1) of air, haze and a layer aloft.
 
     Parameters
@@ -207,7 +207,7 @@ def clear(ratio: float, *, outliers: float = 0.0, bins: int = 201) -> Scene:
         Number of altitudes, 30 m apart.
     """
     height = 150.0 + 30.0 * np.arange(bins, dtype=np.float64)
-    extinction, backscatter = hazy_air(height, np.ones(1), np.full(1, 3000.0))
+    extinction, backscatter = _hazy_air(height, np.ones(1), np.full(1, 3000.0))
     path = np.linspace(1.0, 1.0 / np.cos(np.radians(75.0)), 12)
     label = f"clear air, SNR {ratio:g}"
     angles = np.degrees(np.arccos(1.0 / path))
@@ -296,7 +296,7 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     if rng.random() < 0.5:
         height = 150.0 + 60.0 * np.arange(100, dtype=np.float64)
         layer = rng.uniform(1500.0, 4500.0, (profiles, 1))
-        extinction, backscatter = hazy_air(height, amount, layer)
+        extinction, backscatter = _hazy_air(height, amount, layer)
     else:
         base = cloud()
         height, extinction = base.altitude, 0.5 * amount * base.extinction
@@ -352,7 +352,7 @@ def retrieve(scan: Scan, method: str, *, robust: bool = True) -> MultiAngleResul
 
 def with_prior(scan: Scan, prior: Array) -> ScanEstimates:
     """Retrieve by "mld_prior" with a given prior of optical depth."""
-    return to_estimates(
+    return _to_estimates(
         retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,
@@ -364,7 +364,7 @@ def with_prior(scan: Scan, prior: Array) -> ScanEstimates:
     )
 
 
-def to_estimates(result: MultiAngleResult) -> ScanEstimates:
+def _to_estimates(result: MultiAngleResult) -> ScanEstimates:
     """Return the values of a result that are compared."""
     return ScanEstimates(
         optical_depth=result.optical_depth,
@@ -377,11 +377,11 @@ def to_estimates(result: MultiAngleResult) -> ScanEstimates:
 
 
 def _own_method(scan: Scan, *, method: str) -> ScanEstimates:
-    return to_estimates(retrieve(scan, method))
+    return _to_estimates(retrieve(scan, method))
 
 
 def _mld(scan: Scan, *, regularisation: Regularisation) -> ScanEstimates:
-    return to_estimates(
+    return _to_estimates(
         retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,

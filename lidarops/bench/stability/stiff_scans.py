@@ -48,7 +48,7 @@ BITS: Final = {
 """Quality bit of each flag, as in the products."""
 
 
-def solve_scan(altitudes: slice = slice(None), **arguments: Any) -> Answer:
+def _solve_scan(altitudes: slice = slice(None), **arguments: Any) -> Answer:
     """Return some altitudes of the solution; its standard errors include the gradient error."""
     result = optical_depth.retrieve_optical_depth(**arguments)
     bits = np.asarray(result.quality).copy()
@@ -88,7 +88,7 @@ def _short() -> Scene:
 def scan_arguments(
     scene_of: Any = _short, profiles: int = 16, *seed: int, **more: Any
 ) -> dict[str, Any]:
-    """Return the arguments of `solve_scan` for scans of a scene."""
+    """Return the arguments of `_solve_scan` for scans of a scene."""
     scene, signal, variance = _drawn(scene_of, profiles, *(seed or (41,)))
     arguments = {
         "signal": signal,
@@ -183,7 +183,7 @@ def _with_sample(value: float) -> dict[str, Any]:
 def _change_of_others(**arguments: Any) -> Answer:
     """Return the largest change of the other profiles, in their standard errors."""
     rest = np.delete(np.arange(16), 3)
-    changed, clean = solve_scan(**arguments), solve_scan(**scan_arguments())
+    changed, clean = _solve_scan(**arguments), _solve_scan(**scan_arguments())
     change = (changed.value("optical_depth") - clean.value("optical_depth"))[rest]
     stated = clean.value("optical_depth_standard_error")[rest]
     return Answer({"change": np.nanmax(np.abs(change / stated))})
@@ -199,7 +199,7 @@ def _with_horizontal_beams() -> Answer:
         "variance": np.concatenate([arguments["variance"], flat], axis=1),
         "zenith_angle": np.append(angle, [89.0, 90.0]),
     }
-    return _compare(solve_scan(**extended), solve_scan(**arguments))
+    return _compare(_solve_scan(**extended), _solve_scan(**arguments))
 
 
 def _compare(first: Answer, other: Answer) -> Answer:
@@ -219,7 +219,7 @@ def _scale_signals(factor: float) -> Answer:
     scaled = arguments | {
         "signal": arguments["signal"] * factor, "variance": arguments["variance"] * factor**2
     }  # fmt: skip
-    return _compare(solve_scan(**scaled), solve_scan(**arguments))
+    return _compare(_solve_scan(**scaled), _solve_scan(**arguments))
 
 
 def _permute_beams() -> Answer:
@@ -229,14 +229,14 @@ def _permute_beams() -> Answer:
         "signal": arguments["signal"][:, order], "variance": arguments["variance"][:, order],
         "zenith_angle": arguments["zenith_angle"][order],
     }  # fmt: skip
-    return _compare(solve_scan(**permuted), solve_scan(**arguments))
+    return _compare(_solve_scan(**permuted), _solve_scan(**arguments))
 
 
 def _without_stated_noise() -> Answer:
     arguments = scan_arguments()
     floor = (1e-6 * arguments["signal"]) ** 2
-    noiseless = solve_scan(**arguments | {"variance": np.zeros_like(floor)})
-    return _compare(noiseless, solve_scan(**arguments | {"variance": floor}))
+    noiseless = _solve_scan(**arguments | {"variance": np.zeros_like(floor)})
+    return _compare(noiseless, _solve_scan(**arguments | {"variance": floor}))
 
 
 def _without_empty_beams(method: str) -> Answer:
@@ -249,7 +249,7 @@ def _without_empty_beams(method: str) -> Answer:
         "signal": arguments["signal"][:, keep], "variance": arguments["variance"][:, keep],
         "zenith_angle": arguments["zenith_angle"][keep],
     }  # fmt: skip
-    return _compare(solve_scan(**arguments | {"signal": signal}), solve_scan(**reduced))
+    return _compare(_solve_scan(**arguments | {"signal": signal}), _solve_scan(**reduced))
 
 
 def _solve_without_noise(span: float, scale: float) -> Answer:
@@ -270,20 +270,20 @@ def _solved_cases() -> tuple[StiffCase, ...]:
     same = (Near("change", 0.0, 1e-9, relative=False), Near("same flags", 1.0, 0.0))
     honest = Covered("optical_depth", _truth, most=1e-3)
     return (
-        _case("a one beam", build=lambda: scan_arguments(_one_beam), solve=solve_scan,
+        _case("a one beam", build=lambda: scan_arguments(_one_beam), solve=_solve_scan,
               expected=(Flagged(Quality.NO_LEVERAGE), Missing("optical_depth"))),
         _case("b all beams at one angle", build=lambda: scan_arguments(_equal_beams),
-              solve=solve_scan, expected=(Flagged(Quality.NO_LEVERAGE), Missing("optical_depth"))),
+              solve=_solve_scan, expected=(Flagged(Quality.NO_LEVERAGE), Missing("optical_depth"))),
         _case("slant paths from 1 to 1.035", build=lambda: scan_arguments(_narrow),
-              solve=solve_scan,
+              solve=_solve_scan,
               expected=(Flagged(Quality.LOW_LEVERAGE),
                         Covered("optical_depth", partial(_truth, _narrow), most=1e-3))),
         _case("c slant paths from 1 to 1.001", build=lambda: scan_arguments(_narrowest),
-              solve=solve_scan,
+              solve=_solve_scan,
               expected=(Flagged(Quality.LOW_LEVERAGE | Quality.NO_LEVERAGE),
                         Covered("optical_depth", partial(_truth, _narrowest), most=1e-3))),
         _case("c the same, altitude by altitude: a standard error of 14",
-              build=lambda: scan_arguments(_narrowest, method="kano_hamilton"), solve=solve_scan,
+              build=lambda: scan_arguments(_narrowest, method="kano_hamilton"), solve=_solve_scan,
               expected=(Flagged(Quality.LOW_LEVERAGE),
                         Between("random error at the top", 7.0, 28.0))),
         _case("d beams along the horizon are ignored", build=dict, solve=_with_horizontal_beams,
@@ -299,16 +299,16 @@ def _solved_cases() -> tuple[StiffCase, ...]:
             for value in (1e300, -1e300, np.inf)
         ),
         _case("e the profile with a sample of 1e300", build=lambda: _with_sample(1e300),
-              solve=solve_scan, expected=(honest,)),
-        _case("f all signals negative", solve=solve_scan,
+              solve=_solve_scan, expected=(honest,)),
+        _case("f all signals negative", solve=_solve_scan,
               build=lambda: scan_arguments() | {"signal": -scan_arguments()["signal"]},
               expected=(Missing("optical_depth"), Missing("extinction"), Flagged(_ANY))),
-        _case("all NaN", solve=solve_scan,
+        _case("all NaN", solve=_solve_scan,
               build=lambda: scan_arguments()
               | {"signal": np.full_like(scan_arguments()["signal"], np.nan)},
               expected=(Missing("optical_depth"), Flagged(Quality.INPUT_MISSING))),
         _case("g 30 % missing, a gap of 6 altitudes, half the beams lost aloft", build=_with_gaps,
-              solve=solve_scan,
+              solve=_solve_scan,
               expected=(Covered("optical_depth", _truth, valued=0.9, most=1e-3),)),
         *(
             _case(f"g missing beams have no effect, {method}",
@@ -316,24 +316,24 @@ def _solved_cases() -> tuple[StiffCase, ...]:
             for method in ("kano_hamilton", "joint")
         ),
         _case("h optical depth 20 in 600 m", build=lambda: scan_arguments(_thick, 100),
-              solve=solve_scan,
+              solve=_solve_scan,
               expected=(Covered("optical_depth", partial(_truth, _thick), most=5e-3),)),
         _case("h and nothing beyond its reach", build=lambda: scan_arguments(_thick, 100),
-              solve=partial(solve_scan, slice(30, 60)),
+              solve=partial(_solve_scan, slice(30, 60)),
               expected=(Missing("optical_depth"), Flagged(Quality.EXTRAPOLATED))),
         _case("i constant extinction: smoothing has no bias, and most blocks are saturated",
               build=dict, solve=_blocks_of_constant,
               expected=(Near("optical depth at the top", 0.24, 0.01),
                         Between("share saturated", 0.75, 1.0))),
         _case("j signal over noise 10 at the zenith", build=lambda: scan_arguments(_weak, 64),
-              solve=solve_scan,
+              solve=_solve_scan,
               expected=(Covered("optical_depth", partial(_truth, _weak), most=1e-3),)),
         *(
-            _case(f"k {bins} altitudes", build=partial(_first_altitudes, bins), solve=solve_scan,
+            _case(f"k {bins} altitudes", build=partial(_first_altitudes, bins), solve=_solve_scan,
                   expected=(Covered("optical_depth", partial(_first_truth, bins), most=1e-3),))
             for bins in (1, 3)
         ),
-        _case("k, p one profile", build=lambda: scan_arguments(_short, 1), solve=solve_scan,
+        _case("k, p one profile", build=lambda: scan_arguments(_short, 1), solve=_solve_scan,
               expected=(Covered("optical_depth", _truth, valued=0.5, most=1e-3),)),
         *(
             _case(f"l signals times {factor:g}", build=partial(dict, factor=factor),
@@ -344,16 +344,16 @@ def _solved_cases() -> tuple[StiffCase, ...]:
         _case("m a variance of zero counts as noise of 1e-6 of the signal", build=dict,
               solve=_without_stated_noise, expected=same),
         _case("n beams at 0, 0.01, 7, 7 and 15 degrees", build=lambda: scan_arguments(_close_beams),
-              solve=solve_scan,
+              solve=_solve_scan,
               expected=(Covered("optical_depth", partial(_truth, _close_beams), most=1e-3),)),
         *(
             _case(f"n the same, {method}",
                   build=partial(scan_arguments, _close_beams, method=method),
-                  solve=solve_scan, expected=(Accepted(0.5),))
+                  solve=_solve_scan, expected=(Accepted(0.5),))
             for method in ("mld", "two_angle", "kano_hamilton", "auto")
         ),
         _case("o cloud at 15 degrees, extinction varies: withheld",
-              build=lambda: scan_arguments(_varying, 64), solve=partial(solve_scan, inside),
+              build=lambda: scan_arguments(_varying, 64), solve=partial(_solve_scan, inside),
               expected=(Missing("extinction"),
                         Flagged(Quality.POOR_STRATIFICATION | Quality.EXTRAPOLATED))),
         *(
@@ -387,7 +387,7 @@ def _first_truth(bins: int) -> Array:
 
 def _refused_cases() -> tuple[StiffCase, ...]:
     def wrong(name: str, field: str | None, **more: Any) -> StiffCase:
-        return _case(name, build=lambda: scan_arguments() | more, solve=solve_scan,
+        return _case(name, build=lambda: scan_arguments() | more, solve=_solve_scan,
                      expected=(Refused(RetrievalInputError, field),))  # fmt: skip
 
     height = _short().altitude
