@@ -12,7 +12,7 @@ import yaml
 from support.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.run.archive import Options, reprocess
+from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
 
@@ -70,8 +70,8 @@ def test_a_fixed_beam_is_not_a_scan(tmp_path):
     instrument = simulation["instruments"]["scanner"]
     still = instrument | {"scan": {"zenith_angles": [0], "azimuth": 90}}
     settings, _ = campaign(tmp_path, duration=400, instruments={"scanner": still})
-    (outcome,) = reprocess(settings).scenes
-    assert "does not scan" in outcome.error
+    (reason,) = bring_up_to_date(settings).empty_scenes.values()
+    assert "does not scan" in reason
 
 
 @pytest.mark.slow
