@@ -11,7 +11,14 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+# Inlined by force: a reassociated sum as a symbol of its own has other bits fresh than cached.
+@numba.njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"reassoc", "contract", "nsz"},
+)
 def _product(first: Any, second: Any) -> float:
     total = 0.0
     for i in range(second.size):

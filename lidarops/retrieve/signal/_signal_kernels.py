@@ -42,8 +42,14 @@ _PILE_UP: Final = int(Quality.PILE_UP)
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _finding = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
+# Inlined by force: a reassociated sum as a symbol of its own has other bits fresh than cached.
+_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 _summing = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"contract", "nsz", "reassoc"},
 )
 
 
@@ -272,7 +278,7 @@ def _floor(x: Array, weight: Array) -> float:
     return lowest
 
 
-@_compiled
+@_inlined
 def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float]:
     """Return y at the floor of x and the slope, neither below zero; NaN without weights."""
     x_mean, y_mean = _means(x, y, weight)
@@ -288,7 +294,7 @@ def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float
     return lowest, slope
 
 
-@_compiled
+@_inlined
 def _estimate(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> None:
     complete = _load(power, s.sums)
     _averages(s.sums, noise.narrow, complete, s.mean)

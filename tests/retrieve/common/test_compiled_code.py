@@ -13,7 +13,7 @@ import pytest
 from numba import config
 from numba.core.registry import CPUDispatcher
 
-from lidarops.retrieve import background, homogeneous
+from lidarops.retrieve import background, homogeneous, signal
 from lidarops.retrieve.common.compiled_code import keep_apart
 from lidarops.retrieve.signal._signal_kernels import photon_profiles
 
@@ -75,7 +75,7 @@ def depends_on_optimisation(function: CPUDispatcher) -> bool:
     return any(depends_on_optimisation(callee) for callee in callees(function))
 
 
-@pytest.mark.parametrize("package", [background, homogeneous])
+@pytest.mark.parametrize("package", [background, homogeneous, signal])
 def test_called_functions_that_are_reassociated_are_inlined(package: ModuleType):
     """A symbol of its own has other bits when compiled in this process than from the cache."""
     called = {callee for function in compiled_functions(package) for callee in callees(function)}
