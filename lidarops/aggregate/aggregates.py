@@ -52,7 +52,7 @@ class AggregateResult:
     """Products that could not be read."""
     failed: list[str] = field(default_factory=list)
     """Aggregates that could not be made, one sentence each."""
-    told: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     """Notes, one sentence each."""
 
 
@@ -90,11 +90,11 @@ def make_aggregates(
         raise ProductError("no product found", file=root, remedy=_remedy(made))
     made.products = len(products)
     by_group = groups(products)
-    made.told += grid_notes(by_group)
+    made.notes += grid_notes(by_group)
     if options.selection == EVERYTHING:
         made.index = write_index(root, products)
     else:
-        made.told.append("the index lists all products; run without a selection to update it")
+        made.notes.append("the index lists all products; run without a selection to update it")
     for group_products in by_group.values():
         _try(made, partial(_view, made, group_products))
         if options.period is not None:

@@ -102,7 +102,7 @@ def _tell(made: AggregateResult) -> None:
         add_row(refused, product.path, product.reason)
     for table in (views, means, refused):
         show(table)
-    for sentence in made.told:
+    for sentence in made.notes:
         typer.echo(f"note: {sentence}")
     for sentence in made.failed:
         typer.secho(f"failed: {sentence}", fg="red", err=True)

@@ -18,7 +18,12 @@ from lidarops.campaign.simulation import DamageKind, SimulationSettings
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
-from lidarops.simulate.site import PlannedFile, Site, channel_name, photon_dead_time
+from lidarops.simulate.planned_files import (
+    PlannedFile,
+    SimulatedSite,
+    channel_name,
+    photon_dead_time,
+)
 from lidarops.simulate.truth import FileTruth, TruthTable
 
 if TYPE_CHECKING:
@@ -56,7 +61,7 @@ class SimulationPlan:
     """Every file that a simulation will write."""
 
     campaign: Campaign
-    sites: tuple[Site, ...]
+    sites: tuple[SimulatedSite, ...]
     files: tuple[tuple[PlannedFile, ...], ...]
     """Files of each site: dark files first, then signal files in time."""
     paths: tuple[str, ...]
@@ -67,7 +72,7 @@ class SimulationPlan:
 class _Batch:
     """Files of one instrument that are written together, and their rows in the truth."""
 
-    site: Site
+    site: SimulatedSite
     files: tuple[PlannedFile, ...]
     rows: tuple[int | None, ...]
     """None for dark files."""
@@ -254,7 +259,7 @@ def _write(
     return _BatchResult(len(work), size, tuple(truths))
 
 
-def _sites(campaign: Campaign) -> list[Site]:
+def _sites(campaign: Campaign) -> list[SimulatedSite]:
     settings = campaign.simulation
     if settings is None:
         raise CampaignError(
@@ -283,7 +288,7 @@ def _clash(stem: str, other: str) -> bool:
     return same_folder and (stem.startswith(other) or other.startswith(stem))
 
 
-def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Site:
+def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> SimulatedSite:
     if key not in campaign.instruments:
         known = ", ".join(sorted(campaign.instruments))
         raise CampaignError(
@@ -298,7 +303,7 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Site:
         patterns[Role.DARK] = instrument.dark_files
     places = {role: _place_of(key, role, globs) for role, globs in patterns.items()}
     station = campaign.stations[instrument.station]
-    return Site(
+    return SimulatedSite(
         key=key,
         settings=settings,
         instrument=instrument,
@@ -321,7 +326,7 @@ def _origin(campaign: Campaign, settings: SimulationSettings) -> Station:
     return campaign.stations[key]
 
 
-def _check_air(site: Site) -> None:
+def _check_air(site: SimulatedSite) -> None:
     air = site.settings.air_of(site.key)
     east, north, _ = site.position
     distance = math.hypot(east, north)
@@ -334,7 +339,7 @@ def _check_air(site: Site) -> None:
         )
 
 
-def _check_facts(site: Site, files: Iterable[PlannedFile]) -> None:
+def _check_facts(site: SimulatedSite, files: Iterable[PlannedFile]) -> None:
     """Check the facts at every file before the first file is written."""
     field = f"instruments.{site.key}.facts"
     if site.simulated.pointing is not None:
@@ -364,7 +369,7 @@ def _check_facts(site: Site, files: Iterable[PlannedFile]) -> None:
             _check_vertical(site, planned)
 
 
-def _check_vertical(site: Site, planned: PlannedFile) -> None:
+def _check_vertical(site: SimulatedSite, planned: PlannedFile) -> None:
     facts = site.instrument.facts_at(site.start_of(planned.role, planned.index))
     if site.pointing_of(planned, facts)[0] and facts.zenith_angle is None:
         raise CampaignError(
@@ -386,7 +391,9 @@ def _place_of(key: str, role: Role, patterns: list[str]) -> tuple[str, str]:
     return match["folder"], match["prefix"]
 
 
-def _paths(sites: Sequence[Site], files: Sequence[Sequence[PlannedFile]]) -> tuple[str, ...]:
+def _paths(
+    sites: Sequence[SimulatedSite], files: Sequence[Sequence[PlannedFile]]
+) -> tuple[str, ...]:
     paths: dict[str, None] = {}
     for site, planned_files in zip(sites, files, strict=True):
         for planned in planned_files:
@@ -401,7 +408,9 @@ def _paths(sites: Sequence[Site], files: Sequence[Sequence[PlannedFile]]) -> tup
     return tuple(paths)
 
 
-def _refuse_foreign_files(archive: Path, sites: Sequence[Site], expected: frozenset[str]) -> None:
+def _refuse_foreign_files(
+    archive: Path, sites: Sequence[SimulatedSite], expected: frozenset[str]
+) -> None:
     for site in sites:
         for role, folder in site.folder.items():
             matches = (archive / folder).glob(f"{site.prefix[role]}*")

@@ -35,15 +35,15 @@ from lidarops.simulate.photoelectrons import (
     delay_recorder,
     release,
 )
-from lidarops.simulate.signal import backscatter_signal, bin_centres
-from lidarops.simulate.site import (
+from lidarops.simulate.planned_files import (
     PlannedFile,
-    Site,
+    SimulatedSite,
     channel_name,
     modes,
     photon_dead_time,
     random_stream,
 )
+from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.sun import sky_brightness, solar_elevation
 from lidarops.simulate.truth import (
     ChannelTruth,
@@ -128,7 +128,7 @@ class Simulator:
     site : Site
     """
 
-    def __init__(self, site: Site) -> None:
+    def __init__(self, site: SimulatedSite) -> None:
         self.site = site
         self._datasets: dict[tuple[int, float, int], tuple[Dataset, ...]] = {}
         self._paths: dict[Key, BeamPath] = {}
@@ -438,7 +438,7 @@ def _grid_of(acquisition: Acquisition, detector: Detector) -> tuple[int, float]:
     return detector.bins or acquisition.bins, detector.bin_width or acquisition.bin_width
 
 
-def _truth_grid(site: Site) -> TruthGrid:
+def _truth_grid(site: SimulatedSite) -> TruthGrid:
     settings, acquisition = site.settings, site.simulated.acquisition
     grids = [_grid_of(acquisition, detector) for detector in site.simulated.detectors]
     bin_width = min(width for _, width in grids)
@@ -453,7 +453,11 @@ def _truth_grid(site: Site) -> TruthGrid:
 
 
 def _dataset(
-    site: Site, acquisition: Acquisition, detector: Detector, mode: DetectionMode, number: int
+    site: SimulatedSite,
+    acquisition: Acquisition,
+    detector: Detector,
+    mode: DetectionMode,
+    number: int,
 ) -> Dataset:
     analog = detector.analog if mode is DetectionMode.ANALOG else None
     level = 0 if detector.photon is None else detector.photon.discriminator_level

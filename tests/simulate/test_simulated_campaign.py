@@ -14,7 +14,7 @@ from lidarops.errors import CampaignError
 from lidarops.raw import licel
 from lidarops.records import Role
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.simulate.site import random_stream
+from lidarops.simulate.planned_files import random_stream
 
 
 def _contents(root):

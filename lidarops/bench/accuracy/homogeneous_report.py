@@ -506,8 +506,8 @@ def cost_part(costs: tuple[StepCost, ...], bins: int) -> Part:
         text=f"Profiles of {bins} bins, float64, one thread, least CPU time of interleaved "
         "repeats. Steps of lidarops compute all errors and flags; all steps: background, clouds, "
         "reference window and inversion with its error budget. The peers give values without "
-        "errors: a weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy and "
-        "in plain Python. The read is a vectorised maximum of the same array in the same run.",
+        "errors: a weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy "
+        "and in plain Python. The read is a vectorised maximum of the same array in the same run.",
         charts=(_cost_ladder(costs, batches, bins),),
         tables=tuple(_cost_table(costs, batch) for batch in batches),
     )

@@ -1,6 +1,6 @@
 """Background of a profile: the power that a recorder shows without backscatter.
 
-Choose one of three estimates: `tail_mean` averages the far bins, `cubic` solves the quartic of a
+Choose one of three estimates: `tail_mean` averages the far bins, `cubic` solves the cubic of a
 homogeneous path in closed form, `fit_known_shape` fits background and amplitude of clear air
 (`molecular_shape`). Beside them, `photon_counts` gives the variance of counts, and
 `detectable_light` tests on a few profiles whether a stretch of range holds any backscatter.

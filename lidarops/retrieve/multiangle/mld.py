@@ -1,5 +1,7 @@
 r"""Method "mld": regularised differentiation of the logarithm along the slant path (historical).
 
+The method of `gobrusenko1989`.
+
 The slope of :math:`\ln S` over the slant path x is taken as constant between neighbouring beams,
 :math:`y_l - c = \int_{x_0}^{x_l} \varphi\,dx`, and kept small (order 0) or constant (order 1) by a
 penalty of strength :math:`\alpha`. Its mean over the path gives :math:`\tau = -\bar\varphi / 2`.

@@ -46,7 +46,7 @@ class PlannedFile:
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class SimulatedSite:
     """One simulated instrument: its simulation settings, campaign facts and place."""
 
     key: str
@@ -184,7 +184,7 @@ def modes(detector: Detector) -> tuple[DetectionMode, ...]:
     return analog + photon
 
 
-def photon_dead_time(site: Site, start: datetime, channel: str) -> float:
+def photon_dead_time(site: SimulatedSite, start: datetime, channel: str) -> float:
     """Return the dead time of a photon counter at the start of a file, s, from the campaign.
 
     Raises
