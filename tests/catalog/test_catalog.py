@@ -325,7 +325,7 @@ def test_a_damaged_catalog_says_that_a_new_one_can_be_made(damage: str, campaign
     broken = b"?" * 8192 if damage == "no database" else content[:100] + b"?" * 8192
     file.write_bytes(broken + content[len(broken) :])
     with (
-        pytest.raises(CatalogError, match="move it away: a new one is made from the archive"),
+        pytest.raises(CatalogError, match="move it away; lidarops then makes a new one"),
         Store(campaign.catalog_url, campaign.name) as damaged,
     ):
         damaged.granules()
