@@ -23,10 +23,12 @@ lint: .venv/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The products and tables that tests compare with; look at the difference before you commit it.
+# The products and pages that tests compare with; look at the difference before you commit it.
 golden: .venv/.dev
 	PYTHONPATH=tests $(BIN)/python -m golden.regenerate
 	$(BIN)/python docs/products_table.py
+	$(BIN)/python docs/api_page.py
+	$(BIN)/python docs/architecture_picture.py
 
 # Error against run time of every retrieval, one page: bench/index.html.
 bench: .venv/.runtime

@@ -9,8 +9,8 @@ The modules follow the light:
 3. Detectors: `photoelectrons`, then `counting` (photon counter with dead time) and `analog`
    (digitiser).
 4. Raw files: `dialects` (headers of real stations), `damage` (truncated, foreign and odd files),
-   `planned_files` (names, times and places of the files), `files` (one file and its truth), `truth` (table
-   of true values), `campaign` (all files of a campaign).
+   `planned_files` (names, times and places of the files), `files` (one file and its truth),
+   `truth` (table of true values), `campaign` (all files of a campaign).
 
 Start with `campaign.simulate_campaign` for a whole campaign, or `pulse.pulsed_signal` for one
 signal.

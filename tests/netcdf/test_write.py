@@ -294,10 +294,10 @@ import sys
 from support.made_products import MAKERS, context
 from test_write import of_noise, truth
 from lidarops.products.layouts import build_product
-from lidarops.netcdf.write import write, write_plain
+from lidarops.netcdf.write import write_product, write_plain
 for kind, maker in MAKERS.items():
-    print(write(build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind)), sys.argv[1]).sha256)
-print(write(of_noise(), sys.argv[1]).sha256)
+    print(write_product(build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind)), sys.argv[1]).sha256)
+print(write_product(of_noise(), sys.argv[1]).sha256)
 print(write_plain(truth(), sys.argv[1]).sha256)
 """
 
@@ -322,11 +322,11 @@ from pathlib import Path
 import h5py
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from test_write import assert_stored, of_noise
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 product = of_noise(150)
 def work(number):
     path = f"{sys.argv[1]}/{number}.nc"
-    sha256 = write(product, path).sha256
+    sha256 = write_product(product, path).sha256
     with NETCDF4_PYTHON_LOCK:
         assert_stored(Path(path), product)
         with h5py.File(path) as file:
@@ -381,7 +381,7 @@ from support.made_products import context, homogeneous
 from lidarops.netcdf import write as writer
 from lidarops.products.layouts import build_product
 writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)
-writer.write(build_product(homogeneous(), context()), sys.argv[1])
+writer.write_product(build_product(homogeneous(), context()), sys.argv[1])
 """
 
 
@@ -395,14 +395,14 @@ FULL = """
 import resource, signal, sys
 from test_write import of_noise
 from lidarops.errors import ProductError
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 product = of_noise()
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 # Nothing; enough for some variables, for all but their data, for half of these; all.
 for room in (100, 10_000, 100_000, 1_000_000, resource.RLIM_INFINITY):
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
     try:
-        write(product, sys.argv[1])
+        write_product(product, sys.argv[1])
         print("written")
     except ProductError as error:
         print(error)

@@ -1,0 +1,55 @@
+"""The page of the public API is current, and no public name exists for tests alone."""
+
+from __future__ import annotations
+
+import ast
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def api(repository: Path) -> ModuleType:
+    """The module that writes docs/api.md."""
+    spec = spec_from_file_location("api_page", repository / "docs/api_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_is_current(api: ModuleType):
+    assert api.PAGE.read_text(encoding="utf-8") == api.page(), "run: python docs/api_page.py"
+
+
+def test_every_public_name_is_used_or_belongs_to_the_api(repository: Path, api: ModuleType):
+    used: set[str] = set()
+    defined: dict[str, Path] = {}
+    for root in ("lidarops", "flows", "examples", "docs"):
+        for path in sorted((repository / root).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            for node in ast.walk(tree):
+                if isinstance(node, ast.Name):
+                    used.add(node.id)
+                elif isinstance(node, ast.Attribute):
+                    used.add(node.attr)
+                elif isinstance(node, ast.alias) and path.name != "__init__.py":
+                    used.add(node.name)
+            if root == "lidarops" and path.parent.name != "cli":
+                defined |= {
+                    node.name: path.relative_to(repository)
+                    for node in tree.body
+                    if isinstance(node, ast.FunctionDef | ast.ClassDef)
+                    and not node.name.startswith("_")
+                }
+    # Named in pyproject.toml, looked up by dask, run in a process of its own.
+    entry_points = {"LicelBackendEntrypoint", "dask_setup", "first_times"}
+    offered = {
+        name for module in api.MODULES for name, _ in api.public_names(import_module(module))
+    }
+    unused = {name: str(path) for name, path in defined.items() if name not in used}
+    assert {name: path for name, path in unused.items() if name not in offered | entry_points} == {}
