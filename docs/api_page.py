@@ -38,6 +38,8 @@ MODULES: Final = (
     "lidarops.simulate.pulse",
     "lidarops.simulate.overlap",
     "lidarops.simulate.mie",
+    "lidarops.simulate.counting",
+    "lidarops.simulate.analog",
     "lidarops.simulate.lidar",
 )
 """Modules whose public functions and classes users may call."""

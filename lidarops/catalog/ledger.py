@@ -524,9 +524,9 @@ class Ledger(Granules):
     def verdicts(self) -> dict[int, tuple[str, int, int]]:
         """Return settled day -> signature, number of empty scenes, of granules set aside."""
         verdict = VERDICT.c
-        query = sa.select(verdict.day, verdict.signature, verdict.barren, verdict.set_aside).where(
-            verdict.campaign == self.campaign
-        )
+        query = sa.select(
+            verdict.day, verdict.signature, verdict.empty_scenes, verdict.set_aside
+        ).where(verdict.campaign == self.campaign)
         with self.transaction() as connection:
             return {row[0]: (row[1], row[2], row[3]) for row in connection.execute(query)}
 
@@ -537,7 +537,7 @@ class Ledger(Granules):
         rows = [
             {
                 "campaign": self.campaign, "day": day, "signature": signature,
-                "barren": empty_scenes, "set_aside": set_aside,
+                "empty_scenes": empty_scenes, "set_aside": set_aside,
             }
             for day, (signature, empty_scenes, set_aside) in verdicts.items()
         ]  # fmt: skip

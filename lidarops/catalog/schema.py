@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 4
+SCHEMA_VERSION: Final = 5
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -170,7 +170,7 @@ VERDICT = sa.Table(
     # State of the day (see Signature) when all its requested products were fresh.
     sa.Column("signature", _DIGEST, nullable=False),
     # Scenes of the day without product.
-    sa.Column("barren", sa.Integer, nullable=False),
+    sa.Column("empty_scenes", sa.Integer, nullable=False),
     # Good granules of the day that belong to no scene.
     sa.Column("set_aside", sa.Integer, nullable=False),
     sqlite_with_rowid=False,

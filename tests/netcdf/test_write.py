@@ -296,7 +296,8 @@ from test_write import of_noise, truth
 from lidarops.products.layouts import build_product
 from lidarops.netcdf.write import write_product, write_plain
 for kind, maker in MAKERS.items():
-    print(write_product(build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind)), sys.argv[1]).sha256)
+    product = build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind))
+    print(write_product(product, sys.argv[1]).sha256)
 print(write_product(of_noise(), sys.argv[1]).sha256)
 print(write_plain(truth(), sys.argv[1]).sha256)
 """
@@ -424,7 +425,7 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path):
 
 def test_an_impossible_folder_is_an_error(product: xr.Dataset, tmp_path: Path):
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(ProductError, match="folder can be written"):
+    with pytest.raises(ProductError, match="folder is writable"):
         write_product(product, tmp_path / "file" / "product.nc")
     (tmp_path / "taken.nc").mkdir()
     with pytest.raises(ProductError, match=r"taken\.nc"):
@@ -436,7 +437,7 @@ def test_an_impossible_folder_is_an_error(product: xr.Dataset, tmp_path: Path):
 def test_a_folder_without_permission_is_an_error(product: xr.Dataset, tmp_path: Path):
     tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
     try:
-        with pytest.raises(ProductError, match="folder can be written"):
+        with pytest.raises(ProductError, match="folder is writable"):
             write_product(product, tmp_path / "product.nc")
     finally:
         tmp_path.chmod(stat.S_IRWXU)
