@@ -29,7 +29,7 @@ MODULES: Final = (
     "lidarops.retrieve.multiangle",
     "lidarops.retrieve.multiangle.labeled",
     "lidarops.retrieve.multiangle.vertical.smooth_profile",
-    "lidarops.retrieve.network",
+    "lidarops.retrieve.network.extinction_field",
     "lidarops.retrieve.network.geometry",
     "lidarops.retrieve.network.cycles",
     "lidarops.retrieve.network.labeled",
@@ -62,7 +62,8 @@ def public_names(module: ModuleType) -> Iterator[tuple[str, object]]:
     for name in sorted(names if names is not None else vars(module)):
         value = getattr(module, name)
         own = names is not None or getattr(value, "__module__", "") == module.__name__
-        if own and not name.startswith("_") and (inspect.isclass(value) or callable(value)):
+        documented = inspect.isclass(value) or inspect.isroutine(value)
+        if own and not name.startswith("_") and documented:
             yield name, value
 
 

@@ -124,7 +124,7 @@ def choose_reference(
     most_deviation: float = 3.0,
     least_signal: float = 20.0,
 ) -> ReferenceWindow:
-    r"""Return the cleanest window, of equally clean ones the one that is known best.
+    r"""Return the cleanest window; of equally clean ones, the best determined.
 
     In each candidate the power is fitted with the molecular shape :math:`\phi` by weighted
     least squares: :math:`P = \phi (a_0 + a_1 p_1(R) + a_2 p_2(R))`, with polynomials that are

@@ -537,7 +537,7 @@ def range_corrected(
     background_variance: npt.ArrayLike,
     dtype: npt.DTypeLike = np.float64,
 ) -> Signal:
-    r"""Return the signal minus the background, multiplied with the square of range.
+    r"""Return the signal minus the background, multiplied by the square of range.
 
     .. math:: X = (P - P^*) R^2, \qquad \mathrm{var}(X) = (v_P + v_{P^*}) R^4
 

@@ -147,7 +147,7 @@ def range_corrected_signals(
 
 
 def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
-    """Return signals minus the mean of far bins, multiplied with the square of range.
+    """Return signals minus the mean of far bins, multiplied by the square of range.
 
     Parameters
     ----------
