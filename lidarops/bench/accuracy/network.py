@@ -46,7 +46,7 @@ from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
 from lidarops.bench.harness.timing import in_threads, least_times, machine
 from lidarops.retrieve.air import visibility as sight
 from lidarops.retrieve.network.cycles import solve_cycle, values_and_variances
-from lidarops.retrieve.network.extinction_field import MultiPositionResult
+from lidarops.retrieve.network.extinction_field import NetworkResult
 
 Booleans = npt.NDArray[np.bool_]
 
@@ -144,7 +144,7 @@ def figure_points() -> tuple[FigurePoint, ...]:
 
 def _measure_case(
     lidars: LidarLine, air: Air, noise: float, signals: Signals, chunks: _Chunks, seed: int
-) -> tuple[NetworkScenario, list[MultiPositionResult]]:
+) -> tuple[NetworkScenario, list[NetworkResult]]:
     """Return the scores of every solver, and the results of the network method."""
     truth, near = signals.truth(chunks.size), signals.network.near_crossing
     errors: dict[str, list[CrossingErrors]] = {
@@ -185,7 +185,7 @@ def _timed(call: Callable[[], _Result]) -> tuple[float, _Result]:
 
 
 def _visibility_scores(
-    results: Sequence[MultiPositionResult], signals: Signals, noise: float
+    results: Sequence[NetworkResult], signals: Signals, noise: float
 ) -> list[VisibilityScore]:
     near = signals.network.near_crossing
     truth = np.concatenate([signals.truth(len(result.extinction))[:, near] for result in results])

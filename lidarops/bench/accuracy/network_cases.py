@@ -15,7 +15,7 @@ from lidarops.retrieve.network.cycles import systematic_error
 from lidarops.retrieve.network.extinction_field import (
     DEFAULT_BINS,
     FieldPrior,
-    MultiPositionResult,
+    NetworkResult,
     NetworkMethod,
     retrieve_network,
 )
@@ -217,7 +217,7 @@ class NetworkSolver:
 
     def __call__(
         self, power: Array, variance: Array, signals: Signals, *, full_overlap: float = FULL_OVERLAP
-    ) -> MultiPositionResult:
+    ) -> NetworkResult:
         """Solve profiles (profile, beam, range), block by block."""
         return retrieve_network(
             power,

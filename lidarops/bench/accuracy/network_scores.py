@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lidarops.bench.accuracy.homogeneous import SIGMAS, MonteCarloFigure
 from lidarops.bench.accuracy.network_cases import BLOCK, Array, FigurePoint
 from lidarops.bench.harness.timing import Machine
-from lidarops.retrieve.network.extinction_field import MultiPositionResult
+from lidarops.retrieve.network.extinction_field import NetworkResult
 
 Booleans = npt.NDArray[np.bool_]
 
@@ -161,7 +161,7 @@ class CrossingErrors:
     """(profile,)."""
 
 
-def crossing_errors(result: MultiPositionResult, truth: Array, near: Booleans) -> CrossingErrors:
+def crossing_errors(result: NetworkResult, truth: Array, near: Booleans) -> CrossingErrors:
     """Return the errors of a result.
 
     Parameters

@@ -176,7 +176,7 @@ def score_networks(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, 
 
 def _solve_damaged(
     rng: Random, draw_air: Any, damage: Any, profiles: int
-) -> tuple[extinction_field.MultiPositionResult, Array] | None:
+) -> tuple[extinction_field.NetworkResult, Array] | None:
     """Return the result and the truth; None where the beams do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
     net = _random_network(rng).network()

@@ -35,7 +35,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility
 from lidarops.retrieve.network import cycles, extinction_field, geometry
-from lidarops.retrieve.network.extinction_field import MultiPositionResult
+from lidarops.retrieve.network.extinction_field import NetworkResult
 
 _case = partial(StiffCase, retrieval=Retrieval.MULTIPOSITION)
 _ANY: Final = Quality(REJECTING)
@@ -44,7 +44,7 @@ FLAGGED: Final = Quality.UNSTABLE_INVERSION
 _PROFILES: Final = 200
 
 
-def _answer(result: MultiPositionResult) -> Answer:
+def _answer(result: NetworkResult) -> Answer:
     """Return the values, with a quality bit where any flag doubts them."""
     bits = np.where(result.flags.flagged, np.int32(FLAGGED), np.int32(0))
     return Answer(

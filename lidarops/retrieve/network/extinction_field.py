@@ -150,7 +150,7 @@ class CrossingFlags:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MultiPositionResult:
+class NetworkResult:
     """Extinction at the crossings of a network. Leading axes are those of the power."""
 
     extinction: Array
@@ -196,7 +196,7 @@ def retrieve_network(
     multiplier: float | None = None,
     bins: int = DEFAULT_BINS,
     contrast: float = air_visibility.MOR_CONTRAST,
-) -> MultiPositionResult:
+) -> NetworkResult:
     """Retrieve extinction and visibility where the beams of several lidars cross.
 
     Average signals before the retrieval, not results afterwards: noise biases single results.
@@ -373,7 +373,7 @@ def _flag_result(
     fit: _empirical_prior.PriorSolution | None,
     method: NetworkMethod,
     contrast: float,
-) -> MultiPositionResult:
+) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
     shape = estimate.extinction.shape
     near = beams.layout.near_crossing | estimate.far_start
@@ -427,7 +427,7 @@ def _flag_result(
     )
     values = extinction.reshape(*leading, shape[1])
     errors = error.reshape(*leading, shape[1])
-    return MultiPositionResult(
+    return NetworkResult(
         values, errors,
         air_visibility.visibility_from_extinction(values, errors, contrast=contrast),
         shaped, near, chi_square.reshape(leading), freedom.reshape(leading),

@@ -16,7 +16,7 @@ from lidarops.retrieve.air import labeled
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.background import cubic_and_tail as _background
 from lidarops.retrieve.network import extinction_field
-from lidarops.retrieve.network.extinction_field import MultiPositionResult
+from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.geometry import Network
 
 Array = npt.NDArray[np.float64]
@@ -305,7 +305,7 @@ class _Solver:
             "blocks": intervals // settings.block_intervals,
         }
 
-    def solve(self, power: Array, exponent: Array | None = None) -> MultiPositionResult:
+    def solve(self, power: Array, exponent: Array | None = None) -> NetworkResult:
         """Solve for signals, optionally with other exponents."""
         return extinction_field.retrieve_network(
             power,
@@ -336,7 +336,7 @@ class _Solver:
                     weights[index] = np.interp(self.signals.range[index], ranges, peak)
             yield weights
 
-    def extinction_changes(self, result: MultiPositionResult, change: Array) -> Iterator[Array]:
+    def extinction_changes(self, result: NetworkResult, change: Array) -> Iterator[Array]:
         """Yield, for each group of beams, the change of extinction with the signals."""
         for group in self.beam_groups:
             if not change[:, group].any():
@@ -361,7 +361,7 @@ class _Errors:
 
     @staticmethod
     def estimate(
-        solver: _Solver, result: MultiPositionResult, settings: NetworkSettings
+        solver: _Solver, result: NetworkResult, settings: NetworkSettings
     ) -> _Errors:
         """Return the errors from noise and background, and from the systematic effects."""
         signals = solver.signals
@@ -400,7 +400,7 @@ class _Errors:
 
 
 def _lidar_ratio_error(
-    solver: _Solver, result: MultiPositionResult, relative_error: float
+    solver: _Solver, result: NetworkResult, relative_error: float
 ) -> Array:
     """Return the error from lidar ratios that differ between crossings, m-1."""
     square_sum = np.zeros(result.extinction.shape)
@@ -420,7 +420,7 @@ def _root_sum_square(contributions: Sequence[Array]) -> Array:
 
 
 def _quality_flags(
-    result: MultiPositionResult, errors: _Errors, signals: _Signals, network: Network
+    result: NetworkResult, errors: _Errors, signals: _Signals, network: Network
 ) -> Flags:
     """Return the quality bits of each value, with a reason for each missing one."""
     bits = np.zeros(result.extinction.shape, dtype=np.int32)
@@ -506,7 +506,7 @@ def _coordinates(
 def _describe_steps(
     beams: Sequence[BeamAverages],
     network: Network,
-    result: MultiPositionResult,
+    result: NetworkResult,
     settings: NetworkSettings,
 ) -> str:
     """Return a description of the beams, their crossings and the definition of visibility."""
