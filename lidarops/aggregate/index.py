@@ -23,7 +23,7 @@ from lidarops.aggregate.selection import parse_selection
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.records import ProductKind
-from lidarops.reports.run_record import write_atomically
+from lidarops.system.files import write_atomically
 
 INDEX: Final = "products.parquet"
 FORMAT: Final = b"1"

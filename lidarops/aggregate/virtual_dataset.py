@@ -34,7 +34,7 @@ from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_dupli
 from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.records import DetectionMode
-from lidarops.reports.run_record import write_atomically
+from lidarops.system.files import write_atomically
 
 FORMAT: Final = 1
 _BRACES: Final = ("{", "}")

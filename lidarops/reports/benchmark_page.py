@@ -14,7 +14,7 @@ from lidarops.errors import CatalogError
 from lidarops.figures import product_figures
 from lidarops.figures.charts import Chart, Ladder, draw_chart
 from lidarops.figures.wording import visible
-from lidarops.reports.run_record import write_atomically
+from lidarops.system.files import write_atomically
 
 INDEX: Final = "index.html"
 """Name of the page inside its folder."""

@@ -48,7 +48,7 @@ from lidarops.figures.series_data import (
 from lidarops.figures.wording import counted
 from lidarops.flags import Quality
 from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
-from lidarops.reports.run_record import write_atomically
+from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40
 """Most figures of products in a report."""

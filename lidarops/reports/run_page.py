@@ -19,7 +19,8 @@ from lidarops.figures.wording import duration, lacking, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.gallery import Compared, Figure, Gallery
-from lidarops.reports.run_record import FILE_NAME, write_atomically
+from lidarops.reports.run_record import FILE_NAME
+from lidarops.system.files import write_atomically
 
 INDEX: Final = "index.html"
 """Name of the page inside a run's report folder."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import tempfile
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -18,6 +16,7 @@ from typing import Any, Final, TypeVar
 
 from lidarops.errors import NO_FILE, CatalogError
 from lidarops.records import RunRecord
+from lidarops.system.files import write_atomically
 
 FILE_NAME: Final = "run.json"
 """Name of the record inside a run's report folder."""
@@ -128,35 +127,6 @@ def load_run_record(path: str | Path) -> RunRecord:
             f"expected {error.expected}", file=path, field=error.place, remedy=_REMEDY
         ) from error
     return record
-
-
-def write_atomically(target: Path, content: bytes) -> None:
-    """Write `content` to a temporary file beside `target`, sync it and rename it.
-
-    Parameters
-    ----------
-    target : Path
-        File to create or replace; its folder must exist.
-    content : bytes
-        Whole content.
-
-    Raises
-    ------
-    OSError
-        If the file system refuses; `target` is then unchanged.
-    """
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        # mkstemp makes files that only their owner can read, but reports are shared.
-        temporary.chmod(0o644)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _plain(value: object) -> object:

@@ -21,7 +21,6 @@ import xarray as xr
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.reports.run_record import write_atomically
 from lidarops.site import pages, product_contents, product_gallery
 from lidarops.site.paths import (
     SITE,
@@ -33,6 +32,7 @@ from lidarops.site.paths import (
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
+from lidarops.system.files import write_atomically
 
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""

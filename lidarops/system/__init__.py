@@ -1,1 +1,2 @@
-"""Processes of this machine (`processes`) and object stores behind URLs (`stores`)."""
+"""Processes of this machine (`processes`), object stores behind URLs (`stores`), atomic writing of
+files (`files`)."""

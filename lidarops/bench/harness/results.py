@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from lidarops.errors import CatalogError
-from lidarops.reports.run_record import write_atomically
+from lidarops.system.files import write_atomically
 
 _Result = TypeVar("_Result")
 
