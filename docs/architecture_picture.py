@@ -20,7 +20,7 @@ PURPOSES: Final = {
     "flows": "Prefect flows: schedules",
     "cli": "command line",
     "bench": "accuracy, stability, throughput",
-    "run": "an archive: what is stale, runs, clusters",
+    "run": "stale products, runs, clusters",
     "site": "pages to browse an archive",
     "aggregate": "many products as one",
     "reports": "page and record of a run",
@@ -44,6 +44,8 @@ WIDTH: Final = 1180
 ROW: Final = 92
 BOX: Final = (240, 52)
 MARGIN: Final = 20
+LANE: Final = 10
+"""Distance of two lines that pass a row side by side."""
 
 
 def imports() -> dict[str, set[str]]:
@@ -103,8 +105,12 @@ def draw() -> str:
         "<title>Packages of lidarops: each imports only packages below it</title>",
         f'<rect width="{WIDTH}" height="{height}" fill="#ffffff"/>',
     ]
+    lanes: set[tuple[int, int]] = set()
+    level = {name: number for number, row in enumerate(rows) for name in row}
     for name in sorted(graph):
-        lines += [_arrow(centres[name], centres[other]) for other in sorted(_direct(name, graph))]
+        for other in sorted(_direct(name, graph)):
+            between = range(level[name] + 1, level[other])
+            lines.append(_line(centres, name, other, [rows[number] for number in between], lanes))
     lines += [_box(name, *centres[name]) for row in rows for name in row]
     return "\n".join([*lines, "</svg>"]) + "\n"
 
@@ -128,15 +134,45 @@ def _reachable(name: str, graph: dict[str, set[str]]) -> set[str]:
     return reached
 
 
-def _arrow(start: tuple[float, float], stop: tuple[float, float]) -> str:
-    (x, y), (end, below) = start, stop
-    y, below = y + BOX[1] / 2, below - BOX[1] / 2
-    bend = (y + below) / 2
+def _line(
+    centres: dict[str, tuple[float, float]],
+    name: str,
+    other: str,
+    rows: list[list[str]],
+    lanes: set[tuple[int, int]],
+) -> str:
+    """Return a line from one box down to another, through the gaps of the rows between them."""
+    (x, y), (end, below) = centres[name], centres[other]
+    path = [f"M{x:.0f} {y + BOX[1] / 2:.0f}"]
+    at = (x, y + BOX[1] / 2)
+    for row in rows:
+        middle = centres[row[0]][1]
+        straight = x + (end - x) * (middle - y) / (below - y)
+        gap = _gap(straight, [centres[box][0] for box in row], round(middle), lanes)
+        path += [_bend(at, (gap, middle - BOX[1] / 2)), f"V{middle + BOX[1] / 2:.0f}"]
+        at = (gap, middle + BOX[1] / 2)
+    path.append(_bend(at, (end, below - BOX[1] / 2)))
     return (
-        f'<path d="M{x:.0f} {y:.0f} C{x:.0f} {bend:.0f} {end:.0f} {bend:.0f}'
-        f' {end:.0f} {below:.0f}" fill="none" stroke="#8a97a6" stroke-width="1.4"/>'
-        f'<circle cx="{end:.0f}" cy="{below:.0f}" r="3" fill="#8a97a6"/>'
+        f'<path d="{" ".join(path)}" fill="none" stroke="#8a97a6" stroke-width="1.4"/>'
+        f'<circle cx="{end:.0f}" cy="{below - BOX[1] / 2:.0f}" r="3" fill="#8a97a6"/>'
     )
+
+
+def _bend(start: tuple[float, float], stop: tuple[float, float]) -> str:
+    middle = (start[1] + stop[1]) / 2
+    return f"C{start[0]:.0f} {middle:.0f} {stop[0]:.0f} {middle:.0f} {stop[0]:.0f} {stop[1]:.0f}"
+
+
+def _gap(target: float, boxes: list[float], row: int, lanes: set[tuple[int, int]]) -> float:
+    """Return the free place nearest to a place in a row of boxes, and keep it."""
+    places = [
+        place
+        for place in range(MARGIN, WIDTH - MARGIN, LANE)
+        if all(abs(place - box) > BOX[0] / 2 + LANE for box in boxes) and (row, place) not in lanes
+    ]
+    place = min(places, key=lambda place: abs(place - target))
+    lanes.add((row, place))
+    return float(place)
 
 
 def _box(name: str, x: float, y: float) -> str:

@@ -179,7 +179,7 @@ def show_plan(
             name.partition(",")[0].replace(" ", "_"): tally.parts for name, tally in tallies.items()
         }
         estimate = {**total, "costs": machine.words, "calibrated": not machine.note}
-        no_scene_found = {"no_scene_asked_for": no_scene}
+        no_scene_found = {"no_scene_selected": no_scene}
         document = {"scenes": scenes, **no_scene_found, "estimated_cpu_seconds": estimate}
         typer.echo(json.dumps(document, indent=2))
         return
@@ -233,7 +233,9 @@ def reprocess(
     remove_orphans: Annotated[
         bool,
         typer.Option(
-            "--remove-orphans", help="Remove products that the campaign no longer requests."
+            "--remove-orphans",
+            help="Remove products that would not be made again: no longer requested, or without"
+            " raw files.",
         ),
     ] = False,
     profiles_per_chunk: Annotated[
@@ -289,7 +291,7 @@ def reprocess(
         # The result is printed even if the page or the removal failed.
         if as_json:
             summary = _run_summary(settings, result, page)
-            summary |= {"no_scene_asked_for": no_scene, "removed": removed or 0}
+            summary |= {"no_scene_selected": no_scene, "removed": removed or 0}
             typer.echo(json.dumps({**summary, "unreported": report_note}, indent=2))
         elif page is not None:
             typer.echo(f"report:   {page}")

@@ -299,7 +299,7 @@ def test_a_selection_without_scene_is_reported_as_text_and_json(archive: Archive
             line = [command, str(archive.file), *options]
             assert (said in CliRunner().invoke(app, line).stdout) is none
             summary = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
-            assert summary["no_scene_asked_for"] is none
+            assert summary["no_scene_selected"] is none
 
 
 def test_force_makes_what_is_fresh(archive: Archive) -> None:

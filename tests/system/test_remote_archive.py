@@ -78,7 +78,7 @@ def test_a_denied_file_is_refused_but_a_lost_connection_ends_the_scan(
 
     def failing(self: RemoteStore, path: str, size: int) -> bytes:
         if path == "coast/h1":
-            with self._told(CatalogError, f"{path} cannot be read"):
+            with self._errors_as(CatalogError, f"{path} cannot be read"):
                 raise error
         return head(self, path, size)
 
