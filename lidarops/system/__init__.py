@@ -1,2 +1,1 @@
-"""Processes of this machine (`processes`), object stores behind URLs (`stores`), atomic writing of
-files (`files`)."""
+"""Processes of this machine, object stores behind URLs, and atomic writing of local files."""
