@@ -14,15 +14,8 @@ from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.plan.signal_rules import (
-    GLUED,
-    Decisions,
-    Rule,
-    StepName,
-    applied,
-    glued_parts,
-    joined_layout,
-)
+from lidarops.plan.rules import Decisions, Rule, StepName, applied
+from lidarops.plan.signal_rules import GLUED, glued_parts, joined_layout
 from lidarops.records import ChannelLayout, Holding, LeftOut, ProductKind, Unmet
 
 FACTS: Final = "facts"

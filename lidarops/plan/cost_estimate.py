@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from lidarops.errors import CatalogError
-from lidarops.plan.signal_rules import GLUED, StepName, glued_parts, read_windows
+from lidarops.plan.rules import StepName
+from lidarops.plan.signal_rules import GLUED, glued_parts, read_windows
 from lidarops.raw.model import count_bins
 from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 

@@ -13,16 +13,18 @@ import numpy.typing as npt
 from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
 from lidarops.campaign.product_settings import NetworkVisibilitySettings, VisibilitySettings
 from lidarops.errors import RetrievalInputError
-from lidarops.plan.signal_rules import (
+from lidarops.plan.rules import (
     ALL_STEPS,
     ANALOG_NOISE,
-    GLUED,
     NO_WAVELENGTH,
     Case,
     Decisions,
     Rule,
     StepName,
     applied,
+)
+from lidarops.plan.signal_rules import (
+    GLUED,
     bins_with_noise,
     bins_within,
     conditioning,

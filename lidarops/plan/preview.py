@@ -16,7 +16,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.plan.signal_rules import Decisions, Rule, StepName, applied
+from lidarops.plan.rules import Decisions, Rule, StepName, applied
 from lidarops.records import Granule, LeftOut, Plan, Step
 from lidarops.retrieve.background.detectable_light import (
     LightDetection,

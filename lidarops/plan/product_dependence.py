@@ -13,7 +13,8 @@ from dataclasses import replace
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
-from lidarops.plan.signal_rules import GLUED, StepName, glued_parts, required_by
+from lidarops.plan.rules import StepName
+from lidarops.plan.signal_rules import GLUED, glued_parts, required_by
 from lidarops.records import InputRecord, Plan, ProductKind, Role, Scene, Step
 
 ProductKey = tuple[ProductKind, str]

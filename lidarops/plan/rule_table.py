@@ -7,8 +7,9 @@ from typing import Final
 from lidarops.plan.availability import ABSENT, UNMATCHED
 from lidarops.plan.network_plan import NETWORK
 from lidarops.plan.preview import REFINEMENTS
+from lidarops.plan.rules import Rule
 from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW
-from lidarops.plan.signal_rules import CONDITIONING, GLUING, Rule
+from lidarops.plan.signal_rules import CONDITIONING, GLUING
 
 RULES: Final[tuple[Rule, ...]] = tuple(
     dict.fromkeys(

@@ -21,11 +21,9 @@ from lidarops.campaign.product_settings import (
 )
 from lidarops.plan import availability, network_plan, scan_rules
 from lidarops.plan.availability import glued_channels
-from lidarops.plan.signal_rules import (
+from lidarops.plan.rules import (
     ALL_STEPS,
     ANALOG_NOISE,
-    CONDITIONING,
-    GLUED,
     NO_PRODUCT,
     NO_WAVELENGTH,
     NOT_REQUESTED,
@@ -35,6 +33,10 @@ from lidarops.plan.signal_rules import (
     Rule,
     StepName,
     applied,
+)
+from lidarops.plan.signal_rules import (
+    CONDITIONING,
+    GLUED,
     bins_with_noise,
     fixed_zenith,
     glue_rules,

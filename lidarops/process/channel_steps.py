@@ -15,7 +15,8 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.flags import Quality
 from lidarops.plan import scan_rules
 from lidarops.plan.preview import OMITTED
-from lidarops.plan.signal_rules import GLUED, WHOLE, StepName, glued_parts
+from lidarops.plan.rules import WHOLE, StepName
+from lidarops.plan.signal_rules import GLUED, glued_parts
 from lidarops.records import Plan, ProductKind, Step
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import Definition

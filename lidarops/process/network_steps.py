@@ -15,7 +15,7 @@ from lidarops.campaign.model import Station
 from lidarops.flags import Quality
 from lidarops.plan import network_plan
 from lidarops.plan.network_plan import SAME_POINTING, BeamPlan
-from lidarops.plan.signal_rules import StepName
+from lidarops.plan.rules import StepName
 from lidarops.process import channel_steps
 from lidarops.process.channel_steps import Bench
 from lidarops.records import Step

@@ -28,7 +28,8 @@ from lidarops.netcdf.context import Context, product_path
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
 from lidarops.plan.preview import refine_plan
-from lidarops.plan.signal_rules import NO_PRODUCT, NOT_REQUESTED, StepName, read_windows
+from lidarops.plan.rules import NO_PRODUCT, NOT_REQUESTED, StepName
+from lidarops.plan.signal_rules import read_windows
 from lidarops.process import channel_steps, network_steps
 from lidarops.products.layouts import build_product
 from lidarops.raw import licel

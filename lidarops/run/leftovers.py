@@ -12,8 +12,9 @@ from lidarops.campaign.model import Campaign
 from lidarops.campaign.product_settings import Products
 from lidarops.catalog.ledger import RecordedProduct
 from lidarops.plan import product_dependence
+from lidarops.plan.rules import StepName
 from lidarops.plan.scenes import Cut, parse_scene_id
-from lidarops.plan.signal_rules import GLUED, StepName
+from lidarops.plan.signal_rules import GLUED
 from lidarops.process.scene import nothing_to_do
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Scene
 
