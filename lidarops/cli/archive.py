@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from lidarops.plan.cost_estimate import Tally
     from lidarops.records import Granule, Plan, RunRecord
     from lidarops.run.archive import Result
-    from lidarops.run.staleness import Judgement, Selection
+    from lidarops.run.selection import Selection
+    from lidarops.run.staleness import Judgement
 
 _LEAST_MEMORY = 2**20
 """Bytes; a smaller size probably lacks its unit."""
@@ -362,7 +363,7 @@ def _selection(
     until: datetime | None,
 ) -> Selection:
     from lidarops.records import ProductKind
-    from lidarops.run.staleness import Selection
+    from lidarops.run.selection import Selection
 
     kinds = [kind.value for kind in ProductKind]
     for name in products or ():

@@ -33,9 +33,9 @@ from lidarops.run.executor import (
 )
 from lidarops.run.leftovers import Orphan
 from lidarops.run.options import Options, Result
-from lidarops.run.selection import check_selection, unmet_requests
+from lidarops.run.selection import Selection, check_selection, unmet_requests
 from lidarops.run.session import Session
-from lidarops.run.staleness import DaysJudged, Judge, Judgement, Selection, Signature
+from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
 
 if TYPE_CHECKING:

@@ -1,16 +1,66 @@
-"""Check a selection against the campaign: unknown names, no scene, channels that no file holds."""
+"""Selection of what to process, and its check against the campaign and its files."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.database import refuse_wrong_url
+from lidarops.catalog.ledger import RecordedProduct
+from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.plan import availability
-from lidarops.plan.scenes import cut_scenes
-from lidarops.records import ProductKind, Unmet
-from lidarops.run.staleness import Selection
+from lidarops.plan.scenes import cut_scenes, parse_scene_id, scene_stop, select_scenes
+from lidarops.records import ProductKind, Scene, Unmet
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Stations, instruments, kinds of product and times to process; empty fields select all."""
+
+    stations: tuple[str, ...] = ()
+    instruments: tuple[str, ...] = ()
+    kinds: tuple[ProductKind, ...] = ()
+    since: datetime | None = None
+    until: datetime | None = None
+
+    @property
+    def everything(self) -> bool:
+        """Whether the selection contains everything."""
+        return self == Selection()
+
+    def days(self, days: Iterable[int]) -> list[int]:
+        """Return the days that may hold selected scenes."""
+        first = None if self.since is None else day_of(self.since)
+        last = None if self.until is None else day_of(self.until)
+        return [
+            day for day in days if (first is None or day >= first) and (last is None or day <= last)
+        ]
+
+    def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
+        """Return whether a product is selected; its scene may no longer exist."""
+        instrument, start = parse_scene_id(made.scene)
+        owner = campaign.instruments.get(instrument)
+        return (
+            (not self.kinds or made.kind in self.kinds)
+            and (not self.instruments or instrument in self.instruments)
+            and (not self.stations or (owner.station if owner else instrument) in self.stations)
+            and (self.since is None or scene_stop(made.scene, campaign) > self.since)
+            and (self.until is None or start < self.until)
+        )
+
+    def scenes(self, scenes: Sequence[Scene]) -> tuple[Scene, ...]:
+        """Return the selected scenes."""
+        return tuple(
+            scene
+            for scene in select_scenes(scenes, since=self.since, until=self.until)
+            if (not self.instruments or scene.instrument in self.instruments)
+            and (not self.stations or scene.station in self.stations)
+        )
 
 
 def check_selection(campaign: Campaign, selection: Selection) -> None:

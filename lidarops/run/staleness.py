@@ -26,17 +26,11 @@ from lidarops.netcdf.provenance import code_version
 from lidarops.plan import product_dependence
 from lidarops.plan.product_dependence import ProductKey
 from lidarops.plan.scene_plan import plan_scene
-from lidarops.plan.scenes import (
-    DARK_REACH,
-    Cut,
-    cut_scenes,
-    parse_scene_id,
-    scene_stop,
-    select_scenes,
-)
+from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
+from lidarops.run.selection import Selection
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
@@ -48,51 +42,6 @@ CRASHES: Final = 3
 _PROFILE_ROLES: Final = {"molecular_profile": Role.MOLECULAR, "overlap_profile": Role.OVERLAP}
 # Settings that change neither the scenes nor the content of a product.
 _OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "simulation"})
-
-
-@dataclass(frozen=True, slots=True)
-class Selection:
-    """Stations, instruments, kinds of product and times to process; empty fields select all."""
-
-    stations: tuple[str, ...] = ()
-    instruments: tuple[str, ...] = ()
-    kinds: tuple[ProductKind, ...] = ()
-    since: datetime | None = None
-    until: datetime | None = None
-
-    @property
-    def everything(self) -> bool:
-        """Whether the selection contains everything."""
-        return self == Selection()
-
-    def days(self, days: Iterable[int]) -> list[int]:
-        """Return the days that may hold selected scenes."""
-        first = None if self.since is None else day_of(self.since)
-        last = None if self.until is None else day_of(self.until)
-        return [
-            day for day in days if (first is None or day >= first) and (last is None or day <= last)
-        ]
-
-    def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
-        """Return whether a product is selected; its scene may no longer exist."""
-        instrument, start = parse_scene_id(made.scene)
-        owner = campaign.instruments.get(instrument)
-        return (
-            (not self.kinds or made.kind in self.kinds)
-            and (not self.instruments or instrument in self.instruments)
-            and (not self.stations or (owner.station if owner else instrument) in self.stations)
-            and (self.since is None or scene_stop(made.scene, campaign) > self.since)
-            and (self.until is None or start < self.until)
-        )
-
-    def scenes(self, scenes: Sequence[Scene]) -> tuple[Scene, ...]:
-        """Return the selected scenes."""
-        return tuple(
-            scene
-            for scene in select_scenes(scenes, since=self.since, until=self.until)
-            if (not self.instruments or scene.instrument in self.instruments)
-            and (not self.stations or scene.station in self.stations)
-        )
 
 
 @dataclass(frozen=True, slots=True)
