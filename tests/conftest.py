@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 
-pytest_plugins = ["support.report_fixtures", "support.s3_fixtures"]
+pytest_plugins = ["support.products.report_fixtures", "support.servers.s3_fixtures"]
 
 # Examples are derandomized, so that failures are reproducible; run times do not count as failures.
 hypothesis.settings.register_profile("lidarops", deadline=None, derandomize=True)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.aggregate_archive import add_day
+from support.archives.aggregate_archive import add_day
 from typer.testing import CliRunner
 
 from lidarops.aggregate._optional_packages import need

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
-from support.aggregate_archive import add_day, facts_of
+from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import (
     Facts,

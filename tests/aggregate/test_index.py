@@ -10,7 +10,7 @@ from uuid import UUID
 import numpy as np
 import pandas as pd
 import pytest
-from support.aggregate_archive import add_day, facts_of
+from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import Facts, ProductSelection
 from lidarops.aggregate.index import INDEX, find_in_index, find_products, write_index

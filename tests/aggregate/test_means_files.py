@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from compliance_checker.runner import CheckSuite, ComplianceChecker
-from support.aggregate_archive import add_day, facts_of
-from support.made_products import MAKERS
+from support.archives.aggregate_archive import add_day, facts_of
+from support.products.made_products import MAKERS
 
 from lidarops.aggregate.facts import Refused, groups, read_facts
 from lidarops.aggregate.means import MeansResult, write_means

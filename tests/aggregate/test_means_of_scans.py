@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.angle_scenes import clear, estimates
+from support.oracles.angle_scenes import clear, estimates
 
 from lidarops.aggregate._sums import Sample, Sums
 from lidarops.aggregate.means_variables import budget_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.aggregate_archive import add_day, facts_of
+from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products

@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from support.aggregate_archive import add_day, facts_of
+from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.stac import write_stac
 from lidarops.errors import ProductError

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from support.aggregate_archive import add_day, facts_of
-from support.made_products import MAKERS
+from support.archives.aggregate_archive import add_day, facts_of
+from support.products.made_products import MAKERS
 
 from lidarops.aggregate.facts import groups
 from lidarops.aggregate.open_products import open_products

@@ -61,7 +61,7 @@ def test_every_module_stands_in_a_package(repository: Path, picture: ModuleType)
 
 def test_no_folder_is_crowded(repository: Path):
     modules: dict[Path, int] = defaultdict(int)
-    for path, _ in sources(repository, "lidarops", "flows"):
+    for path, _ in sources(repository, "lidarops", "flows", "tests"):
         modules[path.parent] += 1
     assert {folder: count for folder, count in modules.items() if count > MOST_MODULES} == {}
 

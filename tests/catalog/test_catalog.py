@@ -12,7 +12,8 @@ from pathlib import Path
 import fsspec
 import pytest
 import sqlalchemy as sa
-from support import factories, raw_archives
+from support import factories
+from support.archives import raw_archives
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import headers

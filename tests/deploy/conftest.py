@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.servers import free_port
+from support.servers.loopback import free_port
 
 POSTGRES = Path("/usr/lib/postgresql")
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import dask.config
 import pytest
 import yaml
-from support import servers
+from support.servers import loopback
 
 from lidarops.run import clusters, kubernetes
 
@@ -103,7 +103,7 @@ def test_local_workers_are_processes_of_one_thread_on_loopback() -> None:
 
 
 def test_an_absent_scheduler_is_reported() -> None:
-    address = f"tcp://127.0.0.1:{servers.free_port()}"
+    address = f"tcp://127.0.0.1:{loopback.free_port()}"
     with (
         pytest.raises(clusters.ClusterError, match="no scheduler cluster") as caught,
         clusters.connect_client(clusters.Scheduler(address=address, wait=1.0)),
@@ -123,7 +123,7 @@ FILES = {
 
 def dask_settings(folder: Path) -> dict[str, str]:
     """Return the variables that deploy/kubernetes sets, for certificates in another folder."""
-    documents = (servers.REPOSITORY / "deploy" / "kubernetes" / "base.yaml").read_text()
+    documents = (loopback.REPOSITORY / "deploy" / "kubernetes" / "base.yaml").read_text()
     (settings,) = (
         each["data"] for each in yaml.safe_load_all(documents) if each["kind"] == "ConfigMap"
     )
@@ -180,7 +180,7 @@ def certificates(folder: Path, host: str = "127.0.0.1") -> clusters.Tls:
 def encrypted(tmp_path: Path) -> Iterator[tuple[str, clusters.Tls]]:
     """A scheduler and a worker as deploy/kubernetes starts them, on loopback."""
     tls = certificates(tmp_path)
-    port = servers.free_port()
+    port = loopback.free_port()
     address = f"tls://127.0.0.1:{port}"
     commands = [
         ["scheduler", "--protocol=tls", "--host=127.0.0.1", f"--port={port}", "--no-dashboard"],
@@ -198,11 +198,11 @@ def encrypted(tmp_path: Path) -> Iterator[tuple[str, clusters.Tls]]:
         for command in commands
     ]
     try:
-        servers.wait_until(lambda: servers.listens(port), 60, "the scheduler does not listen")
+        loopback.wait_until(lambda: loopback.listens(port), 60, "the scheduler does not listen")
         yield address, tls
     finally:
         for process in running:
-            servers.kill_tree(process)
+            loopback.kill_tree(process)
         log.close()
 
 

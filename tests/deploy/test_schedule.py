@@ -12,7 +12,9 @@ from typing import Any, ClassVar
 import httpx
 import pytest
 import yaml
-from support import factories, raw_archives, servers
+from support import factories
+from support.archives import raw_archives
+from support.servers import loopback
 
 pytestmark = [pytest.mark.deployment, pytest.mark.timeout(900)]
 
@@ -20,7 +22,7 @@ pytestmark = [pytest.mark.deployment, pytest.mark.timeout(900)]
 class Api:
     """The requests of the tests to a Prefect server."""
 
-    def __init__(self, site: servers.Site) -> None:
+    def __init__(self, site: loopback.Site) -> None:
         user, _, password = site.environment["PREFECT_API_AUTH_STRING"].partition(":")
         self._client = httpx.Client(
             base_url=site.environment["PREFECT_API_URL"], auth=(user, password), timeout=60
@@ -69,12 +71,12 @@ def notified(problem: str) -> bool:
     return any("lidarops: a run failed" in each and problem in each for each in Sink.posted)
 
 
-def schedule(site: servers.Site, api: Api) -> subprocess.Popen[bytes]:
+def schedule(site: loopback.Site, api: Api) -> subprocess.Popen[bytes]:
     """Deploy the file with a 45 s schedule and the campaign of the test; start a worker.
 
     The worker makes the pool while the file is read: each takes ten seconds to start.
     """
-    shipped = yaml.safe_load((servers.REPOSITORY / "deploy" / "prefect.yaml").read_text())
+    shipped = yaml.safe_load((loopback.REPOSITORY / "deploy" / "prefect.yaml").read_text())
     file = str(campaign_file(site.folder))
     for deployment in shipped["deployments"]:
         if "campaign" in deployment.get("parameters", {}):
@@ -85,12 +87,12 @@ def schedule(site: servers.Site, api: Api) -> subprocess.Popen[bytes]:
     described = site.folder / "prefect.yaml"
     described.write_text(yaml.safe_dump(shipped))
     worker = work(site, "first")
-    servers.wait_until(lambda: "lidarops" in api.pools(), 120, "the worker made no pool")
+    loopback.wait_until(lambda: "lidarops" in api.pools(), 120, "the worker made no pool")
     site.call("prefect", "--no-prompt", "deploy", "--all", "--prefect-file", str(described))
     return worker
 
 
-def work(site: servers.Site, name: str) -> subprocess.Popen[bytes]:
+def work(site: loopback.Site, name: str) -> subprocess.Popen[bytes]:
     pool = ("--pool", "lidarops", "--type", "process", "--limit", "4")
     return site.start(name, "prefect", "worker", "start", *pool, "--name", name)
 
@@ -102,21 +104,21 @@ RECOVERY = 120.0
 
 
 def scheduled_run_starts_and_dead_run_is_ended(
-    site: servers.Site, record_testsuite_property: Any
+    site: loopback.Site, record_testsuite_property: Any
 ) -> None:
     refused = httpx.post(site.environment["PREFECT_API_URL"] + "/flow_runs/filter", json={})
     assert refused.status_code == 401
     api = Api(site)
     worker = schedule(site, api)
-    servers.wait_until(lambda: bool(api.runs("RUNNING")), 240, "no run started", every=0.1)
+    loopback.wait_until(lambda: bool(api.runs("RUNNING")), 240, "no run started", every=0.1)
     dead_run = api.runs("RUNNING")[0]
-    servers.kill_tree(worker)
+    loopback.kill_tree(worker)
     killed = time.monotonic()
     site.start("reaper", "flows.maintenance", "--every", "5", "--silence", f"{SILENCE:.0f}")
     work(site, "second")
     time.sleep(5)
     assert [run["id"] for run in api.runs("RUNNING")] == [dead_run["id"]]
-    servers.wait_until(
+    loopback.wait_until(
         lambda: dead_run["id"] in {run["id"] for run in api.runs("CRASHED")}, 150, "not reaped"
     )
     reaped = time.monotonic() - killed
@@ -126,7 +128,7 @@ def scheduled_run_starts_and_dead_run_is_ended(
 
     # It was alive when it was killed, so it is ended after the silence at the latest.
     left = SILENCE + RECOVERY - reaped
-    servers.wait_until(completed_later, left, "no later run completed")
+    loopback.wait_until(completed_later, left, "no later run completed")
     completed = time.monotonic() - killed
     done = api.runs("COMPLETED")[-1]
     assert done["auto_scheduled"]
@@ -141,7 +143,7 @@ def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
     """Notifications of failed runs are sent, too."""
     with (
         http.server.ThreadingHTTPServer(("127.0.0.1", 0), Sink) as sink,
-        servers.prefect_site(tmp_path) as site,
+        loopback.prefect_site(tmp_path) as site,
     ):
         threading.Thread(target=sink.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{sink.server_port}/hook"
@@ -151,7 +153,7 @@ def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
         scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         (site.folder / "campaign.yaml").unlink()
         # Prefect needs minutes to activate automations: the first failure may not be reported.
-        servers.wait_until(lambda: notified("cannot be read"), 300, "nobody was told")
+        loopback.wait_until(lambda: notified("cannot be read"), 300, "nobody was told")
         sink.shutdown()
 
 
@@ -162,6 +164,6 @@ def test_on_postgresql(tmp_path: Path, postgresql: str, record_testsuite_propert
         "PREFECT_SERVER_DATABASE_CONNECTION_URL": f"postgresql+asyncpg://{postgresql}",
         "LIDAROPS_CATALOG": f"postgresql+psycopg://{postgresql}",
     }
-    with servers.prefect_site(tmp_path, **urls) as site:
+    with loopback.prefect_site(tmp_path, **urls) as site:
         scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         assert not (tmp_path / "prefect" / "prefect.db").exists()

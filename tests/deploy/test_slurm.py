@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from support import raw_archives, servers
+from support.archives import raw_archives
+from support.servers import loopback
 
 from lidarops.campaign.model import load_campaign
 from lidarops.records import RunRecord
@@ -69,8 +70,8 @@ def slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     configuration = CONFIGURATION.format(
         host=host,
         folder=folder,
-        controller=servers.free_port(),
-        node=servers.free_port(),
+        controller=loopback.free_port(),
+        node=loopback.free_port(),
         cpus=os.cpu_count(),
     )
     (folder / "slurm.conf").write_text(configuration)
@@ -92,13 +93,13 @@ def slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
                     subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
                 )
             if len(running) == 1:
-                servers.wait_until(link.exists, 30, "munged does not answer", every=0.1)
-        servers.wait_until(idle, 60, "no node is idle")
+                loopback.wait_until(link.exists, 30, "munged does not answer", every=0.1)
+        loopback.wait_until(idle, 60, "no node is idle")
         yield folder
     finally:
         subprocess.run(["scancel", "--user", "root"], check=False, timeout=60)
         for process in reversed(running):
-            servers.kill_tree(process)
+            loopback.kill_tree(process)
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -146,9 +147,9 @@ def test_a_cancelled_worker_loses_nothing(slurm: Path, tmp_path: Path) -> None:
         client.wait_for_workers(2, timeout=120)
         record = reprocess(settings, options=Options(progress=cancel_one), client=client)
         assert cancelled
-        servers.wait_until(lambda: len(jobs()) == 2, 90, "the lost worker was not replaced")
+        loopback.wait_until(lambda: len(jobs()) == 2, 90, "the lost worker was not replaced")
     assert digests(record) == expected
-    servers.wait_until(lambda: not said("squeue", "--noheader"), 60, "the queue is not empty")
+    loopback.wait_until(lambda: not said("squeue", "--noheader"), 60, "the queue is not empty")
 
 
 def digests(record: RunRecord) -> dict[str, str]:

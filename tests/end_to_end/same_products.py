@@ -59,7 +59,7 @@ RENAMED: dict[str, str] = {}
 """Words of names in the older products -> words in the newer ones."""
 
 WRITE_MIXED = (
-    "import sys, yaml, mixed_campaign;"
+    "import sys, yaml; from support.archives import mixed_campaign;"
     "yaml.safe_dump(mixed_campaign.tree(profiles=40), open(sys.argv[1], 'w'))"
 )
 
@@ -133,7 +133,7 @@ def _environment(root: Path, out: Path) -> dict[str, str]:
         for name, value in os.environ.items()
         if not name.startswith("LIDAROPS_") and name != "SOURCE_DATE_EPOCH"
     }
-    folders = (root, root / "tests", root / "tests" / "support")
+    folders = (root, root / "tests")
     return kept | {
         "PYTHONPATH": os.pathsep.join(map(str, folders)),
         "NUMBA_CACHE_DIR": str(out / "cache" / "numba"),

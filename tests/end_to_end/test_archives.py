@@ -10,7 +10,8 @@ import fsspec
 import numpy as np
 import pytest
 import xarray as xr
-from support import factories, raw_archives
+from support import factories
+from support.archives import raw_archives
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign

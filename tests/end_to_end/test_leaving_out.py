@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 import xarray as xr
-from support import factories, mixed_campaign, raw_archives
-from support.scene_jobs import catalogued_scenes
+from support import factories
+from support.archives import mixed_campaign, raw_archives
+from support.archives.scene_jobs import catalogued_scenes
 
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store

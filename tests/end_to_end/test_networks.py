@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from support import network_campaigns as made
-from support.scene_jobs import scene_jobs
+from support.archives import network_campaigns as made
+from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import Campaign
 from lidarops.flags import Quality

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.scene_jobs import catalogued_scenes
+from support.archives.scene_jobs import catalogued_scenes
 
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality

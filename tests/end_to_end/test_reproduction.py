@@ -13,8 +13,8 @@ import netCDF4
 import pytest
 import xarray as xr
 import yaml
-from support import network_campaigns as networks
-from support import scan_campaign as scans
+from support.archives import network_campaigns as networks
+from support.archives import scan_campaign as scans
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign

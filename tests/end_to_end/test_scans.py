@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
-from support.scan_campaign import ALTITUDE, TREE
+from support.archives.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.run.archive import Options, bring_up_to_date, reprocess

@@ -10,9 +10,9 @@ import pytest
 import xarray as xr
 from matplotlib.collections import QuadMesh
 from PIL import Image
-from support import fabricated as fab
-from support.fabricated import CHANNEL, START, Archive
-from support.made_products import context, elastic
+from support.products import fabricated as fab
+from support.products.fabricated import CHANNEL, START, Archive
+from support.products.made_products import context, elastic
 
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures

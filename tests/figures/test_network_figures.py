@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
-from support.made_network import EXTINCTION, product
+from support.products.made_network import EXTINCTION, product
 
 from lidarops.errors import ProductError
 from lidarops.figures import network_figures, product_figures

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 from PIL import Image
-from support import fabricated as fab
-from support.fabricated import (
+from support.products import fabricated as fab
+from support.products.fabricated import (
     CHANNEL,
     SECTIONS,
     START,
@@ -368,7 +368,7 @@ def test_no_global_state_of_matplotlib_is_touched():
         # Reading the parameters in the usual way would choose a backend and load pyplot.
         "def state(): return {k: matplotlib.rcParams._get(k) for k in matplotlib.rcParams}\n"
         "before = state()\n"
-        "from support import fabricated as fab\n"
+        "from support.products import fabricated as fab\n"
         "from lidarops.figures import product_figures as figures\n"
         "from lidarops.figures.raster import read_raster\n"
         "from lidarops.figures.series_data import read_sections\n"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.fabricated import START, signal, times
+from support.products.fabricated import START, signal, times
 
 from lidarops.errors import ProductError
 from lidarops.figures import panels, product_figures, raster

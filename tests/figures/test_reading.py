@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.fabricated import (
+from support.products.fabricated import (
     START,
     Archive,
     homogeneous,

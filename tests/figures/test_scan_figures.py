@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from matplotlib.collections import QuadMesh
 from PIL import Image
-from support.fabricated import CHANNEL, START, Archive, outcome, run_record, times
+from support.products.fabricated import CHANNEL, START, Archive, outcome, run_record, times
 
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures, scan_data

@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import fabricated as fab
-from support.fabricated import CHANNEL, START, homogeneous, times, truth_of
+from support.products import fabricated as fab
+from support.products.fabricated import CHANNEL, START, homogeneous, times, truth_of
 
 from lidarops.errors import ProductError
 from lidarops.figures.series_data import (

@@ -22,7 +22,8 @@ from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
 from prefect.states import Completed, Failed, Pending, Running
 from prefect.utilities.callables import parameter_schema
-from support import factories, raw_archives
+from support import factories
+from support.archives import raw_archives
 from typer.testing import CliRunner
 
 import flows.catalog

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from golden.cdl import dump
-from support.made_products import MAKERS, PLACED, context
+from support.products.made_products import MAKERS, PLACED, context
 
 from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product

@@ -14,8 +14,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from support.angle_scenes import retrieve_scan
-from support.made_products import (
+from support.oracles.angle_scenes import retrieve_scan
+from support.products.made_products import (
     MAKERS,
     PLACED,
     STATION,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from support.compliance import findings, permitted
-from support.made_products import MAKERS, context, homogeneous
+from support.products.compliance import findings, permitted
+from support.products.made_products import MAKERS, context, homogeneous
 
 from lidarops.flags import Quality
 from lidarops.netcdf.write import write_product

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.made_products import context, homogeneous, provenance
+from support.products.made_products import context, homogeneous, provenance
 
 from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import (

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.made_products import MAKERS, context, signal
+from support.products.made_products import MAKERS, context, signal
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.made_products import MAKERS, STATION, context
+from support.products.made_products import MAKERS, STATION, context
 
 from lidarops.campaign.model import Station
 from lidarops.netcdf.sounded_air import beam_positions

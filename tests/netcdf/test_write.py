@@ -21,7 +21,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from support.made_products import MAKERS, context, homogeneous, signal
+from support.products.made_products import MAKERS, context, homogeneous, signal
 
 from lidarops.errors import ProductError
 from lidarops.netcdf import write as writer
@@ -291,7 +291,7 @@ def run(script: str, *arguments: str, **environment: str) -> subprocess.Complete
 
 SHA = """
 import sys
-from support.made_products import MAKERS, context
+from support.products.made_products import MAKERS, context
 from test_write import of_noise, truth
 from lidarops.products.layouts import build_product
 from lidarops.netcdf.write import write_product, write_plain
@@ -378,7 +378,7 @@ def test_an_interrupt_leaves_nothing(
 
 KILLED = """
 import os, signal, sys
-from support.made_products import context, homogeneous
+from support.products.made_products import context, homogeneous
 from lidarops.netcdf import write as writer
 from lidarops.products.layouts import build_product
 writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)

@@ -140,7 +140,7 @@ def carry_out(products, raw=None, *, channel="photon_532o", dark=None, ancillari
     made = planned(campaign(products, **facts), dark=dark is not None, bins=raw.sizes["range"])
     files = NONE if ancillaries is None else ancillaries
     return channel_steps.process_channel(
-        channel_steps.Bench(made, raw, dark, files, STATION), channel
+        channel_steps.SceneData(made, raw, dark, files, STATION), channel
     )
 
 
@@ -506,10 +506,12 @@ def test_the_background_follows_the_method_of_the_campaign() -> None:
     assert kinds["tail_mean"] == pytest.approx(SKY + left, abs=0.2 * left)
 
 
-def test_loading_does_not_change_the_bench_of_the_caller():
+def test_loading_does_not_change_the_data_of_the_caller():
     lazy = archive(profiles=3)
-    bench = channel_steps.Bench(planned(campaign({"signal": {}})), lazy, None, NONE, STATION)
-    near = channel_steps.load_small(bench, ["photon_532o"]).archive
+    scene_data = channel_steps.SceneData(
+        planned(campaign({"signal": {}})), lazy, None, NONE, STATION
+    )
+    near = channel_steps.load_small(scene_data, ["photon_532o"]).archive
     assert isinstance(near["photon_532o"].data, np.ndarray)
     assert isinstance(near["analog_532o"].data, da.Array)
     assert isinstance(lazy["photon_532o"].data, da.Array)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.made_products import MAKERS, context
+from support.products.made_products import MAKERS, context
 
 from lidarops.flags import Quality, Severity
 from lidarops.netcdf.variables import summarize_flags

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.made_products import context, multiangle
+from support.products.made_products import context, multiangle
 
 from lidarops.errors import ProductError
 from lidarops.products.layouts import build_product

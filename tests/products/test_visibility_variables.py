@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.compliance import findings, permitted
-from support.made_network import product as made
-from support.made_products import context
+from support.products.compliance import findings, permitted
+from support.products.made_network import product as made
+from support.products.made_products import context
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
-from support.made_products import MAKERS, context
+from support.products.made_products import MAKERS, context
 from typer.testing import CliRunner
 
 from lidarops.cli import app

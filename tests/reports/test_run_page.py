@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
-from support import fabricated as fab
-from support.fabricated import (
+from support.products import fabricated as fab
+from support.products.fabricated import (
     CHANNEL,
     START,
     homogeneous,

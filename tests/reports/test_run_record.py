@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support import fabricated as fab
+from support.products import fabricated as fab
 
 from lidarops.errors import CatalogError, LidarOpsError
 from lidarops.records import (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from support import quick
-from support.small_archive import Archive, made
+from support.archives.small_archive import Archive, made
 
 from lidarops.run import executor
 from lidarops.run.archive import reprocess

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
-from support.small_archive import DAY, Archive
+from support.archives.small_archive import DAY, Archive
 from typer.testing import CliRunner
 
 from lidarops.catalog import lock as lock_module

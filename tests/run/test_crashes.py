@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from support import crash_archive
+from support.archives import crash_archive
 
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock

@@ -13,9 +13,9 @@ import pytest
 from distributed import Client, Nanny
 from distributed.core import Status
 from distributed.deploy.spec import SpecCluster
+from support.archives.scene_jobs import catalogued_scenes, scene_jobs
+from support.archives.small_archive import Archive, made
 from support.poison import Poison
-from support.scene_jobs import catalogued_scenes, scene_jobs
-from support.small_archive import Archive, made
 
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from support import quick
-from support.small_archive import DAY, Archive, made
+from support.archives.small_archive import DAY, Archive, made
 from typer.testing import CliRunner
 
 from lidarops.catalog.ledger import RunStatus
@@ -442,7 +442,7 @@ def test_a_scene_that_failed_for_good_is_not_tried_until_something_changes(
     assert "air.csv" in next(iter(again.failures.values()))
     assert again.has_failures
     assert archive.contents() == before
-    from support.small_archive import SOUNDING
+    from support.archives.small_archive import SOUNDING
 
     (archive.folder / "air.csv").write_text(SOUNDING)
     healed = bring_up_to_date(archive.write())
@@ -573,7 +573,7 @@ def test_only_days_with_failures_are_judged_again(
 
 def _elsewhere(archive: Archive) -> None:
     """Change the sounding."""
-    from support.small_archive import SOUNDING
+    from support.archives.small_archive import SOUNDING
 
     (archive.folder / "air.csv").write_text(SOUNDING.replace("288.15", "287.15"))
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import NoReturn
 
 import pytest
-from support.small_archive import DAY, Archive
+from support.archives.small_archive import DAY, Archive
 from typer.testing import CliRunner
 
 from lidarops.catalog.ledger import Run, RunStatus

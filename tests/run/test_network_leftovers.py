@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
-from support import raw_archives
+from support.archives import raw_archives
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from support import factories, raw_archives
+from support import factories
+from support.archives import raw_archives
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import load_campaign

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.small_campaign import TREE
+from support.archives.small_campaign import TREE
 
 from lidarops.campaign.model import Campaign
 

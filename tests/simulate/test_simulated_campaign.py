@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.small_campaign import FAST, SLOW
+from support.archives.small_campaign import FAST, SLOW
 
 from lidarops.errors import CampaignError
 from lidarops.raw import licel

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.site_archive import CHROMIUM, add_unknown, browser, small_archive
+from support.archives.site_archive import CHROMIUM, add_unknown, browser, small_archive
 
 from lidarops.site.build import build_site
 

@@ -16,7 +16,7 @@ import netCDF4
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.site_archive import add, add_unknown, contents, small_archive
+from support.archives.site_archive import add, add_unknown, contents, small_archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app

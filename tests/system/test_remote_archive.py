@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support import factories, raw_archives
+from support import factories
+from support.archives import raw_archives
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.scan import ScanSummary, scan_archive

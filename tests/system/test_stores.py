@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from support.s3server import KEYS, free_port
+from support.servers.ports import KEYS, free_port
 
 from lidarops.errors import CatalogError, ProductError
 from lidarops.system.stores import RemoteStore, without_keys

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.made_products import MAKERS, context
+from support.products.made_products import MAKERS, context
 
 from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product

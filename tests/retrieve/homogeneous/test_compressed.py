@@ -7,13 +7,13 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from scipy import stats
-from support.oracle_homogeneous import GEOMETRIES, lowest_errors, section, signal
+from support.oracles.homogeneous import GEOMETRIES, lowest_errors, section, signal
 
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import (
     _compressed,
-    _dense,
     _functional_tables,
+    _routing,
     _vector_loops,
 )
 from lidarops.retrieve.homogeneous._functional_tables import make_tables
@@ -70,10 +70,10 @@ def test_tables_do_not_depend_on_the_block_size(monkeypatch, room):
 
 
 def test_long_profiles_are_solved_without_tables(monkeypatch):
-    r = 2500.0 + 2.0 * np.arange(_dense.MOST_BINS + 1.0)
+    r = 2500.0 + 2.0 * np.arange(_routing.MOST_BINS + 1.0)
     power = signal(r, 100.0, 3e-5) + np.random.default_rng(8).standard_normal((3, r.size))
     made = []
-    monkeypatch.setattr(_dense, "make_tables", lambda *arguments: made.append(arguments))
+    monkeypatch.setattr(_routing, "make_tables", lambda *arguments: made.append(arguments))
     fit, direct = (
         fit_homogeneous_path(power, r, variance=1.0, method=name) for name in ("auto", "direct")
     )

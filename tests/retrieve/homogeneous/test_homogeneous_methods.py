@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from support.oracle_homogeneous import (
+from support.oracles.homogeneous import (
     GEOMETRIES,
     TABLE_BIAS,
     amplitude,

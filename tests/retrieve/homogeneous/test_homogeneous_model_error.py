@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.oracle_homogeneous import iterated_fit, section, signal
+from support.oracles.homogeneous import iterated_fit, section, signal
 
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
-from support.oracle_homogeneous import section, signal
+from support.oracles.homogeneous import section, signal
 
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM

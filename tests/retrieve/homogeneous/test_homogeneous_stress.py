@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import mpmath as mp
 import numpy as np
 import pytest
-from support.oracle_homogeneous import (
+from support.oracles.homogeneous import (
     GEOMETRIES,
     amplitude,
     brute_force,

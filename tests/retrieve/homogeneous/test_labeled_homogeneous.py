@@ -6,7 +6,7 @@ import dask
 import numpy as np
 import pytest
 import xarray as xr
-from support.oracle_homogeneous import signal
+from support.oracles.homogeneous import signal
 
 import lidarops
 from lidarops.errors import RetrievalInputError

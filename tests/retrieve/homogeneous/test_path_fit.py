@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.oracle_homogeneous import (
+from support.oracles.homogeneous import (
     GEOMETRIES,
     amplitude,
     iterated_fit,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.oracle_multiangle import (
+from support.oracles.multiangle import (
     ANGLES,
     PATHS,
     clear,

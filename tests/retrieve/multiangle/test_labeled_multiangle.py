@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from support.angle_scenes import retrieve_scan
+from support.oracles.angle_scenes import retrieve_scan
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality

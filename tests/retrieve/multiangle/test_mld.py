@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.oracle_multiangle import PER_KM, rms
+from support.oracles.multiangle import PER_KM, rms
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle import mld

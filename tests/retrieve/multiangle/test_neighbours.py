@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.oracle_multiangle import Scan, ScanScene, clear_scene, random_scene
+from support.oracles.multiangle import Scan, ScanScene, clear_scene, random_scene
 
 from lidarops.retrieve.multiangle._neighbours import neighbours_alike
 

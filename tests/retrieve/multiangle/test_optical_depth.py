@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.oracle_multiangle import (
+from support.oracles.multiangle import (
     ANGLES,
     clear,
     cloud,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.oracle_multiangle import cloud_scene
+from support.oracles.multiangle import cloud_scene
 
 
 @pytest.mark.parametrize(("beams", "scatter"), [(4, 0.2), (10, 0.05)])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import erfc
-from support.oracle_multiangle import (
+from support.oracles.multiangle import (
     Scan,
     ScanScene,
     clear_scene,

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from support.oracle_network import gradient, grid, noisy, plume, signals, three_by_two
+from support.oracles.network import gradient, grid, noisy, plume, signals, three_by_two
 
 from lidarops.retrieve.network import _block_errors
 from lidarops.retrieve.network.extinction_field import retrieve_network

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.oracle_network import (
+from support.oracles.network import (
     at_crossings,
     gradient,
     grid,

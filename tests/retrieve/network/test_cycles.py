@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.oracle_network import homogeneous, optical_depths, triangle
+from support.oracles.network import homogeneous, optical_depths, triangle
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.network import _multiplier, geometry

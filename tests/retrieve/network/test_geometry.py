@@ -5,7 +5,7 @@ from __future__ import annotations
 import mpmath as mp
 import numpy as np
 import pytest
-from support.oracle_network import fan, triangle
+from support.oracles.network import fan, triangle
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.network import geometry

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, optimize
-from support.oracle_network import (
+from support.oracles.network import (
     at_crossings,
     gradient,
     grid,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from support.made_network import EXTINCTION, beam, network, product, without
+from support.products.made_network import EXTINCTION, beam, network, product, without
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from support import oracle_signal
+from support.oracles import signal as oracle
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -285,12 +285,12 @@ def test_analog_agrees_with_plain_numpy(bins: int, offset: float) -> None:
     for chosen in (settings, settings | {"dark": rng.normal(0, 0.1, bins)}):
         _assert_agree(
             counts_to_signal.analog_signal(counts, shots, distance, input_range=volt, **chosen),
-            oracle_signal.analog(counts, shots, distance, input_range=volt, **chosen),
+            oracle.analog(counts, shots, distance, input_range=volt, **chosen),
         )
     known = settings | {"noise_variance": 1e-3, "dark_variance": rng.random(bins) * 1e-2}
     _assert_agree(
         counts_to_signal.analog_signal(counts, shots, distance, input_range=volt, **known),
-        oracle_signal.analog(counts, shots, distance, input_range=volt, **known),
+        oracle.analog(counts, shots, distance, input_range=volt, **known),
     )
 
 
@@ -306,7 +306,7 @@ def test_photon_agrees_with_plain_numpy(bins: int, dead_time: float | None) -> N
     settings = {"bin_width": 7.5, "dead_time": dead_time, "full_overlap_range": 200.0}
     _assert_agree(
         counts_to_signal.photon_signal(counts, shots, distance, **settings),
-        oracle_signal.photon(counts, shots, distance, **settings),
+        oracle.photon(counts, shots, distance, **settings),
     )
 
 
@@ -316,7 +316,7 @@ def test_the_near_range_does_not_degrade_sums_of_the_far_range(decades: int) -> 
     distance = (np.arange(4096) + 0.5) * 7.5
     values = rng.normal(1.0, 1.0, 4096) * 10.0 ** np.linspace(decades, 0.0, 4096)
     values[:30] *= 10.0**decades
-    first, past = oracle_signal.windows(distance, 0.1)
+    first, past = oracle.windows(distance, 0.1)
     inside = [values[a:b] for a, b in zip(first, past, strict=True)]
     exact = np.array([math.fsum(window) / window.size for window in inside])
     size = np.array([math.fsum(np.abs(window)) / window.size for window in inside])
@@ -325,7 +325,7 @@ def test_the_near_range_does_not_degrade_sums_of_the_far_range(decades: int) -> 
     assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
     if decades > 0:
         # Differences of one running sum, as in the oracle, lose these digits.
-        oracle_error = np.abs(oracle_signal.smooth(values, distance) - exact)
+        oracle_error = np.abs(oracle.smooth(values, distance) - exact)
         assert oracle_error.max() > 1e-10 * size[np.argmax(oracle_error)]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.banded_matrices import dense
+from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded
 from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.banded_matrices import dense
+from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded, _calibration
 from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision

@@ -9,13 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import erf
-from support.angle_scenes import (
-    clear,
-    clear_depth,
-    cloud,
-    estimates,
-)
-from support.banded_matrices import dense
+from support.oracles.angle_scenes import clear, clear_depth, cloud, estimates
+from support.oracles.banded_matrices import dense
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle.vertical import _banded, _correlation, _outliers, monotone

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.banded_matrices import dense
+from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded
 from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.oracle_multiangle import ANGLES, clear, cloud, rms, signals
+from support.oracles.multiangle import ANGLES, clear, cloud, rms, signals
 
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 from lidarops.retrieve.multiangle.vertical import _correlation, gaps

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.interpolate import BarycentricInterpolator
-from support.oracle_network import FIELDS, fan, grid, noisy, signals, three_by_two, triangle
+from support.oracles.network import (
+    FIELDS,
+    fan,
+    grid,
+    noisy,
+    signals,
+    three_by_two,
+    triangle,
+)
 
 from lidarops.retrieve.network import _condensed_signals, _fit_layout
 from lidarops.retrieve.network.extinction_field import retrieve_network

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.oracle_network import (
+from support.oracles.network import (
     at_crossings,
     grid,
     homogeneous,

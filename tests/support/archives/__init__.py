@@ -1,0 +1,1 @@
+"""Small campaigns, archives of raw files and of products, and runs over them."""

@@ -1,0 +1,25 @@
+"""Scenes and jobs of a campaign, for tests that carry out a step of a run by themselves."""
+
+from __future__ import annotations
+
+from lidarops.campaign.model import Campaign
+from lidarops.catalog.store import Store
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
+from lidarops.process.scene import Job
+from lidarops.records import Scene
+from lidarops.run.archive import update_catalog
+
+
+def catalogued_scenes(campaign: Campaign) -> tuple[Scene, ...]:
+    """Bring the catalog up to date and return its scenes."""
+    update_catalog(campaign)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        return cut_scenes(campaign, store.granules()).scenes
+
+
+def scene_jobs(campaign: Campaign) -> list[Job]:
+    """Bring the catalog up to date and return a job for every product of every scene."""
+    return [
+        Job(campaign, scene, plan_scene(scene, campaign)) for scene in catalogued_scenes(campaign)
+    ]

@@ -1,0 +1,14 @@
+"""Banded matrices in dense form, for comparison."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def dense(bands):
+    """Return the symmetric matrix of its diagonal and two upper off-diagonals."""
+    matrix = np.diag(bands[0])
+    for step in range(1, min(3, bands.shape[1])):
+        above = np.diag(bands[step][: bands.shape[1] - step], step)
+        matrix = matrix + above + above.T
+    return matrix

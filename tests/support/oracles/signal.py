@@ -1,0 +1,167 @@
+"""`lidarops.retrieve.signal.counts_to_signal` in plain numpy: slow, and easy to read.
+
+Sums over windows are differences of running sums, with the rounding errors of these.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarops.constants import DEFAULT_DEAD_TIME, LICEL_RANGE_PER_MICROSECOND
+from lidarops.flags import Quality
+from lidarops.retrieve.signal import counts_to_signal
+from lidarops.retrieve.signal.counts_to_signal import Signal
+
+EXTREMES = (-(2**31), 1 - 2**31, 2**31 - 1)
+UNUSABLE = int(Quality.INPUT_MISSING | Quality.SATURATED)
+
+
+def analog(
+    counts,
+    shots,
+    range,  # noqa: A002
+    *,
+    adc_bits,
+    input_range,
+    dark=0.0,
+    dark_variance=0.0,
+    noise_variance=None,
+    full_overlap_range=0.0,
+):
+    fired = shots.astype(np.float64)[..., np.newaxis]
+    quality = raw_quality(counts, fired, range, full_overlap_range)
+    quality[counts >= fired * (2.0**adc_bits - 1.0)] |= np.int32(Quality.SATURATED)
+    whole = input_range[..., np.newaxis] * 1000.0 / 2.0**adc_bits
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step = input_range[..., np.newaxis] * 1000.0 / (fired * 2.0**adc_bits)
+        power = counts * step - dark
+    power[(quality & UNUSABLE) != 0] = np.nan
+    if noise_variance is None:
+        variance = difference_variance(power, range)
+    else:
+        variance = np.full(power.shape, noise_variance) + dark_variance
+    top = fired * (2.0**adc_bits - 1.0)
+    with np.errstate(invalid="ignore"):
+        clipped = (top - counts) * step < counts_to_signal.CLIPPING * np.sqrt(variance * fired)
+        clipped &= fired > 0
+        clipped &= counts > counts_to_signal.NEAR_FULL_SCALE * top
+    power[clipped] = np.nan
+    quality[clipped] |= np.int32(Quality.SATURATED)
+    if noise_variance is None:
+        with_clipping = clipped.any(axis=-1)
+        variance[with_clipping] = difference_variance(power, range)[with_clipping]
+        return Signal(power, rounded(variance, whole, fired), quality)
+    known = rounded(np.full(power.shape, noise_variance), whole, fired)
+    return Signal(power, known + dark_variance, quality)
+
+
+def rounded(variance, step, shots):
+    """Return the variance of a mean of shots, each rounded by the digitiser to whole steps."""
+    result = variance.copy()
+    for row, size, fired in zip(result, step[:, 0], shots[:, 0], strict=True):
+        if fired == 0:
+            row[:] = row + np.inf
+            continue
+        shot = row * fired / size**2
+        middle = np.sort(shot)[(shot.size - 1) // 2]
+        least = shot if np.isnan(middle) else np.where(shot < middle, shot, middle)
+        few = np.where(least < 1 / 12, 1.0, np.exp(-4 * np.pi**2 * (least - 1 / 12)))
+        bias = np.maximum((1 / 4 - least) / 3, few / (2 * np.pi**2))
+        coarse = (np.maximum(shot, 1 / 12) / fired + bias) * size**2
+        row[shot < 0.5] = coarse[shot < 0.5]
+    return result
+
+
+def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_range=0.0):  # noqa: A002
+    fired = shots.astype(np.float64)[..., np.newaxis]
+    quality = raw_quality(counts, fired, range, full_overlap_range)
+    quality[counts < 0] |= np.int32(Quality.INPUT_MISSING)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        exposure = fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)
+        rate = counts / exposure
+        load = rate * ((dead_time or DEFAULT_DEAD_TIME) * 1e6)
+        correction = load / (1.0 - np.minimum(load, counts_to_signal.PARALYSIS))
+        quality[load > counts_to_signal.PARALYSIS] |= np.int32(Quality.SATURATED)
+        limit = (
+            counts_to_signal.UNCORRECTED_PILE_UP
+            if dead_time is None
+            else counts_to_signal.PILE_UP_CORRECTION
+        )
+        quality[correction > limit] |= np.int32(Quality.PILE_UP)
+        rate[(quality & UNUSABLE) != 0] = np.nan
+        live = 1.0 - rate * ((dead_time or 0.0) * 1e6)
+        power = rate / live
+        floor = 1.0 / (exposure * window_sums(np.isfinite(power).astype(float), range, 0.1))
+        expected = np.maximum(smooth(power, range), floor)
+        variance = expected / (exposure * smooth(live, range))
+    return Signal(power, variance, quality)
+
+
+def raw_quality(counts, shots, range, full_overlap_range):  # noqa: A002
+    quality = np.zeros(counts.shape, dtype=np.int32)
+    dead = ~counts.any(axis=-1, keepdims=True)
+    missing = np.isin(counts, EXTREMES) | (shots <= 0) | dead
+    quality[missing] |= np.int32(Quality.INPUT_MISSING)
+    quality[..., range < full_overlap_range] |= np.int32(Quality.INCOMPLETE_OVERLAP)
+    return quality
+
+
+def windows(range, window):  # noqa: A002
+    """Return first and past-the-last bin of the smoothing window of each bin."""
+    index = np.arange(range.size)
+    spacing = float(np.min(np.abs(np.diff(range)))) if range.size > 1 else 1.0
+    half = np.maximum(np.abs(range) * (window / spacing), 16).astype(np.intp)
+    half = np.minimum(half, np.maximum(np.minimum(index, range.size - 1 - index), 16))
+    return np.maximum(index - half, 0), np.minimum(index + half + 1, range.size)
+
+
+def window_sums(values, range, window):  # noqa: A002
+    first, past = windows(range, window)
+    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
+    return sums[..., past] - sums[..., first]
+
+
+def smooth(values, range, *, window=0.1):  # noqa: A002
+    finite = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        sums = window_sums(np.where(finite, values, 0.0), range, window)
+        return sums / window_sums(finite.astype(float), range, window)
+
+
+def difference_variance(power, range):  # noqa: A002
+    third = power[..., 3:] - 3.0 * power[..., 2:-1] + 3.0 * power[..., 1:-2] - power[..., :-3]
+    squares = np.full(power.shape, np.nan)
+    squares[..., 1:-2] = third**2 / 20.0
+    local = smooth(squares, range, window=0.3)
+    mean = smooth(power, range)
+    spacing = np.abs(np.gradient(range)) if range.size > 1 else np.ones(1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        leak = (24.0 * (spacing / range) ** 3 * mean) ** 2 / 20.0
+        usable = np.isfinite(squares) & np.isfinite(mean) & (local > 0)
+        usable &= leak < counts_to_signal.LEAK * local
+        weight = np.where(usable, 1.0 / local**2, 0.0)
+        weight /= np.max(weight, axis=-1, keepdims=True)
+        weighty = usable & (weight > 0.0)
+        floor = np.min(np.where(weighty, mean, np.inf), axis=-1, keepdims=True)
+        x, y = np.where(weighty, mean, 0.0), np.where(weighty, squares, 0.0)
+        a, b = line(x, y, weight, floor)
+        variance = a + b * np.maximum(mean - floor, 0.0)
+    return np.where(np.isfinite(variance) & (variance > 0), variance, local)
+
+
+def line(x, y, weight, floor):
+    total = weight.sum(axis=-1, keepdims=True)
+    x_mean = (weight * x).sum(axis=-1, keepdims=True) / total
+    y_mean = (weight * y).sum(axis=-1, keepdims=True) / total
+    from_mean = x - x_mean
+    square = (weight * from_mean**2).sum(axis=-1, keepdims=True)
+    slope = (weight * from_mean * (y - y_mean)).sum(axis=-1, keepdims=True) / square
+    x_square = (weight * x**2).sum(axis=-1, keepdims=True)
+    # Values of x that differ only by rounding define no slope.
+    slope = np.where((slope > 0) & (square > 1e-24 * x_square), slope, 0.0)
+    lowest = y_mean - slope * (x_mean - floor)
+    above = np.where(weight > 0.0, x - floor, 0.0)
+    through = (weight * above * y).sum(axis=-1, keepdims=True)
+    through /= (weight * above**2).sum(axis=-1, keepdims=True)
+    negative = lowest < 0
+    return np.where(negative, 0.0, lowest), np.where(negative, through, slope)

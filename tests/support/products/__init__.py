@@ -1,0 +1,1 @@
+"""Synthetic results, products and run records, and the compliance check of a product."""

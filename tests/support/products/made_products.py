@@ -1,0 +1,364 @@
+"""Made-up results of retrievals, as input of the builder."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidarops.campaign.model import Metadata, Station
+from lidarops.flags import Quality
+from lidarops.netcdf.build import Context
+from lidarops.records import (
+    DetectionMode,
+    InputRecord,
+    LeftOut,
+    Plan,
+    ProductKind,
+    Provenance,
+    Role,
+    Step,
+)
+
+START = datetime(2026, 3, 1, tzinfo=UTC)
+SCENE = "lidar-1_20260301T000000"
+STATION = Station(name="Одеса, hill", latitude=46.44, longitude=30.76, altitude=53.5)
+METADATA = Metadata(
+    institution="Université d'Été",
+    creator_name="A. Person",
+    creator_email="a.person@example.org",
+    license="CC-BY-4.0",
+    comment="A comment of the campaign.",
+)
+
+
+def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Provenance:
+    plan = Plan(
+        scene=SCENE,
+        steps=(
+            Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
+            Step("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
+            Step("homogeneous", "photon_532o", {"method": "auto"}, "requested"),
+            Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "requested"),
+            Step("multiangle", "photon_532o", {"method": "auto"}, "requested"),
+            Step("visibility", "photon_532o", {"contrast": 0.05}, "requested"),
+            Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
+        ),
+        left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
+    )
+    inputs = tuple(
+        InputRecord(f"2026/03/a{number:02d}.dat", Role.SIGNAL, f"{number:064x}")
+        for number in range(3)
+    )
+    fields = {
+        "campaign": "demo",
+        "scene": SCENE,
+        "kind": kind,
+        "channel": "photon_532o",
+        "inputs": (*inputs, InputRecord("dark/d.dat", Role.DARK, "f" * 64)),
+        "plan": plan,
+        "settings": {"facts": {"full_overlap_range": 500.0}, "station": {"name": "Одеса"}},
+        "versions": {"numpy": "2.4.6", "lidarops": "0.1.0"},
+        "code_version": "0123456789abcdef",
+    }
+    return Provenance(**(fields | changes))
+
+
+def context(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Context:
+    fields = {
+        "kind": kind,
+        "channel": "photon_532o",
+        "mode": DetectionMode.PHOTON,
+        "wavelength": 532e-9,
+        "station_key": "odesa",
+        "station": STATION,
+        "instrument_key": "lidar-1",
+        "instrument_name": "Lidar One",
+        "metadata": METADATA,
+        "campaign": "demo",
+        "title": "Demo campaign",
+        "summary": "What the campaign is about.",
+        "scene": SCENE,
+        "start": START,
+        "stop": START + timedelta(days=1),
+        "provenance": provenance(kind),
+    }
+    return Context(**(fields | changes))
+
+
+def clock(profiles: int, zenith: Any = 90.0, azimuth: Any = None) -> dict[str, Any]:
+    """Return the coordinates of all kinds: profiles of 10 minutes, zenith angle over time."""
+    first = np.datetime64("2026-03-01T10:00:00", "ns")
+    length = np.timedelta64(600, "s")
+    starts = first + length * np.arange(profiles)
+    found = {
+        "time": ("time", starts + length // 2),
+        "time_bnds": (("time", "nv"), np.stack([starts, starts + length], axis=-1)),
+        "zenith_angle": ("time", np.broadcast_to(np.float64(zenith), (profiles,)).copy()),
+    }
+    if azimuth is not None:
+        found["azimuth"] = ("time", np.broadcast_to(np.float64(azimuth), (profiles,)).copy())
+    return found
+
+
+def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset:
+    """Return a made-up result of `homogeneous.labeled.fit_homogeneous_path`."""
+    rng = np.random.default_rng(1)
+    shape = (profiles, sections)
+    dims = ("time", "section")
+    near = 500.0 + 1000.0 * np.arange(sections)
+    extinction = rng.uniform(1e-6, 1e-3, shape)
+    flags = np.zeros(shape, np.int32)
+    flags[0, 0] = Quality.NO_SIGNAL | Quality.LOW_SIGNAL
+    extinction[0, 0] = np.nan
+    return xr.Dataset(
+        {
+            "extinction": (dims, extinction),
+            "extinction_standard_error": (dims, np.abs(extinction) * 0.05),
+            "extinction_model_error": (dims, np.abs(extinction) * 0.05 + 1e-5),
+            "amplitude": (dims, rng.uniform(1e7, 1e12, shape)),
+            "amplitude_standard_error": (dims, rng.uniform(1e5, 1e9, shape)),
+            "background": (dims, rng.uniform(0.1, 2.0, shape)),
+            "background_standard_error": (dims, rng.uniform(1e-4, 1e-3, shape)),
+            "background_model_error": (dims, np.full(shape, 5e-4)),
+            "reduced_chi2": (dims, rng.uniform(0.8, 1.2, shape)),
+            "valid_bins": (dims, rng.integers(8, 500, shape)),
+            "quality_flag": (dims, flags),
+            "shots": ("time", np.full(profiles, 600, np.int64)),
+        },
+        coords={
+            **clock(profiles, **beam),
+            "section": ("section", np.arange(sections)),
+            "section_range": ("section", near + 1000.0),
+            "section_bounds": (("section", "nv"), np.stack([near, near + 2000.0], axis=-1)),
+        },
+    )
+
+
+def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
+    """Return a made-up background-subtracted, range-corrected signal."""
+    rng = np.random.default_rng(2)
+    dims = ("time", "range")
+    shape = (profiles, bins)
+    values = rng.normal(1e6, 1e4, shape)
+    flags = np.zeros(shape, np.int32)
+    flags[:, :3] = Quality.INCOMPLETE_OVERLAP
+    flags[0, 0] |= Quality.INPUT_MISSING
+    values[0, 0] = np.nan
+    return xr.Dataset(
+        {
+            "signal": (dims, values),
+            "signal_standard_error": (dims, np.full(shape, 1e4)),
+            "background": ("time", rng.uniform(0.1, 2.0, profiles)),
+            "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
+            "quality_flag": (dims, flags),
+            "shots": ("time", np.full(profiles, 600, np.int32)),
+        },
+        coords={**clock(profiles, **beam), "range": ("range", 7.5 * (np.arange(bins) + 0.5))},
+    )
+
+
+def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
+    """Return a made-up result of `elastic.labeled.invert_elastic`."""
+    rng = np.random.default_rng(3)
+    dims = ("time", "range")
+    shape = (profiles, bins)
+    flags = np.zeros(shape, np.int32)
+    flags[:, :3] = Quality.INCOMPLETE_OVERLAP
+    flags[-1] |= np.int32(Quality.NO_REFERENCE)
+    flags[0, 5:] |= np.int32(Quality.CLOUD)
+    missing = (flags & int(Quality.INCOMPLETE_OVERLAP | Quality.NO_REFERENCE)) != 0
+    scales = {
+        "backscatter": 1e-6,
+        "extinction": 5e-5,
+        "scattering_ratio": 2.0,
+        "attenuated_backscatter": 2e-6,
+    }
+    retrieved = {}
+    for name, scale in scales.items():
+        retrieved[name] = rng.normal(scale, 0.1 * scale, shape)
+        retrieved[f"{name}_standard_error"] = np.full(shape, 0.1 * scale)
+    for cause in ("noise", "background", "reference", "lidar_ratio", "molecular"):
+        retrieved[f"backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
+    window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
+    return xr.Dataset(
+        {
+            **{
+                name: (dims, np.where(missing, np.nan, values))
+                for name, values in retrieved.items()
+            },
+            "molecular_backscatter": ("range", np.linspace(1.5e-6, 1e-6, bins)),
+            "molecular_extinction": ("range", np.linspace(1.3e-5, 1e-5, bins)),
+            "lidar_ratio": ((), 50.0),
+            "lidar_ratio_standard_error": ((), 10.0),
+            "reference_bottom": ("time", window),
+            "reference_top": ("time", window + 50.0),
+            "cloud_base_range": ("time", np.where(np.arange(profiles) == 0, 40.0, np.nan)),
+            "background": ("time", rng.uniform(0.1, 2.0, profiles)),
+            "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
+            "glue_slope": ("time", np.full(profiles, 20.0)),
+            "glue_slope_standard_error": ("time", np.full(profiles, 0.1)),
+            "glue_bottom": ("time", np.full(profiles, 100.0)),
+            "glue_top": ("time", np.full(profiles, 150.0)),
+            "quality_flag": (dims, flags),
+            "profiles": ("time", np.full(profiles, 10, np.int32)),
+            "shots": ("time", np.full(profiles, 6000, np.int32)),
+        },
+        coords={**clock(profiles, **beam), "range": ("range", 7.5 * (np.arange(bins) + 0.5))},
+    )
+
+
+def multiangle(
+    profiles: int = 5,
+    levels: int = 20,
+    zenith: Any = (0.0, 30.0, 60.0),
+    azimuth: Any = None,
+    *,
+    layers: bool = True,
+) -> xr.Dataset:
+    """Return a made-up result of `multiangle.labeled.retrieve_optical_depth`."""
+    rng = np.random.default_rng(4)
+    angles = np.atleast_1d(np.float64(zenith))
+    dims = ("time", "altitude")
+    shape = (profiles, levels)
+    flags = np.full(shape, np.int32(Quality.ONE_SIDED))
+    flags[0, 2 * levels // 3 :] = Quality.EXTRAPOLATED
+    flags[-1, 0] |= np.int32(Quality.INTERPOLATED | Quality.HORIZONTAL_GRADIENT)
+    scales = {
+        "optical_depth": 0.3,
+        "optical_depth_standard_error": 0.01,
+        "optical_depth_gradient_error": 0.005,
+        "extinction": 1e-4,
+        "extinction_standard_error": 1e-5,
+        "extinction_gradient_error": 5e-6,
+        "log_intercept": 14.0,
+        "log_intercept_standard_error": 0.02,
+        "data_share": 0.99,
+        "inhomogeneity": 0.03,
+        "monotone_optical_depth": 0.3,
+        "reduced_chi2": 1.0,
+    }
+    missing = (flags & int(Quality.EXTRAPOLATED)) != 0
+    residual = rng.normal(0.0, 0.03, (profiles, angles.size, levels))
+    residual[0, -1] = np.nan
+    along = {} if azimuth is None else {"azimuth": azimuth}
+    pointing = {
+        f"beam_{name}": ("beam", np.broadcast_to(np.float64(values), angles.shape).copy())
+        for name, values in {"zenith_angle": zenith, **along}.items()
+    }
+    times = {name: clock(profiles)[name] for name in ("time", "time_bnds")}
+    found = xr.Dataset(
+        {
+            **{
+                name: (dims, np.where(missing, np.nan, scale * rng.uniform(0.5, 1.5, shape)))
+                for name, scale in scales.items()
+            },
+            "residual": (("time", "beam", "altitude"), residual),
+            "effective_degrees_of_freedom": ("time", np.full(profiles, 12.5)),
+            "reach": ("time", np.full(profiles, 800.0)),
+            "quality_flag": (dims, flags),
+            "beams": ("time", np.full(profiles, angles.size, np.int32)),
+            "shots": ("time", np.full(profiles, 6000, np.int32)),
+        },
+        coords={
+            **times,
+            **pointing,
+            "beam": ("beam", np.arange(angles.size, dtype=np.int32)),
+            "altitude": ("altitude", STATION.altitude + 60.0 * np.arange(1, levels + 1)),
+        },
+        attrs={"steps": "joint: extinction is requested"},
+    )
+    return with_layers(found) if layers else found
+
+
+def with_layers(data: xr.Dataset) -> xr.Dataset:
+    """Return data with optical depths of two layers, the second one missing in the first cycle."""
+    bounds = STATION.altitude + 60.0 * np.array([[0.0, 2.0], [1.0, 4.0]])
+    dims, shape = ("time", "layer"), (data.sizes["time"], 2)
+    missing = np.zeros(shape, np.bool_)
+    missing[0, 1] = True
+    scales = {"": 0.1, "_standard_error": 0.01, "_gradient_error": 0.005}
+    return data.assign(
+        {
+            f"layer_optical_depth{error}": (dims, np.where(missing, np.nan, scale))
+            for error, scale in scales.items()
+        }
+    ).assign_coords(
+        layer_altitude=("layer", bounds.mean(axis=1)), layer_bnds=(("layer", "nv"), bounds)
+    )
+
+
+def visibility(
+    profiles: int = 5, crossings: int = 3, zenith: Any = 90.0, azimuth: Any = None
+) -> xr.Dataset:
+    """Return a made-up result of `network.labeled.retrieve_network`."""
+    rng = np.random.default_rng(5)
+    beams = max(3, np.size(zenith))
+    pair = ("time", "crossing")
+    shape = (profiles, crossings)
+    flags = np.zeros(shape, np.int32)
+    flags[-1] = int(Quality.LOW_LEVERAGE)
+    flags[0, 0] = int(Quality.INPUT_MISSING | Quality.LOW_SIGNAL)
+    lost = flags[:, :] == flags[0, 0]
+    extinction = rng.uniform(1e-4, 1e-3, shape)
+    error, systematic = 0.02 * extinction, 0.03 * extinction
+    both = np.hypot(error, systematic)
+    law = -np.log(0.05)
+    values = {
+        "visibility_in_air": law / extinction,
+        "visibility_in_air_standard_error": law * error / extinction**2,
+        "visibility_in_air_lower": law / (extinction + both),
+        "visibility_in_air_upper": law / (extinction - both),
+        "extinction": extinction,
+        "extinction_standard_error": error,
+        "extinction_systematic_error": systematic,
+        "condition": rng.uniform(1.0, 3.0, shape),
+    }
+    scalars = {"optical_depth": 0.8, "reduced_chi2": 1.1, "degrees_of_freedom": 1.0}
+    distance = np.full((beams, crossings), np.nan)
+    for crossing in range(crossings):
+        meeting = [crossing % beams, (crossing + 1) % beams]
+        distance[meeting, crossing] = 500.0 + 1000.0 * crossing + 100.0 * np.arange(2)
+    beam_values = {
+        "latitude": STATION.latitude + 0.01 * np.arange(beams),
+        "longitude": STATION.longitude + 0.02 * np.arange(beams),
+        "altitude": STATION.altitude + np.arange(beams),
+        "zenith_angle": np.resize(np.float64(zenith), beams),
+        "azimuth": np.resize(
+            np.float64([70.0, 310.0, 190.0] if azimuth is None else azimuth), beams
+        ),
+    }
+    crossing = np.arange(crossings)
+    return xr.Dataset(
+        {
+            **{name: (pair, np.where(lost, np.nan, found)) for name, found in values.items()},
+            **{name: ("time", np.full(profiles, found)) for name, found in scalars.items()},
+            "prior_deviation": ("time", np.full(profiles, np.nan)),
+            "quality_flag": (pair, flags),
+            "shots": ("time", np.full(profiles, 9000, np.int32)),
+            "beam_range": (("beam", "crossing"), distance),
+        },
+        coords={
+            **{name: clock(profiles)[name] for name in ("time", "time_bnds")},
+            "crossing_id": ("crossing", crossing.astype(np.int32)),
+            "latitude": ("crossing", STATION.latitude + 0.003 * (crossing + 1)),
+            "longitude": ("crossing", STATION.longitude + 0.004 * (crossing + 1)),
+            "altitude": ("crossing", STATION.altitude + 5.0 * crossing[::-1]),
+            "beam": ("beam", np.arange(beams, dtype=np.int32)),
+            **{f"beam_{name}": ("beam", found) for name, found in beam_values.items()},
+        },
+        attrs={"steps": "method iterative; beam 0: lidar-0, with the crossings 0 at 500 m"},
+    )
+
+
+MAKERS = {
+    ProductKind.SIGNAL: signal,
+    ProductKind.HOMOGENEOUS: homogeneous,
+    ProductKind.ELASTIC: elastic,
+    ProductKind.MULTIANGLE: multiangle,
+    ProductKind.VISIBILITY: visibility,
+}
+PLACED = (ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
+"""Kinds whose values lie where several beams look, and not along one."""

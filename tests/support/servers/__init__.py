@@ -1,0 +1,1 @@
+"""Local servers of the tests: object store, scheduler, Prefect."""
