@@ -25,7 +25,7 @@ from lidarops.bench.accuracy.elastic import Elastic
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.multiangle_scores import measure_multiangle as measure_scans
 from lidarops.bench.accuracy.network_scores import NetworkAccuracy
-from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import Machine, least_times, machine
 from lidarops.bench.overview import Baseline, WorkPrecision
 from lidarops.reports.benchmark_page import BenchmarkReport, Part
@@ -47,7 +47,7 @@ class AllRetrievals:
     homogeneous: accuracy.Accuracy
     elastic: Elastic
     multiangle: MultiAngle
-    multiposition: NetworkAccuracy
+    network: NetworkAccuracy
 
 
 def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> BenchmarkOutput:
@@ -83,7 +83,7 @@ def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Benchmark
         homogeneous=paths,
         elastic=vertical,
         multiangle=scans,
-        multiposition=networks,
+        network=networks,
     )
     return BenchmarkOutput(result, _report(result))
 
@@ -104,7 +104,7 @@ def _baselines() -> Iterator[Baseline]:
 
 
 def _report(result: AllRetrievals) -> BenchmarkReport:
-    chapters = (
+    reports = (
         (
             "Homogeneous path",
             "homogeneous",
@@ -112,20 +112,22 @@ def _report(result: AllRetrievals) -> BenchmarkReport:
         ),
         ("Elastic inversion", "elastic", elastic.elastic_accuracy_report(result.elastic)),
         ("Scans", "multiangle", multiangle_report.multiangle_accuracy_report(result.multiangle)),
-        ("Networks", "network", network_report.network_accuracy_report(result.multiposition)),
+        ("Networks", "network", network_report.network_accuracy_report(result.network)),
     )
-    parts = [
-        _prefixed(part, title, name) for title, name, report in chapters for part in report.parts
+    chapters = [
+        _prefixed(chapter, title, name)
+        for title, name, report in reports
+        for chapter in report.parts
     ]
     return BenchmarkReport(
         title="All retrievals: error against run time",
         facts=homogeneous_report.facts(result.date, result.machine),
-        parts=(overview.overview(result.works, result.baselines), *parts),
+        parts=(overview.overview(result.works, result.baselines), *chapters),
         data=RESULT,
     )
 
 
-def _prefixed(part: Part, title: str, name: str) -> Part:
+def _prefixed(chapter: Part, title: str, name: str) -> Part:
     """Return a chapter with the retrieval in its title and file names, which makes them unique."""
-    charts = tuple(replace(chart, name=f"{name}-{chart.name}") for chart in part.charts)
-    return replace(part, title=f"{title}: {part.title}", charts=charts)
+    charts = tuple(replace(chart, name=f"{name}-{chart.name}") for chart in chapter.charts)
+    return replace(chapter, title=f"{title}: {chapter.title}", charts=charts)

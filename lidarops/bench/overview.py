@@ -69,7 +69,7 @@ class WorkPrecision:
     setting: str
     quantity: str
     """With its unit."""
-    way: str
+    method: str
     ours: bool
     """Whether a method of lidarops; else a peer."""
     error: MonteCarloFigure
@@ -95,7 +95,7 @@ def work_precision_rows(
 def _path_rows(accuracy: Accuracy) -> Iterator[WorkPrecision]:
     peers = iterative_peers()
     for method in dict.fromkeys(
-        outcome.way for case in accuracy.cases for outcome in case.outcomes
+        outcome.method for case in accuracy.cases for outcome in case.outcomes
     ):
         pairs = outcomes_of(accuracy, method)
         scores = [o.scores[_EXTINCTION] for _, o in pairs if _EXTINCTION in o.scores]
@@ -157,8 +157,8 @@ def _scan_rows(accuracy: MultiAngle) -> Iterator[WorkPrecision]:
                 SCANS,
                 scene.label,
                 "optical depth",
-                score.way,
-                score.way not in _SCAN_PEERS,
+                score.method,
+                score.method not in _SCAN_PEERS,
                 score.rmse,
                 None if score.coverage is None else score.coverage[_INNER],
                 score.nanoseconds,
@@ -212,7 +212,7 @@ def best_methods(works: Sequence[WorkPrecision]) -> Table:
             work
             for work in works
             if (work.retrieval, work.quantity) == (retrieval, quantity)
-            and work.way not in _WITH_PRIOR_KNOWLEDGE
+            and work.method not in _WITH_PRIOR_KNOWLEDGE
         ]
         setting = _SHOWN.get(retrieval, group[0].setting)
         for ours in (True, False):
@@ -242,7 +242,7 @@ def _best(works: Sequence[WorkPrecision]) -> WorkPrecision:
 
 def _cells(work: WorkPrecision) -> tuple[str, ...]:
     return (
-        work.way if work.ours else f"peer: {work.way}",
+        work.method if work.ours else f"peer: {work.method}",
         f"{work.error.value:.3g} ({work.error.error:.1g})",
         _NONE if work.coverage is None else percent(work.coverage.value),
         format_time(work.nanoseconds),
@@ -272,7 +272,7 @@ def _chart(works: Sequence[WorkPrecision], retrieval: str) -> Chart:
     shown = [work for work in of_retrieval if work.quantity == quantity]
     settings = list(dict.fromkeys(work.setting for work in shown))
     chosen = dict.fromkeys((settings[0], _SHOWN.get(retrieval, settings[-1])))
-    methods = list(dict.fromkeys(work.way for work in shown))
+    methods = list(dict.fromkeys(work.method for work in shown))
     return Chart(
         name="all-" + retrieval.replace(" ", "-"),
         title=f"{retrieval.capitalize()}: error against CPU time",
@@ -287,21 +287,21 @@ def _chart(works: Sequence[WorkPrecision], retrieval: str) -> Chart:
 
 
 def _panel(works: Sequence[WorkPrecision], setting: str, methods: Sequence[str]) -> Panel:
-    by_way = {work.way: work for work in works}
+    by_method = {work.method: work for work in works}
     return Panel(
         title=setting,
         x_label="CPU time per profile (µs)",
         y_label="RMSE",
         # A method without value keeps its place, so that a mark means the same in all panels.
         series=tuple(
-            _point(by_way[method]) if method in by_way else Series(method, (), ())
+            _point(by_method[method]) if method in by_method else Series(method, (), ())
             for method in methods
         ),
         front=pareto(
             [
                 (_micro(work), work.error.value)
                 for work in works
-                if work.way not in _WITH_PRIOR_KNOWLEDGE
+                if work.method not in _WITH_PRIOR_KNOWLEDGE
             ]
         ),
     )
@@ -310,12 +310,12 @@ def _panel(works: Sequence[WorkPrecision], setting: str, methods: Sequence[str])
 def _point(work: WorkPrecision) -> Series:
     error = work.error
     return Series(
-        work.way,
+        work.method,
         (_micro(work),),
         (error.value,),
         (max(error.value - 2 * error.error, 0.5 * error.value),),
         (error.value + 2 * error.error,),
-        hollow=not work.ours or work.way in _WITH_PRIOR_KNOWLEDGE,
+        hollow=not work.ours or work.method in _WITH_PRIOR_KNOWLEDGE,
     )
 
 

@@ -16,7 +16,7 @@ from lidarops.bench.accuracy import (
     network,
 )
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import (
     archives,
@@ -29,7 +29,7 @@ from lidarops.errors import CampaignError
 from lidarops.reports import benchmark_page
 
 STABILITY: Final = "stability"
-"""The benchmark that is no `Kind`, because it has no cases to choose from."""
+"""The benchmark that is no `BenchmarkKind`, because it has no cases to choose from."""
 _REPEATS: Final = 7
 
 _Names = TypeVar("_Names", bound=StrEnum)
@@ -40,12 +40,12 @@ class Benchmark(StrEnum):
 
     ALL = "all"
     ARCHIVE = "archive"
+    CAMPAIGNS = "campaigns"
     COSTS = "costs"
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
     MULTIANGLE = "multiangle"
     NETWORK = "network"
-    PIPELINE = "pipeline"
     READER = "reader"
 
 
@@ -78,19 +78,19 @@ def run_benchmark(
     RawFormatError
         If "reader" gets no file, or one that cannot be read.
     """
-    kind = _member(Kind, what, "benchmark", STABILITY)
-    default = Benchmark.ALL if kind is Kind.ACCURACY else Benchmark.HOMOGENEOUS
+    kind = _member(BenchmarkKind, what, "benchmark", STABILITY)
+    default = Benchmark.ALL if kind is BenchmarkKind.ACCURACY else Benchmark.HOMOGENEOUS
     benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
     _check(kind, benchmark, files, data)
     runs: dict[Benchmark, Callable[[], BenchmarkOutput]] = {
         Benchmark.ALL: lambda: all_retrievals.run_all_retrievals(effort, data=data),
         Benchmark.ARCHIVE: lambda: archives.run_archives(kind, effort=effort),
+        Benchmark.CAMPAIGNS: lambda: campaigns.run_campaigns(kind, effort=effort),
         Benchmark.COSTS: lambda: cost_calibration.run_cost_calibration(kind, effort=effort),
         Benchmark.ELASTIC: lambda: elastic.run_elastic(kind, data=data, effort=effort),
         Benchmark.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
         Benchmark.MULTIANGLE: lambda: multiangle_report.run_multiangle(kind, effort=effort),
         Benchmark.NETWORK: lambda: network.run_network(kind, effort=effort),
-        Benchmark.PIPELINE: lambda: campaigns.run_campaigns(kind, effort=effort),
         Benchmark.READER: lambda: _reader(files, effort),
     }
     return runs[benchmark]()
@@ -103,8 +103,8 @@ def _reader(files: Sequence[Path], effort: Effort) -> BenchmarkOutput:
     )
 
 
-def _homogeneous(kind: Kind, effort: Effort) -> BenchmarkOutput:
-    if kind is Kind.ACCURACY:
+def _homogeneous(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
+    if kind is BenchmarkKind.ACCURACY:
         accuracy = homogeneous.measure_homogeneous(
             quick=effort.quick, date=effort.date, progress=effort.progress
         )
@@ -119,15 +119,15 @@ def _homogeneous(kind: Kind, effort: Effort) -> BenchmarkOutput:
     )
 
 
-def _check(kind: Kind, case: Benchmark, files: Sequence[Path], data: Path | None) -> None:
-    if case is Benchmark.READER and kind is Kind.ACCURACY:
+def _check(kind: BenchmarkKind, case: Benchmark, files: Sequence[Path], data: Path | None) -> None:
+    if case is Benchmark.READER and kind is BenchmarkKind.ACCURACY:
         raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
-    if case is Benchmark.ALL and kind is Kind.THROUGHPUT:
+    if case is Benchmark.ALL and kind is BenchmarkKind.THROUGHPUT:
         raise CampaignError("the case 'all' has no throughput", remedy="choose another case")
     if case is not Benchmark.READER and files:
         raise CampaignError(f"the case {case.value!r} takes no files", remedy="leave them out")
     if data is not None and (
-        case not in {Benchmark.ELASTIC, Benchmark.ALL} or kind is not Kind.ACCURACY
+        case not in {Benchmark.ELASTIC, Benchmark.ALL} or kind is not BenchmarkKind.ACCURACY
     ):
         raise CampaignError(
             "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"

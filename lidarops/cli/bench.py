@@ -23,7 +23,7 @@ from lidarops.cli.app import (
 from lidarops.errors import CampaignError
 
 if TYPE_CHECKING:
-    from lidarops.bench.harness.terms import BenchmarkOutput, Effort
+    from lidarops.bench.harness.benchmark import BenchmarkOutput, Effort
 
 
 @app.command()
@@ -36,7 +36,7 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, archive, costs, elastic, homogeneous, multiangle, network, pipeline "
+            help="all, archive, campaigns, costs, elastic, homogeneous, multiangle, network "
             "or reader."
         ),
     ] = None,
@@ -73,30 +73,30 @@ def bench(
     """
     from lidarops.bench import registry
     from lidarops.bench.harness import results
-    from lidarops.bench.harness.terms import Effort
+    from lidarops.bench.harness.benchmark import Effort
 
     today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as advance:
         effort = Effort(quick=quick, repeats=repeats, date=today, progress=advance)
         if what == registry.STABILITY:
             _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
-            finding = _stability(effort)
+            output = _stability(effort)
         else:
-            finding = registry.run_benchmark(what, case, files or [], effort, data=data)
-    page = None if out is None else registry.write_benchmark(finding, Path(out))
+            output = registry.run_benchmark(what, case, files or [], effort, data=data)
+    page = None if out is None else registry.write_benchmark(output, Path(out))
     if as_json:
-        typer.echo(json.dumps(results.plain(finding.result), indent=1))
-        exit_with_status(failed=_failed(finding))
+        typer.echo(json.dumps(results.plain(output.result), indent=1))
+        exit_with_status(failed=_failed(output))
         return
-    for part in finding.report.parts:
-        for content in part.tables:
-            table = make_table(content.title, *content.columns)
-            for cells in content.rows:
+    for chapter in output.report.parts:
+        for contents in chapter.tables:
+            table = make_table(contents.title, *contents.columns)
+            for cells in contents.rows:
                 add_row(table, *cells)
             show(table)
     if page is not None:
         typer.echo(f"report: {page}")
-    exit_with_status(failed=_failed(finding))
+    exit_with_status(failed=_failed(output))
 
 
 def _refuse(options: dict[str, object]) -> None:
@@ -114,6 +114,6 @@ def _stability(effort: Effort) -> BenchmarkOutput:
     return study.run_stability(effort)
 
 
-def _failed(finding: BenchmarkOutput) -> bool:
+def _failed(output: BenchmarkOutput) -> bool:
     """Return whether a case gave another result than expected."""
-    return bool(getattr(finding.result, "failed", False))
+    return bool(getattr(output.result, "failed", False))

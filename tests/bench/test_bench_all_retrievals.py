@@ -17,7 +17,7 @@ from lidarops.bench.accuracy import (
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.multiangle_scores import StudySize
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import Effort
+from lidarops.bench.harness.benchmark import Effort
 
 SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20, random=4)
 
@@ -56,14 +56,16 @@ def test_every_retrieval_has_our_methods_and_peers(output):
 
 
 def test_rows_hold_the_figures_of_the_retrievals(output):
-    works = {(w.setting, w.quantity, w.way): w for w in output.result.works}
+    works = {(w.setting, w.quantity, w.method): w for w in output.result.works}
     scene = output.result.multiangle.scenes[0]
-    score = next(score for score in scene.scores if score.way == "joint")
+    score = next(score for score in scene.scores if score.method == "joint")
     row = works[scene.label, "optical depth", "joint"]
     assert (row.error, row.nanoseconds) == (score.rmse, score.nanoseconds)
-    case = output.result.multiposition.cases[0]
+    case = output.result.network.cases[0]
     method, networked = next(iter(case.scores.items()))
-    rows = [w for w in output.result.works if w.retrieval == overview.NETWORKS and w.way == method]
+    rows = [
+        w for w in output.result.works if w.retrieval == overview.NETWORKS and w.method == method
+    ]
     assert rows[0].nanoseconds == pytest.approx(1e3 * networked.microseconds)
     assert rows[0].error == networked.rmse
 
@@ -78,29 +80,29 @@ def test_the_first_table_shows_the_best_method_without_prior_knowledge(output):
     first = [work for work in scans if work.setting == scans[0].setting and work.ours]
     best = min(first, key=lambda work: work.error.value)
     shown_methods = [row[1] for row in table.rows if row[0].startswith(overview.SCANS)]
-    (shown,) = (work for work in first if work.way in shown_methods)
+    (shown,) = (work for work in first if work.method in shown_methods)
     assert shown.error.value <= best.error.value + 3.0 * (shown.error.error + best.error.error)
     assert shown.nanoseconds <= best.nanoseconds
 
 
 def test_of_equally_accurate_methods_the_first_table_shows_the_fastest():
-    def work(way: str, error: float, nanoseconds: float) -> overview.WorkPrecision:
+    def work(method: str, error: float, nanoseconds: float) -> overview.WorkPrecision:
         measured = MonteCarloFigure(error, 0.01)
         return overview.WorkPrecision(
-            "paths", "all", "extinction", way, ours=True, error=measured, coverage=None,
+            "paths", "all", "extinction", method, ours=True, error=measured, coverage=None,
             nanoseconds=nanoseconds,
         )  # fmt: skip
 
     works = [work("slow", 1.0, 90.0), work("fast", 1.02, 9.0), work("rough", 1.2, 1.0)]
-    ((_, way, *_),) = overview.best_methods(works).rows
-    assert way == "fast"
+    ((_, method, *_),) = overview.best_methods(works).rows
+    assert method == "fast"
 
 
 def test_page_and_figures_are_written_once_each(output, tmp_path):
     page = registry.write_benchmark(output, tmp_path)
     text = page.read_text(encoding="utf-8")
-    titles = [part.title for part in output.report.parts]
-    charts = [chart.name for part in output.report.parts for chart in part.charts]
+    titles = [chapter.title for chapter in output.report.parts]
+    charts = [chart.name for chapter in output.report.parts for chart in chapter.charts]
     assert len(set(titles)) == len(titles)
     assert len(set(charts)) == len(charts)
     assert all(f"{name}.png" in text and (tmp_path / f"{name}.png").is_file() for name in charts)

@@ -29,7 +29,7 @@ from lidarops.bench.accuracy.homogeneous_report import (
     elastic_throughput_report,
     facts,
 )
-from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput.retrievals import StepCost, elastic_costs, measure_elastic
 from lidarops.figures.charts import Chart, Panel, Series
@@ -84,7 +84,7 @@ class ClosedLoop:
 class PublishedProfileScore:
     """Score of one method or chain on one published file."""
 
-    way: str
+    method: str
     level: float
     background: float
     """Error, counts."""
@@ -200,7 +200,9 @@ def _block(
     }
     errors = {}
     for name, chain in elastic_cases.chains().items():
-        errors[name] = _errors(elastic_cases.invert(counts, sky, estimates[chain.way], chain), sky)
+        errors[name] = _errors(
+            elastic_cases.invert(counts, sky, estimates[chain.method], chain), sky
+        )
     return estimates, errors
 
 
@@ -261,18 +263,18 @@ def _file_scores(file: elastic_cases.Published, sky: SimulatedSky) -> list[Publi
     }
     solved = {}
     for name, chain in elastic_cases.chains().items():
-        inverted = elastic_cases.invert(file.counts, sky, estimates[chain.way], chain)
+        inverted = elastic_cases.invert(file.counts, sky, estimates[chain.method], chain)
         error, stated = _errors(inverted, sky)
         solved[name] = inversion_score(error, stated, _scale(sky))
     rows = {name: (name, None) for name in estimates} | {
-        name: (chain.way, solved[name]) for name, chain in elastic_cases.chains().items()
+        name: (chain.method, solved[name]) for name, chain in elastic_cases.chains().items()
     }
     scores = []
     for name, (method, inversion) in rows.items():
         error_of_background = float(estimates[method].background[0]) - file.background
         scores.append(
             PublishedProfileScore(
-                way=name,
+                method=name,
                 level=file.level,
                 background=error_of_background,
                 deviation=error_of_background / float(estimates[method].standard_error[0]),
@@ -293,12 +295,12 @@ _DRAWN: Final = (
 _NONE: Final = "-"
 
 
-def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> BenchmarkOutput:
+def run_elastic(kind: BenchmarkKind, *, data: Path | None, effort: Effort) -> BenchmarkOutput:
     """Run a benchmark of the elastic retrieval.
 
     Parameters
     ----------
-    kind : Kind
+    kind : BenchmarkKind
     data : Path, optional
         Folder of the published files, for the accuracy.
     effort : Effort
@@ -310,7 +312,7 @@ def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> BenchmarkOu
     RawFormatError
         If a published file cannot be read.
     """
-    if kind is Kind.ACCURACY:
+    if kind is BenchmarkKind.ACCURACY:
         accuracy = measure_elastic_accuracy(
             quick=effort.quick, date=effort.date, data=data, progress=effort.progress
         )
@@ -323,13 +325,13 @@ def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> BenchmarkOu
 
 def elastic_accuracy_report(accuracy: Elastic, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
-    parts = [_backgrounds(accuracy), _inversions(accuracy), _without_noise(accuracy.closed)]
+    chapters = [_backgrounds(accuracy), _inversions(accuracy), _without_noise(accuracy.closed)]
     if accuracy.published:
-        parts.append(_files(accuracy.published))
+        chapters.append(_files(accuracy.published))
     return BenchmarkReport(
         title="Elastic inversion: error against the level of the background",
         facts=facts(accuracy.date, accuracy.machine),
-        parts=(*parts, cost_part(accuracy.costs, elastic_cases.RANGE.size)),
+        parts=(*chapters, cost_part(accuracy.costs, elastic_cases.RANGE.size)),
         data=data,
     )
 
@@ -586,18 +588,18 @@ def _files(published: tuple[PublishedProfileScore, ...]) -> Part:
     backgrounds = tuple(
         (
             _decade(score.level),
-            score.way,
+            score.method,
             f"{score.background:+.3g}",
             f"{score.deviation:+.2f}",
             f"{score.truth_error:.2g}",
         )
         for score in published
-        if score.way in elastic_cases.background_methods()
+        if score.method in elastic_cases.background_methods()
     )
     inversions = tuple(
-        (_decade(score.level), score.way, *_inversion_cells(score.inversion))
+        (_decade(score.level), score.method, *_inversion_cells(score.inversion))
         for score in published
-        if score.way in elastic_cases.chains()
+        if score.method in elastic_cases.chains()
     )
     return Part(
         title="Files of the intercomparison",

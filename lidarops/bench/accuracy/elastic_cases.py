@@ -307,7 +307,7 @@ def invert_particles(
 class Chain:
     """Steps from counts to particles."""
 
-    way: str
+    method: str
     """Method of the background."""
     choose: bool = False
     """Whether the reference window is chosen instead of `GIVEN_WINDOW`."""

@@ -17,8 +17,8 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     QUANTITIES,
     Array,
     Estimates,
+    PathSolver,
     Scenario,
-    Way,
     background_bias,
     difficulty,
     least_errors,
@@ -72,7 +72,7 @@ class PathScore:
 class SolverOutcome:
     """Errors, flags and time of one solver on one scenario."""
 
-    way: str
+    method: str
     profiles: int
     flagged: float
     """Share of profiles with any quality bit."""
@@ -151,10 +151,10 @@ def measure_homogeneous(
         Called with 1 after each scenario.
     """
     count = profiles or (QUICK_PROFILES if quick else PROFILES)
-    ways = {**methods(), **iterative_peers()}
+    solvers = {**methods(), **iterative_peers()}
     cases = []
     for seed, scenario in enumerate(scenarios(quick=quick)):
-        cases.append(_case(scenario, ways, scenario.powers(count, seed)))
+        cases.append(_case(scenario, solvers, scenario.powers(count, seed)))
         progress(1)
     return Accuracy(date, machine(), tuple(cases), tuple(offsets(count)))
 
@@ -213,18 +213,19 @@ def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
     )
 
 
-def _case(scenario: Scenario, ways: Mapping[str, Way], power: Any) -> AccuracyCase:
+def _case(scenario: Scenario, solvers: Mapping[str, PathSolver], power: Any) -> AccuracyCase:
     least = least_errors(scenario)
-    converged = ways[HomogeneousMethod.DIRECT](power, scenario)
+    converged = solvers[HomogeneousMethod.DIRECT](power, scenario)
     outcomes = [
-        _outcome(name, way, scenario, power, least, converged) for name, way in ways.items()
+        _outcome(name, solver, scenario, power, least, converged)
+        for name, solver in solvers.items()
     ]
     return AccuracyCase(scenario, difficulty(scenario), least, tuple(outcomes))
 
 
 def _outcome(
     name: str,
-    way: Way,
+    solver: PathSolver,
     scenario: Scenario,
     power: Any,
     least: Mapping[str, float],
@@ -232,9 +233,9 @@ def _outcome(
 ) -> SolverOutcome:
     if name.startswith(_SLOW):
         power = power[: max(len(power) // _SLOW_SHARE, 16)]
-    way(power[:_WARM], scenario)
+    solver(power[:_WARM], scenario)
     begin = time.process_time()
-    solution = way(power, scenario)
+    solution = solver(power, scenario)
     spent = time.process_time() - begin
     scores = {
         quantity: score
@@ -242,7 +243,7 @@ def _outcome(
         if (score := _score(solution, quantity, scenario.truth[quantity], least[quantity]))
     }
     return SolverOutcome(
-        way=name,
+        method=name,
         profiles=len(power),
         flagged=float(solution.flagged.mean()),
         rejected=float(solution.rejected.mean()),
@@ -295,13 +296,13 @@ def share_inside(inside: npt.NDArray[np.bool_]) -> MonteCarloFigure:
     )
 
 
-def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[AccuracyCase, SolverOutcome]]:
-    """Return the outcomes of one solver, with their cases."""
+def outcomes_of(accuracy: Accuracy, method: str) -> Sequence[tuple[AccuracyCase, SolverOutcome]]:
+    """Return the outcomes of one method, with their cases."""
     return [
         (case, outcome)
         for case in accuracy.cases
         for outcome in case.outcomes
-        if outcome.way == way
+        if outcome.method == method
     ]
 
 

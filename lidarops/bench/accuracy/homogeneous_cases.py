@@ -169,7 +169,7 @@ class Estimates:
     """A rejecting quality bit."""
 
 
-Way = Callable[[Any, Scenario], Estimates]
+PathSolver = Callable[[Any, Scenario], Estimates]
 """Solver: returns estimates from powers (profile, range) and their scenario."""
 
 
@@ -189,16 +189,16 @@ def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str,
             return {}
 
 
-def methods() -> dict[str, Way]:
+def methods() -> dict[str, PathSolver]:
     """Return a solver for every method of `fit_homogeneous_path`, by name."""
     return {
-        str(method): _way(method)
+        str(method): _solver(method)
         for method in HomogeneousMethod
         if method is not HomogeneousMethod.AUTO
     }
 
 
-def _way(method: HomogeneousMethod) -> Way:
+def _solver(method: HomogeneousMethod) -> PathSolver:
     def solve(power: Any, scenario: Scenario) -> Estimates:
         fit = path_fit.fit_homogeneous_path(
             power,

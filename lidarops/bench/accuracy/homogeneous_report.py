@@ -76,12 +76,12 @@ def reader_report(
         columns=("what", "files/s", "MB/s", "times floor"),
         rows=tuple(
             (
-                way.name,
-                f"{way.files_per_second:,.0f}",
-                f"{way.megabytes_per_second:,.0f}",
-                f"{way.times_floor:.2f}",
+                rate.name,
+                f"{rate.files_per_second:,.0f}",
+                f"{rate.megabytes_per_second:,.0f}",
+                f"{rate.times_floor:.2f}",
             )
-            for way in result
+            for rate in result
         ),
     )
     text = "Raw files to arrays, from the page cache, against floors measured in the same run."
@@ -100,8 +100,8 @@ def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
     return tuple(fact for fact in (*known, ("Packages", packages)) if fact[1])
 
 
-def _ways(result: Accuracy) -> list[str]:
-    return [outcome.way for outcome in result.cases[0].outcomes]
+def _methods(result: Accuracy) -> list[str]:
+    return [outcome.method for outcome in result.cases[0].outcomes]
 
 
 # Accuracy ------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ def _overview(result: Accuracy) -> Part:
         "background and amplitude and 0.8 of the true extinction.",
         charts=(_work_precision(result), _convergence(result)),
         tables=(_costs(result), *(_summary(result, quantity) for quantity in QUANTITIES)),
-        details=tuple(_table(result, way) for way in _ways(result)),
+        details=tuple(_table(result, method) for method in _methods(result)),
     )
 
 
@@ -139,14 +139,14 @@ def _work_precision(result: Accuracy) -> Chart:
 def _work_panel(result: Accuracy, quantity: str) -> Panel:
     series = []
     points = []
-    for way in _ways(result):
-        pairs = outcomes_of(result, way)
+    for method in _methods(result):
+        pairs = outcomes_of(result, method)
         errors = [o.scores[quantity].rmse.value for _, o in pairs if quantity in o.scores]
         cost = float(np.median([o.nanoseconds for _, o in pairs]))
-        complete = way not in _HELPED and len(errors) == len(pairs)
+        complete = method not in _HELPED and len(errors) == len(pairs)
         if complete:
             points.append((cost, float(np.median(errors))))
-        series.append(_point(way, cost, errors, hollow=not complete))
+        series.append(_point(method, cost, errors, hollow=not complete))
     return Panel(
         title=_spelled(quantity),
         x_label="CPU time per profile (ns)",
@@ -171,14 +171,14 @@ def _convergence(result: Accuracy) -> Chart:
 def _convergence_panel(result: Accuracy, quantity: str) -> Panel:
     series = []
     points = []
-    for way in _ways(result):
-        pairs = outcomes_of(result, way)
+    for method in _methods(result):
+        pairs = outcomes_of(result, method)
         distances = [o.distances[quantity] for _, o in pairs if o.distances.get(quantity)]
         cost = float(np.median([o.nanoseconds for _, o in pairs]))
-        complete = way not in _HELPED and len(distances) == len(pairs)
+        complete = method not in _HELPED and len(distances) == len(pairs)
         if complete:
             points.append((cost, float(np.median(distances))))
-        series.append(_point(way, cost, distances, hollow=not complete))
+        series.append(_point(method, cost, distances, hollow=not complete))
     return Panel(
         title=_spelled(quantity),
         x_label="CPU time per profile (ns)",
@@ -188,20 +188,20 @@ def _convergence_panel(result: Accuracy, quantity: str) -> Panel:
     )
 
 
-def _point(way: str, cost: float, errors: Sequence[float], *, hollow: bool) -> Series:
+def _point(method: str, cost: float, errors: Sequence[float], *, hollow: bool) -> Series:
     if not errors:
-        return Series(way, (), (), hollow=hollow)
+        return Series(method, (), (), hollow=hollow)
     middle = float(np.median(errors))
-    return Series(way, (cost,), (middle,), (min(errors),), (max(errors),), hollow=hollow)
+    return Series(method, (cost,), (middle,), (min(errors),), (max(errors),), hollow=hollow)
 
 
 def _costs(result: Accuracy) -> Table:
     rows = []
-    for way in _ways(result):
-        outcomes = [outcome for _, outcome in outcomes_of(result, way)]
+    for method in _methods(result):
+        outcomes = [outcome for _, outcome in outcomes_of(result, method)]
         rows.append(
             (
-                way,
+                method,
                 f"{outcomes[0].profiles:,}",
                 percent(float(np.mean([outcome.flagged for outcome in outcomes]))),
                 percent(float(np.mean([outcome.rejected for outcome in outcomes]))),
@@ -217,14 +217,14 @@ def _costs(result: Accuracy) -> Table:
 
 def _summary(result: Accuracy, quantity: str) -> Table:
     rows = []
-    for way in _ways(result):
-        pairs = outcomes_of(result, way)
+    for method in _methods(result):
+        pairs = outcomes_of(result, method)
         scores = [outcome.scores[quantity] for _, outcome in pairs if quantity in outcome.scores]
         if scores:
             coverage = sorted((score.coverage for score in scores), key=lambda m: m.value)
             rows.append(
                 (
-                    way,
+                    method,
                     f"{len(scores)} of {len(pairs)}",
                     f"{np.median([score.rmse.value for score in scores]):.3f}",
                     _value(max((score.rmse for score in scores), key=lambda m: m.value)),
@@ -244,13 +244,13 @@ def _summary(result: Accuracy, quantity: str) -> Table:
     )
 
 
-def _table(result: Accuracy, way: str) -> Table:
-    pairs = outcomes_of(result, way)
+def _table(result: Accuracy, method: str) -> Table:
+    pairs = outcomes_of(result, method)
     columns = [
         f"{_spelled(q)}: {what}" for q in QUANTITIES for what in ("RMSE", "bias", "coverage")
     ]
     return Table(
-        title=f"{way}, path by path",
+        title=f"{method}, path by path",
         columns=("path", "difficulty", *columns, "flagged", "rejected", "ns per profile"),
         rows=tuple(_row(case, outcome) for case, outcome in pairs),
         note=f"{pairs[0][1].profiles:,} profiles per path. RMSE and bias over the bound. "
@@ -278,7 +278,9 @@ def _value(figure: MonteCarloFigure) -> str:
 
 
 def _by_difficulty(result: Accuracy) -> Part:
-    ways = [way for way in ("compressed", "fast", "direct", "cubic") if way in _ways(result)]
+    methods = [
+        method for method in ("compressed", "fast", "direct", "cubic") if method in _methods(result)
+    ]
     return Part(
         title="Error against difficulty",
         text="The same errors, path by path, against the least possible error of extinction.",
@@ -288,35 +290,35 @@ def _by_difficulty(result: Accuracy) -> Part:
                 title="Error against difficulty",
                 caption="RMSE over the Cramér-Rao bound against the least standard error of "
                 "extinction over extinction + 1 / mean range, with Monte Carlo errors.",
-                panels=tuple(_difficulty_panel(result, ways, q) for q in QUANTITIES),
+                panels=tuple(_difficulty_panel(result, methods, q) for q in QUANTITIES),
             ),
         ),
     )
 
 
-def _difficulty_panel(result: Accuracy, ways: Sequence[str], quantity: str) -> Panel:
+def _difficulty_panel(result: Accuracy, methods: Sequence[str], quantity: str) -> Panel:
     return Panel(
         title=_spelled(quantity),
         x_label="difficulty",
         y_label="RMSE over bound" if quantity == QUANTITIES[0] else "",
-        series=tuple(_difficulties(result, way, quantity) for way in ways),
+        series=tuple(_difficulties(result, method, quantity) for method in methods),
         level=1.0,
     )
 
 
-def _difficulties(result: Accuracy, way: str, quantity: str) -> Series:
+def _difficulties(result: Accuracy, method: str, quantity: str) -> Series:
     points = [
         (case.difficulty, outcome.scores[quantity].rmse)
-        for case, outcome in outcomes_of(result, way)
+        for case, outcome in outcomes_of(result, method)
         if quantity in outcome.scores
     ]
     return Series(
-        label=way,
+        label=method,
         x=tuple(x for x, _ in points),
         y=tuple(y.value for _, y in points),
         low=tuple(y.value - y.error for _, y in points),
         high=tuple(y.value + y.error for _, y in points),
-        hollow=way in (HomogeneousMethod.FAST, HomogeneousMethod.DIRECT),
+        hollow=method in (HomogeneousMethod.FAST, HomogeneousMethod.DIRECT),
     )
 
 
@@ -418,7 +420,7 @@ def _offset_table(offsets: Sequence[Offset]) -> Table:
 
 def _times(result: SolverThroughput) -> Part:
     by_setting = {setting: _speeds(result, setting) for setting in settings()}
-    names = list(dict.fromkeys(speed.way for speed in result.speeds))
+    names = list(dict.fromkeys(speed.method for speed in result.speeds))
     return Part(
         title="CPU time per profile",
         text=f"Path {result.path.label}, {result.path.bins} bins; all outputs and flags, one "
@@ -430,7 +432,7 @@ def _times(result: SolverThroughput) -> Part:
 
 
 def _speeds(result: SolverThroughput, setting: Setting) -> dict[str, Speed]:
-    return {speed.way: speed for speed in result.speeds if speed.setting == setting}
+    return {speed.method: speed for speed in result.speeds if speed.setting == setting}
 
 
 def _ladder(names: Sequence[str], result: Mapping[Setting, Mapping[str, Speed]]) -> Ladder:
@@ -458,7 +460,7 @@ def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
         columns=("method", "profiles", "ns each", "reads", "ratio"),
         rows=tuple(
             (
-                speed.way,
+                speed.method,
                 f"{speed.profiles:,}",
                 f"{speed.nanoseconds:,.1f}",
                 f"{speed.reads:,.2f}",
@@ -479,7 +481,7 @@ def _threads(result: SolverThroughput) -> Part:
             Table(
                 title="Gain of two threads",
                 columns=("method", "data", "gain"),
-                rows=tuple((t.way, t.dtype, f"{t.gain:.2f}") for t in result.threads),
+                rows=tuple((t.method, t.dtype, f"{t.gain:.2f}") for t in result.threads),
             ),
         ),
     )

@@ -160,7 +160,7 @@ class ScanEstimates:
     """(profile,)"""
 
 
-Way = Callable[[Scan], ScanEstimates]
+ScanSolver = Callable[[Scan], ScanEstimates]
 """A method to retrieve optical depth, ours or a peer."""
 
 
@@ -321,7 +321,7 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
 # Our methods ----------------------------------------------------------------------------------
 
 
-def scan_methods() -> Mapping[str, Way]:
+def scan_methods() -> Mapping[str, ScanSolver]:
     """Return the methods of lidarops that are compared, by name."""
     return {
         TWO_ANGLE: partial(_own_method, method=TWO_ANGLE),
@@ -396,7 +396,7 @@ def _mld(scan: Scan, *, regularisation: Regularisation) -> ScanEstimates:
 # Peers ----------------------------------------------------------------------------------------
 
 
-def scan_peers() -> Mapping[str, Way]:
+def scan_peers() -> Mapping[str, ScanSolver]:
     """Return methods written directly with numpy and scipy, which solve each altitude on its own.
 
     They know the true scatter, and use samples of more than 3 times their noise.

@@ -19,7 +19,7 @@ from lidarops.bench.accuracy.multiangle_scores import (
     SceneScore,
     measure_multiangle,
 )
-from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
 from lidarops.bench.throughput.retrievals import READ, StepCost
 from lidarops.bench.throughput.scan_kernels import (
     INPUTS,
@@ -41,15 +41,15 @@ _ERRORS: Final = (
 )
 
 
-def run_multiangle(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
+def run_multiangle(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
     """Run a benchmark of the retrieval from scans.
 
     Parameters
     ----------
-    kind : Kind
+    kind : BenchmarkKind
     effort : Effort
     """
-    if kind is Kind.ACCURACY:
+    if kind is BenchmarkKind.ACCURACY:
         study = measure_multiangle(quick=effort.quick, date=effort.date, progress=effort.progress)
         return BenchmarkOutput(study, multiangle_accuracy_report(study, RESULT))
     timing = measure_scan_kernels(
@@ -132,7 +132,7 @@ def _work_chart(scenes: Sequence[SceneScore], name: str, quantity: str, unit: st
 
 
 def _drawn(scene: SceneScore) -> list[ScanScore]:
-    return [score for score in scene.scores if score.way != _UNDRAWN]
+    return [score for score in scene.scores if score.method != _UNDRAWN]
 
 
 def _rmse(score: ScanScore, name: str) -> MonteCarloFigure:
@@ -145,12 +145,12 @@ def _point(score: ScanScore, name: str) -> Series:
     rmse = _rmse(score, name)
     low = max(rmse.value - 2.0 * rmse.error, 0.1 * rmse.value)
     return Series(
-        score.way,
+        score.method,
         (score.nanoseconds / 1e6,),
         (rmse.value,),
         (low,),
         (rmse.value + 2.0 * rmse.error,),
-        hollow=score.way in cases.scan_peers(),
+        hollow=score.method in cases.scan_peers(),
     )
 
 
@@ -174,7 +174,7 @@ def _scene_table(scene: SceneScore) -> Table:
         ),
         rows=tuple(
             (
-                score.way,
+                score.method,
                 f"{score.profiles:,}",
                 f"{score.nanoseconds / 1e6:.3g}",
                 percent(score.solved),
@@ -228,11 +228,11 @@ def _published(study: MultiAngle) -> Part:
 
 
 def _verdict(study: MultiAngle) -> str:
-    def central(way: str, angle: float) -> PublishedCloudScore:
+    def central(method: str, angle: float) -> PublishedCloudScore:
         return next(
             score
             for score in study.published
-            if (score.way, score.largest_angle) == (way, angle)
+            if (score.method, score.largest_angle) == (method, angle)
             and (score.beams, score.share) == scores.CENTRAL
         )
 
@@ -240,7 +240,7 @@ def _verdict(study: MultiAngle) -> str:
     line, joint = central(cases.KANO_HAMILTON, 15.0), central(cases.JOINT, 15.0)
     prior_below, zero = central(cases.MLD_PRIOR, 15.0), central(scores.NOTHING, 15.0)
     correlated = max(
-        study.correlations, key=lambda score: (score.correlation, score.way == cases.JOINT)
+        study.correlations, key=lambda score: (score.correlation, score.method == cases.JOINT)
     )
     enough = [
         angle
@@ -274,7 +274,7 @@ def _verdict(study: MultiAngle) -> str:
 
 def _angle_chart(published: Sequence[PublishedCloudScore]) -> Chart:
     central = [score for score in published if (score.beams, score.share) == scores.CENTRAL]
-    ways = (
+    methods = (
         scores.NOTHING,
         scores.TWO_ANGLE_ALONE,
         cases.KANO_HAMILTON,
@@ -282,7 +282,7 @@ def _angle_chart(published: Sequence[PublishedCloudScore]) -> Chart:
         cases.MLD_PRIOR,
         cases.JOINT,
     )
-    drawn = {way: [score for score in central if score.way == way] for way in ways}
+    drawn = {method: [score for score in central if score.method == method] for method in methods}
     return Chart(
         name="angles",
         title="Published experiment: error against the largest zenith angle",
@@ -294,12 +294,12 @@ def _angle_chart(published: Sequence[PublishedCloudScore]) -> Chart:
                 y_label="root mean square error",
                 series=tuple(
                     Series(
-                        way,
+                        method,
                         tuple(point.largest_angle for point in points),
                         tuple(point.rmse.value for point in points),
                         joined=True,
                     )
-                    for way, points in drawn.items()
+                    for method, points in drawn.items()
                 ),
                 x_log=False,
             ),
@@ -309,12 +309,12 @@ def _angle_chart(published: Sequence[PublishedCloudScore]) -> Chart:
                 y_label="median share",
                 series=tuple(
                     Series(
-                        way,
+                        method,
                         tuple(p.largest_angle for p in points if p.data_share is not None),
                         tuple(p.data_share for p in points if p.data_share is not None),
                         joined=True,
                     )
-                    for way, points in drawn.items()
+                    for method, points in drawn.items()
                 ),
                 x_log=False,
             ),
@@ -346,7 +346,7 @@ def _published_table(
         ),
         rows=tuple(
             (
-                score.way,
+                score.method,
                 with_error(score.rmse),
                 with_error(score.top_bias, sign=True),
                 with_error(scaled(score.extinction_rmse, _PER_KM)),
@@ -389,7 +389,7 @@ def _correlation_table(study: MultiAngle) -> Table:
         rows=tuple(
             (
                 f"{score.correlation:g}",
-                score.way,
+                score.method,
                 with_error(score.rmse),
                 percent(score.close.value),
             )
@@ -403,19 +403,19 @@ def _correlation_table(study: MultiAngle) -> Table:
 
 
 def _outliers(outlier_scores: Sequence[OutlierScore]) -> Part:
-    ways = list(dict.fromkeys(score.way for score in outlier_scores))
+    methods = list(dict.fromkeys(score.method for score in outlier_scores))
     clean = {
-        score.way.split(",")[0]: score
+        score.method.split(",")[0]: score
         for score in outlier_scores
-        if score.outliers == 0.0 and score.way.endswith("plain")
+        if score.outliers == 0.0 and score.method.endswith("plain")
     }
     rows = []
-    for way in ways:
-        for score in (score for score in outlier_scores if score.way == way):
-            base = clean[way.split(",")[0]]
+    for method in methods:
+        for score in (score for score in outlier_scores if score.method == method):
+            base = clean[method.split(",")[0]]
             rows.append(
                 (
-                    f"{way}, {100.0 * score.outliers:.0f} %",
+                    f"{method}, {100.0 * score.outliers:.0f} %",
                     with_error(score.low_rmse),
                     f"{score.low_rmse.value / base.low_rmse.value:.2f}",
                     with_error(score.rmse),
@@ -453,7 +453,7 @@ def _outliers(outlier_scores: Sequence[OutlierScore]) -> Part:
 def _safety(safety: Sequence[SafetyScore]) -> Part:
     rows = tuple(
         (
-            f"{score.air}, {score.way}, {score.quantity}",
+            f"{score.air}, {score.method}, {score.quantity}",
             f"{score.values:,}",
             _rare(score.random_only),
             _rare(score.false),
@@ -501,7 +501,7 @@ def _safety(safety: Sequence[SafetyScore]) -> Part:
 
 def _flag_table(score: SafetyScore) -> Table:
     return Table(
-        title=f"Flags of {score.air}, {score.way}, {score.quantity}",
+        title=f"Flags of {score.air}, {score.method}, {score.quantity}",
         columns=("flag", "share of values", "false of these"),
         rows=tuple(
             (flag.flag, percent(flag.values), _NONE if flag.false is None else _rare(flag.false))

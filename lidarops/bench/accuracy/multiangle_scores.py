@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.bench.accuracy.homogeneous import SIGMAS, MonteCarloFigure
-from lidarops.bench.accuracy.multiangle_cases import Array, Scan, ScanEstimates, Scene, Way
+from lidarops.bench.accuracy.multiangle_cases import Array, Scan, ScanEstimates, ScanSolver, Scene
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleFlags, MultiAngleResult
 
@@ -65,7 +65,7 @@ FULL: Final = StudySize(blocks=16, profiles=64, slow=2, published=250, random=30
 class ScanScore:
     """Errors of one method in one scene, at the altitudes that kano_hamilton reaches."""
 
-    way: str
+    method: str
     profiles: int
     nanoseconds: float
     """CPU time a profile."""
@@ -104,7 +104,7 @@ class SceneScore:
 class PublishedCloudScore:
     """Errors of one method in the published experiment, at the centres of 8 layers of a cloud."""
 
-    way: str
+    method: str
     largest_angle: float
     """degree."""
     beams: int
@@ -143,7 +143,7 @@ class PriorScore:
 class CorrelationScore:
     """Errors of one method where the scatter of neighbouring layers is correlated."""
 
-    way: str
+    method: str
     correlation: float
     rmse: MonteCarloFigure
     close: MonteCarloFigure
@@ -153,7 +153,7 @@ class CorrelationScore:
 class OutlierScore:
     """Errors of one method with outlying samples, in clear air."""
 
-    way: str
+    method: str
     outliers: float
     low_rmse: MonteCarloFigure
     """Of optical depth, below 2 km."""
@@ -182,7 +182,7 @@ class SafetyScore:
 
     air: str
     """How the scatter was drawn."""
-    way: str
+    method: str
     quantity: str
     scenes: int
     profiles: int
@@ -329,20 +329,22 @@ def _compare(scene: Scene, size: StudySize, number: int) -> SceneScore:
     within = [
         np.isfinite(cases.retrieve(scan, cases.KANO_HAMILTON).optical_depth) for scan in scans
     ]
-    ours = [_score(name, way, scans, within) for name, way in cases.scan_methods().items()]
+    ours = [_score(name, solver, scans, within) for name, solver in cases.scan_methods().items()]
     few = [scan.first(size.slow) for scan in scans]
-    others = [_score(name, way, few, within) for name, way in cases.scan_peers().items()]
+    others = [_score(name, solver, few, within) for name, solver in cases.scan_peers().items()]
     profiles = size.blocks * size.profiles
     scores = tuple(score for score in (*ours, *others) if score is not None)
     return SceneScore(scene.label, profiles, scene.altitude.size, scores)
 
 
-def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -> ScanScore | None:
-    way(scans[0].first(1))
+def _score(
+    name: str, solver: ScanSolver, scans: Sequence[Scan], within: Sequence[Mask]
+) -> ScanScore | None:
+    solver(scans[0].first(1))
     blocks, times, shares = [], [], []
     for scan, reached in zip(scans, within, strict=True):
         begin = time.process_time()
-        estimates = way(scan)
+        estimates = solver(scan)
         times.append((time.process_time() - begin) / len(scan.signal))
         mask = reached[: len(scan.signal)]
         blocks.append(_block_means(estimates, scan.scene, mask))
@@ -352,7 +354,7 @@ def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -
         return None
     share = float(np.nanmedian(np.concatenate(shares))) if shares else None
     return ScanScore(
-        way=name,
+        method=name,
         profiles=sum(len(scan.signal) for scan in scans),
         nanoseconds=1e9 * float(np.median(times)),
         solved=over_blocks([means["solved"] for means in blocks]).value,
@@ -411,8 +413,8 @@ def _published(size: StudySize) -> Iterator[PublishedCloudScore]:
         ]
         yield _published_score(NOTHING, _nothing, scans, share)
         yield _published_score(TWO_ANGLE_ALONE, cases.scan_methods()[cases.TWO_ANGLE], noisy, share)
-        for name, way in cases.scan_methods().items():
-            yield _published_score(name, way, scans, share)
+        for name, solver in cases.scan_methods().items():
+            yield _published_score(name, solver, scans, share)
 
 
 def _published_blocks(size: StudySize) -> int:
@@ -424,17 +426,17 @@ def _nothing(scan: Scan) -> ScanEstimates:
 
 
 def _published_score(
-    name: str, way: Way, scans: Sequence[Scan], share: float
+    name: str, solver: ScanSolver, scans: Sequence[Scan], share: float
 ) -> PublishedCloudScore:
     scene = scans[0].scene
-    blocks = [way(scan) for scan in scans]
+    blocks = [solver(scan) for scan in scans]
     depth = np.concatenate([estimates.optical_depth for estimates in blocks])
     means = [
         _block_means(estimates, scene, np.ones(estimates.optical_depth.shape, np.bool_))
         for estimates in blocks
     ]
     return PublishedCloudScore(
-        way=name,
+        method=name,
         largest_angle=float(scene.zenith_angle.max()),
         beams=scene.zenith_angle.size,
         share=share,
@@ -504,7 +506,7 @@ def _outliers(share: float, size: StudySize) -> Iterator[OutlierScore]:
         pairs = list(zip(errors, stated, strict=True))
         inside = [over_blocks([_share_within(e, s, n) for e, s in pairs]) for n in SIGMAS]
         yield OutlierScore(
-            way=f"{method}, {'robust' if robust else 'plain'}",
+            method=f"{method}, {'robust' if robust else 'plain'}",
             outliers=share,
             low_rmse=root(over_blocks([_mean(error[:, low] ** 2) for error in errors])),
             rmse=root(over_blocks([_mean(error**2) for error in errors])),

@@ -42,7 +42,7 @@ from lidarops.bench.accuracy.network_scores import (
     score,
     share_by_block,
 )
-from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import in_threads, least_times, machine
 from lidarops.retrieve.air import visibility as sight
 from lidarops.retrieve.network.cycles import solve_cycle, values_and_variances
@@ -382,7 +382,7 @@ def _thread_gain(*, quick: bool, repeats: int) -> float:
     times = least_times(
         {
             "one": lambda: _with_variance(rows),
-            "two": lambda: in_threads(lambda part: _with_variance(halves[part]), 2),
+            "two": lambda: in_threads(lambda half: _with_variance(halves[half]), 2),
         },
         repeats,
         clock="perf_counter",
@@ -393,15 +393,15 @@ def _thread_gain(*, quick: bool, repeats: int) -> float:
 # The command ----------------------------------------------------------------------------------
 
 
-def run_network(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
+def run_network(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
     """Run the accuracy or throughput benchmark of networks of lidars.
 
     Parameters
     ----------
-    kind : Kind
+    kind : BenchmarkKind
     effort : Effort
     """
-    if kind is Kind.ACCURACY:
+    if kind is BenchmarkKind.ACCURACY:
         accuracy = measure_network(
             quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
         )

@@ -15,8 +15,8 @@ from lidarops.retrieve.network.cycles import systematic_error
 from lidarops.retrieve.network.extinction_field import (
     DEFAULT_BINS,
     FieldPrior,
-    NetworkResult,
     NetworkMethod,
+    NetworkResult,
     retrieve_network,
 )
 

@@ -91,7 +91,9 @@ def _chart(
     scenarios: Sequence[NetworkScenario], lidars: LidarLine, comparisons: Sequence[Comparison]
 ) -> Chart:
     solvers = [
-        way.name for way in network_cases.network_solvers(lidars) if way.name not in _NOT_DRAWN
+        solver.name
+        for solver in network_cases.network_solvers(lidars)
+        if solver.name not in _NOT_DRAWN
     ]
     return Chart(
         name=f"work-precision-{lidars.name.replace(' ', '')}",
@@ -149,7 +151,7 @@ def _peer_series(comparisons: Sequence[Comparison]) -> Series:
 
 
 def _first_crossing(scenarios: Sequence[NetworkScenario], lidars: LidarLine) -> Table:
-    names = [way.name for way in network_cases.network_solvers(lidars)]
+    names = [solver.name for solver in network_cases.network_solvers(lidars)]
     return Table(
         title=f"{lidars.name.capitalize()}: visibility at the first crossing, mean / RMS error, %",
         columns=("air", "noise", *names),
@@ -434,7 +436,7 @@ def _cycles(rates: Sequence[SolverRate]) -> Part:
                 columns=("method", "by", "cycles", "million / s", "ns each", "reads"),
                 rows=tuple(
                     (
-                        rate.way,
+                        rate.method,
                         _provider(rate),
                         f"{rate.size:,}",
                         f"{1e3 / rate.nanoseconds:,.3g}",
@@ -464,7 +466,7 @@ def _profiles(result: NetworkThroughput) -> Part:
                 columns=("method", "profiles", "µs each", "reads"),
                 rows=tuple(
                     (
-                        rate.way,
+                        rate.method,
                         f"{rate.size:,}",
                         f"{rate.nanoseconds / 1e3:,.3g}",
                         f"{rate.reads:,.1f}",
@@ -480,7 +482,7 @@ def _profiles(result: NetworkThroughput) -> Part:
 
 
 def _provider(rate: SolverRate) -> str:
-    return "lidarops" if rate.ours else "floor" if rate.way == READ else "peer"
+    return "lidarops" if rate.ours else "floor" if rate.method == READ else "peer"
 
 
 def _noise(noise: float) -> str:

@@ -106,7 +106,7 @@ class Comparison:
 class SolverRate:
     """CPU time of one solver for cycles, or for profiles of a network."""
 
-    way: str
+    method: str
     beams: int
     size: int
     """Cycles or profiles in a call."""

@@ -21,8 +21,8 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     WRONG_PRIOR,
     Array,
     Estimates,
+    PathSolver,
     Scenario,
-    Way,
     estimated,
 )
 
@@ -33,9 +33,9 @@ _JAX_ITERATIONS: Final = 8
 _JAX_DAMPING: Final = 1e-6
 
 
-def iterative_peers() -> dict[str, Way]:
+def iterative_peers() -> dict[str, PathSolver]:
     """Return the iterative solvers by name; the JAX solver only if JAX is installed."""
-    peers: dict[str, Way] = {
+    peers: dict[str, PathSolver] = {
         JIT: compiled,
         "scipy curve_fit": _one_by_one(_curve_fit),
         "scipy least_squares": _one_by_one(_least_squares),
@@ -141,7 +141,7 @@ def _least_squares(
     return solution.x, np.linalg.inv(solution.jac.T @ solution.jac)
 
 
-def _one_by_one(single: _Single) -> Way:
+def _one_by_one(single: _Single) -> PathSolver:
     def solve(power: Any, scenario: Scenario) -> Estimates:
         geometry, begin = _geometry(scenario), start(scenario)
         fits = [single(np.asarray(row, np.float64), geometry, begin) for row in power]

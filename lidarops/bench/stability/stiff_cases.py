@@ -43,7 +43,7 @@ class Retrieval(StrEnum):
     SIGNAL = "signal chain"
     ELASTIC = "elastic"
     MULTIANGLE = "multi-angle"
-    MULTIPOSITION = "multi-position"
+    NETWORK = "network"
     FORWARD = "forward model"
 
 

@@ -111,17 +111,24 @@ def _plain(array: Any) -> Any:
 
 def _same_bits(solver: Solver, array: Callable[[], Any], *layouts: Any) -> Answer:
     """Return whether two layouts give the same bits."""
-    one, other = (solver(array(), layout) for layout in layouts)
-    same = [np.array_equal(one[n], other[n], equal_nan=one[n].dtype.kind == "f") for n in one]
+    reference, changed = (solver(array(), layout) for layout in layouts)
+    same = [
+        np.array_equal(reference[n], changed[n], equal_nan=reference[n].dtype.kind == "f")
+        for n in reference
+    ]
     return Answer({"same bits": float(all(same))})
 
 
 def _single_precision(solver: Solver, name: str, error: str, array: Callable[[], Any]) -> Answer:
     """Return the largest change due to single precision, in standard errors."""
-    one = solver(array(), _plain)
-    other = solver(array().astype(np.float32), _plain)
-    stated = np.asarray(one[error]) if error in one else np.abs(np.asarray(one[name])) * 1e-3
-    change = np.abs(np.asarray(one[name]) - np.asarray(other[name])) / stated
+    reference = solver(array(), _plain)
+    changed = solver(array().astype(np.float32), _plain)
+    stated = (
+        np.asarray(reference[error])
+        if error in reference
+        else np.abs(np.asarray(reference[name])) * 1e-3
+    )
+    change = np.abs(np.asarray(reference[name]) - np.asarray(changed[name])) / stated
     return Answer({"change": np.nanmax(change)})
 
 
@@ -135,7 +142,7 @@ _SOLVED: Final[dict[Retrieval, tuple[Solver, Callable[[], Any], str]]] = {
     Retrieval.SIGNAL: (_signal, _counts, "counts"),
     Retrieval.ELASTIC: (_elastic, lambda: stiff_elastic.elastic_arguments(5)["power"], "power"),
     Retrieval.MULTIANGLE: (_scans, lambda: stiff_scans.scan_arguments()["signal"], "signal"),
-    Retrieval.MULTIPOSITION: (
+    Retrieval.NETWORK: (
         _network,
         lambda: stiff_networks.network_arguments()["power"],
         "power",
@@ -145,7 +152,7 @@ _FLOAT32: Final = {
     Retrieval.HOMOGENEOUS: "extinction",
     Retrieval.ELASTIC: "backscatter",
     Retrieval.MULTIANGLE: "optical_depth",
-    Retrieval.MULTIPOSITION: "extinction",
+    Retrieval.NETWORK: "extinction",
 }
 
 
@@ -189,9 +196,11 @@ def _single(retrieval: Retrieval, quantity: str) -> StiffCase:
 def _whole_numbers() -> Answer:
     """Compare integers with the same values as floats."""
     power = np.rint(100.0 * CLEAR.noisy(20))
-    one = _homogeneous(power.astype(np.int64), _plain)
-    other = _homogeneous(power, _plain)
-    return Answer({"same bits": float(all(np.array_equal(one[n], other[n]) for n in one))})
+    reference = _homogeneous(power.astype(np.int64), _plain)
+    changed = _homogeneous(power, _plain)
+    return Answer(
+        {"same bits": float(all(np.array_equal(reference[n], changed[n]) for n in reference))}
+    )
 
 
 def _blocks() -> Answer:
@@ -209,9 +218,9 @@ def _blocks() -> Answer:
 
 def _turned() -> Answer:
     power = CLEAR.noisy(20)
-    one = path_fit.fit_homogeneous_path(power[:, ::-1], CLEAR.range[::-1], variance=1.0)
-    other = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
-    return Answer({"same bits": float(np.array_equal(one.extinction, other.extinction))})
+    reference = path_fit.fit_homogeneous_path(power[:, ::-1], CLEAR.range[::-1], variance=1.0)
+    changed = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
+    return Answer({"same bits": float(np.array_equal(reference.extinction, changed.extinction))})
 
 
 def memory_layout_cases() -> tuple[StiffCase, ...]:

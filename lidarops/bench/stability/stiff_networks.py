@@ -37,7 +37,7 @@ from lidarops.retrieve.air import visibility
 from lidarops.retrieve.network import cycles, extinction_field, geometry
 from lidarops.retrieve.network.extinction_field import NetworkResult
 
-_case = partial(StiffCase, retrieval=Retrieval.MULTIPOSITION)
+_case = partial(StiffCase, retrieval=Retrieval.NETWORK)
 _ANY: Final = Quality(REJECTING)
 FLAGGED: Final = Quality.UNSTABLE_INVERSION
 """Quality bit that stands for any flag of the retrieval that doubts a value."""

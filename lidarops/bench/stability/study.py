@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.stability import (
     random_elastic,
@@ -51,7 +51,7 @@ DRAWS: Final = (
     Draws(Retrieval.SIGNAL, random_signals.score_signals, 50, 1500, 60, 0.05),
     Draws(Retrieval.ELASTIC, random_elastic.score_elastic, 20, 1500, 40, 0.05),
     Draws(Retrieval.MULTIANGLE, random_scans.score_scans, 8, 2000, 60, 0.13),
-    Draws(Retrieval.MULTIPOSITION, random_networks.score_networks, 50, 800, 30, 0.05),
+    Draws(Retrieval.NETWORK, random_networks.score_networks, 50, 800, 30, 0.05),
 )
 """Sizes for about 20 minutes on one core, and less than 2 for a quick run."""
 

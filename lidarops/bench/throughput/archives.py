@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.harness.terms import (
+from lidarops.bench.harness.benchmark import (
     CAMPAIGN_FILE,
     RESULT,
+    BenchmarkKind,
     BenchmarkOutput,
     Effort,
-    Kind,
 )
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import stand_in_archives
@@ -106,7 +106,7 @@ _QUICK_STAND_INS: Final = StandIns(instruments=4, days=10)
 _TO_WARM: Final = CampaignSize(1, 30, _BINS, retrieved=False)
 
 
-def run_archives(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
+def run_archives(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
     """Run the benchmark of archives.
 
     Raises
@@ -114,7 +114,7 @@ def run_archives(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
     CampaignError
         If its accuracy is requested.
     """
-    if kind is not Kind.THROUGHPUT:
+    if kind is not BenchmarkKind.THROUGHPUT:
         raise CampaignError("an archive has no accuracy benchmark", remedy="choose throughput")
     archives_result = measure_archives(
         _QUICK if effort.quick else SIZES,
@@ -245,7 +245,7 @@ def growth(first: ArchiveCost, last: ArchiveCost, operation: Pass) -> float:
 def archives_report(archives: Archives, data: str = "") -> BenchmarkReport:
     """Return the report page."""
     real_archives = [cost for cost in archives.measured if cost.read]
-    part = Part(
+    chapter = Part(
         title="Cost per file, and its growth with the archive",
         text="Simulated archives of one lidar on a local disk, in one process. The process has "
         "done the same with a small archive before, so imports and compilation are not counted. "
@@ -256,7 +256,7 @@ def archives_report(archives: Archives, data: str = "") -> BenchmarkReport:
     return BenchmarkReport(
         title="Archives: cost per file",
         facts=facts(archives.date, archives.machine),
-        parts=(part,),
+        parts=(chapter,),
         data=data,
     )
 

@@ -17,12 +17,12 @@ import yaml
 from scipy import stats
 
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.harness.terms import (
+from lidarops.bench.harness.benchmark import (
     CAMPAIGN_FILE,
     RESULT,
+    BenchmarkKind,
     BenchmarkOutput,
     Effort,
-    Kind,
 )
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import orchestration
@@ -107,15 +107,15 @@ class Growth:
 
 
 @dataclass(frozen=True, slots=True)
-class Pipeline:
-    """Result of the throughput benchmark of the pipeline."""
+class CampaignStudy:
+    """CPU times of simulated campaigns, and how they grow."""
 
     date: str
     machine: Machine
     growths: tuple[Growth, ...]
     workers: Mapping[int, float]
     """Wall time of a run in s, by number of worker processes."""
-    ways: tuple[orchestration.RunMode, ...] = ()
+    modes: tuple[orchestration.RunMode, ...] = ()
     """Times of whole commands, on campaigns of `COMMAND_SIZES`."""
 
 
@@ -132,16 +132,16 @@ _WORKER_SIZE: Final = CampaignSize(scenes=16, profiles=60)
 COMMAND_SIZES: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
 
 
-def run_campaigns(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
-    """Run the benchmark of the pipeline.
+def run_campaigns(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
+    """Run the throughput benchmark of whole campaigns.
 
     Raises
     ------
     CampaignError
         If its accuracy is requested.
     """
-    if kind is not Kind.THROUGHPUT:
-        raise CampaignError("the pipeline has no accuracy benchmark", remedy="choose throughput")
+    if kind is not BenchmarkKind.THROUGHPUT:
+        raise CampaignError("the case 'campaigns' has no accuracy", remedy="choose throughput")
     result = measure_campaigns(quick=effort.quick, date=effort.date, progress=effort.progress)
     return BenchmarkOutput(result, campaigns_report(result, RESULT))
 
@@ -153,7 +153,7 @@ def measure_campaigns(
     along: Mapping[str, Sequence[CampaignSize]] | None = None,
     workers: Sequence[int] | None = None,
     progress: Callable[[int], object] = lambda _: None,
-) -> Pipeline:
+) -> CampaignStudy:
     """Simulate campaigns of several sizes in temporary folders, and time their processing.
 
     Parameters
@@ -178,7 +178,7 @@ def measure_campaigns(
     counts = workers if workers is not None else (() if quick else (1, 2))
     times = {count: _wall(count, progress) for count in counts}
     commands = _time_commands(progress) if workers is None and not quick else ()
-    return Pipeline(date, machine(), tuple(growths), times, commands)
+    return CampaignStudy(date, machine(), tuple(growths), times, commands)
 
 
 def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
@@ -346,27 +346,25 @@ def _slopes(
 # Page -----------------------------------------------------------------------------------------
 
 
-def campaigns_report(pipeline: Pipeline, data: str = "") -> BenchmarkReport:
+def campaigns_report(study: CampaignStudy, data: str = "") -> BenchmarkReport:
     """Return the report page."""
     return BenchmarkReport(
-        title="Pipeline: cost of a campaign",
-        facts=facts(pipeline.date, pipeline.machine),
-        parts=tuple(_parts_of_page(pipeline)),
+        title="Campaigns: CPU time by stage",
+        facts=facts(study.date, study.machine),
+        parts=tuple(_parts_of_page(study)),
         data=data,
     )
 
 
-def _parts_of_page(pipeline: Pipeline) -> Iterator[Part]:
-    yield _stages(pipeline)
-    if pipeline.workers:
-        yield _workers(pipeline)
-    if pipeline.ways:
-        yield orchestration.orchestration_part(
-            pipeline.ways, [size.scenes for size in COMMAND_SIZES]
-        )
+def _parts_of_page(study: CampaignStudy) -> Iterator[Part]:
+    yield _stages(study)
+    if study.workers:
+        yield _workers(study)
+    if study.modes:
+        yield orchestration.orchestration_part(study.modes, [size.scenes for size in COMMAND_SIZES])
 
 
-def _stages(pipeline: Pipeline) -> Part:
+def _stages(study: CampaignStudy) -> Part:
     return Part(
         title="Cost of each stage, and its growth",
         text="Simulated campaigns of one lidar, from raw files on disk to products and report, "
@@ -378,10 +376,10 @@ def _stages(pipeline: Pipeline) -> Part:
                 name="growth",
                 title="CPU time of a campaign",
                 caption="One line per stage; a slope of 1 means a constant cost per item.",
-                panels=tuple(_panel(growth) for growth in pipeline.growths),
+                panels=tuple(_panel(growth) for growth in study.growths),
             ),
         ),
-        tables=tuple(_table(growth) for growth in pipeline.growths),
+        tables=tuple(_table(growth) for growth in study.growths),
     )
 
 
@@ -419,11 +417,11 @@ def _table(growth: Growth) -> Table:
     )
 
 
-def _workers(pipeline: Pipeline) -> Part:
-    single = pipeline.workers.get(1)
+def _workers(study: CampaignStudy) -> Part:
+    single = study.workers.get(1)
     rows = tuple(
         (f"{count}", f"{seconds:.1f}", f"{single / seconds:.2f}" if single else _NOTHING)
-        for count, seconds in pipeline.workers.items()
+        for count, seconds in study.workers.items()
     )
     size = _WORKER_SIZE
     table = Table(

@@ -25,12 +25,12 @@ import yaml
 from scipy.optimize import nnls
 
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.harness.terms import (
+from lidarops.bench.harness.benchmark import (
     CAMPAIGN_FILE,
     RESULT,
+    BenchmarkKind,
     BenchmarkOutput,
     Effort,
-    Kind,
 )
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.campaign.model import Campaign, load_campaign
@@ -103,7 +103,7 @@ def accuracy_warning(calibration: Calibration) -> str:
     )
 
 
-def run_cost_calibration(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
+def run_cost_calibration(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
     """Calibrate this machine, and save the costs for ``lidarops plan``.
 
     Raises
@@ -113,7 +113,7 @@ def run_cost_calibration(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
     CatalogError
         If the calibration cannot be saved.
     """
-    if kind is not Kind.THROUGHPUT:
+    if kind is not BenchmarkKind.THROUGHPUT:
         raise CampaignError("costs have no accuracy benchmark", remedy="choose throughput")
     rounds = effort.repeats or (1 if effort.quick else _ROUNDS)
     calibration = calibrate(date=effort.date, rounds=rounds, progress=effort.progress)

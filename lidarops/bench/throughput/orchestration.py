@@ -31,7 +31,7 @@ JOB: Final = 300.0
 
 @dataclass(frozen=True, slots=True)
 class RunMode:
-    """A way of running campaigns, and the times of each campaign with all its processes."""
+    """A command that runs campaigns, and the times of each campaign with all its processes."""
 
     name: str
     cpu: tuple[float, ...]

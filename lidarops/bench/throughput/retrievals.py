@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.accuracy.homogeneous_cases import Scenario, Way, method_arguments
+from lidarops.bench.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
 from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.timing import Machine, in_threads, least_times, machine
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
@@ -55,7 +55,7 @@ class Setting:
 class Speed:
     """CPU time of one solver in one setting."""
 
-    way: str
+    method: str
     setting: Setting
     profiles: int
     nanoseconds: float
@@ -68,7 +68,7 @@ class Speed:
 class Threads:
     """Wall time of one thread over that of two, each with half of the profiles."""
 
-    way: str
+    method: str
     dtype: str
     gain: float
 
@@ -112,9 +112,9 @@ def measure_solvers(
         speeds += _speeds(setting, count, rounds)
         progress(1)
     threads = [
-        _threads(way, dtype, count, rounds)
-        for way, dtype in product(THREADED, ("float32", "float64"))
-        if way in set(HomogeneousMethod)
+        _threads(method, dtype, count, rounds)
+        for method, dtype in product(THREADED, ("float32", "float64"))
+        if method in set(HomogeneousMethod)
     ]
     return SolverThroughput(date, machine(), PATH, tuple(speeds), tuple(threads))
 
@@ -141,9 +141,9 @@ def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
     power = _powers(setting, count)
     calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
     sizes = {READ: count}
-    for name, way in _ways(setting).items():
-        sizes[name] = _affordable(_first(way, power), count)
-        calls[name] = partial(way, power[: sizes[name]], PATH)
+    for name, solver in _solvers(setting).items():
+        sizes[name] = _affordable(_first(solver, power), count)
+        calls[name] = partial(solver, power[: sizes[name]], PATH)
     times = least_times(calls, repeats)
     read = times[READ] / count
     for name, seconds in times.items():
@@ -151,7 +151,7 @@ def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
         yield Speed(name, setting, sizes[name], 1e9 * per_profile, per_profile / read)
 
 
-def _ways(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
+def _solvers(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
     variance = 1.0 if setting.known_variance else None
     ours = {
         str(m): partial(_solve, m, variance)
@@ -160,8 +160,8 @@ def _ways(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
     }
     if setting.missing:
         # The cubic allows no gaps: it raises an error at once.
-        return {name: way for name, way in ours.items() if name != HomogeneousMethod.CUBIC}
-    others: dict[str, Way] = iterative_peers() if setting.known_variance else {}
+        return {name: solver for name, solver in ours.items() if name != HomogeneousMethod.CUBIC}
+    others: dict[str, PathSolver] = iterative_peers() if setting.known_variance else {}
     return {**ours, **others}
 
 
@@ -175,8 +175,8 @@ def _solve(method: HomogeneousMethod, variance: float | None, power: Any, path: 
     )
 
 
-def _first(way: Callable[[Any, Scenario], object], power: Any) -> Callable[[int], object]:
-    return lambda few: way(power[:few], PATH)
+def _first(solver: Callable[[Any, Scenario], object], power: Any) -> Callable[[int], object]:
+    return lambda few: solver(power[:few], PATH)
 
 
 def _affordable(call: Callable[[int], object], most: int) -> int:
@@ -194,9 +194,9 @@ def _within(call: Callable[[int], object], count: int, most: int) -> int:
     return int(min(most, max(round(_LONGEST / per_profile), _TRIED)))
 
 
-def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
+def _threads(method: str, dtype: str, count: int, repeats: int) -> Threads:
     power = _powers(Setting(dtype, known_variance=True, missing=0.0), count)
-    call = partial(_solve, HomogeneousMethod(way), 1.0)
+    call = partial(_solve, HomogeneousMethod(method), 1.0)
     halves = np.array_split(power, 2)
     times = least_times(
         {
@@ -206,7 +206,7 @@ def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
         repeats,
         clock="perf_counter",
     )
-    return Threads(way, dtype, times["one"] / times["two"])
+    return Threads(method, dtype, times["one"] / times["two"])
 
 
 # Elastic inversion ----------------------------------------------------------------------------
@@ -332,11 +332,13 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
             background_error=estimate.standard_error[:few],
         )
 
-    whole_way = elastic_cases.Chain(elastic_cases.KNOWN_SHAPE, choose=True)
+    whole_chain = elastic_cases.Chain(elastic_cases.KNOWN_SHAPE, choose=True)
 
     def everything(few: int) -> object:
         first = counts[:few]
-        return elastic_cases.invert(first, sky, methods[whole_way.way](first, sky), whole_way)
+        return elastic_cases.invert(
+            first, sky, methods[whole_chain.method](first, sky), whole_chain
+        )
 
     ours: dict[str, _Step] = {
         READ: lambda few: np.max(counts[:few]),

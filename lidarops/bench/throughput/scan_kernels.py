@@ -81,12 +81,12 @@ def _costs(scan: Scan, repeats: int) -> Iterator[StepCost]:
     scan = Scan(scan.scene, scan.signal, np.ascontiguousarray(scan.variance))
     few = min(batch, _PEER_PROFILES)
     ours = _kernels(scan)
-    ours |= {name: partial(way, scan) for name, way in cases.scan_methods().items()}
+    ours |= {name: partial(solver, scan) for name, solver in cases.scan_methods().items()}
     ours |= {
         f"{method}, plain": partial(cases.retrieve, scan, method, robust=False)
         for method in (cases.KANO_HAMILTON, cases.JOINT)
     }
-    others = {name: partial(way, scan.first(few)) for name, way in cases.scan_peers().items()}
+    others = {name: partial(solver, scan.first(few)) for name, solver in cases.scan_peers().items()}
     reads: dict[str, Callable[[], object]] = {
         READ: lambda: np.max(scan.signal),
         INPUTS: lambda: (np.max(scan.signal), np.max(scan.variance)),

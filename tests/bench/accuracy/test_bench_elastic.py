@@ -20,7 +20,7 @@ from lidarops.bench.accuracy.homogeneous import (
     inversion_score,
 )
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import Effort
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, RawFormatError
@@ -222,13 +222,13 @@ def test_published_files_are_reproduced(data_root, published):
     assert noisiest.background_error == pytest.approx(math.sqrt(1e8 / 1000 / 945), rel=0.05)
     assert np.all(np.isfinite(sky.backscatter[sky.inverted]))
     for score in published:
-        if score.way == elastic_cases.KNOWN_SHAPE:
+        if score.method == elastic_cases.KNOWN_SHAPE:
             assert score.inversion is None
             assert abs(score.deviation) < 3.0
             assert score.level > 1e5 or abs(score.background) < 1.0
-        if score.way == "window given" and score.level <= 1e5:
+        if score.method == "window given" and score.level <= 1e5:
             assert abs(score.inversion.bias.value) < 0.01
-        if score.way == elastic_cases.TAIL_MEAN and score.level <= 1e4:
+        if score.method == elastic_cases.TAIL_MEAN and score.level <= 1e4:
             assert score.background == pytest.approx(2.75, abs=0.1)
 
 
@@ -259,17 +259,19 @@ def test_pages_hold_tables_and_figures(accuracy, timed, published, tmp_path):
     for name, report in reports.items():
         folder = tmp_path / name
         text = build_benchmark_page(report, folder).read_text()
-        for part in report.parts:
-            for chart in part.charts:
+        for chapter in report.parts:
+            for chart in chapter.charts:
                 assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
-            for table in (*part.tables, *part.details):
+            for table in (*chapter.tables, *chapter.details):
                 assert table.title in text
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
         assert "2024-01-01" in text
-    titles = [part.title for part in reports["accuracy"].parts]
+    titles = [chapter.title for chapter in reports["accuracy"].parts]
     assert "Files of the intercomparison" in titles
-    titles_without_files = [part.title for part in elastic.elastic_accuracy_report(accuracy).parts]
+    titles_without_files = [
+        chapter.title for chapter in elastic.elastic_accuracy_report(accuracy).parts
+    ]
     assert [title for title in titles if title not in titles_without_files] == [
         "Files of the intercomparison"
     ]
@@ -295,7 +297,7 @@ def test_errors_stand_in_the_last_digits(value, error, text):
 
 
 def test_a_band_is_an_area_between_its_edges():
-    series = Series("way", (1.0, 10.0), (5.0, 6.0), (0.1, 0.2), (2.0, 3.0), band=True)
+    series = Series("method", (1.0, 10.0), (5.0, 6.0), (0.1, 0.2), (2.0, 3.0), band=True)
     figure = draw_chart(Chart("name", "Title", "Caption.", (Panel("panel", "x", "y", (series,)),)))
     (area,) = [a for a in figure.axes[0].collections if isinstance(a, PolyCollection)]
     corners = {tuple(corner) for corner in area.get_paths()[0].vertices.tolist()}

@@ -24,7 +24,7 @@ from lidarops.bench.accuracy.homogeneous_cases import (
 )
 from lidarops.bench.accuracy.peers import JIT, iterative_peers
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import Effort
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import in_threads, least_times
 from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
@@ -128,8 +128,8 @@ def test_every_peer_agrees_with_the_direct_fit(path):
     power = path.powers(20)
     direct = methods()["direct"](power, path)
     bound = least_errors(path)
-    for name, way in iterative_peers().items():
-        peer = way(power, path)
+    for name, solver in iterative_peers().items():
+        peer = solver(power, path)
         for quantity in QUANTITIES:
             distance = np.abs(peer.values[quantity] - direct.values[quantity]) / bound[quantity]
             assert distance.max() < 1e-3, (name, quantity)
@@ -150,7 +150,7 @@ def test_scores_of_known_errors():
     bound = least_errors(PATH)
     error = np.array([3.0, -1.0, 1.0, 5.0, np.nan])
 
-    def way(power, scenario):
+    def solver(power, scenario):
         return homogeneous.Estimates(
             values={name: scenario.truth[name] + error * bound[name] for name in QUANTITIES},
             standard_errors={
@@ -162,8 +162,8 @@ def test_scores_of_known_errors():
             rejected=np.array([False, False, False, True, True]),
         )
 
-    truth = way(np.empty((5, PATH.bins)), PATH)
-    outcome = homogeneous._outcome("way", way, PATH, np.empty((5, PATH.bins)), bound, truth)
+    truth = solver(np.empty((5, PATH.bins)), PATH)
+    outcome = homogeneous._outcome("solver", solver, PATH, np.empty((5, PATH.bins)), bound, truth)
     score = outcome.scores["extinction"]
     assert score.rmse.value == pytest.approx(math.sqrt(11 / 3), rel=1e-6)
     assert score.rmse_of_all == pytest.approx(3.0, rel=1e-6)
@@ -179,12 +179,12 @@ def test_scores_of_known_errors():
 def test_least_squares_reaches_the_bound(accuracy):
     for case in accuracy.cases:
         for outcome in case.outcomes:
-            if outcome.way in {"compressed", "direct", JIT}:
+            if outcome.method in {"compressed", "direct", JIT}:
                 for quantity, score in outcome.scores.items():
                     assert abs(score.rmse.value - 1) < 5 * score.rmse.error + 0.02, quantity
                     assert score.coverage.value > 0.85
                     assert outcome.distances[quantity] < 0.05
-    assert {o.way for o in accuracy.cases[0].outcomes} == set(methods()) | set(iterative_peers())
+    assert {o.method for o in accuracy.cases[0].outcomes} == set(methods()) | set(iterative_peers())
 
 
 def test_lag_1_is_biased_as_published_and_least_squares_is_not():
@@ -203,27 +203,27 @@ def test_lag_1_is_biased_as_published_and_least_squares_is_not():
 def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
     assert {s.setting for s in timed.speeds} == set(retrievals.settings())
     for setting in retrievals.settings():
-        group = {s.way: s for s in timed.speeds if s.setting == setting}
+        group = {s.method: s for s in timed.speeds if s.setting == setting}
         read = group[retrievals.READ]
         assert read.reads == 1.0
         assert set(group) >= {"compressed", "direct"}
         for speed in group.values():
             assert speed.reads == pytest.approx(speed.nanoseconds / read.nanoseconds)
-    assert {t.way for t in timed.threads} == set(retrievals.THREADED)
+    assert {t.method for t in timed.threads} == set(retrievals.THREADED)
 
 
 def test_calls_alternate_and_the_least_time_counts(monkeypatch):
     clock = iter([0.0, 5.0, 0.0, 7.0, 0.0, 4.0, 0.0, 9.0])
     calls: list[str] = []
     monkeypatch.setattr("time.process_time", lambda: next(clock))
-    ways = {name: (lambda name=name: calls.append(name)) for name in "ab"}
-    assert least_times(ways, 2) == {"a": 4.0, "b": 7.0}
+    functions = {name: (lambda name=name: calls.append(name)) for name in "ab"}
+    assert least_times(functions, 2) == {"a": 4.0, "b": 7.0}
     assert calls == ["a", "b"] * 3
 
 
 def test_threads_pass_errors_on():
     with pytest.raises(ZeroDivisionError):
-        in_threads(lambda part: 1 / part, 2)
+        in_threads(lambda chapter: 1 / chapter, 2)
 
 
 def test_results_survive_json(accuracy, timed, tmp_path):
@@ -245,13 +245,13 @@ def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
     for name, report in reports.items():
         folder = tmp_path / name
         text = build_benchmark_page(report, folder).read_text()
-        charts = [chart for part in report.parts for chart in part.charts]
+        charts = [chart for chapter in report.parts for chart in chapter.charts]
         assert charts
         for chart in charts:
             assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
             assert f'src="{chart.name}.png" alt="{chart.title}' in text
-        for part in report.parts:
-            for table in (*part.tables, *part.details):
+        for chapter in report.parts:
+            for table in (*chapter.tables, *chapter.details):
                 assert table.title in text
                 assert all(len(row) == len(table.columns) for row in table.rows)
         assert "compressed" in text
@@ -273,7 +273,7 @@ def test_the_pareto_front_holds_the_unbeaten_points():
     ("quantity", "case", "files", "error", "message"),
     [
         ("luck", None, [], CampaignError, "throughput"),
-        ("accuracy", "weather", [], CampaignError, "pipeline or reader"),
+        ("accuracy", "weather", [], CampaignError, "network or reader"),
         ("accuracy", "reader", ["file"], CampaignError, "no accuracy"),
         ("throughput", "homogeneous", ["file"], CampaignError, "takes no files"),
         ("throughput", "reader", [], RawFormatError, "at least one file"),

@@ -13,7 +13,7 @@ from lidarops.bench.accuracy import multiangle_cases, multiangle_report, multian
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.multiangle_scores import StudySize
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import RESULT, Effort, Kind
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, Effort
 from lidarops.bench.throughput import scan_kernels
 from lidarops.bench.throughput.retrievals import READ
 from lidarops.reports.benchmark_page import build_benchmark_page
@@ -243,30 +243,31 @@ def test_false_values_are_counted_with_and_without_flags():
 def test_every_method_is_scored_in_every_scene(study):
     names = [*multiangle_cases.scan_methods(), *multiangle_cases.scan_peers()]
     for scene in study.scenes:
-        assert [score.way for score in scene.scores] == names
+        assert [score.method for score in scene.scores] == names
         assert scene.profiles == SMALL.blocks * SMALL.profiles
-        by_way = {score.way: score for score in scene.scores}
-        assert by_way["numpy lstsq"].profiles == SMALL.blocks * SMALL.slow
-        line, joint = by_way["kano_hamilton"], by_way["joint"]
+        by_method = {score.method: score for score in scene.scores}
+        assert by_method["numpy lstsq"].profiles == SMALL.blocks * SMALL.slow
+        line, joint = by_method["kano_hamilton"], by_method["joint"]
         assert line.solved == 1.0
         assert joint.rmse.value < 0.6 * line.rmse.value
         assert joint.extinction_rmse.value < 0.2 * line.extinction_rmse.value
         assert line.coverage[1].value == pytest.approx(0.95, abs=0.06)
         assert abs(line.bias.value) < 5.0 * line.bias.error + 1e-3
-        assert by_way["scipy lsq_linear"].coverage is None
-        assert by_way["numpy lstsq"].extinction_coverage is None
-        assert by_way["two_angle"].rmse.value > line.rmse.value
-        assert by_way["mld 0, discrepancy"].bias.value < 0.0
-        assert by_way["mld 0, discrepancy"].data_share < line.data_share == 1.0
+        assert by_method["scipy lsq_linear"].coverage is None
+        assert by_method["numpy lstsq"].extinction_coverage is None
+        assert by_method["two_angle"].rmse.value > line.rmse.value
+        assert by_method["mld 0, discrepancy"].bias.value < 0.0
+        assert by_method["mld 0, discrepancy"].data_share < line.data_share == 1.0
         assert all(score.nanoseconds > 0 for score in scene.scores)
 
 
 def test_the_published_experiment_is_reproduced(study):
-    def central(way, angle):
+    def central(method, angle):
         (only,) = [
             score
             for score in study.published
-            if (score.way, score.largest_angle, score.beams, score.share) == (way, angle, 6, 0.25)
+            if (score.method, score.largest_angle, score.beams, score.share)
+            == (method, angle, 6, 0.25)
         ]
         return only
 
@@ -294,26 +295,26 @@ def test_the_prior_determines_the_error_at_15_degrees(study):
     assert by_factor[0.0].alone == pytest.approx(2.737, abs=0.001)
     assert by_factor[1.0].rmse.value < 0.6 * by_factor[0.0].rmse.value
     assert by_factor[1.5].rmse.value > 1.2 * by_factor[1.0].rmse.value
-    equal = {score.way: score for score in study.correlations if score.correlation == 1.0}
+    equal = {score.method: score for score in study.correlations if score.correlation == 1.0}
     assert equal["joint"].rmse.value < 0.4 * equal["kano_hamilton"].rmse.value
 
 
 def test_outliers_hurt_the_plain_method(study):
-    by_way = {(score.way, score.outliers): score for score in study.outliers}
-    assert len(by_way) == 4 * len(multiangle_scores.OUTLIERS)
-    clean = by_way["kano_hamilton, plain", 0.0]
-    assert by_way["kano_hamilton, plain", 0.1].low_rmse.value > 3.0 * clean.low_rmse.value
-    assert by_way["kano_hamilton, robust", 0.1].low_rmse.value < 1.6 * clean.low_rmse.value
-    assert by_way["joint, robust", 0.1].flagged > 0.2
-    assert by_way["joint, robust", 0.1].ran == 1.0
-    assert by_way["joint, plain", 0.1].ran == 0.0
+    by_method = {(score.method, score.outliers): score for score in study.outliers}
+    assert len(by_method) == 4 * len(multiangle_scores.OUTLIERS)
+    clean = by_method["kano_hamilton, plain", 0.0]
+    assert by_method["kano_hamilton, plain", 0.1].low_rmse.value > 3.0 * clean.low_rmse.value
+    assert by_method["kano_hamilton, robust", 0.1].low_rmse.value < 1.6 * clean.low_rmse.value
+    assert by_method["joint, robust", 0.1].flagged > 0.2
+    assert by_method["joint, robust", 0.1].ran == 1.0
+    assert by_method["joint, plain", 0.1].ran == 0.0
 
 
 def test_random_scenes_are_counted_completely(study):
-    assert [(score.air, score.way, score.quantity) for score in study.safety] == [
-        (air, way, quantity)
+    assert [(score.air, score.method, score.quantity) for score in study.safety] == [
+        (air, method, quantity)
         for air in (multiangle_scores.ANY, multiangle_scores.CALM)
-        for way in ("kano_hamilton", "joint")
+        for method in ("kano_hamilton", "joint")
         for quantity in ("optical depth", "extinction")
     ]
     for score in study.safety:
@@ -351,11 +352,11 @@ def test_pages_have_tables_and_figures(study, timed, tmp_path):
         folder = tmp_path / name
         text = build_benchmark_page(report, folder).read_text()
         assert "2024-01-01" in text
-        assert sum(len(part.charts) for part in report.parts) >= 1
-        for part in report.parts:
-            for chart in part.charts:
+        assert sum(len(chapter.charts) for chapter in report.parts) >= 1
+        for chapter in report.parts:
+            for chart in chapter.charts:
                 assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
-            for table in (*part.tables, *part.details):
+            for table in (*chapter.tables, *chapter.details):
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
     published = reports["accuracy"].parts[1]
@@ -384,8 +385,8 @@ def test_both_kinds_run(monkeypatch, study, timed):
     monkeypatch.setattr(multiangle_report, "measure_multiangle", accuracy)
     monkeypatch.setattr(multiangle_report, "measure_scan_kernels", throughput)
     effort = Effort(quick=True, repeats=2, date="2024-01-01")
-    assert multiangle_report.run_multiangle(Kind.ACCURACY, effort=effort).result is study
-    assert multiangle_report.run_multiangle(Kind.THROUGHPUT, effort=effort).result is timed
+    assert multiangle_report.run_multiangle(BenchmarkKind.ACCURACY, effort=effort).result is study
+    assert multiangle_report.run_multiangle(BenchmarkKind.THROUGHPUT, effort=effort).result is timed
     assert [call["quick"] for call in calls] == [True, True]
     assert calls[1]["repeats"] == 2
 

@@ -19,7 +19,7 @@ from lidarops.bench.accuracy.network_report import (
     network_throughput_report,
 )
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import Effort, Kind
+from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import solve_cycle, systematic_error
@@ -28,21 +28,21 @@ PROFILES = 3 * network_cases.BLOCK
 
 
 @pytest.fixture(scope="module")
-def found():
+def accuracy():
     return network_benchmark.measure_network(
         date="2024-01-01", profiles=PROFILES, repeats=1, peer_profiles=10
     )
 
 
 @pytest.fixture(scope="module")
-def timed():
+def throughput_result():
     return network_benchmark.measure_network_throughput(quick=True, date="2024-01-01", repeats=1)
 
 
 @pytest.fixture(scope="module")
-def case(found):
+def case(accuracy):
     scenarios = {
-        (scenario.place, scenario.air, scenario.noise): scenario for scenario in found.cases
+        (scenario.place, scenario.air, scenario.noise): scenario for scenario in accuracy.cases
     }
     return lambda lidars, air, noise: scenarios[lidars.name, air, noise].scores
 
@@ -265,11 +265,11 @@ def test_scores_of_known_errors():
 # Results --------------------------------------------------------------------------------------
 
 
-def test_every_case_is_scored_with_every_solver(found):
-    assert len(found.cases) == len(network_cases.LIDAR_LINES) * len(network_cases.AIRS) * len(
+def test_every_case_is_scored_with_every_solver(accuracy):
+    assert len(accuracy.cases) == len(network_cases.LIDAR_LINES) * len(network_cases.AIRS) * len(
         network_cases.NOISES
     )
-    for scenario in found.cases:
+    for scenario in accuracy.cases:
         lidars = next(
             lidars for lidars in network_cases.LIDAR_LINES if lidars.name == scenario.place
         )
@@ -329,10 +329,10 @@ def test_solvers_for_homogeneous_air_are_flagged_in_other_air(case):
         assert case(network_cases.TRIANGLE, "homogeneous", 0.02)[solver.name].flagged.value < 0.01
 
 
-def test_a_contrast_changes_values_and_errors_alike(found):
-    assert {score.noise for score in found.sights} == set(network_cases.NOISES)
+def test_a_contrast_changes_values_and_errors_alike(accuracy):
+    assert {score.noise for score in accuracy.sights} == set(network_cases.NOISES)
     for noise in network_cases.NOISES:
-        mor, koschmieder, paper = (score for score in found.sights if score.noise == noise)
+        mor, koschmieder, paper = (score for score in accuracy.sights if score.noise == noise)
         assert mor.constant == pytest.approx(math.log(20.0))
         assert koschmieder.constant == pytest.approx(3.912, abs=1e-4)
         assert paper.constant == pytest.approx(3.0)
@@ -347,51 +347,51 @@ def test_a_contrast_changes_values_and_errors_alike(found):
         assert 0.683 - 4.0 * inside.error - 0.05 < inside.value < 0.99
 
 
-def test_the_network_agrees_with_a_plain_fit(found):
-    assert len(found.comparisons) == 8
-    for comparison in found.comparisons:
+def test_the_network_agrees_with_a_plain_fit(accuracy):
+    assert len(accuracy.comparisons) == 8
+    for comparison in accuracy.comparisons:
         assert comparison.profiles == 10
         assert comparison.apart < 1.0
         assert comparison.peer == pytest.approx(comparison.ours, rel=0.5)
 
 
-def test_times_are_multiples_of_the_read(found, timed):
-    for rates in (found.cycles, timed.cycles, timed.profiles):
+def test_times_are_multiples_of_the_read(accuracy, throughput_result):
+    for rates in (accuracy.cycles, throughput_result.cycles, throughput_result.profiles):
         for beams in {rate.beams for rate in rates}:
-            group = {rate.way: rate for rate in rates if rate.beams == beams}
+            group = {rate.method: rate for rate in rates if rate.beams == beams}
             read = group[scores.READ]
             assert (read.reads, read.ours) == (1.0, False)
             for rate in group.values():
                 assert rate.reads == pytest.approx(rate.nanoseconds / read.nanoseconds)
             assert any(rate.ours for rate in group.values())
-    assert {rate.beams for rate in timed.cycles} == {3, 12}
-    assert {rate.beams for rate in timed.profiles} == {3, 6}
-    assert timed.gain > 0.0
+    assert {rate.beams for rate in throughput_result.cycles} == {3, 12}
+    assert {rate.beams for rate in throughput_result.profiles} == {3, 6}
+    assert throughput_result.gain > 0.0
 
 
 # Pages and the command ------------------------------------------------------------------------
 
 
-def test_pages_hold_tables_and_figures(found, timed, tmp_path):
+def test_pages_hold_tables_and_figures(accuracy, throughput_result, tmp_path):
     for name, report in (
-        ("accuracy", network_accuracy_report(found, "result.json")),
-        ("throughput", network_throughput_report(timed, "result.json")),
+        ("accuracy", network_accuracy_report(accuracy, "result.json")),
+        ("throughput", network_throughput_report(throughput_result, "result.json")),
     ):
         folder = tmp_path / name
         text = build_benchmark_page(report, folder).read_text()
         assert "2024-01-01" in text
-        for part in report.parts:
-            for chart in part.charts:
+        for chapter in report.parts:
+            for chart in chapter.charts:
                 assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
-            for table in (*part.tables, *part.details):
+            for table in (*chapter.tables, *chapter.details):
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
-    titles = [part.title for part in network_accuracy_report(found).parts]
+    titles = [chapter.title for chapter in network_accuracy_report(accuracy).parts]
     assert "Figure 2 of the paper, and the correct signs" in titles
 
 
-def test_results_survive_json(found, timed, tmp_path):
-    for result in (found, timed):
+def test_results_survive_json(accuracy, throughput_result, tmp_path):
+    for result in (accuracy, throughput_result):
         path = results.save(result, tmp_path / "result.json")
         assert results.load(type(result), path) == result
 
@@ -404,24 +404,26 @@ def test_errors_are_given_in_the_last_digits(value, error, text):
     assert bracketed(MonteCarloFigure(value, error)) == text
 
 
-def test_the_command_runs_the_requested_benchmark(monkeypatch, found, timed):
+def test_the_command_runs_the_requested_benchmark(monkeypatch, accuracy, throughput_result):
     received = {}
 
     def measure(**arguments):
         received.update(arguments)
-        return found
+        return accuracy
 
     monkeypatch.setattr(network_benchmark, "measure_network", measure)
-    monkeypatch.setattr(network_benchmark, "measure_network_throughput", lambda **_: timed)
-    accuracy = network_benchmark.run_network(
-        Kind.ACCURACY, effort=Effort(quick=True, date="2024-01-01")
+    monkeypatch.setattr(
+        network_benchmark, "measure_network_throughput", lambda **_: throughput_result
+    )
+    output = network_benchmark.run_network(
+        BenchmarkKind.ACCURACY, effort=Effort(quick=True, date="2024-01-01")
     )
     assert (received["quick"], received["date"]) == (True, "2024-01-01")
-    assert accuracy.result is found
-    assert accuracy.report.data == "result.json"
-    throughput = network_benchmark.run_network(Kind.THROUGHPUT, effort=Effort())
-    assert throughput.result is timed
-    assert [part.title for part in throughput.report.parts] == [
+    assert output.result is accuracy
+    assert output.report.data == "result.json"
+    throughput = network_benchmark.run_network(BenchmarkKind.THROUGHPUT, effort=Effort())
+    assert throughput.result is throughput_result
+    assert [chapter.title for chapter in throughput.report.parts] == [
         "Cycles per second",
         "Whole profiles",
     ]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.accuracy.homogeneous_cases import Scenario, difficulty
 from lidarops.bench.harness import results
-from lidarops.bench.harness.terms import Effort
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.stability import (
     random_elastic,
     random_homogeneous,

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from lidarops.bench import registry
-from lidarops.bench.harness.terms import Effort, Kind
+from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import archives, stand_in_archives
 from lidarops.bench.throughput.archives import ArchiveCost, Pass, ProcessCost
@@ -105,4 +105,4 @@ def test_growth_is_that_of_the_cost_per_file(tmp_path):
 
 def test_archives_have_no_accuracy():
     with pytest.raises(CampaignError, match="no accuracy"):
-        archives.run_archives(Kind.ACCURACY, effort=Effort())
+        archives.run_archives(BenchmarkKind.ACCURACY, effort=Effort())

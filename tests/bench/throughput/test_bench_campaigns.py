@@ -1,4 +1,4 @@
-"""Benchmark of the pipeline: campaigns of the requested sizes, and numbers that add up."""
+"""Benchmark of campaigns: archives of the requested sizes, and numbers that add up."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from lidarops.bench import registry
-from lidarops.bench.harness.terms import Effort, Kind
+from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import campaigns, orchestration
 from lidarops.bench.throughput.campaigns import CampaignCost, CampaignSize, Growth, Stage
@@ -19,7 +19,7 @@ SMALL = CampaignSize(scenes=2, profiles=15, bins=500)
 
 
 @pytest.fixture(scope="module")
-def pipeline():
+def study():
     steps = []
     result = campaigns.measure_campaigns(
         date="2024-01-01",
@@ -31,8 +31,8 @@ def pipeline():
     return result
 
 
-def test_every_stage_has_a_time(pipeline):
-    (growth,) = pipeline.growths
+def test_every_stage_has_a_time(study):
+    (growth,) = study.growths
     assert set(growth.costs[1].seconds) == set(Stage)
     assert all(seconds > 0 for seconds in growth.costs[1].seconds.values())
 
@@ -48,7 +48,7 @@ def test_campaigns_have_the_requested_size(size, tmp_path):
     assert reprocess(campaign) is None
 
 
-def test_slopes_are_those_of_the_times(pipeline, tmp_path):
+def test_slopes_are_those_of_the_times(study, tmp_path):
     costs = tuple(
         CampaignCost(
             CampaignSize(scenes=n), {stage: 0.01 * n**power for power, stage in enumerate(Stage)}
@@ -59,7 +59,7 @@ def test_slopes_are_those_of_the_times(pipeline, tmp_path):
     for power, stage in enumerate(Stage):
         assert slopes[stage] == pytest.approx((power, 0.0), abs=1e-6)
     growth = Growth("scenes", costs, slopes)
-    changed = replace(pipeline, growths=(growth,), workers={1: 4.0, 2: 2.5})
+    changed = replace(study, growths=(growth,), workers={1: 4.0, 2: 2.5})
     report = campaigns.campaigns_report(changed, "result.json")
     assert report.parts[1].tables[0].rows[1][2] == "1.60"
     shares = [row[3] for row in report.parts[0].tables[0].rows if row[3] != "-"]
@@ -71,9 +71,9 @@ def test_slopes_are_those_of_the_times(pipeline, tmp_path):
     assert changed.machine == machine()
 
 
-def test_the_pipeline_has_no_accuracy():
+def test_campaigns_have_no_accuracy():
     with pytest.raises(CampaignError, match="no accuracy"):
-        campaigns.run_campaigns(Kind.ACCURACY, effort=Effort())
+        campaigns.run_campaigns(BenchmarkKind.ACCURACY, effort=Effort())
 
 
 def test_overhead_is_a_line_over_the_plain_loop():

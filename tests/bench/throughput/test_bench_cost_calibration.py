@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import mixed_campaign
+from support.archives import mixed_campaign
 
-from lidarops.bench.harness.terms import Effort, Kind
+from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import cost_calibration as calibration
 from lidarops.bench.throughput.cost_calibration import Observation, fit_costs
@@ -73,14 +73,14 @@ def test_poor_estimates_of_the_calibration_scenes_give_a_warning(
     scenes = tuple(Observation("", (), {}, 2.0, 2.0 * factor) for factor in (1.0, ratio))
     result = calibration.Calibration("", machine(), DEFAULTS, scenes, "")
     monkeypatch.setattr(calibration, "calibrate", lambda **_: result)
-    page = calibration.run_cost_calibration(Kind.THROUGHPUT, effort=Effort()).report
+    page = calibration.run_cost_calibration(BenchmarkKind.THROUGHPUT, effort=Effort()).report
     assert ("calibrate again" in caplog.text) == warned
     assert ("calibrate again" in page.parts[0].text) == warned
 
 
 def test_costs_have_no_accuracy():
     with pytest.raises(CampaignError, match="throughput"):
-        calibration.run_cost_calibration(Kind.ACCURACY, effort=Effort())
+        calibration.run_cost_calibration(BenchmarkKind.ACCURACY, effort=Effort())
 
 
 @pytest.mark.slow

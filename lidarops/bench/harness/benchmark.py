@@ -15,7 +15,7 @@ CAMPAIGN_FILE: Final = "campaign.yaml"
 """Name of the campaign file in the folder of each simulated campaign."""
 
 
-class Kind(StrEnum):
+class BenchmarkKind(StrEnum):
     """Quantity that a benchmark measures."""
 
     ACCURACY = "accuracy"
