@@ -45,7 +45,7 @@ _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class SceneData:
     """The data of a scene on which the steps of all its channels work."""
 
     plan: Plan
@@ -62,12 +62,12 @@ class Bench:
         return {step.name: step for step in self.plan.steps if step.channel == channel}
 
 
-def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
+def process_channel(scene_data: SceneData, channel: str) -> dict[ProductKind, xr.Dataset]:
     """Carry out the steps of a channel.
 
     Parameters
     ----------
-    bench : Bench
+    scene_data : SceneData
     channel : str
 
     Returns
@@ -80,21 +80,22 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
     LidarOpsError
         If the data do not agree with the plan.
     """
-    steps = bench.steps(channel)
+    steps = scene_data.steps(channel)
     if _is_read(steps):
-        bench = load_small(bench, glued_parts(channel) if channel.startswith(GLUED) else (channel,))
-    source = channel_source(bench, channel)
+        read = glued_parts(channel) if channel.startswith(GLUED) else (channel,)
+        scene_data = load_small(scene_data, read)
+    source = channel_source(scene_data, channel)
     lazy: dict[ProductKind, xr.Dataset] = {}
     if StepName.SIGNAL in steps:
-        lazy[ProductKind.SIGNAL] = _signal(source, steps, bench.ancillaries)
+        lazy[ProductKind.SIGNAL] = _signal(source, steps, scene_data.ancillaries)
     if StepName.HOMOGENEOUS in steps:
-        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(bench, channel, source)
+        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(scene_data, channel, source)
     for kind, data in lazy.items():
         lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
     if StepName.ELASTIC in steps:
         lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
     if StepName.MULTIANGLE in steps:
-        lazy[ProductKind.MULTIANGLE] = _beams(source, steps, bench)
+        lazy[ProductKind.MULTIANGLE] = _beams(source, steps, scene_data)
     # Computed together, so that the products of a channel share one reading of the files.
     computed = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
     sections = computed.get(ProductKind.HOMOGENEOUS)
@@ -102,27 +103,28 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
         computed[ProductKind.HOMOGENEOUS] = _with_visibility(sections, steps)
     if ProductKind.ELASTIC in computed:
         averages = source.glued(computed[ProductKind.ELASTIC])
-        computed[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
+        computed[ProductKind.ELASTIC] = _elastic(averages, steps, scene_data)
     if ProductKind.MULTIANGLE in computed:
         settings = steps[StepName.MULTIANGLE].settings
         computed[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
             computed[ProductKind.MULTIANGLE],
-            station_altitude=bench.station_altitude,
+            station_altitude=scene_data.station_altitude,
             method=settings["method"],
             largest_gradient=settings["largest_gradient"],
             layers=[
-                (low + bench.station_altitude, high + bench.station_altitude)
+                (low + scene_data.station_altitude, high + scene_data.station_altitude)
                 for low, high in settings["layers"]
             ],
         )
     return computed
 
 
-def load_small(bench: Bench, channels: Sequence[str]) -> Bench:
-    """Return a bench with the counts of channels in memory, if they are at most `IN_MEMORY`."""
-    counts = bench.archive[[name for name in channels if name in bench.archive]]
-    small = counts.nbytes <= IN_MEMORY
-    return replace(bench, archive=bench.archive.assign(counts.compute())) if small else bench
+def load_small(scene_data: SceneData, channels: Sequence[str]) -> SceneData:
+    """Return the data with the counts of channels in memory, if they are at most `IN_MEMORY`."""
+    counts = scene_data.archive[[name for name in channels if name in scene_data.archive]]
+    if counts.nbytes > IN_MEMORY:
+        return scene_data
+    return replace(scene_data, archive=scene_data.archive.assign(counts.compute()))
 
 
 def _is_read(steps: Mapping[str, Step]) -> bool:
@@ -133,23 +135,22 @@ def _is_read(steps: Mapping[str, Step]) -> bool:
     return len(settings.get(OMITTED, ())) < len(settings.get("sections", ()))
 
 
-def channel_source(bench: Bench, channel: str) -> FileChannel | GluedChannel:
+def channel_source(scene_data: SceneData, channel: str) -> FileChannel | GluedChannel:
     """Return the source of the profiles of a channel."""
-    return (
-        GluedChannel(bench, channel) if channel.startswith(GLUED) else FileChannel(bench, channel)
-    )
+    kind = GluedChannel if channel.startswith(GLUED) else FileChannel
+    return kind(scene_data, channel)
 
 
 class FileChannel:
     """A channel that the files hold."""
 
-    def __init__(self, bench: Bench, channel: str) -> None:
+    def __init__(self, scene_data: SceneData, channel: str) -> None:
         self._channel = channel
-        archive, steps = bench.archive, bench.steps(channel)
+        archive, steps = scene_data.archive, scene_data.steps(channel)
         self._dark: labeled_signal.DarkSignals | None = None
-        if bench.dark is not None and StepName.DARK in steps:
+        if scene_data.dark is not None and StepName.DARK in steps:
             method = steps[StepName.DARK].settings["method"]
-            self._dark = labeled_signal.read_dark(bench.dark, channel, method=method)
+            self._dark = labeled_signal.read_dark(scene_data.dark, channel, method=method)
         self._archive = archive
         self._settings = {
             "dead_time": _setting(steps, StepName.DEAD_TIME, "dead_time"),
@@ -193,11 +194,11 @@ class FileChannel:
 class GluedChannel:
     """A channel that is glued from an analog and a photon-counting one."""
 
-    def __init__(self, bench: Bench, channel: str) -> None:
-        steps = bench.steps(channel)
+    def __init__(self, scene_data: SceneData, channel: str) -> None:
+        steps = scene_data.steps(channel)
         parts = steps[StepName.GLUE].settings
-        self._analog = FileChannel(bench, parts["analog"])
-        self._photon = FileChannel(bench, parts["photon"])
+        self._analog = FileChannel(scene_data, parts["analog"])
+        self._photon = FileChannel(scene_data, parts["photon"])
         self.geometry, self.shots = self._photon.geometry, self._photon.shots
         self._lag = self._find_lag(steps.get(StepName.LAG))
 
@@ -271,17 +272,19 @@ def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
     return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
 
 
-def _homogeneous(bench: Bench, channel: str, source: FileChannel | GluedChannel) -> xr.Dataset:
-    steps = bench.steps(channel)
+def _homogeneous(
+    scene_data: SceneData, channel: str, source: FileChannel | GluedChannel
+) -> xr.Dataset:
+    steps = scene_data.steps(channel)
     settings = steps[StepName.HOMOGENEOUS].settings
     omitted = {(near, far): Quality[bit] for near, far, bit in settings.get(OMITTED, ())}
     sections = [(near, far) for near, far in settings["sections"]]
     kept = [section for section in sections if section not in omitted]
     parts = []
     if kept:
-        parts.append(_retrieved(source.profiles(), kept, steps, bench.ancillaries))
+        parts.append(_retrieved(source.profiles(), kept, steps, scene_data.ancillaries))
     if omitted:
-        unit = labeled_signal.channel_unit(bench.archive, channel)
+        unit = labeled_signal.channel_unit(scene_data.archive, channel)
         parts.append(_empty_sections(source.shots, unit, omitted))
     result = parts[0]
     if len(parts) > 1:
@@ -343,14 +346,14 @@ def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Datase
     return result.assign(visibility.data_vars).assign_attrs(steps=definition.words)
 
 
-def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], scene_data: SceneData) -> xr.Dataset:
     settings = steps[StepName.ELASTIC].settings
     window = steps[StepName.REFERENCE].settings
     inverted = labeled_elastic.invert_elastic(
         averages,
-        molecules=_molecules(steps, bench.ancillaries),
+        molecules=_molecules(steps, scene_data.ancillaries),
         wavelength=steps[StepName.READ].settings["wavelength"],
-        station_altitude=bench.station_altitude,
+        station_altitude=scene_data.station_altitude,
         lidar_ratio=settings["lidar_ratio"],
         lidar_ratio_standard_error=settings["lidar_ratio_standard_error"],
         molecular_relative_error=settings["molecular_relative_error"],
@@ -362,13 +365,13 @@ def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> x
             relative_error=window["relative_error"],
         ),
         known_shape=StepName.KNOWN_SHAPE in steps,
-        overlap=overlap_at(steps, bench.ancillaries, averages["range"].to_numpy()),
+        overlap=overlap_at(steps, scene_data.ancillaries, averages["range"].to_numpy()),
     )
     return inverted.assign(_gluing(averages))
 
 
 def _beams(
-    source: FileChannel | GluedChannel, steps: Mapping[str, Step], bench: Bench
+    source: FileChannel | GluedChannel, steps: Mapping[str, Step], scene_data: SceneData
 ) -> xr.Dataset:
     """Return the beams of every scan cycle on common altitudes, as lazy arrays."""
     settings = steps[StepName.MULTIANGLE].settings
@@ -381,14 +384,14 @@ def _beams(
         azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
         time_bnds=geometry["time_bnds"].to_numpy(),
         shots=source.shots.to_numpy(),
-        altitude_grid=bench.station_altitude + heights,
-        station_altitude=bench.station_altitude,
+        altitude_grid=scene_data.station_altitude + heights,
+        station_altitude=scene_data.station_altitude,
         background=labeled_altitudes.Background(
             (near, far),
-            _molecules(steps, bench.ancillaries),
+            _molecules(steps, scene_data.ancillaries),
             steps[StepName.READ].settings["wavelength"],
         ),
-        overlap=overlap_at(steps, bench.ancillaries, profiles["range"].to_numpy()),
+        overlap=overlap_at(steps, scene_data.ancillaries, profiles["range"].to_numpy()),
     )
 
 

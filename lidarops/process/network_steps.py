@@ -17,7 +17,7 @@ from lidarops.plan import network_plan
 from lidarops.plan.network_plan import SAME_POINTING, BeamPlan
 from lidarops.plan.rules import StepName
 from lidarops.process import channel_steps
-from lidarops.process.channel_steps import Bench
+from lidarops.process.channel_steps import SceneData
 from lidarops.records import Step
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.network import geometry, labeled
@@ -34,7 +34,7 @@ class Member:
 
     instrument: str
     station: Station
-    bench: Bench | None
+    scene_data: SceneData | None
     """Holds the steps of this instrument only; None where no granule can be read."""
     range: npt.NDArray[np.float64]
     """m, ranges of the bins according to the plan."""
@@ -112,19 +112,21 @@ class _Beam:
         self._source: channel_steps.FileChannel | channel_steps.GluedChannel | None = None
         self._interval: Integers = np.zeros(0, dtype=np.int64)
         self.lazy = _no_averages(member.range)
-        bench = member.bench
-        profiles = [] if bench is None else list(_profiles_of(bench.archive, beam_plan))
-        if bench is not None and profiles:
-            archive = bench.archive.isel(time=profiles)
-            self._source = channel_steps.channel_source(replace(bench, archive=archive), channel)
+        scene_data = member.scene_data
+        profiles = [] if scene_data is None else list(_profiles_of(scene_data.archive, beam_plan))
+        if scene_data is not None and profiles:
+            archive = scene_data.archive.isel(time=profiles)
+            self._source = channel_steps.channel_source(
+                replace(scene_data, archive=archive), channel
+            )
             self._interval = _intervals(archive["time"].to_numpy(), seconds)
             self.lazy = self._source.averages(seconds)
 
     def signals(self, computed: xr.Dataset) -> BeamAverages:
         """Return the averages with the geometry and settings of the beam."""
-        member, bench = self._member, self._member.bench
+        member, scene_data = self._member, self._member.scene_data
         averages = computed if self._source is None else self._source.glued(computed)
-        planned = {} if bench is None else bench.steps(self._channel)
+        planned = {} if scene_data is None else scene_data.steps(self._channel)
         distance = averages["range"].to_numpy().astype(np.float64)
         near, far = (
             planned[StepName.BACKGROUND].settings["range"] if planned else (distance[0], np.inf)
@@ -138,8 +140,8 @@ class _Beam:
             nearest=self._beam_plan.nearest,
             overlap=(
                 None
-                if bench is None
-                else channel_steps.overlap_at(planned, bench.ancillaries, distance)
+                if scene_data is None
+                else channel_steps.overlap_at(planned, scene_data.ancillaries, distance)
             ),
             exponent=self._beam_plan.exponent,
             zenith_angle=self._beam_plan.zenith_angle,

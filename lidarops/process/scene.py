@@ -157,14 +157,14 @@ def _process(job: Job, root: Path) -> SceneOutcome:
             channels = list(
                 dict.fromkeys(step.channel for step in product_steps if job.concerns(step))
             )
-            bench = _open_bench(job, usable, job.plan, root)
-            job, bench = _refined(job, usable, bench, root)
+            scene_data = _open_data(job, usable, job.plan, root)
+            job, scene_data = _refined(job, usable, scene_data, root)
             clock.lap("look")
-            inputs += bench.ancillaries.inputs
+            inputs += scene_data.ancillaries.inputs
             products = tuple(
                 product
                 for channel in channels
-                for product in _channel_products(job, usable, inputs, bench, channel, clock)
+                for product in _channel_products(job, usable, inputs, scene_data, channel, clock)
             )
     return replace(
         failure,
@@ -180,27 +180,29 @@ def nothing_to_do(plan: Plan) -> str:
     """Return why a plan makes no product: omissions of requested steps, those of products first."""
     kinds = tuple(ProductKind)
     requested = [
-        left
-        for left in plan.left_out
-        if not any(words in left.reason for words in (NOT_REQUESTED, NO_PRODUCT))
+        omission
+        for omission in plan.left_out
+        if not any(words in omission.reason for words in (NOT_REQUESTED, NO_PRODUCT))
     ]
-    omissions = sorted(requested or plan.left_out, key=lambda left: left.name not in kinds)
-    reasons = dict.fromkeys(f"{left.name} of {left.channel}: {left.reason}" for left in omissions)
+    omissions = sorted(requested or plan.left_out, key=lambda omission: omission.name not in kinds)
+    reasons = dict.fromkeys(
+        f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
+    )
     return "nothing to do: " + "; ".join(reasons)
 
 
 def _refined(
-    job: Job, scene: Scene, bench: channel_steps.Bench, root: Path
-) -> tuple[Job, channel_steps.Bench]:
-    """Return job and bench with the plan refined from some profiles of the scene."""
+    job: Job, scene: Scene, scene_data: channel_steps.SceneData, root: Path
+) -> tuple[Job, channel_steps.SceneData]:
+    """Return job and data with the plan refined from some profiles of the scene."""
 
     def profiles(channel: str, granules: Sequence[Granule]) -> xr.Dataset:
         archive = _open(job, scene, granules, root, [channel])
-        sample = channel_steps.load_small(replace(bench, archive=archive), [channel])
+        sample = channel_steps.load_small(replace(scene_data, archive=archive), [channel])
         return channel_steps.FileChannel(sample, channel).profiles().compute()
 
     plan = refine_plan(job.plan, scene.granules, profiles)
-    return replace(job, plan=plan), replace(bench, plan=plan)
+    return replace(job, plan=plan), replace(scene_data, plan=plan)
 
 
 class _Clock:
@@ -311,12 +313,12 @@ def _open(
     return archive.assign_coords(pointing) if pointing else archive
 
 
-def _open_bench(job: Job, scene: Scene, plan: Plan, root: Path) -> channel_steps.Bench:
+def _open_data(job: Job, scene: Scene, plan: Plan, root: Path) -> channel_steps.SceneData:
     """Open the data that the steps of a scene work on: only the channels that they read."""
     read = dict.fromkeys(step.channel for step in plan.steps if step.name == StepName.READ)
     present = {channel.name for channel in scene.layout}
     subtracted = [step.channel for step in plan.steps if step.name == StepName.DARK]
-    return channel_steps.Bench(
+    return channel_steps.SceneData(
         plan=plan,
         archive=_open(
             job,
@@ -336,15 +338,15 @@ def _channel_products(
     job: Job,
     scene: Scene,
     inputs: tuple[InputRecord, ...],
-    bench: channel_steps.Bench,
+    scene_data: channel_steps.SceneData,
     name: str,
     clock: _Clock,
 ) -> Iterator[ProductRecord]:
     layout = _layout(job, scene, name)
-    computed = channel_steps.process_channel(bench, name)
+    computed = channel_steps.process_channel(scene_data, name)
     clock.lap("retrieve")
     for kind, data in computed.items():
-        wavelength = bench.steps(name)[StepName.READ].settings["wavelength"]
+        wavelength = scene_data.steps(name)[StepName.READ].settings["wavelength"]
         context = _context(job, scene, kind, layout, wavelength, inputs)
         yield _written(job, context, data, clock)
 
@@ -367,16 +369,16 @@ def _network_product(
         steps = tuple(step for step in job.plan.steps if step.instrument == planned.instrument)
         if not steps:
             continue
-        bench = None
+        scene_data = None
         if usable.granules:
-            bench = _open_bench(job, usable, Plan(job.plan.scene, steps, ()), root)
-            inputs += tuple(file for file in bench.ancillaries.inputs if file not in inputs)
+            scene_data = _open_data(job, usable, Plan(job.plan.scene, steps, ()), root)
+            inputs += tuple(file for file in scene_data.ancillaries.inputs if file not in inputs)
         grid = network_plan.channel_ranges(
             network_plan.member_channel(planned, retrieval.channel),
             product_dependence.scene_facts(job.campaign, planned),
         )
         station = job.campaign.stations[planned.station]
-        members.append(network_steps.Member(planned.instrument, station, bench, grid))
+        members.append(network_steps.Member(planned.instrument, station, scene_data, grid))
     data = network_steps.process_network(members, joint)
     clock.lap("retrieve")
     first = next(m for m in job.scene.members if m.instrument == members[0].instrument)
