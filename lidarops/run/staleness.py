@@ -36,8 +36,6 @@ DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
 """Granules that are judged at a time, unless one day has more. Memory holds the current group and,
 if workers process the scenes, the next group."""
-CRASHES: Final = 3
-"""A scene that kills its process this often is refused."""
 
 _PROFILE_ROLES: Final = {"molecular_profile": Role.MOLECULAR, "overlap_profile": Role.OVERLAP}
 # Settings that change neither the scenes nor the content of a product.
