@@ -42,10 +42,10 @@ def planned(*granules: Any, all_steps: bool = False, **changes: Any) -> Plan:
     return plan_scene(cut_scenes(campaign, granules or (factories.granule(0),)).scenes[0], campaign)
 
 
-def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
+def decided(plan: Plan, rule: str) -> tuple[list[str], list[str]]:
     """Return the steps that a rule runs, and the reasons of those that it leaves out."""
-    steps = [step.name for step in made.steps if step.rule == rule]
-    return steps, [left.reason for left in made.left_out if left.rule == rule]
+    steps = [step.name for step in plan.steps if step.rule == rule]
+    return steps, [omission.reason for omission in plan.left_out if omission.rule == rule]
 
 
 # The table ------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
 
 
 @pytest.mark.parametrize(
-    ("rule", "needing", "needless"),
+    ("rule", "with_need", "without_need"),
     [
         ("channel", ([LEVEL], {}), ([LEVEL], with_products(signal={"channels": []}))),
         ("range_window", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
@@ -128,21 +128,21 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
         ("layers", (ONE_SIDE, multi(layers=[[600, 1200]])), (ONE_SIDE, MULTI)),
     ],
 )  # fmt: skip
-def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless):
-    granules, changes = needing
+def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, with_need, without_need):
+    granules, changes = with_need
     steps, _ = decided(planned(*granules, **changes), rule)
     assert steps
-    granules, changes = needless
-    made = planned(*granules, **changes)
-    steps, reasons = decided(made, rule)
+    granules, changes = without_need
+    plan = planned(*granules, **changes)
+    steps, reasons = decided(plan, rule)
     assert reasons
     assert all(reasons)
-    channels = {left.channel for left in made.left_out if left.rule == rule}
-    assert not [step for step in made.steps if step.rule == rule and step.channel in channels]
+    channels = {omission.channel for omission in plan.left_out if omission.rule == rule}
+    assert not [step for step in plan.steps if step.rule == rule and step.channel in channels]
 
 
 @pytest.mark.parametrize(
-    ("rule", "needing", "needless"),
+    ("rule", "with_need", "without_need"),
     [
         ("noise", ([LEVEL], {}), ([LEVEL], with_products())),
         ("glue", ([UP], GLUED), ([UP], ELASTIC)),
@@ -153,9 +153,9 @@ def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless
         ("look", ([LEVEL], {}), ([UP], {})),
     ],
 )
-def test_a_rule_whose_question_does_not_arise_decides_nothing(rule, needing, needless):
-    assert decided(planned(*needing[0], **needing[1]), rule)[0]
-    assert decided(planned(*needless[0], **needless[1]), rule) == ([], [])
+def test_a_rule_whose_question_does_not_arise_decides_nothing(rule, with_need, without_need):
+    assert decided(planned(*with_need[0], **with_need[1]), rule)[0]
+    assert decided(planned(*without_need[0], **without_need[1]), rule) == ([], [])
 
 
 @pytest.mark.parametrize(
@@ -185,9 +185,9 @@ def test_impossible_requests_are_left_out_by_name(rule, changes):
     ],
 )
 def test_numbers_of_scans(granules, rule, number):
-    made = planned(*granules, **MULTI)
-    (found,) = (each for each in (*made.steps, *made.left_out) if each.rule == rule)
-    assert found.number == pytest.approx(number)
+    plan = planned(*granules, **MULTI)
+    (decision,) = (step for step in (*plan.steps, *plan.left_out) if step.rule == rule)
+    assert decision.number == pytest.approx(number)
 
 
 JITTER = scans(
@@ -201,11 +201,11 @@ FLAT = scans((0.0, 90.0), (30.0, 90.0), (60.0, 90.0), (88.0, 270.0))
     ("granules", "count"), [(JITTER, 3), (NEARLY_OPPOSITE, 5), (FLAT, 3), (BOTH_SIDES, 11)]
 )
 def test_the_beams_of_a_plan_are_those_of_the_retrieval(granules, count):
-    made = planned(*granules, **MULTI)
-    decisions = {each.rule: each for each in (*made.steps, *made.left_out)}
-    found, surrounded = retrieved(granules, highest=6000.0, step=60.0)
-    assert found == decisions["robust"].number == count
-    assert surrounded == (decisions["gradient_regressor"] in made.steps)
+    plan = planned(*granules, **MULTI)
+    decisions = {decision.rule: decision for decision in (*plan.steps, *plan.left_out)}
+    beams, surrounded = retrieved(granules, highest=6000.0, step=60.0)
+    assert beams == decisions["robust"].number == count
+    assert surrounded == (decisions["gradient_regressor"] in plan.steps)
 
 
 def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int, bool]:
@@ -242,8 +242,8 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
 
 
 def test_invalid_angles_are_left_to_the_retrieval():
-    made = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
-    assert decided(made, "robust") == (
+    plan = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
+    assert decided(plan, "robust") == (
         [],
         ["fewer than 4 beam directions cannot identify an outlier"],
     )
@@ -254,8 +254,8 @@ def test_every_decision_has_a_rule_of_the_table():
     for granules, changes in (
         ([LEVEL, DARK], {}), ([UP], ELASTIC), ([UP], LATE), (BOTH_SIDES, MULTI), ([LEVEL], FEW),
     ):  # fmt: skip
-        made = planned(*granules, **changes)
-        assert {each.rule for each in (*made.steps, *made.left_out)} <= names
+        plan = planned(*granules, **changes)
+        assert {decision.rule for decision in (*plan.steps, *plan.left_out)} <= names
 
 
 def test_every_rule_is_tested():
@@ -284,20 +284,20 @@ def test_every_rule_is_tested():
 def test_sections_are_retrieved_along_nearly_level_beams(angles, kept):
     # At 89 degree a beam climbs 65 m over 3750 m, 105 m over 6000 m; the limit is 100 m.
     granules = [factories.granule(k, zenith_angle=angle) for k, angle in enumerate(angles)]
-    made = planned(*granules, products=HOMOGENEOUS)
-    step = [step for step in made.steps if step.name == "homogeneous"]
-    assert sum(len(each.settings["sections"]) for each in step) == kept
-    assert len(decided(made, "section_level")[1]) == 2 - kept
+    plan = planned(*granules, products=HOMOGENEOUS)
+    steps = [step for step in plan.steps if step.name == "homogeneous"]
+    assert sum(len(step.settings["sections"]) for step in steps) == kept
+    assert len(decided(plan, "section_level")[1]) == 2 - kept
     whole = planned(*granules, products=HOMOGENEOUS, all_steps=True)
     (step,) = (step for step in whole.steps if step.name == "homogeneous")
     assert len(step.settings["sections"]) == 2
-    assert any("all_steps is set" in left.reason for left in whole.left_out)
+    assert any("all_steps is set" in omission.reason for omission in whole.left_out)
 
 
 def test_the_window_holds_the_farthest_section_and_the_bins_for_its_noise():
     # 7500 m, a tenth more for the variance, and two bins for rounding.
-    made = planned(products=HOMOGENEOUS)
-    (window,) = (step for step in made.steps if step.name == "range_window")
+    plan = planned(products=HOMOGENEOUS)
+    (window,) = (step for step in plan.steps if step.name == "range_window")
     assert window.settings == {"bins": [[0, 1102]]}
     assert window.number == 1102
     assert window.as_dict()["rule"] == "range_window"
@@ -323,13 +323,13 @@ def test_a_window_without_effect_states_why(products, why):
     # The beam climbs 90 m along the section, below the limit, and reaches aerosol-free air.
     steep = factories.granule(0, zenith_angle=0.0)
     products = {**products, "homogeneous": {**SECTIONS, "sections": [[750, 840]]}}
-    made = planned(steep, products=products)
-    (window,) = (step for step in made.steps if step.name == "range_window")
-    assert idle_window(window, made.steps) == why
-    assert ("photon_532o" in read_windows(made.steps)) == (not why)
-    assert not any(idle_window(step, made.steps) for step in made.steps if step is not window)
+    plan = planned(steep, products=products)
+    (window,) = (step for step in plan.steps if step.name == "range_window")
+    assert idle_window(window, plan.steps) == why
+    assert ("photon_532o" in read_windows(plan.steps)) == (not why)
+    assert not any(idle_window(step, plan.steps) for step in plan.steps if step is not window)
     # The product of sections states the same, whatever other products there are.
-    alone = product_dependence.plan_closure(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
+    alone = product_dependence.plan_closure(plan, [(ProductKind.HOMOGENEOUS, "photon_532o")])
     assert window in alone.steps
     assert not idle_window(window, alone.steps)
 
@@ -375,31 +375,32 @@ def looked(profiles, count=600):
     return refine_plan(planned(*granules, products=HOMOGENEOUS), granules, profiles)
 
 
-def absent(made):
-    (step,) = (step for step in made.steps if step.name == "homogeneous")
+def absent(plan):
+    (step,) = (step for step in plan.steps if step.name == "homogeneous")
     return step.settings.get(OMITTED, [])
 
 
 def test_sixteen_profiles_with_signal_are_enough():
     profiles, seen = sky(lambda _: 1.0)
-    made = looked(profiles)
-    assert absent(made) == []
+    plan = looked(profiles)
+    assert absent(plan) == []
     assert len(seen) == 16
 
 
 def test_a_dark_scene_is_left_out_with_its_number():
-    made = looked(sky(lambda _: 0.0)[0])
-    assert absent(made) == [[750.0, 4500.0, "LOW_SIGNAL"], [1500.0, 7500.0, "LOW_SIGNAL"]]
-    left = [each for each in made.left_out if each.rule == "section_dark"]
-    assert [each.channel for each in left] == ["photon_532o"] * 2
-    assert all(each.number is not None and each.number < 1e-6 for each in left)
-    assert "no signal" in left[0].reason
+    plan = looked(sky(lambda _: 0.0)[0])
+    assert absent(plan) == [[750.0, 4500.0, "LOW_SIGNAL"], [1500.0, 7500.0, "LOW_SIGNAL"]]
+    omissions = [omission for omission in plan.left_out if omission.rule == "section_dark"]
+    assert [omission.channel for omission in omissions] == ["photon_532o"] * 2
+    numbers = [omission.number for omission in omissions]
+    assert all(number is not None and number < 1e-6 for number in numbers)
+    assert "no signal" in omissions[0].reason
 
 
 @pytest.mark.parametrize("begins", [3, 101, 333, 580])
 def test_a_signal_of_ten_minutes_in_a_dark_day_is_not_lost(begins):
-    made = looked(sky(lambda minute: float(begins <= minute <= begins + 10))[0])
-    assert absent(made) == []
+    plan = looked(sky(lambda minute: float(begins <= minute <= begins + 10))[0])
+    assert absent(plan) == []
 
 
 def test_sampled_profiles_are_close_in_time():
@@ -418,9 +419,9 @@ def test_sections_that_are_always_saturated_are_left_out():
 
 
 def test_a_refined_plan_stays_as_it_is():
-    made = looked(sky(lambda _: 0.0)[0])
+    plan = looked(sky(lambda _: 0.0)[0])
     granules = [factories.granule(float(k)) for k in range(600)]
-    assert refine_plan(made, granules, sky(lambda _: 1.0)[0]) == made
+    assert refine_plan(plan, granules, sky(lambda _: 1.0)[0]) == plan
 
 
 # Files ----------------------------------------------------------------------------------------
@@ -440,10 +441,10 @@ def test_a_known_file_is_not_read_again(tmp_path):
     again = reprocess(campaign, options=Options(force=True))
     whole = reprocess(campaign.model_copy(update={"all_steps": True}), options=Options(force=True))
     size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
-    (one,), (two,), (three,) = first.scenes, again.scenes, whole.scenes
-    assert one.inputs == two.inputs == three.inputs
-    assert one.bytes_read - two.bytes_read == size
-    assert three.bytes_read == size + 4 * 1000 * 4
+    (unknown,), (known,), (complete,) = first.scenes, again.scenes, whole.scenes
+    assert unknown.inputs == known.inputs == complete.inputs
+    assert unknown.bytes_read - known.bytes_read == size
+    assert complete.bytes_read == size + 4 * 1000 * 4
 
 
 @pytest.mark.parametrize("far", [1500, 3000, 4500, 6700])
@@ -453,17 +454,17 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, far]]}}
     campaign = archive(tmp_path, facts=[facts], products=products)
     scene = catalogued_scenes(campaign)[0]
-    made = plan_scene(scene, campaign)
+    plan = plan_scene(scene, campaign)
     values, read = [], []
     for dropped in (["look"], ["look", "range_window"]):
-        steps = tuple(step for step in made.steps if step.name not in dropped)
-        outcome = process_scene(Job(campaign, scene, replace(made, steps=steps)))
+        steps = tuple(step for step in plan.steps if step.name not in dropped)
+        outcome = process_scene(Job(campaign, scene, replace(plan, steps=steps)))
         values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))
         read.append(outcome.bytes_read)
     assert read[0] < read[1]
     for name in ("extinction", "extinction_standard_error", "reduced_chi2", "quality_flag"):
-        one, two = (each[name].to_numpy() for each in values)
-        np.testing.assert_array_equal(one, two)
+        windowed, whole = (product[name].to_numpy() for product in values)
+        np.testing.assert_array_equal(windowed, whole)
     assert np.isfinite(values[0]["extinction"]).any()
 
 
@@ -471,22 +472,22 @@ def test_an_omitted_section_flags_profiles_without_shots(tmp_path, monkeypatch):
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
     campaign = archive(tmp_path, products=products)
     scene = catalogued_scenes(campaign)[0]
-    made = plan_scene(scene, campaign)
+    plan = plan_scene(scene, campaign)
     absent = {OMITTED: [[700.0, 1500.0, "LOW_SIGNAL"]]}
     steps = [
         replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
-        for step in made.steps
+        for step in plan.steps
         if step.name != "look"
     ]
     opened = processing.open_archive
 
     def without_shots(*files: Any, **settings: Any) -> xr.Dataset:
-        found = opened(*files, **settings)
-        found["photon_532o_shots"][1] = 0
-        return found
+        raw = opened(*files, **settings)
+        raw["photon_532o_shots"][1] = 0
+        return raw
 
     monkeypatch.setattr(processing, "open_archive", without_shots)
-    (product,) = process_scene(Job(campaign, scene, replace(made, steps=tuple(steps)))).products
+    (product,) = process_scene(Job(campaign, scene, replace(plan, steps=tuple(steps)))).products
     flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
     bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
     low = int(Quality.LOW_SIGNAL)
@@ -507,13 +508,13 @@ def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
 
 def test_a_file_with_a_changed_time_is_read_again(tmp_path, monkeypatch):
     campaign = archive(tmp_path)
-    one = reprocess(campaign).scenes[0]
+    first = reprocess(campaign).scenes[0]
     size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
     scene = catalogued_scenes(campaign)[0]
     stale = replace(scene, granules=tuple(replace(g, mtime_ns=1) for g in scene.granules))
-    found = process_scene(Job(campaign, stale, plan_scene(stale, campaign)))
-    assert found.inputs == one.inputs
-    assert found.bytes_read > size
+    outcome = process_scene(Job(campaign, stale, plan_scene(stale, campaign)))
+    assert outcome.inputs == first.inputs
+    assert outcome.bytes_read > size
     seen: list[str] = []
     read = RawFile.read_header
     monkeypatch.setattr(
@@ -537,8 +538,8 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
         changed = campaign.model_copy(update=changes)
         (scene,) = reprocess(changed, options=Options(force=True)).scenes
         if not changes:
-            assert [each.sha256 for each in scene.products] == [
-                each.sha256 for each in first.products
+            assert [product.sha256 for product in scene.products] == [
+                product.sha256 for product in first.products
             ]
         return seen
 
@@ -583,25 +584,25 @@ def test_omissions_lose_and_change_no_good_value(tmp_path):
     simulate_campaign(campaign)
     reprocess(campaign)
     planned_run = reprocess(campaign, options=Options(force=True))
-    everything = campaign.model_copy(
+    all_steps = campaign.model_copy(
         update={"all_steps": True, "output": str(tmp_path / "everything")}
     )
-    whole = reprocess(everything, options=Options(force=True))
+    whole = reprocess(all_steps, options=Options(force=True))
     assert len(whole.scenes) >= 8
-    ours, theirs = _opened(planned_run), _opened(whole)
+    planned_products, all_products = _opened(planned_run), _opened(whole)
     good = 0
-    for path, full in theirs.items():
+    for path, full in all_products.items():
         kind = path.rsplit("/", 1)[-1]
         value, error = next(names for key, names in _MAIN.items() if key in kind)
         unflagged = full["quality_flag"].to_numpy() == 0
         good += int(unflagged.sum())
-        if path not in ours:
+        if path not in planned_products:
             assert not unflagged.any()
             continue
-        mine = ours[path]
-        assert (mine["quality_flag"].to_numpy()[unflagged] == 0).all()
-        apart = np.abs(mine[value].to_numpy() - full[value].to_numpy())[unflagged]
-        assert np.all(apart <= 0.1 * full[error].to_numpy()[unflagged])
+        product = planned_products[path]
+        assert (product["quality_flag"].to_numpy()[unflagged] == 0).all()
+        difference = np.abs(product[value].to_numpy() - full[value].to_numpy())[unflagged]
+        assert np.all(difference <= 0.1 * full[error].to_numpy()[unflagged])
     assert good > 1000
     read = [sum(scene.bytes_read for scene in record.scenes) for record in (planned_run, whole)]
     assert read[0] <= 0.5 * read[1]

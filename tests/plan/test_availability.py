@@ -27,7 +27,7 @@ EDGE = "2026-03-02T00:00:00Z"
 BEFORE, AFTER = {"valid_to": EDGE}, {"valid_from": EDGE}
 
 
-def _found(
+def unavailable(
     facts: list[dict[str, Any]],
     *granules: Granule,
     products: dict[str, Any] | None = None,
@@ -37,43 +37,49 @@ def _found(
     campaign = factories.campaign(facts=facts, products=products or {"signal": {}})
     with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
         store.replace([row_of(granule, campaign.name, "key") for granule in granules])
-        found = list(
+        channels = list(
             unavailable_channels(campaign, store.holdings(validity_edges(campaign)), **selection)
         )
-        # The quick check covers whatever the full one finds.
-        assert lacks_channels(campaign, store.layouts()) or not found
-        return found
+        # The quick check covers every channel of the full one.
+        assert lacks_channels(campaign, store.layouts()) or not channels
+        return channels
 
 
-def _file(day: int, *layout: Any, minutes: float = 0.0, role: Role = Role.SIGNAL) -> Granule:
+def file_of(day: int, *layout: Any, minutes: float = 0.0, role: Role = Role.SIGNAL) -> Granule:
     name = f"coast/h{day}{minutes:g}{role}"
     return factories.granule(day * DAY + minutes, path=name, role=role, layout=layout)
 
 
-def _told(*channels: str) -> dict[str, Any]:
+def dead_times_of(*channels: str) -> dict[str, Any]:
     return {"channels": {name: {"dead_time": 4e-9} for name in channels}}
 
 
 def test_a_name_that_no_file_has_is_reported_with_counts(tmp_path: Path) -> None:
     products = {"homogeneous": {"channels": ["photon_999o"], "sections": [[750, 900]]}}
-    files = [_file(0, OLD), _file(1, OLD), _file(1, NEW, role=Role.DARK)]
-    facts = [_told("photon_533o", "photon_532o")]
-    found = {
-        each.channel: each for each in _found(facts, *files, products=products, folder=tmp_path)
+    files = [file_of(0, OLD), file_of(1, OLD), file_of(1, NEW, role=Role.DARK)]
+    facts = [dead_times_of("photon_533o", "photon_532o")]
+    by_channel = {
+        channel.channel: channel
+        for channel in unavailable(facts, *files, products=products, folder=tmp_path)
     }
-    assert found.keys() == {"photon_999o", "photon_533o"}
-    assert found["photon_999o"].requested_by == "homogeneous"
-    assert found["photon_533o"].requested_by == "facts"
-    for each in found.values():
-        assert (each.nowhere, each.files, each.of) == (True, 2, 2)
-        assert "photon_532o" in each.reason
+    assert by_channel.keys() == {"photon_999o", "photon_533o"}
+    assert by_channel["photon_999o"].requested_by == "homogeneous"
+    assert by_channel["photon_533o"].requested_by == "facts"
+    for channel in by_channel.values():
+        assert (channel.nowhere, channel.files, channel.files_expected) == (True, 2, 2)
+        assert "photon_532o" in channel.reason
 
 
 def test_a_channel_of_a_new_detector_is_not_a_typing_error(tmp_path: Path) -> None:
     products = {"signal": {"channels": ["photon_607o", "photon_607o"]}}
-    files = [_file(0, OLD), _file(1, OLD), _file(2, OLD, NEW)]
-    found = _found([_told("photon_607o")], *files, products=products, folder=tmp_path)
-    assert {(each.requested_by, each.nowhere, each.files, each.of) for each in found} == {
+    files = [file_of(0, OLD), file_of(1, OLD), file_of(2, OLD, NEW)]
+    missing = unavailable(
+        [dead_times_of("photon_607o")], *files, products=products, folder=tmp_path
+    )
+    assert {
+        (channel.requested_by, channel.nowhere, channel.files, channel.files_expected)
+        for channel in missing
+    } == {
         ("signal", False, 2, 3),
         ("facts", False, 2, 3),
     }
@@ -81,23 +87,27 @@ def test_a_channel_of_a_new_detector_is_not_a_typing_error(tmp_path: Path) -> No
 
 def test_facts_are_compared_with_the_files_of_their_period(tmp_path: Path) -> None:
     # At the edge itself the later facts hold.
-    files = [_file(0, OLD), _file(1, NEW, minutes=0.0), _file(2, NEW)]
-    right = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_607o")}]
-    assert _found(right, *files, folder=tmp_path) == []
-    wrong = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_532o")}]
-    (each,) = _found(wrong, *files, folder=tmp_path)
-    assert (each.requested_by, each.files, each.of) == ("facts from 2026-03-02T00:00:00Z", 2, 2)
+    files = [file_of(0, OLD), file_of(1, NEW, minutes=0.0), file_of(2, NEW)]
+    right = [{**BEFORE, **dead_times_of("photon_532o")}, {**AFTER, **dead_times_of("photon_607o")}]
+    assert unavailable(right, *files, folder=tmp_path) == []
+    wrong = [{**BEFORE, **dead_times_of("photon_532o")}, {**AFTER, **dead_times_of("photon_532o")}]
+    (channel,) = unavailable(wrong, *files, folder=tmp_path)
+    assert (channel.requested_by, channel.files, channel.files_expected) == (
+        "facts from 2026-03-02T00:00:00Z",
+        2,
+        2,
+    )
     # Reported, but no failure: facts of two periods may name the same channels.
-    assert each.held == 1
-    assert not each.nowhere
-    slip = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_606o")}]
-    (each,) = _found(slip, *files, folder=tmp_path)
-    assert each.nowhere
+    assert channel.files_with_channel == 1
+    assert not channel.nowhere
+    slip = [{**BEFORE, **dead_times_of("photon_532o")}, {**AFTER, **dead_times_of("photon_606o")}]
+    (channel,) = unavailable(slip, *files, folder=tmp_path)
+    assert channel.nowhere
 
 
 def test_facts_of_a_time_without_files_are_not_reported(tmp_path: Path) -> None:
-    facts = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_533o")}]
-    assert _found(facts, _file(0, OLD), folder=tmp_path) == []
+    facts = [{**BEFORE, **dead_times_of("photon_532o")}, {**AFTER, **dead_times_of("photon_533o")}]
+    assert unavailable(facts, file_of(0, OLD), folder=tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -115,21 +125,23 @@ def test_the_selection_restricts_the_result(
     selection: dict[str, Any], channels: set[str], tmp_path: Path
 ) -> None:
     products = {"signal": {"channels": ["photon_999o"]}}
-    facts = [{**BEFORE, **_told("photon_533o")}, {**AFTER, **_told("photon_532o")}]
-    files = [_file(0, OLD), _file(1, OLD)]
-    found = _found(facts, *files, products=products, folder=tmp_path, **selection)
-    assert {each.channel for each in found} == channels
+    facts = [{**BEFORE, **dead_times_of("photon_533o")}, {**AFTER, **dead_times_of("photon_532o")}]
+    files = [file_of(0, OLD), file_of(1, OLD)]
+    missing = unavailable(facts, *files, products=products, folder=tmp_path, **selection)
+    assert {channel.channel for channel in missing} == channels
 
 
 def test_a_campaign_that_names_no_channel_needs_no_check() -> None:
     assert not names_channels(factories.campaign(facts=[{}], products={"signal": {}}))
-    assert names_channels(factories.campaign(facts=[_told("photon_532o")], products={"signal": {}}))
+    assert names_channels(
+        factories.campaign(facts=[dead_times_of("photon_532o")], products={"signal": {}})
+    )
     assert names_channels(factories.campaign(facts=[{}], products={"signal": {"channels": ["a"]}}))
 
 
 def test_files_that_hold_all_need_no_count() -> None:
     """As in most archives; counting a million files takes seconds."""
-    campaign = factories.campaign(facts=[_told("photon_532o")], products={"signal": {}})
+    campaign = factories.campaign(facts=[dead_times_of("photon_532o")], products={"signal": {}})
     assert not lacks_channels(campaign, [("lidar", (OLD,)), ("lidar", (OLD, NEW))])
     assert not lacks_channels(campaign, [("another", (NEW,))])
     assert lacks_channels(campaign, [("lidar", (OLD, NEW)), ("lidar", (NEW,))])

@@ -84,8 +84,8 @@ def planned(settings: Campaign, files: list[Granule] | None = None) -> Plan:
     return plan_scene(scene, settings)
 
 
-def reasons(found: Plan) -> str:
-    return "; ".join(left.reason for left in found.left_out if left.name == "visibility")
+def reasons(plan: Plan) -> str:
+    return "; ".join(left.reason for left in plan.left_out if left.name == "visibility")
 
 
 RED = replace(granules()[2], layout=(replace(PHOTON, wavelength=1064e-9),))
@@ -104,7 +104,7 @@ class TestCampaign:
         assert settings.average == timedelta(minutes=10)
 
     @pytest.mark.parametrize(
-        ("visibility", "said"),
+        ("visibility", "message"),
         [
             ({"average": "7min"}, "divide a day"),
             ({"average": "20min", "block": "30min"}, "multiple of average"),
@@ -116,21 +116,21 @@ class TestCampaign:
             ({"method": "magic"}, "method"),
         ],
     )
-    def test_invalid_settings_are_refused(self, visibility, said):
-        with pytest.raises(ValidationError, match=said):
+    def test_invalid_settings_are_refused(self, visibility, message):
+        with pytest.raises(ValidationError, match=message):
             campaign(visibility)
 
     @pytest.mark.parametrize(
-        ("network", "said"),
+        ("network", "message"),
         [
             ({"instruments": ["west-lidar"]}, "at least 2"),
             ({"instruments": ["west-lidar", "west-lidar"]}, "twice"),
             ({"instruments": ["west-lidar", "moon-lidar"]}, "unknown instrument 'moon-lidar'"),
         ],
     )
-    def test_members_are_instruments(self, network, said):
+    def test_members_are_instruments(self, network, message):
         settings = {"valley": network | {"visibility": {"channel": "photon_532o"}}}
-        with pytest.raises(ValidationError, match=said):
+        with pytest.raises(ValidationError, match=message):
             campaign(networks=settings)
 
     def test_the_key_of_a_network_is_unique(self):
@@ -147,9 +147,9 @@ class TestCampaign:
 class TestScenes:
     def test_members_keep_scenes_of_their_own(self):
         settings = campaign()
-        found = cut_scenes(settings, granules()).scenes
-        assert [scene.instrument for scene in found] == [*sorted(MEMBERS), "valley"]
-        scene = found[-1]
+        scenes = cut_scenes(settings, granules()).scenes
+        assert [scene.instrument for scene in scenes] == [*sorted(MEMBERS), "valley"]
+        scene = scenes[-1]
         assert scene.id == "valley_20260301T000000"
         assert [member.instrument for member in scene.members] == MEMBERS
         union = {g.path for member in scene.members for g in member.granules}
@@ -178,11 +178,11 @@ class TestScenes:
     def test_each_range_grid_makes_a_scene(self):
         short = replace(PHOTON, bins=1000)
         late = replace(granules(30)[0], layout=(short,))
-        found = networks(campaign(), [*granules(), late])
-        assert len(found) == 2
-        assert len({scene.id for scene in found}) == 2
-        # Nothing is lost: each granule is in one of them at least.
-        assert {g.path for s in found for g in s.granules} == {g.path for g in [*granules(), late]}
+        scenes = networks(campaign(), [*granules(), late])
+        assert len(scenes) == 2
+        assert len({scene.id for scene in scenes}) == 2
+        # Nothing is lost: each granule is in at least one scene.
+        assert {g.path for s in scenes for g in s.granules} == {g.path for g in [*granules(), late]}
 
     @given(st.permutations(granules() + granules(10) + granules(20)))
     def test_the_order_of_files_does_not_matter(self, shuffled):
@@ -192,23 +192,23 @@ class TestScenes:
         )
 
     def test_without_a_network_nothing_changes(self):
-        with_one = [s for s in cut_scenes(campaign(), granules()).scenes if not s.members]
-        assert with_one == list(cut_scenes(campaign(networks={}), granules()).scenes)
+        single_lidars = [s for s in cut_scenes(campaign(), granules()).scenes if not s.members]
+        assert single_lidars == list(cut_scenes(campaign(networks={}), granules()).scenes)
 
 
 class TestPlans:
     def test_it_names_beams_and_members(self):
-        found = planned(campaign())
-        step = found.steps[-1]
+        plan = planned(campaign())
+        step = plan.steps[-1]
         assert step.name == "visibility"
         assert [beam["azimuth"] for beam in step.settings["beams"]] == [70.0, 310.0, 190.0]
         assert "3 beams of 3 instruments have 3 crossings, 3 of them near ones" in step.reason
-        per_member = [s for s in found.steps if s.instrument]
+        per_member = [s for s in plan.steps if s.instrument]
         assert {s.instrument for s in per_member} == set(MEMBERS)
         assert all(s.reason.startswith(f"{s.instrument}: ") for s in per_member)
-        names = [s.name for s in found.steps if s.instrument == "west-lidar"]
+        names = [s.name for s in plan.steps if s.instrument == "west-lidar"]
         assert names == ["read", "overlap", "noise", "background", "range_window"]
-        joint = [s.name for s in found.steps if not s.instrument]
+        joint = [s.name for s in plan.steps if not s.instrument]
         assert joint == ["average", "prior", "visibility"]
 
     def test_members_are_not_read_for_themselves(self):
@@ -216,22 +216,22 @@ class TestPlans:
         alone = next(
             s for s in cut_scenes(settings, granules()).scenes if s.instrument == "west-lidar"
         )
-        found = plan_scene(alone, settings)
-        assert found.steps == ()
-        left_out = {left.channel: left.reason for left in found.left_out}
+        plan = plan_scene(alone, settings)
+        assert plan.steps == ()
+        left_out = {left.channel: left.reason for left in plan.left_out}
         assert left_out["photon_532o"] == "used only by network valley"
         assert left_out["analog_532o"] == "no product of the campaign uses this channel"
         glued = plan_scene(alone, campaign({"channel": "glued_532o"}))
         assert {left.reason for left in glued.left_out} == {"used only by network valley"}
 
     def test_it_is_plain_data(self):
-        found = planned(campaign({"exponents": {"east-lidar": 1.2}}))
-        assert found.as_dict()["steps"][0]["instrument"] == "west-lidar"
-        assert [beam["exponent"] for beam in found.steps[-1].settings["beams"]] == [1.0, 1.2, 1.0]
-        assert found.hash != planned(campaign()).hash
+        plan = planned(campaign({"exponents": {"east-lidar": 1.2}}))
+        assert plan.as_dict()["steps"][0]["instrument"] == "west-lidar"
+        assert [beam["exponent"] for beam in plan.steps[-1].settings["beams"]] == [1.0, 1.2, 1.0]
+        assert plan.hash != planned(campaign()).hash
 
     @pytest.mark.parametrize(
-        ("facts", "changes", "said"),
+        ("facts", "changes", "message"),
         [
             ({"west-lidar": [{}]}, {}, "west-lidar: the campaign gives neither full_overlap_range"),
             ({}, {"layout": (ANALOG,)}, "the files hold no photon_532o, only analog_532o"),
@@ -243,20 +243,20 @@ class TestPlans:
             ),
         ],
     )
-    def test_the_reason_names_what_a_member_lacks(self, facts, changes, said):
-        found = planned(campaign(facts=facts), granules(**changes))
-        assert found.steps == ()
-        assert said in reasons(found)
+    def test_the_reason_names_what_a_member_lacks(self, facts, changes, message):
+        plan = planned(campaign(facts=facts), granules(**changes))
+        assert plan.steps == ()
+        assert message in reasons(plan)
 
     def test_the_reason_names_beams_without_crossings(self):
-        found = planned(campaign(), granules(zenith_angle=0.0))
-        assert found.steps == ()
-        assert "no beam has two crossings with other beams" in reasons(found)
-        assert "fewer than two crossings with other beams" in reasons(found)
+        plan = planned(campaign(), granules(zenith_angle=0.0))
+        assert plan.steps == ()
+        assert "no beam has two crossings with other beams" in reasons(plan)
+        assert "fewer than two crossings with other beams" in reasons(plan)
 
     def test_the_reason_names_a_missing_member(self):
-        found = planned(campaign(), granules()[:2])
-        assert "north-lidar: no granule in the window" in reasons(found)
+        plan = planned(campaign(), granules()[:2])
+        assert "north-lidar: no granule in the window" in reasons(plan)
 
     def test_members_must_have_one_wavelength(self):
         other = (replace(PHOTON, wavelength=1064e-9),)
@@ -264,8 +264,8 @@ class TestPlans:
         assert "different wavelengths: 532, 1064 nm" in reasons(planned(campaign(), red))
 
     def test_the_method_cycle_takes_one_cycle(self):
-        found = planned(campaign({"method": "cycle"}))
-        assert found.steps[-1].settings["method"] == "cycle"
+        plan = planned(campaign({"method": "cycle"}))
+        assert plan.steps[-1].settings["method"] == "cycle"
 
     @pytest.mark.parametrize(
         ("rule", "settings", "files", "number"),
@@ -282,12 +282,12 @@ class TestPlans:
         ],
     )
     def test_rules_that_leave_out(self, rule, settings, files, number):
-        found = planned(campaign(**settings), files)
-        left = [each for each in found.left_out if each.rule == rule]
-        assert left
-        assert all(each.number == pytest.approx(number) for each in left)
-        fine = planned(campaign())
-        assert not [each for each in fine.left_out if each.rule == rule]
+        plan = planned(campaign(**settings), files)
+        omissions = [omission for omission in plan.left_out if omission.rule == rule]
+        assert omissions
+        assert all(omission.number == pytest.approx(number) for omission in omissions)
+        whole = planned(campaign())
+        assert not [omission for omission in whole.left_out if omission.rule == rule]
 
     @pytest.mark.parametrize(
         ("rule", "number"),
@@ -300,16 +300,16 @@ class TestPlans:
         ],
     )
     def test_rules_that_run_steps(self, rule, number):
-        found = planned(campaign())
-        steps = [each for each in found.steps if each.rule == rule]
+        plan = planned(campaign())
+        steps = [step for step in plan.steps if step.rule == rule]
         assert steps
-        assert all(each.number == pytest.approx(number) for each in steps)
+        assert all(step.number == pytest.approx(number) for step in steps)
         without_crossings = planned(campaign(), granules(zenith_angle=0.0))
-        assert not [each for each in without_crossings.steps if each.rule == rule]
+        assert not [step for step in without_crossings.steps if step.rule == rule]
 
     def test_the_range_window_holds_the_bins_of_crossings_and_background(self):
-        found = planned(campaign())
-        windows = [step for step in found.steps if step.rule == "member_window"]
+        plan = planned(campaign())
+        windows = [step for step in plan.steps if step.rule == "member_window"]
         assert len(windows) == len(MEMBERS)
         for window in windows:
             kept = window.settings["bins"]
@@ -324,33 +324,33 @@ class TestPlans:
             assert 0.0 < before[1] * PHOTON.bin_width - 0.7 * 13_500 < 50.0
 
     @pytest.mark.parametrize(
-        ("settings", "layout", "said"),
+        ("settings", "layout", "message"),
         [
             ({"all_steps": True}, PHOTON, "all_steps is set"),
             ({"visibility": {"channel": "analog_532o"}}, ANALOG, "noise of an analog record"),
             ({}, replace(PHOTON, bins=650), "need all bins"),
         ],
     )
-    def test_all_bins_are_read_where_they_are_needed(self, settings, layout, said):
+    def test_all_bins_are_read_where_they_are_needed(self, settings, layout, message):
         files = granules(layout=(layout,))
-        found = planned(campaign(**settings), files)
-        assert found.steps[-1].name == "visibility"
-        left = [each for each in found.left_out if each.rule == "member_window"]
-        assert len(left) == len(MEMBERS)
-        assert all(said in each.reason for each in left)
-        assert not [step for step in found.steps if step.rule == "member_window"]
+        plan = planned(campaign(**settings), files)
+        assert plan.steps[-1].name == "visibility"
+        omissions = [omission for omission in plan.left_out if omission.rule == "member_window"]
+        assert len(omissions) == len(MEMBERS)
+        assert all(message in omission.reason for omission in omissions)
+        assert not [step for step in plan.steps if step.rule == "member_window"]
 
     def test_every_decision_has_a_rule_of_the_table(self):
         names = {rule.name for rule in RULES}
         for files in (granules(), granules(zenith_angle=0.0), granules()[:2]):
-            found = planned(campaign(), files)
-            assert {each.rule for each in (*found.steps, *found.left_out)} <= names
+            plan = planned(campaign(), files)
+            assert {decision.rule for decision in (*plan.steps, *plan.left_out)} <= names
 
     def test_facts_override_headers(self):
         facts = [{"full_overlap_range": 150.0, "zenith_angle": 90.0, "azimuth": 70.0}]
         strange = [replace(granules()[0], azimuth=12.0, zenith_angle=3.0), *granules()[1:]]
-        found = planned(campaign(facts={"west-lidar": facts}), strange)
-        assert found.steps[-1].settings["beams"][0]["azimuth"] == 70.0
+        plan = planned(campaign(facts={"west-lidar": facts}), strange)
+        assert plan.steps[-1].settings["beams"][0]["azimuth"] == 70.0
 
     def test_beams_of_one_instrument_are_distinguished(self):
         other = [replace(g, azimuth=(g.azimuth or 0) + 2.0) for g in granules(10)]
