@@ -34,7 +34,23 @@ _UNDETECTED = (
     " rejecting flag deviated by more than 4 combined standard errors:"
 )
 
-_FIT_FLAGS = Quality(sum(bit for bit in Quality if bit <= Quality.NOT_LEVEL))
+FLAGS: Final = (
+    Quality.INPUT_MISSING
+    | Quality.SATURATED
+    | Quality.PILE_UP
+    | Quality.INCOMPLETE_OVERLAP
+    | Quality.TOO_FEW_BINS
+    | Quality.NO_SIGNAL
+    | Quality.LOW_SIGNAL
+    | Quality.POORLY_DETERMINED
+    | Quality.NEGATIVE_AMPLITUDE
+    | Quality.AT_BOUND
+    | Quality.POOR_FIT
+    | Quality.NOT_HOMOGENEOUS
+    | Quality.OUTLIER
+    | Quality.NO_REAL_SOLUTION
+    | Quality.NOT_LEVEL
+)
 
 HOMOGENEOUS: Final = Layout(
     title="Extinction of homogeneous range sections",
@@ -150,7 +166,7 @@ HOMOGENEOUS: Final = Layout(
             coverage=Coverage.QUALITY,
             valid_min=0.0,
         ),
-        quality(_SECTIONS, _FIT_FLAGS),
+        quality(_SECTIONS, FLAGS),
         shots(of="the profile"),
     ),
 )
