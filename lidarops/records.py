@@ -211,7 +211,7 @@ class Plan:
         return {
             "scene": self.scene,
             "steps": [step.as_dict() for step in self.steps],
-            "left_out": [left.as_dict() for left in self.left_out],
+            "left_out": [omission.as_dict() for omission in self.left_out],
         }
 
     @property
@@ -319,15 +319,15 @@ class Unmet:
     reason: str
     files: int
     """Number of files that lack the channel."""
-    of: int
+    files_expected: int
     """Number of files that should hold it: all of the instrument, or of the period of the facts."""
-    held: int
+    files_with_channel: int
     """Number of files of the instrument, of any period, that hold it."""
 
     @property
     def nowhere(self) -> bool:
         """Whether no file holds the channel, as after a typing error."""
-        return self.held == 0
+        return self.files_with_channel == 0
 
 
 @dataclass(frozen=True, slots=True)

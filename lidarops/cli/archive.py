@@ -398,9 +398,9 @@ def _plan_table(title: str, plan: Plan) -> Table:
         done = f"no effect: {idle}" if idle else settings or "yes"
         cells = (step.channel, step.name, done, step.reason)
         add_row(table, *cells, step.rule, decided_on(step.number))
-    for left in plan.left_out:
-        cells = (left.channel, left.name, "left out", left.reason)
-        add_row(table, *cells, left.rule, decided_on(left.number))
+    for omission in plan.left_out:
+        cells = (omission.channel, omission.name, "left out", omission.reason)
+        add_row(table, *cells, omission.rule, decided_on(omission.number))
     return table
 
 

@@ -61,9 +61,10 @@ def counted(count: int, noun: str) -> str:
 
 def lacking(unmet: Unmet) -> str:
     """Return how many files lack a requested channel."""
+    expected = unmet.files_expected
     if unmet.nowhere:
-        return "the only file" if unmet.of == 1 else f"all {unmet.of:,} files"
-    return f"{unmet.files:,} of {unmet.of:,} files"
+        return "the only file" if expected == 1 else f"all {expected:,} files"
+    return f"{unmet.files:,} of {expected:,} files"
 
 
 def visible(text: str) -> str:

@@ -118,7 +118,11 @@ def _history(context: Context, layout: Layout, date: datetime) -> str:
         return item.channel in ("", context.channel) and item.name not in layout.unused_steps
 
     done = [f"{step.name}: {step.reason}" for step in plan.steps if concerns(step)]
-    omitted = [f"left out {left.name}: {left.reason}" for left in plan.left_out if concerns(left)]
+    omitted = [
+        f"left out {omission.name}: {omission.reason}"
+        for omission in plan.left_out
+        if concerns(omission)
+    ]
     lines = [*done, *omitted, f"wrote the {context.kind.value} product"]
     return "\n".join(f"{_iso(date)} {' '.join(line.split())} [{program}]" for line in lines)
 

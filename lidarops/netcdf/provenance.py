@@ -137,15 +137,16 @@ def _plan(provenance: Provenance) -> dict[str, Any]:
         # The text of this digest.
         "lidarops:json": _canonical(plan.as_dict()),
         "lidarops:left_out": [
-            f"{left.name} of {left.channel}: {left.reason}{_rule(left)}" for left in plan.left_out
+            f"{omission.name} of {omission.channel}: {omission.reason}{_rule(omission)}"
+            for omission in plan.left_out
         ],
     }
 
 
-def _rule(left: LeftOut) -> str:
+def _rule(omission: LeftOut) -> str:
     """Return the rule that decided and its number, in brackets."""
-    number = "" if left.number is None else f", {left.number:g}"
-    return f" [{left.rule}{number}]" if left.rule else ""
+    number = "" if omission.number is None else f", {omission.number:g}"
+    return f" [{omission.rule}{number}]" if omission.rule else ""
 
 
 def _input(records: list[InputRecord]) -> str:

@@ -109,11 +109,11 @@ def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
 def _unmatched_facts(held: Held) -> Decisions:
     """Yield the channels of the campaign's facts that the files lack."""
     present = [channel.name for channel in held.layout]
-    for name, known in held.facts.channels.items():
+    for name, facts in held.facts.channels.items():
         if name not in present:
             reason = f"the facts name a channel that the files lack; they hold {', '.join(present)}"
             yield LeftOut(StepName.READ.value, name, reason)
-        elif known.lag is not None and not name.startswith("analog_"):
+        elif facts.lag is not None and not name.startswith("analog_"):
             reason = "a lag belongs to the facts of the analog channel"
             yield LeftOut(StepName.LAG.value, name, reason)
 
@@ -168,8 +168,8 @@ def names_channels(campaign: Campaign) -> bool:
 
 def _lacking(held: Held) -> list[LeftOut]:
     """Return the channels that files lack, without misplaced facts about a lag."""
-    omissions = (left for left in applied(RULES, held) if isinstance(left, LeftOut))
-    return [left for left in omissions if left.name != StepName.LAG]
+    omissions = (omission for omission in applied(RULES, held) if isinstance(omission, LeftOut))
+    return [omission for omission in omissions if omission.name != StepName.LAG]
 
 
 def unavailable_channels(
@@ -222,11 +222,11 @@ def unavailable_channels(
             until is None or facts.valid_from < until
         )
         reasons = {}
-        for left in _lacking(Held(holding.layout, instrument, facts)):
-            if left.rule == ABSENT.name and StepName(left.name) in requested:
-                reasons[left.name, left.channel] = left.reason
-            elif left.rule == UNMATCHED.name and touched:
-                reasons[period, left.channel] = left.reason
+        for omission in _lacking(Held(holding.layout, instrument, facts)):
+            if omission.rule == ABSENT.name and StepName(omission.name) in requested:
+                reasons[omission.name, omission.channel] = omission.reason
+            elif omission.rule == UNMATCHED.name and touched:
+                reasons[period, omission.channel] = omission.reason
         for (requester, channel), reason in reasons.items():
             lacking[name, requester, channel].append((holding.files, reason))
     unmet = []

@@ -223,8 +223,8 @@ class _MemberCase:
 
     def channel_case(self, channel: ChannelLayout) -> Case:
         """Return the case of a channel."""
-        known = channel_facts(self.facts, channel.name)
-        return Case(self.scene, channel, self.facts, known, self.scene.instrument)
+        facts_of_channel = channel_facts(self.facts, channel.name)
+        return Case(self.scene, channel, self.facts, facts_of_channel, self.scene.instrument)
 
     def why_not(self) -> tuple[str, float | None]:
         """Return why a member cannot take part (empty where it can), and the deciding number."""
@@ -302,7 +302,7 @@ def _signals(case: _MemberCase) -> Decisions:
     present = {channel.name: channel for channel in case.scene.layout}
     for part in glued_parts(name) if name.startswith(GLUED) else (name,):
         part_case = case.channel_case(present[part])
-        yield _read(part_case, wavelength(part_case.channel, part_case.known))
+        yield _read(part_case, wavelength(part_case.channel, part_case.facts_of_channel))
         yield from conditioning(part_case)
     if name.startswith(GLUED):
         glued_case = case.channel_case(case.channel)

@@ -196,5 +196,5 @@ def _without(step: Step, omitted: Mapping[tuple[float, float], LeftOut]) -> Step
     if not omitted:
         return step
     entries: list[list[Any]] = [*step.settings.get(OMITTED, ())]
-    entries += [[*section, _BITS[left.rule].name] for section, left in omitted.items()]
+    entries += [[*section, _BITS[omission.rule].name] for section, omission in omitted.items()]
     return replace(step, settings={**step.settings, OMITTED: entries})

@@ -83,9 +83,9 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         if step.channel in kinds and _serves(step.name, kinds[step.channel])
     )
     left_out = tuple(
-        left
-        for left in plan.left_out
-        if left.channel in kinds and _serves(left.name, kinds[left.channel])
+        omission
+        for omission in plan.left_out
+        if omission.channel in kinds and _serves(omission.name, kinds[omission.channel])
     )
     return replace(plan, steps=steps, left_out=left_out)
 
@@ -106,7 +106,9 @@ def plan_of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
     closure = plan_closure(plan, products) if products else replace(plan, steps=(), left_out=())
     names = {*kinds, StepName.READ}
     left_out = tuple(
-        left for left in plan.left_out if left.name in names or left in closure.left_out
+        omission
+        for omission in plan.left_out
+        if omission.name in names or omission in closure.left_out
     )
     return replace(closure, left_out=left_out)
 
@@ -116,7 +118,7 @@ def _network_closure(plan: Plan, kinds: set[str]) -> Plan:
     return replace(
         plan,
         steps=tuple(step for step in plan.steps if _serves(step.name, kinds)),
-        left_out=tuple(left for left in plan.left_out if _serves(left.name, kinds)),
+        left_out=tuple(omission for omission in plan.left_out if _serves(omission.name, kinds)),
     )
 
 

@@ -68,7 +68,7 @@ class Case:
     scene: Scene
     channel: ChannelLayout
     facts: InstrumentFacts
-    known: ChannelFacts
+    facts_of_channel: ChannelFacts
     member: str
     """Instrument of a network; empty for a single instrument."""
 

@@ -110,7 +110,9 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
     }
     case = _SceneCase(scene, instrument, facts, networks)
     held = availability.Held(scene.layout, instrument, facts)
-    left_out = [left for left in applied(availability.RULES, held) if isinstance(left, LeftOut)]
+    left_out = [
+        omission for omission in applied(availability.RULES, held) if isinstance(omission, LeftOut)
+    ]
     for channel in (*scene.layout, *glued_channels(scene.layout, instrument)):
         for decision in _channel(channel, case, all_steps=campaign.all_steps):
             (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
@@ -129,7 +131,11 @@ def _drop_unused_channels(plan: Plan) -> Plan:
         plan,
         steps=tuple(step for step in plan.steps if step.channel in used),
         left_out=(
-            *(left for left in plan.left_out if left.channel not in unused or left.name in kinds),
+            *(
+                omission
+                for omission in plan.left_out
+                if omission.channel not in unused or omission.name in kinds
+            ),
             *(
                 LeftOut(step.name, step.channel, reason, rule=step.rule)
                 for step in plan.steps
@@ -149,7 +155,7 @@ def _channel(channel: ChannelLayout, whole: _SceneCase, *, all_steps: bool) -> D
         scene=scene,
         channel=channel,
         facts=facts,
-        known=channel_facts(facts, channel.name),
+        facts_of_channel=channel_facts(facts, channel.name),
         member="",
         signal=_settings_for(products.signal, channel),
         homogeneous=None if is_glued else _settings_for(products.homogeneous, channel),
@@ -181,16 +187,18 @@ def _read(case: ChannelCase) -> Decisions:
         yield case.without(StepName.READ, reason)
         return
     name = case.channel.name
-    known = (
-        channel_facts(case.facts, glued_parts(name)[1]) if name.startswith(GLUED) else case.known
+    facts_of_channel = (
+        channel_facts(case.facts, glued_parts(name)[1])
+        if name.startswith(GLUED)
+        else case.facts_of_channel
     )
-    if math.isnan(wavelength(case.channel, known)):
+    if math.isnan(wavelength(case.channel, facts_of_channel)):
         yield case.without(StepName.READ, NO_WAVELENGTH)
         return
     yield case.step(
         StepName.READ,
         required_by(requesters),
-        wavelength=wavelength(case.channel, known),
+        wavelength=wavelength(case.channel, facts_of_channel),
     )
 
 

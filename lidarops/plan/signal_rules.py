@@ -59,9 +59,9 @@ def joined_layout(
     return tuple(glued)
 
 
-def wavelength(channel: ChannelLayout, known: ChannelFacts) -> float:
+def wavelength(channel: ChannelLayout, facts: ChannelFacts) -> float:
     """Return the wavelength in m from the campaign or else the header; may be NaN."""
-    return channel.wavelength if known.wavelength is None else known.wavelength
+    return channel.wavelength if facts.wavelength is None else facts.wavelength
 
 
 def _overlap(case: Case) -> Decisions:
@@ -86,10 +86,10 @@ def _range(case: Case) -> Decisions:
     offset = range_offset(case.channel, case.facts)
     if offset:
         reason = "given by the campaign"
-        if isinstance(case.known.lag, float):
-            reason += f", including a lag of {case.known.lag:g} bins"
+        if isinstance(case.facts_of_channel.lag, float):
+            reason += f", including a lag of {case.facts_of_channel.lag:g} bins"
         yield case.step(StepName.RANGE_OFFSET, reason, number=offset, range_offset=offset)
-    elif case.known.lag == "estimate":
+    elif case.facts_of_channel.lag == "estimate":
         reason = "an estimated lag shifts glued channels only"
         yield case.without(StepName.RANGE_OFFSET, reason)
     else:
@@ -145,7 +145,7 @@ def _times_around(times: Sequence[datetime], first: datetime, last: datetime) ->
 
 
 def _dead_time(case: Case) -> Decisions:
-    dead_time = case.known.dead_time
+    dead_time = case.facts_of_channel.dead_time
     if case.channel.mode is not DetectionMode.PHOTON:
         yield case.without(StepName.DEAD_TIME, "analog detection has no dead time")
     elif dead_time is None:
@@ -157,7 +157,7 @@ def _dead_time(case: Case) -> Decisions:
 
 
 def _noise(case: Case) -> Decisions:
-    variance = case.known.noise_variance
+    variance = case.facts_of_channel.noise_variance
     if case.channel.mode is DetectionMode.PHOTON:
         yield case.step(StepName.NOISE, "photon counts are Poisson distributed", method="poisson")
     elif variance is not None:
@@ -228,9 +228,9 @@ def conditioning(case: Case) -> Decisions:
 
 def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
     """Return the shift of the ranges of a channel, m: the given offset minus the given lag."""
-    known = channel_facts(facts, channel.name)
-    late = known.lag * channel.bin_width if isinstance(known.lag, float) else 0.0
-    return (known.range_offset or 0.0) - late
+    of_channel = channel_facts(facts, channel.name)
+    late = of_channel.lag * channel.bin_width if isinstance(of_channel.lag, float) else 0.0
+    return (of_channel.range_offset or 0.0) - late
 
 
 def read_windows(steps: Collection[Step]) -> dict[str, Stretches]:

@@ -194,9 +194,9 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
 def _why_left_out(plan: Plan, product: RecordedProduct) -> str:
     """Return why a plan leaves out a requested product."""
     reasons = dict.fromkeys(
-        left.reason
-        for left in plan.left_out
-        if left.channel == product.channel and left.name in (product.kind, StepName.READ)
+        omission.reason
+        for omission in plan.left_out
+        if omission.channel == product.channel and omission.name in (product.kind, StepName.READ)
     )
     return "; ".join(reasons) or "its plan leaves it out"
 

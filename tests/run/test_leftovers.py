@@ -173,9 +173,9 @@ def test_a_channel_of_a_new_laser_is_reported_without_failure(archive: Archive) 
     assert any("photon_533o" in path for path in summary["products"])
     files = {(each["channel"], each["requested_by"][:5]): each for each in summary["not_in_files"]}
     assert files["photon_533o", "facts"]["files"] == 3
-    assert files["photon_533o", "facts"]["of"] == 6
+    assert files["photon_533o", "facts"]["files_expected"] == 6
     assert files["photon_532o", "homog"]["files"] == 3
-    assert files["photon_532o", "homog"]["of"] == 12
+    assert files["photon_532o", "homog"]["files_expected"] == 12
     assert not any(each["nowhere"] for each in files.values())
 
 
