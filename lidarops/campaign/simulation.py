@@ -53,6 +53,7 @@ __all__ = [
     "DiurnalCourse",
     "Handling",
     "HorizontalPath",
+    "InstrumentSimulation",
     "LaserDrift",
     "Layer",
     "Lidar",
@@ -61,7 +62,6 @@ __all__ = [
     "Pointing",
     "Pulse",
     "RandomDamage",
-    "SimulatedInstrument",
     "SimulationSettings",
     "TruthSettings",
     "VerticalColumn",
@@ -209,7 +209,7 @@ class Lidar(_Instrument):
         return self.scan
 
 
-SimulatedInstrument = Annotated[
+InstrumentSimulation = Annotated[
     HorizontalPath | VerticalColumn | Lidar, Field(discriminator="kind")
 ]
 
@@ -251,7 +251,7 @@ class SimulationSettings(SimulationModel):
         description="whether noise is drawn in a fast, approximate way, for large archives",
     )
     truth: TruthSettings = TruthSettings()
-    instruments: dict[str, SimulatedInstrument] = Field(min_length=1)
+    instruments: dict[str, InstrumentSimulation] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _damage_exists(self) -> Self:

@@ -20,7 +20,7 @@ from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
 from lidarops.simulate.planned_files import (
     PlannedFile,
-    SimulatedSite,
+    SimulatedInstrument,
     channel_name,
     photon_dead_time,
 )
@@ -61,7 +61,7 @@ class SimulationPlan:
     """Every file that a simulation will write."""
 
     campaign: Campaign
-    sites: tuple[SimulatedSite, ...]
+    sites: tuple[SimulatedInstrument, ...]
     files: tuple[tuple[PlannedFile, ...], ...]
     """Files of each site: dark files first, then signal files in time."""
     paths: tuple[str, ...]
@@ -72,7 +72,7 @@ class SimulationPlan:
 class _Batch:
     """Files of one instrument that are written together, and their rows in the truth."""
 
-    site: SimulatedSite
+    site: SimulatedInstrument
     files: tuple[PlannedFile, ...]
     rows: tuple[int | None, ...]
     """None for dark files."""
@@ -259,7 +259,7 @@ def _write(
     return _BatchResult(len(work), size, tuple(truths))
 
 
-def _sites(campaign: Campaign) -> list[SimulatedSite]:
+def _sites(campaign: Campaign) -> list[SimulatedInstrument]:
     settings = campaign.simulation
     if settings is None:
         raise CampaignError(
@@ -288,7 +288,7 @@ def _clash(stem: str, other: str) -> bool:
     return same_folder and (stem.startswith(other) or other.startswith(stem))
 
 
-def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> SimulatedSite:
+def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> SimulatedInstrument:
     if key not in campaign.instruments:
         known = ", ".join(sorted(campaign.instruments))
         raise CampaignError(
@@ -303,7 +303,7 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Simulat
         patterns[Role.DARK] = instrument.dark_files
     places = {role: _place_of(key, role, globs) for role, globs in patterns.items()}
     station = campaign.stations[instrument.station]
-    return SimulatedSite(
+    return SimulatedInstrument(
         key=key,
         settings=settings,
         instrument=instrument,
@@ -326,7 +326,7 @@ def _origin(campaign: Campaign, settings: SimulationSettings) -> Station:
     return campaign.stations[key]
 
 
-def _check_air(site: SimulatedSite) -> None:
+def _check_air(site: SimulatedInstrument) -> None:
     air = site.settings.air_of(site.key)
     east, north, _ = site.position
     distance = math.hypot(east, north)
@@ -339,7 +339,7 @@ def _check_air(site: SimulatedSite) -> None:
         )
 
 
-def _check_facts(site: SimulatedSite, files: Iterable[PlannedFile]) -> None:
+def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> None:
     """Check the facts at every file before the first file is written."""
     field = f"instruments.{site.key}.facts"
     if site.simulated.pointing is not None:
@@ -369,7 +369,7 @@ def _check_facts(site: SimulatedSite, files: Iterable[PlannedFile]) -> None:
             _check_vertical(site, planned)
 
 
-def _check_vertical(site: SimulatedSite, planned: PlannedFile) -> None:
+def _check_vertical(site: SimulatedInstrument, planned: PlannedFile) -> None:
     facts = site.instrument.facts_at(site.start_of(planned.role, planned.index))
     if site.pointing_of(planned, facts)[0] and facts.zenith_angle is None:
         raise CampaignError(
@@ -392,7 +392,7 @@ def _place_of(key: str, role: Role, patterns: list[str]) -> tuple[str, str]:
 
 
 def _paths(
-    sites: Sequence[SimulatedSite], files: Sequence[Sequence[PlannedFile]]
+    sites: Sequence[SimulatedInstrument], files: Sequence[Sequence[PlannedFile]]
 ) -> tuple[str, ...]:
     paths: dict[str, None] = {}
     for site, planned_files in zip(sites, files, strict=True):
@@ -409,7 +409,7 @@ def _paths(
 
 
 def _refuse_foreign_files(
-    archive: Path, sites: Sequence[SimulatedSite], expected: frozenset[str]
+    archive: Path, sites: Sequence[SimulatedInstrument], expected: frozenset[str]
 ) -> None:
     for site in sites:
         for role, folder in site.folder.items():

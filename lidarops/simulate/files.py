@@ -37,7 +37,7 @@ from lidarops.simulate.photoelectrons import (
 )
 from lidarops.simulate.planned_files import (
     PlannedFile,
-    SimulatedSite,
+    SimulatedInstrument,
     channel_name,
     modes,
     photon_dead_time,
@@ -125,10 +125,10 @@ class Simulator:
 
     Parameters
     ----------
-    site : Site
+    site : SimulatedInstrument
     """
 
-    def __init__(self, site: SimulatedSite) -> None:
+    def __init__(self, site: SimulatedInstrument) -> None:
         self.site = site
         self._datasets: dict[tuple[int, float, int], tuple[Dataset, ...]] = {}
         self._paths: dict[Key, BeamPath] = {}
@@ -438,7 +438,7 @@ def _grid_of(acquisition: Acquisition, detector: Detector) -> tuple[int, float]:
     return detector.bins or acquisition.bins, detector.bin_width or acquisition.bin_width
 
 
-def _truth_grid(site: SimulatedSite) -> TruthGrid:
+def _truth_grid(site: SimulatedInstrument) -> TruthGrid:
     settings, acquisition = site.settings, site.simulated.acquisition
     grids = [_grid_of(acquisition, detector) for detector in site.simulated.detectors]
     bin_width = min(width for _, width in grids)
@@ -453,7 +453,7 @@ def _truth_grid(site: SimulatedSite) -> TruthGrid:
 
 
 def _dataset(
-    site: SimulatedSite,
+    site: SimulatedInstrument,
     acquisition: Acquisition,
     detector: Detector,
     mode: DetectionMode,

@@ -17,7 +17,7 @@ from lidarops.campaign.simulation import (
     DamageKind,
     Detector,
     HorizontalPath,
-    SimulatedInstrument,
+    InstrumentSimulation,
     SimulationSettings,
 )
 from lidarops.errors import CampaignError
@@ -46,7 +46,7 @@ class PlannedFile:
 
 
 @dataclass(frozen=True, slots=True)
-class SimulatedSite:
+class SimulatedInstrument:
     """One simulated instrument: its simulation settings, campaign facts and place."""
 
     key: str
@@ -64,7 +64,7 @@ class SimulatedSite:
     """Damage of single signal files, by index; random damage is not included."""
 
     @property
-    def simulated(self) -> SimulatedInstrument:
+    def simulated(self) -> InstrumentSimulation:
         """Simulation settings of the instrument."""
         return self.settings.instruments[self.key]
 
@@ -184,7 +184,7 @@ def modes(detector: Detector) -> tuple[DetectionMode, ...]:
     return analog + photon
 
 
-def photon_dead_time(site: SimulatedSite, start: datetime, channel: str) -> float:
+def photon_dead_time(site: SimulatedInstrument, start: datetime, channel: str) -> float:
     """Return the dead time of a photon counter at the start of a file, s, from the campaign.
 
     Raises
