@@ -3,7 +3,7 @@
 `fit_homogeneous_path` checks its input (`path_fit`), cuts the sections (`_sections`) and passes a
 `_problem.PathProblem` to the solver of the chosen `HomogeneousMethod`:
 
-1. `_dense`: the default. Profiles without gaps are solved from a few linear functionals
+1. `_routing`: the default. Profiles without gaps are solved from a few linear functionals
    (`_functional_tables`, `_compressed`), all others by Newton steps over their bins (`_masked`).
 2. `_methods`: the direct fit (`_direct`), which serves as reference, and the variants with a
    prior, a known background or a known extinction.

@@ -88,7 +88,7 @@ _summing = numba.njit(
 )
 
 
-class Plan(NamedTuple):
+class MaskedTables(NamedTuple):
     """Tables common to the profiles of a call."""
 
     x: Array
@@ -131,7 +131,7 @@ class _Fit(NamedTuple):
     centre: float
 
 
-def make_plan(range_: Array, bounds: tuple[float, float]) -> Plan:
+def make_masked_tables(range_: Array, bounds: tuple[float, float]) -> MaskedTables:
     """Return the tables common to the profiles of a call.
 
     Parameters
@@ -156,7 +156,7 @@ def make_plan(range_: Array, bounds: tuple[float, float]) -> Plan:
     middle = 0.5 * (x[edges[:-1]] + x[edges[1:] - 1])
     falling = (range_[0] / (range_[0] + length * middle)) ** 2
     shapes = np.exp(-2.0 * middle[:, np.newaxis] * nodes) * falling[:, np.newaxis]
-    return Plan(
+    return MaskedTables(
         x=x,
         envelope=envelope,
         step=1.0 / (bins - 1),
@@ -235,7 +235,7 @@ def _take_roots(values: Array, roots: Array) -> None:
 
 
 @_compiled
-def _group(g: Plan, s: _Scratch) -> tuple[float, float]:
+def _group(g: MaskedTables, s: _Scratch) -> tuple[float, float]:
     """Sum weights and weighted values over the groups; return both sums over all bins."""
     total_weight = value = 0.0
     for k in range(g.edges.size - 1):
@@ -250,7 +250,7 @@ def _group(g: Plan, s: _Scratch) -> tuple[float, float]:
 
 
 @_compiled
-def _seek(g: Plan, s: _Scratch, total_weight: float, value: float, count: float) -> _Fit:
+def _seek(g: MaskedTables, s: _Scratch, total_weight: float, value: float, count: float) -> _Fit:
     """Return the best node on the groups, moved to the peak of a parabola through it."""
     groups, out = g.edges.size - 1, s.sums.ctypes.data
     weights, values, after = s.weights.ctypes.data, s.values.ctypes.data, g.x.ctypes.data
@@ -264,7 +264,7 @@ def _seek(g: Plan, s: _Scratch, total_weight: float, value: float, count: float)
     if best < NODES - 1 and s.lengths[best + 1] == 0.0:
         # The next node holds no information, or has decayed before the first valid bin.
         return _Fit(0.0, math.nan, math.nan, 0.0, 0.0)
-    tau = _vertex(g, s, best)
+    tau = _parabola_peak(g, s, best)
     mean, norm = (
         s.sums[0, best] / total_weight,
         s.sums[1, best] - s.sums[0, best] ** 2 / total_weight,
@@ -286,7 +286,8 @@ def _energies(
 
 
 @_compiled
-def _vertex(g: Plan, s: _Scratch, best: int) -> float:
+def _parabola_peak(g: MaskedTables, s: _Scratch, best: int) -> float:
+    """Return the tau at the peak of a parabola through the roots of three neighbouring energies."""
     middle = min(max(best, 1), NODES - 2)
     before, centre = math.sqrt(s.lengths[middle - 1]), math.sqrt(s.lengths[middle])
     after = math.sqrt(s.lengths[middle + 1])
@@ -342,14 +343,19 @@ def _step(
 
 
 @_compiled
-def _decays(g: Plan, tau: float) -> tuple[float, float]:
+def _decays(g: MaskedTables, tau: float) -> tuple[float, float]:
     e1 = math.exp(-2.0 * tau * g.step)
     return e1, (e1 * e1) * (e1 * e1)
 
 
 @_compiled
 def _describe(
-    g: Plan, before: _Fit, after: _Fit, sums: tuple[float, ...], total_weight: float, row: Array
+    g: MaskedTables,
+    before: _Fit,
+    after: _Fit,
+    sums: tuple[float, ...],
+    total_weight: float,
+    row: Array,
 ) -> None:
     """Write parameters and variances, in the scaled variables."""
     norm, _, slope_on_level, slope_on_shape, shape = _normal(sums, total_weight)
@@ -451,7 +457,7 @@ def _second_differences(residual: Array, used: Array) -> tuple[float, float]:
 
 
 @_compiled
-def _take_residuals(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
+def _take_residuals(g: MaskedTables, s: _Scratch, fit: _Fit, row: Array) -> None:
     """Fill the second differences of the residuals, from which the noise is estimated."""
     decay, e4 = _decays(g, fit.tau)
     steps = g.x.size // STRIDE
@@ -476,7 +482,7 @@ def _take_residuals(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
 
 
 @_compiled
-def _fit(g: Plan, s: _Scratch, count: float, want_differences: bool, row: Array) -> bool:
+def _fit(g: MaskedTables, s: _Scratch, count: float, want_differences: bool, row: Array) -> bool:
     """Fit one loaded profile; return whether the fit succeeded."""
     total_weight, value = _group(g, s)
     after = _seek(g, s, total_weight, value, count)
@@ -519,7 +525,7 @@ def _fit(g: Plan, s: _Scratch, count: float, want_differences: bool, row: Array)
 
 
 @_summing
-def _mean_range(g: Plan, s: _Scratch, total_weight: float) -> float:
+def _mean_range(g: MaskedTables, s: _Scratch, total_weight: float) -> float:
     total = 0.0
     for i in range(s.w.size):
         total += s.w[i] * g.x[i]
@@ -527,7 +533,7 @@ def _mean_range(g: Plan, s: _Scratch, total_weight: float) -> float:
 
 
 @_compiled
-def _scratch(g: Plan) -> _Scratch:
+def _scratch(g: MaskedTables) -> _Scratch:
     bins, groups = g.x.size, g.edges.size - 1
     return _Scratch(
         np.zeros(bins),
@@ -548,7 +554,7 @@ def _solve_profile(
     weights: Array,
     want_differences: bool,
     rounding: float,
-    g: Plan,
+    g: MaskedTables,
     s: _Scratch,
     row: Array,
 ) -> bool:
@@ -573,7 +579,7 @@ def solve_masked(
     weights: Array,
     want_differences: bool,
     rounding: float,
-    g: Plan,
+    g: MaskedTables,
     out: Array,
     solved: npt.NDArray[np.bool_],
 ) -> None:
@@ -588,8 +594,8 @@ def solve_masked(
         Whether the second differences of the residuals are computed; 0 otherwise.
     rounding : float
         Relative rounding error of the power.
-    g : Plan
-        Of `make_plan`.
+    g : MaskedTables
+        Result of `make_masked_tables`.
     out : (profile, column) float64
         Receives the columns of `lidarops.retrieve.homogeneous._estimate`.
     solved : (profile,) bool

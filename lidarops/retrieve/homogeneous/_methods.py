@@ -41,7 +41,7 @@ def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
 
 def solve_by_masked_fit(problem: PathProblem) -> PathSolution:
     """Solve as `solve_by_direct_fit`, in fewer passes over the bins; the range must be uniform."""
-    plan = _masked.make_plan(problem.range, problem.bounds)
+    tables = _masked.make_masked_tables(problem.range, problem.bounds)
     count = problem.power.shape[0]
     table, solved = np.empty((count, len(COLUMNS))), np.empty(count, np.bool_)
     with np.errstate(divide="ignore"):
@@ -51,7 +51,7 @@ def solve_by_masked_fit(problem: PathProblem) -> PathSolution:
         weights,
         not problem.known_variance,
         _rounding(problem),
-        plan,
+        tables,
         table,
         solved,
     )

@@ -14,7 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.background import photon_counts
 from lidarops.retrieve.background.cubic_and_tail import Statistics
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.homogeneous import _dense, _methods, _robust, _sections
+from lidarops.retrieve.homogeneous import _methods, _robust, _routing, _sections
 from lidarops.retrieve.homogeneous._problem import (
     Array,
     Centre,
@@ -49,9 +49,9 @@ class HomogeneousMethod(StrEnum):
 
 
 _SOLVERS: Final[dict[HomogeneousMethod, Callable[[PathProblem], PathSolution]]] = {
-    HomogeneousMethod.AUTO: _dense.compressed,
-    HomogeneousMethod.COMPRESSED: _dense.compressed,
-    HomogeneousMethod.FAST: _dense.fast,
+    HomogeneousMethod.AUTO: _routing.compressed,
+    HomogeneousMethod.COMPRESSED: _routing.compressed,
+    HomogeneousMethod.FAST: _routing.fast,
     HomogeneousMethod.DIRECT: _methods.solve_by_direct_fit,
     HomogeneousMethod.CUBIC: _methods.solve_by_cubic,
     HomogeneousMethod.LINEARIZED: _methods.solve_by_linearization,
@@ -276,7 +276,7 @@ def fit_homogeneous_path(
         but a uniform range without gaps and a signal that starts well above the noise. Its
         scatter is 1.3 to 3 times the least possible one, as its standard errors state.
     linearized
-        Linear least squares for three unknowns about a prior extinction (potapova2023):
+        Linear least squares for three unknowns about a prior extinction (potapova2021):
 
         .. math:: P \approx P^* + [B + G (R - R_c)] R^{-2} e^{-2 \sigma_0 R},
             \qquad \sigma = \sigma_0 - G / 2B
@@ -309,7 +309,7 @@ def fit_homogeneous_path(
 
     References
     ----------
-    golub1973; bobrovsky2024; potapova2023.
+    golub1973; bobrovsky2024; potapova2021.
 
     Examples
     --------

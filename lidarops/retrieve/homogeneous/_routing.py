@@ -1,4 +1,4 @@
-"""Compressed methods of the homogeneous path: which solver takes which profile."""
+"""Routing of the profiles of a homogeneous path: which solver takes which profile."""
 
 from __future__ import annotations
 
