@@ -130,7 +130,7 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     ),
     Quality.POOR_FIT: (
         Severity.REJECT,
-        "the residuals are larger or smaller than the noise explains (reduced chi-square)",
+        "the residuals do not match the stated noise: too large or too small (reduced chi-square)",
     ),
     Quality.NOT_HOMOGENEOUS: (
         Severity.REJECT,

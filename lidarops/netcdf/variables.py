@@ -483,6 +483,20 @@ PROVENANCE: Final = Row(
 )
 
 
+SUBTRACTED_BACKGROUND: Final = Row(
+    name="background",
+    dims=("time",),
+    dtype="f4",
+    units="{signal}",
+    long_name="subtracted background: sky light, dark current and offset",
+    coverage=Coverage.PHYSICAL,
+    cell_methods="time: mean",
+    ancillaries=("shots",),
+    uncertain=True,
+    comment=f"Not calibrated. {NO_STANDARD_NAME}",
+)
+"""Background that was subtracted from the signal of a channel."""
+
 GLUING: Final = (
     Row(
         name="glue_slope",

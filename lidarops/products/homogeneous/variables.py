@@ -18,7 +18,7 @@ from lidarops.netcdf.variables import (
     quality,
     shots,
 )
-from lidarops.products.visibility_variables import visibility
+from lidarops.netcdf.visibility_rows import visibility_rows
 
 _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
@@ -65,7 +65,7 @@ HOMOGENEOUS: Final = Layout(
     processing_level="L2: retrieved quantities",
     references=(
         "Bobrovsky, A. P. et al. (2024): Transparency of a weakly turbid atmosphere with lidars.",
-        "Potapova, I. A. et al. (2023): Inverse problem of lidar sounding of weak turbidity.",
+        "Potapova, I. A. et al. (2021), Izv. Vuzov. Priborostroenie 64, 384-391.",
         "Golub, G. H. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432.",
     ),
     comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 extinction r), with"
@@ -103,7 +103,7 @@ HOMOGENEOUS: Final = Layout(
             " a plume, 8 percent where the top of the signal is clipped, 2.5 percent where"
             f" backscatter is curved, at most 0.5 percent otherwise. {NO_STANDARD_NAME}",
         ),
-        *visibility(
+        *visibility_rows(
             _SECTIONS, place="along the section", ancillaries=_OF_EXTINCTION, optional=True
         ),
         Row(
@@ -142,8 +142,9 @@ HOMOGENEOUS: Final = Layout(
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Separate from the random error in background_standard_error. Background error"
             f" caused by a signal {_CURVED_SIGNAL}, as with backscatter that is curved along the"
-            f" path. {_UNDETECTED} 5 percent where it is curved more, 2.4 percent with an"
-            " afterpulse, 1.1 percent with a plume, at most 0.5 percent otherwise."
+            f" path. {_UNDETECTED} 5 percent where the curvature exceeds this allowance,"
+            " 2.4 percent with an afterpulse, 1.1 percent with a plume, at most 0.5 percent"
+            " otherwise."
             f" {NO_STANDARD_NAME}",
         ),
         Row(

@@ -18,7 +18,7 @@ from lidarops.netcdf.variables import (
     quality,
     shots,
 )
-from lidarops.products.visibility_variables import visibility
+from lidarops.netcdf.visibility_rows import visibility_rows
 
 _SERIES: Final = ("time", "crossing")
 _BITS: Final = 12
@@ -166,7 +166,7 @@ VISIBILITY: Final = Layout(
         *(
             # Most of the error comes from the prior, which all profiles share.
             replace(row, error_kind=ErrorKind.BOTH) if row.uncertain else row
-            for row in visibility(
+            for row in visibility_rows(
                 _SERIES,
                 place="at the crossing of beams",
                 ancillaries=("extinction_systematic_error", *_OF_VALUE),
@@ -230,7 +230,7 @@ VISIBILITY: Final = Layout(
         ),
         _time_series(
             "optical_depth",
-            "optical depth of the longest distance between crossings of one beam",
+            "optical depth along the longest beam section between crossings",
             "From the mean extinction at the crossings.",
         ),
         _time_series(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from lidarops.netcdf.variables import NO_STANDARD_NAME, Coverage, Row
 
 
-def visibility(
+def visibility_rows(
     dims: tuple[str, ...], *, place: str, ancillaries: tuple[str, ...], optional: bool
 ) -> tuple[Row, ...]:
     """Return the rows of visibility and of the limits of its uncertainty interval.
