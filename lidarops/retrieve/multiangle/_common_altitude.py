@@ -16,11 +16,11 @@ from lidarops.retrieve.multiangle import slant_paths
 Array = npt.NDArray[np.float64]
 
 _CLEAR: Final = 30.0
-"""Signal over noise from which on the logarithm is interpolated. Noise shifts the mean of a
+"""Signal over noise at or above which the logarithm is interpolated. Noise shifts the mean of a
 logarithm; below, the error of interpolating the signal itself is far less than its noise."""
 
 
-class AltitudeInterpolation(StrEnum):
+class _AltitudeInterpolation(StrEnum):
     """Interpolation between range bins."""
 
     CUBIC = "cubic"
@@ -89,8 +89,8 @@ def to_altitude(
         For invalid arguments.
     """
     cubic = (
-        inputs.choice(interpolation, AltitudeInterpolation, "interpolation")
-        is AltitudeInterpolation.CUBIC
+        inputs.choice(interpolation, _AltitudeInterpolation, "interpolation")
+        is _AltitudeInterpolation.CUBIC
     )
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height)

@@ -41,7 +41,7 @@ class CrossingEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CycleRows:
+class _CycleRows:
     """Rows of a cycle for each profile: the input of `lidarops.retrieve.network._cycle_kernels`."""
 
     starts: Array
@@ -57,10 +57,10 @@ class CycleRows:
     distinct: bool
     """Whether the fits at the two crossings of each row share no bins."""
 
-    def rotated(self, first: int) -> CycleRows:
+    def rotated(self, first: int) -> _CycleRows:
         """Return the rows in the order that starts with row `first`."""
         order = np.roll(np.arange(self.starts.shape[1]), -first)
-        return CycleRows(
+        return _CycleRows(
             np.ascontiguousarray(self.starts[:, order]),
             np.ascontiguousarray(self.ends[:, order]),
             np.ascontiguousarray(self.integrals[:, order]),
@@ -70,7 +70,7 @@ class CycleRows:
         )
 
 
-def cycle_rows(data: CondensedSignals, beams: BeamSignals, cycle: Cycle) -> CycleRows:
+def _cycle_rows(data: CondensedSignals, beams: BeamSignals, cycle: Cycle) -> _CycleRows:
     """Return the rows of a cycle; NaN where a signal is missing.
 
     Raises
@@ -87,7 +87,7 @@ def cycle_rows(data: CondensedSignals, beams: BeamSignals, cycle: Cycle) -> Cycl
         for b, c in zip(cycle.beam, np.roll(cycle.crossing, -1), strict=True)
     ]
     bins_between = np.abs(beams.layout.window[from_passage] - beams.layout.window[to_passage])
-    rows = CycleRows(
+    rows = _CycleRows(
         np.empty((profiles, k)), np.empty((profiles, k)), np.empty((profiles, k)),
         np.empty((profiles, k, 3, 3)), np.empty(k),
         distinct=bool(np.all(bins_between >= beams.layout.weights.shape[1])),
@@ -168,7 +168,7 @@ def solve_cycle_crossings(
     only_start : bool
         Whether to solve for the start crossing only.
     """
-    rows, mean = cycle_rows(beams.data, beams, cycle), cycle_rows(beams.mean, beams, cycle)
+    rows, mean = _cycle_rows(beams.data, beams, cycle), _cycle_rows(beams.mean, beams, cycle)
     profiles, crossings = rows.starts.shape[0], beams.layout.crossings
     shape = (profiles, crossings)
     estimate = CrossingEstimate(
@@ -229,7 +229,7 @@ def poorly_determined(extinction: Array, variance: Array, block: Indices) -> Boo
 
 
 def _solve_rows(
-    rows: CycleRows, multiplier: Array, *, unbiased: bool
+    rows: _CycleRows, multiplier: Array, *, unbiased: bool
 ) -> tuple[Array, Array, Array, Booleans, Array]:
     """Return solutions, determinants, variances, poles, and variances of the determinants."""
     count, k = rows.starts.shape
@@ -247,7 +247,7 @@ def _solve_rows(
     return value, determinant, variance, codes == _cycle_kernels.POLE, spread
 
 
-def _weak_attenuation(rows: CycleRows) -> Booleans:
+def _weak_attenuation(rows: _CycleRows) -> Booleans:
     """Return where the attenuation around the cycle is below 3 standard errors."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = np.cumsum(np.log(rows.ends / rows.starts), axis=1)[:, -1]
@@ -256,7 +256,7 @@ def _weak_attenuation(rows: CycleRows) -> Booleans:
         return np.asarray(~(np.abs(logarithm) >= 3.0 * np.sqrt(spread)))
 
 
-def _best_multiplier(mean: CycleRows, beams: BeamSignals) -> Array:
+def _best_multiplier(mean: _CycleRows, beams: BeamSignals) -> Array:
     """Return the best multiplier of each block for a homogeneous model of its mean field."""
     model = _mean_extinction(beams.mean)
     depths = model[:, np.newaxis] * mean.depths
@@ -269,7 +269,7 @@ def _best_multiplier(mean: CycleRows, beams: BeamSignals) -> Array:
     return np.where(np.isfinite(model) & (model > 0), multiplier, 1.0)
 
 
-def _modelled_bias(rows: CycleRows, beams: BeamSignals, multiplier: Array) -> Array:
+def _modelled_bias(rows: _CycleRows, beams: BeamSignals, multiplier: Array) -> Array:
     """Return the relative systematic error of a homogeneous mean field."""
     depths = _mean_extinction(beams.mean)[beams.block, np.newaxis] * rows.depths
     return np.where(multiplier < 1.0, _multiplier.relative_bias(depths, multiplier), 0.0)

@@ -24,7 +24,7 @@ _SECOND_DIFFERENCE_VARIANCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
 
 
-class DarkMethod(StrEnum):
+class _DarkMethod(StrEnum):
     """How the dark signal of a profile follows from the dark sessions."""
 
     NEAREST = "nearest"
@@ -101,7 +101,7 @@ def dark_profile(
     RetrievalInputError
         For no dark file, an unknown time, or shapes that do not match.
     """
-    chosen = inputs.choice(method, DarkMethod, "method")
+    chosen = inputs.choice(method, _DarkMethod, "method")
     signals = _signals(dark_signals)
     dark_seconds, seconds = _seconds(dark_times, times)
     if signals.shape[-2] != dark_seconds.size:
@@ -266,13 +266,13 @@ def _smooth(means: Array, variances: Array, window: int) -> tuple[Array, Array]:
 
 
 def _shares(
-    dark_seconds: Array, sessions: list[npt.NDArray[np.intp]], seconds: Array, method: DarkMethod
+    dark_seconds: Array, sessions: list[npt.NDArray[np.intp]], seconds: Array, method: _DarkMethod
 ) -> Array:
     """Return the weight of each session at each time, (time, session)."""
     middles = np.array([dark_seconds[files].mean() for files in sessions])
     shares = np.zeros((seconds.size, middles.size))
     rows = np.arange(seconds.size)
-    if method is DarkMethod.NEAREST:
+    if method is _DarkMethod.NEAREST:
         distances = np.stack(
             [np.abs(dark_seconds[files] - seconds[:, np.newaxis]).min(axis=1) for files in sessions]
         )

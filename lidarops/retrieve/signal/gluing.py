@@ -39,7 +39,7 @@ _FALSE_ALARM: Final = 1e-4
 """Probability with which noise exceeds the largest chi-square, for few bins."""
 
 
-class HandOver(StrEnum):
+class _HandOver(StrEnum):
     """Transition of the glued signal from analog to photon counting."""
 
     BLEND = "blend"
@@ -147,7 +147,7 @@ def glue(
     york2004, licel2023
     """
     grid = inputs.range_grid(range)
-    transition = inputs.choice(hand_over, HandOver, "hand_over")
+    transition = inputs.choice(hand_over, _HandOver, "hand_over")
     _check_limits(count_rate_window, least_snr, correlation)
     x, leading = _rows(analog, "analog", grid)
     y, photon_leading = _rows(photon_counting, "photon_counting", grid)
@@ -167,7 +167,7 @@ def glue(
     starts = np.searchsorted(block_index[order], np.arange(blocks + 1))
     _line_fit.fit_lines(x, y, xv, yv, float(correlation), order, starts, first, past, lines)
     near, far = first, past
-    if transition is HandOver.SWITCH:
+    if transition is _HandOver.SWITCH:
         near = far = (first + past) // 2
     glued = np.empty((3, *x.shape))
     _line_fit.combine(x, y, xv, yv, float(correlation), lines, block_index, near, far, glued)
