@@ -26,7 +26,7 @@ _SCALES: Final = {
     "extinction": (1.0e3, "extinction (km$^{-1}$)"),
 }
 _MARKS: Final = 30
-"""Approximate most marks of one kind in a panel."""
+"""About the largest number of marks of one kind in a panel."""
 _COLORS: Final = "berlin"
 """Diverging, perceptually uniform, readable with colour vision deficiency (Crameri)."""
 _HATCHED: Final = 0.25

@@ -97,7 +97,7 @@ class Dataset:
     bin_width: float
     """m."""
     wavelength_label: str
-    """As written, for example ``00532.o``."""
+    """Label as written, for example ``00532.o``."""
     polarisation: str
     """o none, p parallel, s perpendicular, r and l circular."""
     bin_shift: float
@@ -114,7 +114,7 @@ class Dataset:
     offset: int | None
     """Byte at which the counts start; None if the file does not store them."""
     line: bytes = field(compare=False, repr=False)
-    """As written, with CRLF."""
+    """Header line as written, with CRLF."""
 
     def __hash__(self) -> int:
         return hash((self.name, self.offset, self.shots))

@@ -1,4 +1,4 @@
-"""_Edit of raw files as in real archives: truncated, empty, foreign, wrong, or merely odd."""
+"""Damage of raw files as in real archives: truncated, empty, foreign, wrong, or merely odd."""
 
 from __future__ import annotations
 

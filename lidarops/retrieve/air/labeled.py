@@ -37,12 +37,12 @@ class Definition:
     @property
     def words(self) -> str:
         """The definition in words, for attributes."""
-        colour = f"at {self.wavelength * 1e9:g} nm"
+        extinction = f"extinction at {self.wavelength * 1e9:g} nm"
         if self.law != visibility.WavelengthLaw.NONE:
-            colour = f"brought from {self.wavelength * 1e9:g} to 550 nm by the law {self.law}"
-        if self.angstrom_exponent is not None:
-            colour += f" with the exponent {self.angstrom_exponent:g}"
-        return f"visibility by the contrast {self.contrast:.6g} from extinction {colour}"
+            exponent = self.angstrom_exponent
+            detail = "" if exponent is None else f", exponent {exponent:g}"
+            extinction += f" converted to 550 nm (law {self.law}{detail})"
+        return f"visibility for contrast {self.contrast:.6g}, from {extinction}"
 
 
 def visibility_of_extinction(

@@ -54,9 +54,10 @@ class Limits(NamedTuple):
     """Limits of the two tests for a window free of aerosol."""
 
     waves: float
-    """Of the chi-square of the mean residuals of `GROUPS` groups (2 degrees of freedom used)."""
+    """Limit of the chi-square of the mean residuals of `GROUPS` groups (it uses 2 degrees of
+    freedom)."""
     deviation: float
-    """Of the curvature and of the differences of backgrounds, in standard errors."""
+    """Limit of the curvature and of the differences of backgrounds, in standard errors."""
 
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -17,6 +17,8 @@ from lidarops.flags import Quality
 _TAIL: Final = 0.1
 """Share of the bins, the farthest, whose power is the background."""
 _FEWEST: Final = 8
+"""Bins of the stretch that a profile needs to be tested; with fewer, one outlying bin would decide
+the significance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,7 @@ def detect_light(
 
     Returns
     -------
-    Look
+    LightDetection
 
     Raises
     ------

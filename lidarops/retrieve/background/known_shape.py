@@ -51,7 +51,7 @@ class KnownShapeResult:
     """Power over shape."""
     amplitude_standard_error: Array
     covariance: Array
-    """Of background and amplitude; negative."""
+    """Covariance of background and amplitude; negative."""
     chi2: Array
     """Sum of the squared residuals over their variances; over 1 where no variance is known."""
     degrees_of_freedom: npt.NDArray[np.int64]
@@ -139,7 +139,7 @@ def fit_known_shape(
                        {\sum w (\varphi - \bar\varphi)^2}, \qquad
               b = \bar P - C \bar\varphi
 
-    with weighted means and :math:`w = 1 / v`. This is equation (4) of potapova2023 with the
+    with weighted means and :math:`w = 1 / v`. This is equation (4) of potapova2021 with the
     molecular shape in place of that of a homogeneous path. There is no iteration.
 
     The variance of counts is that of the fitted model, :math:`v = (b + C \varphi) / E`, from two
@@ -190,7 +190,7 @@ def fit_known_shape(
 
     References
     ----------
-    potapova2023, golub1973, vonneumann1941
+    potapova2021, golub1973, vonneumann1941
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)

@@ -17,7 +17,8 @@ _TOP: Final = 2.0
 _DETECTED: Final = 3.0
 """Standard errors that a signal above a layer must exceed."""
 _VISIBLE_SHARE: Final = 0.1
-"""Share of the level below a layer that noise must let be seen where opacity is tested."""
+"""Opacity is tested only where noise would allow this share of the level below the layer to be
+detected."""
 _LEAST_SHARE: Final = 0.01
 """Share of that level below which there is no signal, however low the noise."""
 

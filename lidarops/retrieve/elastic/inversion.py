@@ -93,7 +93,7 @@ class ElasticResult:
     lidar_ratio_standard_error: Array
     """sr, as given, broadcast to the power."""
     molecular_relative_error: Array
-    """As given, broadcast to the power."""
+    """Relative error as given, broadcast to the power."""
     valid: Mask
     unstable: Mask
     """No value: the denominator of the solution is too small, or not certain to be positive."""
@@ -384,7 +384,7 @@ class _Spread:
     total: Array
     square: Array
     product: Array
-    """Of the deviations and the deviates that caused them; its sign is that of the effect."""
+    """Product of the deviations and the deviates that caused them; its sign is the effect's."""
     samples: int = 0
 
     @classmethod

@@ -61,12 +61,12 @@ class ReferenceWindow:
     """Power over the molecular shape, averaged over the window with inverse variances."""
     scale_standard_error: Array
     slope: Array
-    """m-1, of the logarithm of the power over the molecular shape."""
+    """Slope of the logarithm of the power over the molecular shape, m-1."""
     slope_standard_error: Array
     curvature: Array
-    """Of the ratio to the molecular shape, in standard errors."""
+    """Curvature of the ratio to the molecular shape, in standard errors."""
     reduced_chi_square: Array
-    """Of the power against the molecular shape alone."""
+    """Reduced chi-square of the power against the molecular shape alone."""
     rejections: Codes
     """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
 

@@ -55,7 +55,7 @@ class _Limits:
     """Limits beyond which the tests fail."""
 
     least_misfit: Array
-    """Of the reduced chi-square."""
+    """Lower limit of the reduced chi-square."""
     most_misfit: Array
     trend: Array
     outlier: Array
@@ -71,7 +71,7 @@ class CommonLimits(NamedTuple):
     most_misfit: float
     curvature: float
     square: float
-    """Of the residuals along the square of the shape, in standard deviations."""
+    """Limit of the residuals along the square of the shape, in standard deviations."""
     outlier: float
     widening: float
     """Factor on standard errors; not a limit, but a function of the same counts."""

@@ -79,7 +79,7 @@ class Regression:
     residual: Array
     """(profile, angle, altitude): of the logarithms; NaN where there is no sample or fit."""
     leverage: Array
-    """As `residual`: diagonal of the hat matrix."""
+    """(profile, angle, altitude): diagonal of the hat matrix."""
 
     def column(self, number: int) -> Array:
         """Return one column as (profile, altitude)."""

@@ -96,7 +96,7 @@ class MultiAngleResult:
     inhomogeneity: Array
     """Standard deviation of the logarithms of the signals on top of detector noise."""
     reduced_chi_square: Array
-    """Of the fit over angles; NaN where beams are not more than unknowns."""
+    """Reduced chi-square of the fit over angles; NaN where beams are not more than unknowns."""
     reach: Array
     """(...,) m, the highest altitude with an estimate; NaN where there is none."""
     layer_optical_depth: Array

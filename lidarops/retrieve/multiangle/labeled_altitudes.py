@@ -43,7 +43,8 @@ _AT_ONCE: Final = 32
 _BESIDE: Final = 4
 """Bins beside an altitude that an interpolation may need."""
 _BEFORE_TAIL: Final = (0.6, 0.7)
-"""Range over the start of the tail, where the signal left in the tail is estimated from."""
+"""Window, as fractions of the start of the tail, from which the signal left in the tail is
+estimated."""
 _SHAPE_ERROR: Final = 0.2
 """Relative error of the signal in the tail as computed from the shape of clean air, caused by
 aerosol in the far range (haze of 12 percent of the air there, simulated)."""

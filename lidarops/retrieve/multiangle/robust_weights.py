@@ -21,7 +21,7 @@ START_WIDTH: Final = 5.0
 PASS_WIDTH: Final = 7.0
 """Standard errors from a weighted fit beyond which a sample has no weight."""
 FEWEST_BEAMS: Final = 4
-"""Beams from which on one outlier can be identified."""
+"""Number of beams at or above which one outlier can be identified."""
 _CLOSEST: Final = 1e-3
 """Distance of two slant paths, over their span, below which they define no slope."""
 _KEPT: Final = 0.3
@@ -240,7 +240,7 @@ def fill_robust_weights(
     residuals, leverages, noise : (profile, angle, altitude) float
     inhomogeneity : (altitude,) float
     width : float
-        Standard errors from which on the weight is 0.
+        Standard errors at or above which the weight is 0.
     keep : (profile, angle, altitude) float
         Output.
     """

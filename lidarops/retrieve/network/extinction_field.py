@@ -58,9 +58,10 @@ Booleans = npt.NDArray[np.bool_]
 DEFAULT_BINS: Final = 7
 """Bins of the fit that gives the signal at a crossing."""
 DEFAULT_UNBIASED_MULTIPLIER: Final = 0.25
-"""Of the unbiased estimate. Its noise is close to the minimum there, in all kinds of fields."""
+"""Multiplier of the unbiased estimate. Its noise is close to the minimum there, in all kinds of
+fields."""
 _LEAST_PROBABILITY: Final = 1e-4
-"""Of a chi-square; below, a fit is flagged as poor."""
+"""Probability of a chi-square below which a fit is flagged as poor."""
 
 
 class NetworkMethod(StrEnum):

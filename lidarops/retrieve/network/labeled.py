@@ -97,7 +97,8 @@ class NetworkSettings:
     exponent_relative_error: float = 0.1
     """Relative error of the exponent m."""
     lidar_ratio_relative_error: float = 0.02
-    """Of one crossing against the others: of the constant between backscatter^m and extinction."""
+    """Relative error of the constant between backscatter^m and extinction at one crossing, against
+    the others."""
     overlap_relative_error: float = 0.003
     """At the nearest used range of a beam; falls linearly to 0 at the farthest."""
 
@@ -360,9 +361,7 @@ class _Errors:
     """Relative change of extinction over relative change of signals at the near ends of beams."""
 
     @staticmethod
-    def estimate(
-        solver: _Solver, result: NetworkResult, settings: NetworkSettings
-    ) -> _Errors:
+    def estimate(solver: _Solver, result: NetworkResult, settings: NetworkSettings) -> _Errors:
         """Return the errors from noise and background, and from the systematic effects."""
         signals = solver.signals
         background_error = np.nan_to_num(signals.background_error)[..., np.newaxis]
@@ -399,9 +398,7 @@ class _Errors:
         return _Errors(random, _root_sum_square(contributions), tail_signal, condition)
 
 
-def _lidar_ratio_error(
-    solver: _Solver, result: NetworkResult, relative_error: float
-) -> Array:
+def _lidar_ratio_error(solver: _Solver, result: NetworkResult, relative_error: float) -> Array:
     """Return the error from lidar ratios that differ between crossings, m-1."""
     square_sum = np.zeros(result.extinction.shape)
     if relative_error > 0.0:

@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 
 LARGEST_LAG: Final = 30
-"""Bins."""
+"""Largest lag that is searched, bins."""
 CONFIDENCE: Final = 0.999
 """Least probability that noise without a common cause has a lower peak."""
 FEWEST_BINS: Final = 200

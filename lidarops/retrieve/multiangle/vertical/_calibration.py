@@ -43,7 +43,7 @@ class Calibration:
     share: Array
     """(altitude,): correlated share of its variance."""
     correlation: float
-    """Of the correlated noise at neighbouring altitudes."""
+    """Correlation of the correlated noise at neighbouring altitudes."""
     stiffness: Array
     """(3, altitude): bands of the penalty on roughness."""
     smoothing: float

@@ -23,7 +23,7 @@ _SIMPLE_BELOW: Final = 0.1
 _AMPLITUDES: Final = (0.5, 1.05)
 """Limits of the amplitude of the correlation."""
 _LINKED: Final = 0.5
-"""Correlated share, over the largest of the neighbours, from which on an altitude is linked."""
+"""Correlated share, over the largest of the neighbours, at or above which an altitude is linked."""
 _CANDIDATES: Final = np.arange(99) / 100.0
 """Correlations to choose from."""
 

@@ -19,13 +19,13 @@ LEAST_WEIGHT: Final = 1e-3
 SMALLEST_WEIGHT: Final = 1e-9
 """The least share; a smaller one would cost the solution its digits."""
 HALF: Final = 0.5
-"""Share of weight, and of estimates, that counts as most."""
+"""Share of weight, and of estimates, that is regarded as a majority."""
 USUAL_WEIGHT: Final = 1.0 - 2.0 / BISQUARE**2 + 3.0 / BISQUARE**4
 """Mean of the bisquare for normal deviates, by which weights are normalised."""
 _HALF_WINDOW: Final = 7
 """Altitudes to either side of the window of the median."""
 _JUMP: Final = 5.0
-"""Standard errors between neighbouring estimates from which on a profile is screened."""
+"""Standard errors between neighbouring estimates at or above which a profile is screened."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 

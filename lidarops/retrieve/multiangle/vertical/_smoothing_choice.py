@@ -19,12 +19,13 @@ GRID: Final = 10.0 ** (np.arange(11 * PER_DECADE + 1) / PER_DECADE - 10.0)
 LEAST_FREEDOM: Final = 2.0
 """Degrees of freedom below which a weight is not allowed."""
 FEWEST_TO_CHOOSE: Final = 8
-"""Profiles in a block from which on one weight is chosen; with fewer, solutions are averaged."""
+"""Profiles in a block at or above which one weight is chosen; with fewer, solutions are
+averaged."""
 _SCORED_PROFILES: Final = 64
 _SCORED_VALUES: Final = 25_600
 """A block is scored on at most so many profiles, or profiles with so many values together."""
 _SWITCH: Final = 1.2
-"""Ratio of degrees of freedom from which on Cp is preferred to the likelihood."""
+"""Ratio of degrees of freedom at or above which Cp is preferred to the likelihood."""
 _STRANGE: Final = 3.0
 """Cp of a profile, in medians, beyond which it is left out of the sum."""
 _NEGLIGIBLE: Final = 1e-6

@@ -14,7 +14,7 @@ Booleans = npt.NDArray[np.bool_]
 _HALF_WINDOW: Final = 7
 """Altitudes to either side over which the noise of single altitudes is averaged."""
 _LINKED: Final = 0.5
-"""Correlated share, over the largest of the neighbours, from which on an altitude is linked."""
+"""Correlated share, over the largest of the neighbours, at or above which an altitude is linked."""
 _FARTHEST: Final = 2
 """Largest distance of linked altitudes."""
 _LEAST_SHARE: Final = 1e-6

@@ -25,7 +25,7 @@ HIGHEST_CORRELATION: Final = 0.85
 """Correlation of neighbouring altitudes beyond which standard errors may be too small. In random
 scenes they remain right beyond it; if the laser energy varies from file to file they do not."""
 MOST_FREEDOM: Final = 10.0
-"""Degrees of freedom from which on a profile may be undersmoothed."""
+"""Degrees of freedom at or above which a profile may be undersmoothed."""
 ROUGHEST: Final = 0.4
 """Degrees of freedom per estimate beyond which smoothing has little effect. In random scenes with
 fewer, no more values are false than among all unflagged ones."""

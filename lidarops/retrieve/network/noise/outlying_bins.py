@@ -67,7 +67,7 @@ _STEP: Final = 0.1
 _EDGE_BINS: Final = 14
 """Bins that deviate at two edges of layers."""
 _OUTLYING_SHARE: Final = 0.2
-"""Fraction of the bins of a beam that may deviate besides."""
+"""Fraction of the bins of a beam that may be outlying in addition."""
 _LARGEST_LOGARITHM: Final = 300.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
