@@ -25,7 +25,7 @@ from lidarops.bench.accuracy.elastic import Elastic
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.multiangle_scores import measure_multiangle as measure_scans
 from lidarops.bench.accuracy.network_scores import NetworkAccuracy
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, Effort
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, Effort, facts
 from lidarops.bench.harness.timing import Machine, least_times, machine
 from lidarops.bench.overview import Baseline, WorkPrecision
 from lidarops.reports.benchmark_page import BenchmarkReport, Part
@@ -121,7 +121,7 @@ def _report(result: AllRetrievals) -> BenchmarkReport:
     ]
     return BenchmarkReport(
         title="All retrievals: error against run time",
-        facts=homogeneous_report.facts(result.date, result.machine),
+        facts=facts(result.date, result.machine),
         parts=(overview.overview(result.works, result.baselines), *chapters),
         data=RESULT,
     )

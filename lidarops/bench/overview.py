@@ -11,11 +11,11 @@ import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.accuracy.elastic import Elastic
+from lidarops.bench.accuracy.elastic_costs import ALL_STEPS
 from lidarops.bench.accuracy.homogeneous import Accuracy, MonteCarloFigure, outcomes_of
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.network_scores import NetworkAccuracy
 from lidarops.bench.accuracy.peers import iterative_peers
-from lidarops.bench.throughput.retrievals import ALL_STEPS
 from lidarops.figures.charts import Chart, Panel, Series, pareto
 from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import Part, Table

@@ -13,7 +13,9 @@ from lidarops.bench.accuracy import (
     homogeneous,
     homogeneous_report,
     multiangle_report,
+    multiangle_scores,
     network,
+    network_report,
 )
 from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
@@ -22,8 +24,12 @@ from lidarops.bench.throughput import (
     archives,
     campaigns,
     cost_calibration,
+    networks,
     readers,
+    retrieval_reports,
     retrievals,
+    scan_kernels,
+    scan_report,
 )
 from lidarops.errors import CampaignError
 from lidarops.reports import benchmark_page
@@ -87,10 +93,10 @@ def run_benchmark(
         Benchmark.ARCHIVE: lambda: archives.run_archives(kind, effort=effort),
         Benchmark.CAMPAIGNS: lambda: campaigns.run_campaigns(kind, effort=effort),
         Benchmark.COSTS: lambda: cost_calibration.run_cost_calibration(kind, effort=effort),
-        Benchmark.ELASTIC: lambda: elastic.run_elastic(kind, data=data, effort=effort),
+        Benchmark.ELASTIC: lambda: _elastic(kind, data, effort),
         Benchmark.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
-        Benchmark.MULTIANGLE: lambda: multiangle_report.run_multiangle(kind, effort=effort),
-        Benchmark.NETWORK: lambda: network.run_network(kind, effort=effort),
+        Benchmark.MULTIANGLE: lambda: _multiangle(kind, effort),
+        Benchmark.NETWORK: lambda: _network(kind, effort),
         Benchmark.READER: lambda: _reader(files, effort),
     }
     return runs[benchmark]()
@@ -99,7 +105,7 @@ def run_benchmark(
 def _reader(files: Sequence[Path], effort: Effort) -> BenchmarkOutput:
     rates = readers.measure_readers(files, repeats=effort.repeats or _REPEATS)
     return BenchmarkOutput(
-        rates, homogeneous_report.reader_report(rates, effort.date, machine(), RESULT)
+        rates, retrieval_reports.reader_report(rates, effort.date, machine(), RESULT)
     )
 
 
@@ -115,8 +121,48 @@ def _homogeneous(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
     return BenchmarkOutput(
-        throughput, homogeneous_report.homogeneous_throughput_report(throughput, RESULT)
+        throughput, retrieval_reports.homogeneous_throughput_report(throughput, RESULT)
     )
+
+
+def _elastic(kind: BenchmarkKind, data: Path | None, effort: Effort) -> BenchmarkOutput:
+    if kind is BenchmarkKind.ACCURACY:
+        accuracy = elastic.measure_elastic_accuracy(
+            quick=effort.quick, date=effort.date, data=data, progress=effort.progress
+        )
+        return BenchmarkOutput(accuracy, elastic.elastic_accuracy_report(accuracy, RESULT))
+    throughput = retrievals.measure_elastic(
+        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
+    )
+    return BenchmarkOutput(
+        throughput, retrieval_reports.elastic_throughput_report(throughput, RESULT)
+    )
+
+
+def _multiangle(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
+    if kind is BenchmarkKind.ACCURACY:
+        accuracy = multiangle_scores.measure_multiangle(
+            quick=effort.quick, date=effort.date, progress=effort.progress
+        )
+        return BenchmarkOutput(
+            accuracy, multiangle_report.multiangle_accuracy_report(accuracy, RESULT)
+        )
+    throughput = scan_kernels.measure_scan_kernels(
+        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
+    )
+    return BenchmarkOutput(throughput, scan_report.multiangle_throughput_report(throughput, RESULT))
+
+
+def _network(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
+    if kind is BenchmarkKind.ACCURACY:
+        accuracy = network.measure_network(
+            quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
+        )
+        return BenchmarkOutput(accuracy, network_report.network_accuracy_report(accuracy, RESULT))
+    throughput = networks.measure_network_throughput(
+        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
+    )
+    return BenchmarkOutput(throughput, networks.network_throughput_report(throughput, RESULT))
 
 
 def _check(kind: BenchmarkKind, case: Benchmark, files: Sequence[Path], data: Path | None) -> None:

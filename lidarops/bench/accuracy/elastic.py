@@ -17,6 +17,7 @@ from lidarops.bench.accuracy.elastic_cases import (
     Inverted,
     SimulatedSky,
 )
+from lidarops.bench.accuracy.elastic_costs import cost_part, elastic_costs
 from lidarops.bench.accuracy.homogeneous import (
     BackgroundScore,
     InversionScore,
@@ -24,14 +25,8 @@ from lidarops.bench.accuracy.homogeneous import (
     background_score,
     inversion_score,
 )
-from lidarops.bench.accuracy.homogeneous_report import (
-    cost_part,
-    elastic_throughput_report,
-    facts,
-)
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
-from lidarops.bench.harness.timing import Machine, machine
-from lidarops.bench.throughput.retrievals import StepCost, elastic_costs, measure_elastic
+from lidarops.bench.harness.benchmark import facts
+from lidarops.bench.harness.timing import Machine, StepCost, machine
 from lidarops.figures.charts import Chart, Panel, Series
 from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
@@ -293,34 +288,6 @@ _DRAWN: Final = (
     elastic_cases.TAIL_MEAN,
 )
 _NONE: Final = "-"
-
-
-def run_elastic(kind: BenchmarkKind, *, data: Path | None, effort: Effort) -> BenchmarkOutput:
-    """Run a benchmark of the elastic retrieval.
-
-    Parameters
-    ----------
-    kind : BenchmarkKind
-    data : Path, optional
-        Folder of the published files, for the accuracy.
-    effort : Effort
-
-    Raises
-    ------
-    CampaignError
-        If the folder holds no such files.
-    RawFormatError
-        If a published file cannot be read.
-    """
-    if kind is BenchmarkKind.ACCURACY:
-        accuracy = measure_elastic_accuracy(
-            quick=effort.quick, date=effort.date, data=data, progress=effort.progress
-        )
-        return BenchmarkOutput(accuracy, elastic_accuracy_report(accuracy, RESULT))
-    throughput = measure_elastic(
-        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-    )
-    return BenchmarkOutput(throughput, elastic_throughput_report(throughput, RESULT))
 
 
 def elastic_accuracy_report(accuracy: Elastic, data: str = "") -> BenchmarkReport:

@@ -1,8 +1,8 @@
-"""Report pages of the homogeneous, reader and elastic throughput benchmarks."""
+"""Report page of the accuracy on homogeneous paths."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -16,19 +16,9 @@ from lidarops.bench.accuracy.homogeneous import (
     outcomes_of,
 )
 from lidarops.bench.accuracy.homogeneous_cases import QUANTITIES
-from lidarops.bench.harness.timing import Machine
-from lidarops.bench.throughput import readers
-from lidarops.bench.throughput.retrievals import (
-    READ,
-    ElasticThroughput,
-    Setting,
-    SolverThroughput,
-    Speed,
-    StepCost,
-    settings,
-)
-from lidarops.figures.charts import Chart, Ladder, Panel, Series, pareto
-from lidarops.figures.wording import counted, percent
+from lidarops.bench.harness.benchmark import facts
+from lidarops.figures.charts import Chart, Panel, Series, pareto
+from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
@@ -55,49 +45,6 @@ def homogeneous_accuracy_report(result: Accuracy, data: str = "") -> BenchmarkRe
         parts=(_overview(result), _by_difficulty(result), _offsets(result.offsets)),
         data=data,
     )
-
-
-def homogeneous_throughput_report(result: SolverThroughput, data: str = "") -> BenchmarkReport:
-    """Return the page of the throughput benchmark."""
-    return BenchmarkReport(
-        title="Homogeneous path: time per profile",
-        facts=facts(result.date, result.machine),
-        parts=(_times(result), _threads(result)),
-        data=data,
-    )
-
-
-def reader_report(
-    result: Sequence[readers.ReaderThroughput], date: str, machine: Machine, data: str = ""
-) -> BenchmarkReport:
-    """Return the page of the reader's benchmark."""
-    table = Table(
-        title="Throughput, one core, CPU time",
-        columns=("what", "files/s", "MB/s", "times floor"),
-        rows=tuple(
-            (
-                rate.name,
-                f"{rate.files_per_second:,.0f}",
-                f"{rate.megabytes_per_second:,.0f}",
-                f"{rate.times_floor:.2f}",
-            )
-            for rate in result
-        ),
-    )
-    text = "Raw files to arrays, from the page cache, against floors measured in the same run."
-    return BenchmarkReport(
-        title="Reader: files per second",
-        facts=facts(date, machine),
-        parts=(Part("Throughput", text, tables=(table,)),),
-        data=data,
-    )
-
-
-def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
-    """Return date, machine and software of a benchmark run."""
-    packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
-    known = (("Date", date), ("Processor", machine.processor), ("Python", machine.python))
-    return tuple(fact for fact in (*known, ("Packages", packages)) if fact[1])
 
 
 def _methods(result: Accuracy) -> list[str]:
@@ -412,139 +359,4 @@ def _offset_table(offsets: Sequence[Offset]) -> Table:
         "with a lag of one bin, and of the compressed method with its scatter. Expected: "
         "second-order bias of least squares, omitted where it exceeds the scatter and is not "
         "meaningful.",
-    )
-
-
-# Throughput ----------------------------------------------------------------------------------
-
-
-def _times(result: SolverThroughput) -> Part:
-    by_setting = {setting: _speeds(result, setting) for setting in settings()}
-    names = list(dict.fromkeys(speed.method for speed in result.speeds))
-    return Part(
-        title="CPU time per profile",
-        text=f"Path {result.path.label}, {result.path.bins} bins; all outputs and flags, one "
-        "thread, least CPU time of interleaved repeats. The read is a vectorised maximum of the "
-        "same array in the same run. JAX and numba are timed once compiled.",
-        charts=(_ladder(names, by_setting),),
-        tables=tuple(_speed_table(setting, speeds) for setting, speeds in by_setting.items()),
-    )
-
-
-def _speeds(result: SolverThroughput, setting: Setting) -> dict[str, Speed]:
-    return {speed.method: speed for speed in result.speeds if speed.setting == setting}
-
-
-def _ladder(names: Sequence[str], result: Mapping[Setting, Mapping[str, Speed]]) -> Ladder:
-    return Ladder(
-        name="time",
-        title="CPU time per profile of 225 bins",
-        caption="All methods with a given variance; the read is the floor.",
-        x_label="CPU time per profile (ns)",
-        rows=tuple(names),
-        series=tuple(
-            (
-                f"{setting.dtype}, {'gaps' if setting.missing else 'dense'}",
-                tuple(speeds[name].nanoseconds if name in speeds else None for name in names),
-            )
-            for setting, speeds in result.items()
-            if setting.known_variance
-        ),
-    )
-
-
-def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
-    best = speeds.get(HomogeneousMethod.COMPRESSED)
-    return Table(
-        title=setting.label,
-        columns=("method", "profiles", "ns each", "reads", "ratio"),
-        rows=tuple(
-            (
-                speed.method,
-                f"{speed.profiles:,}",
-                f"{speed.nanoseconds:,.1f}",
-                f"{speed.reads:,.2f}",
-                f"{speed.nanoseconds / best.nanoseconds:,.2f}" if best else _UNSOLVED,
-            )
-            for speed in speeds.values()
-        ),
-        note=f"Reads: multiples of {READ}. Ratio: to the compressed method. Profiles: per call.",
-    )
-
-
-def _threads(result: SolverThroughput) -> Part:
-    return Part(
-        title="Two threads",
-        text="Wall time of one thread over that of two threads with half of the profiles each. It "
-        "is meaningful only on a machine with two idle cores.",
-        tables=(
-            Table(
-                title="Gain of two threads",
-                columns=("method", "data", "gain"),
-                rows=tuple((t.method, t.dtype, f"{t.gain:.2f}") for t in result.threads),
-            ),
-        ),
-    )
-
-
-# Elastic retrieval ---------------------------------------------------------------------------
-
-
-def elastic_throughput_report(result: ElasticThroughput, data: str = "") -> BenchmarkReport:
-    """Return the page of the elastic throughput benchmark."""
-    return BenchmarkReport(
-        title="Elastic inversion: time per profile",
-        facts=facts(result.date, result.machine),
-        parts=(cost_part(result.costs, result.bins),),
-        data=data,
-    )
-
-
-def cost_part(costs: tuple[StepCost, ...], bins: int) -> Part:
-    """Return the section on the CPU time of the steps of the elastic retrieval."""
-    batches = sorted({cost.batch for cost in costs})
-    return Part(
-        title="CPU time per profile",
-        text=f"Profiles of {bins} bins, float64, one thread, least CPU time of interleaved "
-        "repeats. Steps of lidarops compute all errors and flags; all steps: background, clouds, "
-        "reference window and inversion with its error budget. The peers give values without "
-        "errors: a weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy "
-        "and in plain Python. The read is a vectorised maximum of the same array in the same run.",
-        charts=(_cost_ladder(costs, batches, bins),),
-        tables=tuple(_cost_table(costs, batch) for batch in batches),
-    )
-
-
-def _cost_ladder(costs: tuple[StepCost, ...], batches: list[int], bins: int) -> Ladder:
-    steps = list(dict.fromkeys(cost.step for cost in costs))
-    spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in costs}
-    return Ladder(
-        name="elastic-time",
-        title=f"CPU time per profile of {bins} bins",
-        caption="By the number of profiles per call.",
-        x_label="CPU time per profile (µs)",
-        rows=tuple(steps),
-        series=tuple(
-            (counted(batch, "profile"), tuple(spent.get((batch, step)) for step in steps))
-            for batch in batches
-        ),
-    )
-
-
-def _cost_table(costs: tuple[StepCost, ...], batch: int) -> Table:
-    return Table(
-        title=f"Calls of {counted(batch, 'profile')}",
-        columns=("step", "code", "profiles", "µs each", "reads"),
-        rows=tuple(
-            (
-                cost.step,
-                "lidarops" if cost.ours else "peer" if cost.step != READ else "floor",
-                f"{cost.profiles:,}",
-                f"{cost.nanoseconds / 1e3:,.2f}",
-                f"{cost.reads:,.1f}",
-            )
-            for cost in costs
-            if cost.batch == batch
-        ),
-        note=f"Reads: multiples of {READ}. Profiles: per call, fewer for slow steps.",
     )

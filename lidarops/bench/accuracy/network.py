@@ -1,10 +1,10 @@
-"""Accuracy and speed of the retrieval of extinction where the beams of several lidars cross."""
+"""Measure the accuracy of the retrieval of extinction where the beams of several lidars cross."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -21,19 +21,13 @@ from lidarops.bench.accuracy.network_cases import (
     LidarLine,
     Signals,
 )
-from lidarops.bench.accuracy.network_report import (
-    network_accuracy_report,
-    network_throughput_report,
-)
+from lidarops.bench.accuracy.network_cycles import cycle_rates
 from lidarops.bench.accuracy.network_scores import (
     CLIPPED,
-    READ,
     Comparison,
     CrossingErrors,
     NetworkAccuracy,
     NetworkScenario,
-    NetworkThroughput,
-    SolverRate,
     VisibilityScore,
     crossing_errors,
     join_errors,
@@ -42,10 +36,8 @@ from lidarops.bench.accuracy.network_scores import (
     score,
     share_by_block,
 )
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
-from lidarops.bench.harness.timing import in_threads, least_times, machine
+from lidarops.bench.harness.timing import READ, machine
 from lidarops.retrieve.air import visibility as sight
-from lidarops.retrieve.network.cycles import solve_cycle, values_and_variances
 from lidarops.retrieve.network.extinction_field import NetworkResult
 
 Booleans = npt.NDArray[np.bool_]
@@ -58,19 +50,11 @@ CONTRASTS: Final = (sight.MOR_CONTRAST, sight.KOSCHMIEDER_CONTRAST, sight.PAPER_
 _PEER_PROFILES: Final = 150
 _QUICK_PEER_PROFILES: Final = 30
 _CHUNK_BLOCKS: Final = 5
-_TIMED_PROFILES: Final = 250
-_CYCLES: Final = {3: 500_000, 12: 100_000}
-_QUICK_CYCLES: Final = {3: 100_000, 12: 20_000}
-"""Number of cycles in a call, by the number of beams of a cycle."""
-_REPEATS: Final = 7
 _QUICK_REPEATS: Final = 3
 _SHORTEST: Final = 1e-9
 """s. A short call may take less than one tick of the clock."""
 
 _Result = TypeVar("_Result")
-
-
-# Accuracy -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +112,7 @@ def measure_network(
         figure=figure_points(),
         sights=tuple(visibility_scores),
         comparisons=tuple(_comparisons(peer_profiles)),
-        cycles=tuple(_cycle_rates(quick=True, repeats=repeats or _QUICK_REPEATS)),
+        cycles=tuple(cycle_rates(quick=True, repeats=repeats or _QUICK_REPEATS)),
     )
 
 
@@ -255,158 +239,3 @@ def _comparisons(profiles: int) -> Iterator[Comparison]:
 
 def _clipped_rms(errors: Array, kept: Booleans) -> float:
     return float(np.sqrt(np.mean(np.clip(errors[kept], -CLIPPED, CLIPPED) ** 2)))
-
-
-# Throughput -----------------------------------------------------------------------------------
-
-
-def measure_network_throughput(
-    *,
-    quick: bool = False,
-    date: str = "",
-    repeats: int | None = None,
-    progress: Callable[[int], object] = lambda _: None,
-) -> NetworkThroughput:
-    """Time cycles, whole profiles of networks, and plain peers.
-
-    Parameters
-    ----------
-    quick : bool
-        Use fewer cycles and repeats.
-    date : str
-        Date of the run, for the report.
-    repeats : int, optional
-        Number of repeats; the shortest time counts.
-    progress : callable
-        Called with 1 after the cycles, and after each network.
-    """
-    repeat_count = repeats or (_QUICK_REPEATS if quick else _REPEATS)
-    cycles = _cycle_rates(quick=quick, repeats=repeat_count)
-    progress(1)
-    profiles: list[SolverRate] = []
-    for lidars in network_cases.LIDAR_LINES:
-        profiles += _profile_rates(lidars, repeat_count)
-        progress(1)
-    return NetworkThroughput(
-        date,
-        machine(),
-        tuple(cycles),
-        tuple(profiles),
-        _thread_gain(quick=quick, repeats=repeat_count),
-    )
-
-
-def _cycle_rates(*, quick: bool, repeats: int) -> list[SolverRate]:
-    """Return CPU times of cycles of 3 and 12 beams with every solver, the read first."""
-    rates = []
-    for beams, cycles in (_QUICK_CYCLES if quick else _CYCLES).items():
-        rows = network_cases.random_rows(cycles, beams)
-        sizes = {name: min(cycles, largest) for name, (_, largest) in _CYCLE_SOLVERS.items()}
-        calls = {
-            name: partial(solver, rows.first(sizes[name]))
-            for name, (solver, _) in _CYCLE_SOLVERS.items()
-        }
-        times = least_times(calls, repeats)
-        nanoseconds = {name: 1e9 * seconds / sizes[name] for name, seconds in times.items()}
-        rates += [
-            SolverRate(
-                name,
-                beams,
-                sizes[name],
-                nanoseconds[name],
-                nanoseconds[name] / nanoseconds[READ],
-                name in OURS,
-            )
-            for name in calls
-        ]
-    return rates
-
-
-def _read(rows: network_cases.RandomRows) -> object:
-    return [np.max(array) for array in rows.arrays]
-
-
-def _with_variance(rows: network_cases.RandomRows) -> object:
-    return values_and_variances(*rows.arrays)
-
-
-def _with_one_variance(rows: network_cases.RandomRows) -> object:
-    return values_and_variances(rows.start, rows.end, rows.integral, rows.variance[0])
-
-
-def _with_flags(rows: network_cases.RandomRows) -> object:
-    return solve_cycle(rows.start, rows.end, rows.integral, relative_variance=rows.variance)
-
-
-VALUES: Final = "closed form with variance"
-SHARED: Final = "closed form, one variance for all"
-FLAGS: Final = "closed form with sensitivities and flags"
-LU: Final = "numpy.linalg.solve at once"
-ONE_BY_ONE: Final = "numpy.linalg.solve, one by one"
-OURS: Final = frozenset({VALUES, SHARED, FLAGS})
-
-_ALL: Final = 10**9
-_CYCLE_SOLVERS: Final[Mapping[str, tuple[Callable[[network_cases.RandomRows], object], int]]] = {
-    READ: (_read, _ALL),
-    VALUES: (_with_variance, _ALL),
-    SHARED: (_with_one_variance, _ALL),
-    FLAGS: (_with_flags, 100_000),
-    LU: (network_cases.solve_by_lu, 50_000),
-    ONE_BY_ONE: (network_cases.solve_by_lu_one_by_one, 5_000),
-}
-"""Solvers of cycles, each with its largest number of cycles."""
-
-
-def _profile_rates(lidars: LidarLine, repeats: int) -> list[SolverRate]:
-    """Return CPU times of profiles of a network with every solver, the read first."""
-    network, size = lidars.network(), _TIMED_PROFILES
-    signals = network_cases.signals(network, network_cases.AIRS[0])
-    power, variance = signals.draw(network_cases.PEER_NOISE, size, 7)
-    calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
-    for solver in network_cases.network_solvers(lidars):
-        calls[solver.name] = partial(solver, power, variance, signals)
-    times = least_times(calls, repeats)
-    return [
-        SolverRate(
-            name, network.beams, size, 1e9 * seconds / size, seconds / times[READ], name != READ
-        )
-        for name, seconds in times.items()
-    ]
-
-
-def _thread_gain(*, quick: bool, repeats: int) -> float:
-    """Return the wall time of one thread over that of two with half of the cycles each."""
-    cycles = (_QUICK_CYCLES if quick else _CYCLES)[3]
-    rows = network_cases.random_rows(cycles, 3)
-    halves = rows.first(cycles // 2), rows.last(cycles // 2)
-    times = least_times(
-        {
-            "one": lambda: _with_variance(rows),
-            "two": lambda: in_threads(lambda half: _with_variance(halves[half]), 2),
-        },
-        repeats,
-        clock="perf_counter",
-    )
-    return times["one"] / times["two"]
-
-
-# The command ----------------------------------------------------------------------------------
-
-
-def run_network(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
-    """Run the accuracy or throughput benchmark of networks of lidars.
-
-    Parameters
-    ----------
-    kind : BenchmarkKind
-    effort : Effort
-    """
-    if kind is BenchmarkKind.ACCURACY:
-        accuracy = measure_network(
-            quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-        )
-        return BenchmarkOutput(accuracy, network_accuracy_report(accuracy, RESULT))
-    throughput = measure_network_throughput(
-        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-    )
-    return BenchmarkOutput(throughput, network_throughput_report(throughput, RESULT))

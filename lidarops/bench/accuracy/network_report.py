@@ -1,4 +1,4 @@
-"""Tables and charts of the benchmark of networks of lidars."""
+"""Report page of the accuracy of networks of lidars."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ import numpy as np
 
 from lidarops.bench.accuracy import network_cases
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
-from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.accuracy.network_cases import FigurePoint, LidarLine
 from lidarops.bench.accuracy.network_scores import (
-    READ,
     Comparison,
     NetworkAccuracy,
     NetworkScenario,
     NetworkScore,
-    NetworkThroughput,
     SolverRate,
     VisibilityScore,
 )
+from lidarops.bench.harness.benchmark import facts
+from lidarops.bench.harness.timing import READ
 from lidarops.figures.charts import Chart, Panel, Series
 from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
@@ -44,18 +43,8 @@ def network_accuracy_report(result: NetworkAccuracy, data: str = "") -> Benchmar
             _figure(result.figure),
             _visibility(result.sights),
             _peers(result.comparisons),
-            _cycles(result.cycles),
+            cycles_part(result.cycles),
         ),
-        data=data,
-    )
-
-
-def network_throughput_report(result: NetworkThroughput, data: str = "") -> BenchmarkReport:
-    """Return the page of the throughput benchmark."""
-    return BenchmarkReport(
-        title="Networks of lidars: time per cycle and per profile",
-        facts=facts(result.date, result.machine),
-        parts=(_cycles(result.cycles), _profiles(result)),
         data=data,
     )
 
@@ -423,7 +412,8 @@ def _peers(comparisons: Sequence[Comparison]) -> Part:
     )  # fmt: skip
 
 
-def _cycles(rates: Sequence[SolverRate]) -> Part:
+def cycles_part(rates: Sequence[SolverRate]) -> Part:
+    """Return the section on the CPU time of cycles."""
     return Part(
         title="Cycles per second",
         text="Random cycles, one thread, shortest CPU time of interleaved repeats. Values and "
@@ -449,34 +439,6 @@ def _cycles(rates: Sequence[SolverRate]) -> Part:
                 note=f"Reads: multiples of {READ} of start, end, integral and variance.",
             )
             for beams in sorted({rate.beams for rate in rates})
-        ),
-    )
-
-
-def _profiles(result: NetworkThroughput) -> Part:
-    return Part(
-        title="Whole profiles",
-        text="From signals to extinction with errors, visibility and flags: point values, "
-        "integrals and their covariances, and the solution. One thread. Two threads with half of "
-        f"the cycles of 3 beams each are {result.gain:.2f} times as fast in wall time, which is "
-        "meaningful only on a machine with two idle cores.",
-        tables=tuple(
-            Table(
-                title=f"Profiles of {beams} beams",
-                columns=("method", "profiles", "µs each", "reads"),
-                rows=tuple(
-                    (
-                        rate.method,
-                        f"{rate.size:,}",
-                        f"{rate.nanoseconds / 1e3:,.3g}",
-                        f"{rate.reads:,.1f}",
-                    )
-                    for rate in result.profiles
-                    if rate.beams == beams
-                ),
-                note=f"Reads: multiples of {READ} of the power.",
-            )
-            for beams in sorted({rate.beams for rate in result.profiles})
         ),
     )
 

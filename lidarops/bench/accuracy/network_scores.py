@@ -21,7 +21,6 @@ CLIPPED: Final = 3.0
 """Limit of relative errors: a quotient of noise has no variance."""
 WITHIN: Final = (*SIGMAS, 3.0)
 """Numbers of standard errors."""
-READ: Final = "read (np.max)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +128,6 @@ class NetworkAccuracy:
     sights: tuple[VisibilityScore, ...]
     comparisons: tuple[Comparison, ...]
     cycles: tuple[SolverRate, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkThroughput:
-    """Result of the throughput benchmark of networks of lidars."""
-
-    date: str
-    machine: Machine
-    cycles: tuple[SolverRate, ...]
-    profiles: tuple[SolverRate, ...]
-    gain: float
-    """Wall time of one thread over that of two threads with half of the cycles each."""
 
 
 # Scores ---------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from lidarops.bench.harness.timing import Machine
 from lidarops.reports import benchmark_page
 
 RESULT: Final = "result.json"
@@ -42,3 +43,10 @@ class Effort:
     """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
+
+
+def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
+    """Return date, machine and software of a benchmark run."""
+    packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
+    known = (("Date", date), ("Processor", machine.processor), ("Python", machine.python))
+    return tuple(fact for fact in (*known, ("Packages", packages)) if fact[1])

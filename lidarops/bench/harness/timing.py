@@ -12,8 +12,13 @@ from typing import Final
 
 from lidarops.plan.cost_estimate import processor
 
+READ: Final = "read (np.max)"
+"""Name of the floor of all times: a vectorised read of the same array in the same run."""
 _SHORTEST: Final = 1e-9
 """s; least time, because a coarse clock may not advance during a fast call."""
+_TRIED: Final = 16
+_LONGEST: Final = 0.06
+"""Longest time of one round of a solver, s; slower solvers get fewer profiles."""
 _PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy", "jax")
 
 
@@ -25,6 +30,22 @@ class Machine:
     python: str
     packages: Mapping[str, str]
     """Versions of installed packages by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepCost:
+    """CPU time of one step of a retrieval, or of a peer."""
+
+    step: str
+    batch: int
+    """Profiles per call."""
+    profiles: int
+    """Profiles actually used: fewer for slow steps."""
+    nanoseconds: float
+    """Per profile, least of the repeats."""
+    reads: float
+    """The same as a multiple of the read of the same array in the same run."""
+    ours: bool
 
 
 def machine() -> Machine:
@@ -76,3 +97,18 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return ""
+
+
+def affordable(call: Callable[[int], object], most: int) -> int:
+    """Return how many profiles a call may get; the call takes a number of profiles."""
+    # The fixed cost of a call counts less with more profiles: estimate twice.
+    few = _within(call, min(_TRIED, most), most)
+    return few if few == most else _within(call, few, most)
+
+
+def _within(call: Callable[[int], object], count: int, most: int) -> int:
+    call(count)
+    begin = time.perf_counter()
+    call(count)
+    per_profile = (time.perf_counter() - begin) / count
+    return int(min(most, max(round(_LONGEST / per_profile), _TRIED)))

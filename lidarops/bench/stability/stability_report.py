@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
-from lidarops.bench.accuracy.homogeneous_report import facts
+from lidarops.bench.harness.benchmark import facts
 from lidarops.bench.harness.timing import Machine
 from lidarops.bench.stability.random_scenes import (
     ALL,

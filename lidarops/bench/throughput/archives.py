@@ -15,13 +15,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.benchmark import (
     CAMPAIGN_FILE,
     RESULT,
     BenchmarkKind,
     BenchmarkOutput,
     Effort,
+    facts,
 )
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import stand_in_archives

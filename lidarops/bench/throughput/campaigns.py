@@ -16,13 +16,13 @@ import numpy as np
 import yaml
 from scipy import stats
 
-from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.benchmark import (
     CAMPAIGN_FILE,
     RESULT,
     BenchmarkKind,
     BenchmarkOutput,
     Effort,
+    facts,
 )
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import orchestration

@@ -24,13 +24,13 @@ import numpy as np
 import yaml
 from scipy.optimize import nnls
 
-from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.benchmark import (
     CAMPAIGN_FILE,
     RESULT,
     BenchmarkKind,
     BenchmarkOutput,
     Effort,
+    facts,
 )
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.campaign.model import Campaign, load_campaign

@@ -5,7 +5,6 @@ Times are compared with a vectorised read of the same array in the same run.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,12 +14,20 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
+from lidarops.bench.accuracy.elastic_costs import ELASTIC_LEVEL, elastic_costs
 from lidarops.bench.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
 from lidarops.bench.accuracy.peers import iterative_peers
-from lidarops.bench.harness.timing import Machine, in_threads, least_times, machine
+from lidarops.bench.harness.timing import (
+    READ,
+    Machine,
+    StepCost,
+    affordable,
+    in_threads,
+    least_times,
+    machine,
+)
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
-READ: Final = "read (np.max)"
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)
 THREADED: Final = ("compressed", "fast")
 
@@ -29,9 +36,6 @@ _QUICK_PROFILES: Final = 8_000
 _REPEATS: Final = 9
 _QUICK_REPEATS: Final = 3
 _MISSING: Final = 0.3
-_TRIED: Final = 16
-_LONGEST: Final = 0.06
-"""Longest time of one round of a solver, s; slower solvers get fewer profiles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +146,7 @@ def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
     calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
     sizes = {READ: count}
     for name, solver in _solvers(setting).items():
-        sizes[name] = _affordable(_first(solver, power), count)
+        sizes[name] = affordable(_first(solver, power), count)
         calls[name] = partial(solver, power[: sizes[name]], PATH)
     times = least_times(calls, repeats)
     read = times[READ] / count
@@ -179,21 +183,6 @@ def _first(solver: Callable[[Any, Scenario], object], power: Any) -> Callable[[i
     return lambda few: solver(power[:few], PATH)
 
 
-def _affordable(call: Callable[[int], object], most: int) -> int:
-    """Return how many profiles a call may get; the call takes a number of profiles."""
-    # The fixed cost of a call counts less with more profiles: estimate twice.
-    few = _within(call, min(_TRIED, most), most)
-    return few if few == most else _within(call, few, most)
-
-
-def _within(call: Callable[[int], object], count: int, most: int) -> int:
-    call(count)
-    begin = time.perf_counter()
-    call(count)
-    per_profile = (time.perf_counter() - begin) / count
-    return int(min(most, max(round(_LONGEST / per_profile), _TRIED)))
-
-
 def _threads(method: str, dtype: str, count: int, repeats: int) -> Threads:
     power = _powers(Setting(dtype, known_variance=True, missing=0.0), count)
     call = partial(_solve, HomogeneousMethod(method), 1.0)
@@ -211,27 +200,8 @@ def _threads(method: str, dtype: str, count: int, repeats: int) -> Threads:
 
 # Elastic inversion ----------------------------------------------------------------------------
 
-ALL_STEPS: Final = "all steps"
-ELASTIC_LEVEL: Final = 1e4
-"""Background of the timed profiles, counts per shot."""
 _BATCHES: Final = (1, 100, 2000)
 _QUICK_BATCHES: Final = (1, 400)
-
-
-@dataclass(frozen=True, slots=True)
-class StepCost:
-    """CPU time of one step of the elastic retrieval, or of a peer."""
-
-    step: str
-    batch: int
-    """Profiles per call."""
-    profiles: int
-    """Profiles actually used: fewer for slow steps."""
-    nanoseconds: float
-    """Per profile, least of the repeats."""
-    reads: float
-    """The same as a multiple of the read of the same array in the same run."""
-    ours: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,87 +246,3 @@ def measure_elastic(
         costs += elastic_costs(size, rounds)
         progress(1)
     return ElasticThroughput(date, machine(), elastic_cases.RANGE.size, ELASTIC_LEVEL, tuple(costs))
-
-
-def elastic_costs(batch: int, repeats: int) -> list[StepCost]:
-    """Return the CPU time of each step and peer, the read first.
-
-    Parameters
-    ----------
-    batch : int
-        Profiles per call; slow peers get fewer.
-    repeats : int
-        Timed rounds.
-    """
-    steps, others = _steps(elastic_cases.simulated_sky().counts(ELASTIC_LEVEL, batch))
-    sizes = {name: _affordable(step, batch) for name, step in (steps | others).items()}
-    sizes[READ] = batch
-    calls = {name: partial(step, sizes[name]) for name, step in (steps | others).items()}
-    times = least_times(calls, repeats)
-    read = times[READ] / batch
-    return [
-        StepCost(
-            step=name,
-            batch=batch,
-            profiles=sizes[name],
-            nanoseconds=1e9 * seconds / sizes[name],
-            reads=seconds / sizes[name] / read,
-            ours=name in steps and name != READ,
-        )
-        for name, seconds in times.items()
-    ]
-
-
-_Step = Callable[[int], object]
-"""Runs a step for a number of profiles."""
-
-
-def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
-    """Return the steps of lidarops with the read, and the peers."""
-    sky = elastic_cases.simulated_sky()
-    methods = elastic_cases.background_methods()
-    estimate = methods[elastic_cases.KNOWN_SHAPE](counts, sky)
-    power, noise = (
-        elastic_cases.subtract_background(counts, sky, estimate),
-        elastic_cases.count_variance(counts),
-    )
-    # The peers allow no gaps: they get the bins of incomplete overlap too.
-    whole = counts - estimate.background[:, np.newaxis]
-
-    def solve_particles(few: int) -> object:
-        return elastic_cases.invert_particles(
-            power[:few],
-            sky,
-            elastic_cases.GIVEN_WINDOW,
-            noise=noise[:few],
-            background_error=estimate.standard_error[:few],
-        )
-
-    whole_chain = elastic_cases.Chain(elastic_cases.KNOWN_SHAPE, choose=True)
-
-    def everything(few: int) -> object:
-        first = counts[:few]
-        return elastic_cases.invert(
-            first, sky, methods[whole_chain.method](first, sky), whole_chain
-        )
-
-    ours: dict[str, _Step] = {
-        READ: lambda few: np.max(counts[:few]),
-        elastic_cases.TAIL_MEAN: lambda few: methods[elastic_cases.TAIL_MEAN](counts[:few], sky),
-        elastic_cases.KNOWN_SHAPE: lambda few: methods[elastic_cases.KNOWN_SHAPE](
-            counts[:few], sky
-        ),
-        elastic_cases.KNOWN_CLEAN_RANGE: lambda few: methods[elastic_cases.KNOWN_CLEAN_RANGE](
-            counts[:few], sky
-        ),
-        "layers.screen": lambda few: elastic_cases.find_clouds(power[:few], noise[:few], sky),
-        "reference.choose": lambda few: elastic_cases.choose_window(power[:few], noise[:few], sky),
-        "elastic.solve": solve_particles,
-        ALL_STEPS: everything,
-    }
-    others: dict[str, _Step] = {
-        "background, numpy lstsq": lambda few: elastic_cases.lstsq_backgrounds(counts[:few], sky),
-        "Klett, numpy": lambda few: elastic_cases.klett_numpy(whole[:few], sky),
-        "Klett, Python": lambda few: elastic_cases.klett_python(whole[:few], sky),
-    }
-    return ours, others

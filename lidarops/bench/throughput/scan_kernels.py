@@ -11,8 +11,7 @@ import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.bench.accuracy.multiangle_cases import Scan
-from lidarops.bench.harness.timing import Machine, least_times, machine
-from lidarops.bench.throughput.retrievals import READ, StepCost
+from lidarops.bench.harness.timing import READ, Machine, StepCost, least_times, machine
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle.vertical import smooth_profile

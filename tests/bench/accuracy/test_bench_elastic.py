@@ -13,7 +13,8 @@ from scipy.integrate import quad
 from typer.testing import CliRunner
 
 from lidarops.bench import registry
-from lidarops.bench.accuracy import elastic, elastic_cases, homogeneous_report
+from lidarops.bench.accuracy import elastic, elastic_cases
+from lidarops.bench.accuracy.elastic_costs import ALL_STEPS
 from lidarops.bench.accuracy.homogeneous import (
     MonteCarloFigure,
     background_score,
@@ -21,7 +22,8 @@ from lidarops.bench.accuracy.homogeneous import (
 )
 from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.throughput import retrievals
+from lidarops.bench.harness.timing import READ
+from lidarops.bench.throughput import retrieval_reports, retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.figures.charts import Chart, Panel, Series, draw_chart
@@ -236,10 +238,10 @@ def test_times_are_multiples_of_the_read_of_their_batch(timed):
     assert {cost.batch for cost in timed.costs} == {1, 20}
     for batch in (1, 20):
         group = {cost.step: cost for cost in timed.costs if cost.batch == batch}
-        read = group[retrievals.READ]
+        read = group[READ]
         assert (read.reads, read.ours) == (1.0, False)
         assert {"known_shape", "layers.screen", "reference.choose", "elastic.solve"} <= set(group)
-        assert group[retrievals.ALL_STEPS].ours
+        assert group[ALL_STEPS].ours
         assert not group["Klett, Python"].ours
         for cost in group.values():
             assert cost.reads == pytest.approx(cost.nanoseconds / read.nanoseconds)
@@ -254,7 +256,7 @@ def test_pages_hold_tables_and_figures(accuracy, timed, published, tmp_path):
     assert results.load(elastic.Elastic, results.save(whole, tmp_path / "whole.json")) == whole
     reports = {
         "accuracy": elastic.elastic_accuracy_report(whole, "result.json"),
-        "throughput": homogeneous_report.elastic_throughput_report(timed, "result.json"),
+        "throughput": retrieval_reports.elastic_throughput_report(timed, "result.json"),
     }
     for name, report in reports.items():
         folder = tmp_path / name

@@ -25,8 +25,8 @@ from lidarops.bench.accuracy.homogeneous_cases import (
 from lidarops.bench.accuracy.peers import JIT, iterative_peers
 from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.timing import in_threads, least_times
-from lidarops.bench.throughput import retrievals
+from lidarops.bench.harness.timing import READ, in_threads, least_times
+from lidarops.bench.throughput import retrieval_reports, retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError, RawFormatError
 from lidarops.figures.charts import pareto
@@ -204,7 +204,7 @@ def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
     assert {s.setting for s in timed.speeds} == set(retrievals.settings())
     for setting in retrievals.settings():
         group = {s.method: s for s in timed.speeds if s.setting == setting}
-        read = group[retrievals.READ]
+        read = group[READ]
         assert read.reads == 1.0
         assert set(group) >= {"compressed", "direct"}
         for speed in group.values():
@@ -240,7 +240,7 @@ def test_results_survive_json(accuracy, timed, tmp_path):
 def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
     reports = {
         "accuracy": homogeneous_report.homogeneous_accuracy_report(accuracy, "result.json"),
-        "throughput": homogeneous_report.homogeneous_throughput_report(timed, "result.json"),
+        "throughput": retrieval_reports.homogeneous_throughput_report(timed, "result.json"),
     }
     for name, report in reports.items():
         folder = tmp_path / name

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from lidarops.bench import registry
 from lidarops.bench.accuracy import multiangle_cases, multiangle_report, multiangle_scores
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.multiangle_scores import StudySize
 from lidarops.bench.harness import results
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, Effort
-from lidarops.bench.throughput import scan_kernels
-from lidarops.bench.throughput.retrievals import READ
+from lidarops.bench.harness.benchmark import RESULT, Effort
+from lidarops.bench.harness.timing import READ
+from lidarops.bench.throughput import scan_kernels, scan_report
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleFlags,
@@ -346,7 +347,7 @@ def test_times_are_multiples_of_the_read(timed):
 def test_pages_have_tables_and_figures(study, timed, tmp_path):
     reports = {
         "accuracy": multiangle_report.multiangle_accuracy_report(study, RESULT),
-        "throughput": multiangle_report.multiangle_throughput_report(timed, RESULT),
+        "throughput": scan_report.multiangle_throughput_report(timed, RESULT),
     }
     for name, report in reports.items():
         folder = tmp_path / name
@@ -382,11 +383,11 @@ def test_both_kinds_run(monkeypatch, study, timed):
         calls.append(arguments)
         return timed
 
-    monkeypatch.setattr(multiangle_report, "measure_multiangle", accuracy)
-    monkeypatch.setattr(multiangle_report, "measure_scan_kernels", throughput)
+    monkeypatch.setattr(multiangle_scores, "measure_multiangle", accuracy)
+    monkeypatch.setattr(scan_kernels, "measure_scan_kernels", throughput)
     effort = Effort(quick=True, repeats=2, date="2024-01-01")
-    assert multiangle_report.run_multiangle(BenchmarkKind.ACCURACY, effort=effort).result is study
-    assert multiangle_report.run_multiangle(BenchmarkKind.THROUGHPUT, effort=effort).result is timed
+    assert registry.run_benchmark("accuracy", "multiangle", [], effort).result is study
+    assert registry.run_benchmark("throughput", "multiangle", [], effort).result is timed
     assert [call["quick"] for call in calls] == [True, True]
     assert calls[1]["repeats"] == 2
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from lidarops.bench import registry
 from lidarops.bench.accuracy import network as network_benchmark
 from lidarops.bench.accuracy import network_cases
 from lidarops.bench.accuracy import network_scores as scores
@@ -16,10 +17,11 @@ from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.network_report import (
     bracketed,
     network_accuracy_report,
-    network_throughput_report,
 )
 from lidarops.bench.harness import results
-from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.timing import READ
+from lidarops.bench.throughput import networks
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import solve_cycle, systematic_error
@@ -36,7 +38,7 @@ def accuracy():
 
 @pytest.fixture(scope="module")
 def throughput_result():
-    return network_benchmark.measure_network_throughput(quick=True, date="2024-01-01", repeats=1)
+    return networks.measure_network_throughput(quick=True, date="2024-01-01", repeats=1)
 
 
 @pytest.fixture(scope="module")
@@ -359,7 +361,7 @@ def test_times_are_multiples_of_the_read(accuracy, throughput_result):
     for rates in (accuracy.cycles, throughput_result.cycles, throughput_result.profiles):
         for beams in {rate.beams for rate in rates}:
             group = {rate.method: rate for rate in rates if rate.beams == beams}
-            read = group[scores.READ]
+            read = group[READ]
             assert (read.reads, read.ours) == (1.0, False)
             for rate in group.values():
                 assert rate.reads == pytest.approx(rate.nanoseconds / read.nanoseconds)
@@ -375,7 +377,7 @@ def test_times_are_multiples_of_the_read(accuracy, throughput_result):
 def test_pages_hold_tables_and_figures(accuracy, throughput_result, tmp_path):
     for name, report in (
         ("accuracy", network_accuracy_report(accuracy, "result.json")),
-        ("throughput", network_throughput_report(throughput_result, "result.json")),
+        ("throughput", networks.network_throughput_report(throughput_result, "result.json")),
     ):
         folder = tmp_path / name
         text = build_benchmark_page(report, folder).read_text()
@@ -412,16 +414,14 @@ def test_the_command_runs_the_requested_benchmark(monkeypatch, accuracy, through
         return accuracy
 
     monkeypatch.setattr(network_benchmark, "measure_network", measure)
-    monkeypatch.setattr(
-        network_benchmark, "measure_network_throughput", lambda **_: throughput_result
-    )
-    output = network_benchmark.run_network(
-        BenchmarkKind.ACCURACY, effort=Effort(quick=True, date="2024-01-01")
+    monkeypatch.setattr(networks, "measure_network_throughput", lambda **_: throughput_result)
+    output = registry.run_benchmark(
+        "accuracy", "network", [], Effort(quick=True, date="2024-01-01")
     )
     assert (received["quick"], received["date"]) == (True, "2024-01-01")
     assert output.result is accuracy
     assert output.report.data == "result.json"
-    throughput = network_benchmark.run_network(BenchmarkKind.THROUGHPUT, effort=Effort())
+    throughput = registry.run_benchmark("throughput", "network", [], Effort())
     assert throughput.result is throughput_result
     assert [chapter.title for chapter in throughput.report.parts] == [
         "Cycles per second",
