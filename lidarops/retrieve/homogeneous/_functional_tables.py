@@ -45,9 +45,8 @@ COUPLING: Final = 3
 LEVEL_SLOPE: Final = 4
 LEVEL_SHAPE: Final = 5
 DECAY: Final = 6
-LOST_NORM: Final = 7
-BACKGROUND_BEND: Final = 8
-EXTINCTION_BEND: Final = 9
+BACKGROUND_BEND: Final = 7
+EXTINCTION_BEND: Final = 8
 SCALARS: Final = 12
 """Columns, padded to whole vectors."""
 
@@ -207,7 +206,6 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
         (mean_slope - coupling * mean) / (norm * turn),
         mean / norm,
         np.exp(-2 * tau * step),
-        _norm(family.centred(shapes)) ** 2 - norm**2,
         *_bend(family, shapes),
     ]
     scalars += [np.zeros_like(norm)] * (SCALARS - len(scalars))
