@@ -50,18 +50,18 @@ def test_units_in_brackets_are_turned_into_si(
 ) -> None:
     length, force, zero = scales
     name = _sounding(tmp_path, head, ALTITUDE * length, PRESSURE * force, TEMPERATURE + zero)
-    found, digest = molecular_profile(tmp_path, name)
-    np.testing.assert_allclose(found.altitude, ALTITUDE, rtol=1e-8)
-    np.testing.assert_allclose(found.pressure, PRESSURE, rtol=1e-8)
-    np.testing.assert_allclose(found.temperature, TEMPERATURE, rtol=1e-8)
+    profile, digest = molecular_profile(tmp_path, name)
+    np.testing.assert_allclose(profile.altitude, ALTITUDE, rtol=1e-8)
+    np.testing.assert_allclose(profile.pressure, PRESSURE, rtol=1e-8)
+    np.testing.assert_allclose(profile.temperature, TEMPERATURE, rtol=1e-8)
     assert digest == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
 
 
 def test_unused_columns_may_hold_anything(tmp_path: Path) -> None:
     (tmp_path / "o.csv").write_text("note,overlap,range [km]\nnear,0.25,0.2\n,1,0.4\n")
-    found, _ = overlap_profile(tmp_path, "o.csv")
-    np.testing.assert_allclose(found.range, [200.0, 400.0])
-    np.testing.assert_array_equal(found.overlap, [0.25, 1.0])
+    profile, _ = overlap_profile(tmp_path, "o.csv")
+    np.testing.assert_allclose(profile.range, [200.0, 400.0])
+    np.testing.assert_array_equal(profile.overlap, [0.25, 1.0])
 
 
 def test_netcdf_is_the_same_as_csv(tmp_path: Path) -> None:
@@ -89,8 +89,8 @@ def test_netcdf_is_the_same_as_csv(tmp_path: Path) -> None:
 
 def test_overlap_between_its_ranges(tmp_path: Path) -> None:
     (tmp_path / "o.csv").write_text(OVERLAP)
-    found, _ = overlap_profile(tmp_path, "o.csv")
-    at = found.at(np.array([-10.0, 199.9, 200.0, 300.0, 600.0, 601.0, 9000.0]))
+    profile, _ = overlap_profile(tmp_path, "o.csv")
+    at = profile.at(np.array([-10.0, 199.9, 200.0, 300.0, 600.0, 601.0, 9000.0]))
     np.testing.assert_array_equal(at, [np.nan, np.nan, 0.25, 0.5, 1.0, 1.0, 1.0])
 
 
@@ -227,14 +227,14 @@ def test_files_of_a_plan_are_read_once_and_recorded(tmp_path: Path) -> None:
         products={"elastic": {"channels": ["analog_532o", "photon_532o"]}},
     )
     scene = cut_scenes(campaign, (factories.granule(0),)).scenes[0]
-    found = Ancillaries.read(tmp_path, plan_scene(scene, campaign))
-    assert list(found.profiles) == ["air.csv"]
-    assert list(found.overlaps) == ["o.csv"]
-    assert [(each.path, each.role) for each in found.inputs] == [
+    files = Ancillaries.read(tmp_path, plan_scene(scene, campaign))
+    assert list(files.profiles) == ["air.csv"]
+    assert list(files.overlaps) == ["o.csv"]
+    assert [(file.path, file.role) for file in files.inputs] == [
         ("air.csv", Role.MOLECULAR),
         ("o.csv", Role.OVERLAP),
     ]
-    for each in found.inputs:
-        assert each.sha256 == hashlib.sha256((tmp_path / each.path).read_bytes()).hexdigest()
+    for file in files.inputs:
+        assert file.sha256 == hashlib.sha256((tmp_path / file.path).read_bytes()).hexdigest()
     bare = factories.campaign()
     assert Ancillaries.read(tmp_path, plan_scene(scene, bare)) == Ancillaries({}, {}, ())

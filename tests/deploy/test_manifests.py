@@ -107,23 +107,23 @@ def rendered() -> list[dict[str, Any]]:
 
 
 def of_kind(rendered: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
-    return {each["metadata"]["name"]: each for each in rendered if each["kind"] == kind}
+    return {item["metadata"]["name"]: item for item in rendered if item["kind"] == kind}
 
 
 def test_deployments_are_well_formed_and_have_no_rights(rendered: list[dict[str, Any]]) -> None:
     deployments = of_kind(rendered, "Deployment")
     assert len(deployments) == 5
-    for each in deployments.values():
-        jsonschema.validate(each["spec"], DEPLOYMENT)
-        labels = each["spec"]["template"]["metadata"]["labels"]
-        assert each["spec"]["selector"]["matchLabels"] == labels
+    for deployment in deployments.values():
+        jsonschema.validate(deployment["spec"], DEPLOYMENT)
+        labels = deployment["spec"]["template"]["metadata"]["labels"]
+        assert deployment["spec"]["selector"]["matchLabels"] == labels
 
 
 def test_what_manifests_refer_to_is_there(rendered: list[dict[str, Any]]) -> None:
-    known = {kind: of_kind(rendered, kind) for kind in {each["kind"] for each in rendered}}
+    known = {kind: of_kind(rendered, kind) for kind in {item["kind"] for item in rendered}}
     readme = (Path(__file__).parents[2] / "deploy" / "README.md").read_text()
-    for each in known["Deployment"].values():
-        pod = each["spec"]["template"]["spec"]
+    for deployment in known["Deployment"].values():
+        pod = deployment["spec"]["template"]["spec"]
         volumes = {volume["name"] for volume in pod["volumes"]}
         for container in pod["containers"]:
             assert {mount["name"] for mount in container["volumeMounts"]} == volumes
@@ -140,7 +140,7 @@ def test_what_manifests_refer_to_is_there(rendered: list[dict[str, Any]]) -> Non
         assert service["spec"]["selector"] == {"app": name}
         assert name in known["Deployment"]
         assert service["spec"].get("type", "ClusterIP") == "ClusterIP"
-    assert all(each["metadata"].get("namespace", "lidarops") == "lidarops" for each in rendered)
+    assert all(item["metadata"].get("namespace", "lidarops") == "lidarops" for item in rendered)
 
 
 def test_a_run_may_scale_the_workers_and_nothing_else(rendered: list[dict[str, Any]]) -> None:
@@ -171,22 +171,22 @@ def test_prefect_file(repository: Path) -> None:
 
     text = (repository / "deploy" / "prefect.yaml").read_text()
     shipped = PrefectYamlModel.model_validate(yaml.safe_load(text))
-    assert {each.name for each in shipped.deployments} == {
+    assert {deployment.name for deployment in shipped.deployments} == {
         "demo-nightly",
         "demo-full",
         "demo-catalog",
         "maintenance",
     }
-    for each in shipped.deployments:
-        assert each.tags
-        assert "lidarops" in each.tags
-        assert each.enforce_parameter_schema
-        assert each.concurrency_limit.limit == 1
-        path, _, name = each.entrypoint.partition(":")
+    for deployment in shipped.deployments:
+        assert deployment.tags
+        assert "lidarops" in deployment.tags
+        assert deployment.enforce_parameter_schema
+        assert deployment.concurrency_limit.limit == 1
+        path, _, name = deployment.entrypoint.partition(":")
         module = __import__(path.removesuffix(".py").replace("/", "."), fromlist=[name])
         flow = getattr(module, name)
-        flow.validate_parameters(each.parameters)
-        campaign = each.parameters.get("campaign")
+        flow.validate_parameters(deployment.parameters)
+        campaign = deployment.parameters.get("campaign")
         assert campaign is None or (repository / campaign).is_file()
 
 

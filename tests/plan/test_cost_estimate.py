@@ -45,14 +45,14 @@ def of(**changes: Any) -> dict[Term, float]:
 
 
 def test_amounts_of_sections():
-    found = of(count=10)
+    counts = of(count=10)
     (window,) = (s for s in planned()[1].steps if s.name == "range_window")
-    assert found[Term.FILE] == 10
-    assert found[Term.DIGEST] == 10 * 1000
-    assert found[Term.CHANNEL] == found[Term.HOMOGENEOUS] == found[Term.LOOK] == 1
-    assert found[Term.VALUE] == 10 * window.number
-    assert found[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
-    assert Term.SIGNAL not in found
+    assert counts[Term.FILE] == 10
+    assert counts[Term.DIGEST] == 10 * 1000
+    assert counts[Term.CHANNEL] == counts[Term.HOMOGENEOUS] == counts[Term.LOOK] == 1
+    assert counts[Term.VALUE] == 10 * window.number
+    assert counts[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
+    assert Term.SIGNAL not in counts
 
 
 def test_known_digests_cost_nothing():
@@ -90,8 +90,8 @@ def test_nothing_to_do_costs_nothing():
 
 @given(st.integers(1, 60), st.integers(1, 60), st.sampled_from([1000, 2000, 4000]))
 def test_more_profiles_and_bins_never_cost_less(few, more, bins):
-    layout = tuple(replace(each, bins=bins) for each in (factories.PHOTON, factories.ANALOG))
-    wider: tuple[ChannelLayout, ...] = tuple(replace(each, bins=2 * bins) for each in layout)
+    layout = tuple(replace(channel, bins=bins) for channel in (factories.PHOTON, factories.ANALOG))
+    wider: tuple[ChannelLayout, ...] = tuple(replace(channel, bins=2 * bins) for channel in layout)
     model = Costs(DEFAULTS)
     products = {"signal": {}, **LEVEL}
     one = model.of(of(count=few, products=products, layout=layout))
@@ -136,20 +136,20 @@ def test_a_calibration_is_read_as_written(cache: Path):
         Costs(seconds, processor=cost_estimate.processor(), date="2026-01-02")
     )
     assert kept == cache
-    found = cost_estimate.load_calibration()
-    assert found.seconds == seconds
-    assert found.words == "calibrated on this machine on 2026-01-02"
+    calibration = cost_estimate.load_calibration()
+    assert calibration.seconds == seconds
+    assert calibration.words == "calibrated on this machine on 2026-01-02"
     assert [path.name for path in cache.parent.iterdir()] == [cache.name]
 
 
 def test_the_note_states_a_missing_calibration(cache: Path):
-    found = cost_estimate.load_calibration()
-    assert found.seconds == DEFAULTS
-    assert found.words.startswith("not calibrated on this machine")
+    calibration = cost_estimate.load_calibration()
+    assert calibration.seconds == DEFAULTS
+    assert calibration.words.startswith("not calibrated on this machine")
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"processor": "abacus"}, "another processor, abacus"),
         ({"format": "letter"}, "not a calibration"),
@@ -158,15 +158,15 @@ def test_the_note_states_a_missing_calibration(cache: Path):
         ({"seconds": dict.fromkeys(Term, "soon")}, "soon"),
     ],
 )
-def test_an_invalid_calibration_is_reported_and_not_used(cache: Path, change: Any, said: str):
+def test_an_invalid_calibration_is_reported_and_not_used(cache: Path, change: Any, message: str):
     cost_estimate.save_calibration(
         Costs(DEFAULTS, processor=cost_estimate.processor(), date="2026-01-02")
     )
     cache.write_text(json.dumps({**json.loads(cache.read_text()), **change}))
-    found = cost_estimate.load_calibration()
-    assert found.seconds == DEFAULTS
-    assert "not calibrated" in found.note
-    assert said in found.note
+    calibration = cost_estimate.load_calibration()
+    assert calibration.seconds == DEFAULTS
+    assert "not calibrated" in calibration.note
+    assert message in calibration.note
 
 
 @pytest.fixture
@@ -183,9 +183,9 @@ def homeless(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("homeless")
 def test_without_a_home_there_is_no_calibration():
-    found = cost_estimate.load_calibration()
-    assert found.seconds == DEFAULTS
-    assert "XDG_CACHE_HOME" in found.words
+    calibration = cost_estimate.load_calibration()
+    assert calibration.seconds == DEFAULTS
+    assert "XDG_CACHE_HOME" in calibration.words
     with pytest.raises(CatalogError, match="XDG_CACHE_HOME"):
         cost_estimate.save_calibration(Costs(DEFAULTS))
 

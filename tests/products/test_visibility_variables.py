@@ -27,10 +27,10 @@ def data() -> xr.Dataset:
 
 @pytest.mark.parametrize("intervals", [1, 6])
 def test_it_complies(intervals: int, tmp_path: Path):
-    found = made(intervals)
+    retrieved = made(intervals)
     path = tmp_path / "product.nc"
-    write_product(build_product(found, context(KIND)), path)
-    assert findings(path) == (set(), permitted(KIND, found))
+    write_product(build_product(retrieved, context(KIND)), path)
+    assert findings(path) == (set(), permitted(KIND, retrieved))
 
 
 def test_missing_values_only_comply(data: xr.Dataset, tmp_path: Path):
@@ -47,24 +47,24 @@ def test_missing_values_only_comply(data: xr.Dataset, tmp_path: Path):
 def test_each_crossing_is_a_time_series(data: xr.Dataset, tmp_path: Path):
     path = tmp_path / "product.nc"
     write_product(build_product(data, context(KIND)), path)
-    with xr.open_dataset(path) as found:
-        assert found.attrs["featureType"] == "timeSeries"
-        roles = [name for name, v in found.variables.items() if "cf_role" in v.attrs]
+    with xr.open_dataset(path) as stored:
+        assert stored.attrs["featureType"] == "timeSeries"
+        roles = [name for name, v in stored.variables.items() if "cf_role" in v.attrs]
         assert roles == ["crossing_id"]
-        assert found["crossing_id"].dims == ("crossing",)
-        main = found["visibility_in_air"]
+        assert stored["crossing_id"].dims == ("crossing",)
+        main = stored["visibility_in_air"]
         assert main.attrs["standard_name"] == "visibility_in_air"
         assert main.attrs["units"] == "m"
         assert main.dims == ("time", "crossing")
         assert {"latitude", "longitude", "altitude", "crossing_id"} <= set(main.coords)
-        assert found.attrs["geospatial_lat_min"] == pytest.approx(float(data["latitude"].min()))
-        assert found.attrs["geospatial_lon_max"] == pytest.approx(float(data["longitude"].max()))
-        assert "POLYGON" in found.attrs["geospatial_bounds"]
+        assert stored.attrs["geospatial_lat_min"] == pytest.approx(float(data["latitude"].min()))
+        assert stored.attrs["geospatial_lon_max"] == pytest.approx(float(data["longitude"].max()))
+        assert "POLYGON" in stored.attrs["geospatial_bounds"]
         # Positions and pointings of the lidars.
-        np.testing.assert_allclose(found["beam_azimuth"], [70, 310, 190])
-        np.testing.assert_allclose(found["beam_latitude"], data["beam_latitude"])
-        assert np.isfinite(found["beam_range"]).sum() == 6
-        assert "beam 0: lidar-0" in found.attrs["lidarops_steps"]
+        np.testing.assert_allclose(stored["beam_azimuth"], [70, 310, 190])
+        np.testing.assert_allclose(stored["beam_latitude"], data["beam_latitude"])
+        assert np.isfinite(stored["beam_range"]).sum() == 6
+        assert "beam 0: lidar-0" in stored.attrs["lidarops_steps"]
         np.testing.assert_allclose(main, data["visibility_in_air"], rtol=2e-4)
 
 

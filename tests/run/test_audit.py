@@ -106,7 +106,7 @@ def test_commands_that_read_the_ledger_create_none(command: str, archive: Archiv
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         (["--product", "luck"], 2, "homogeneous"),
         (["--instrument", "luck"], 2, "poor"),
@@ -127,11 +127,11 @@ def test_commands_that_read_the_ledger_create_none(command: str, archive: Archiv
     ],
 )
 def test_wrong_use_names_the_choices(
-    archive: Archive, words: list[str], code: int, said: str
+    archive: Archive, words: list[str], code: int, message: str
 ) -> None:
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), *words])
     assert result.exit_code == code
-    assert said in result.output
+    assert message in result.output
 
 
 @pytest.mark.parametrize("command", ["catalog", "plan", "verify"])
@@ -176,15 +176,15 @@ def test_a_size_of_memory_is_read_before_the_archive(tmp_path: Path) -> None:
 def test_a_selection_without_scene_is_reported_unlike_one_with_fresh_products(
     archive: Archive,
 ) -> None:
-    def said(*words: str) -> str:
+    def output(*words: str) -> str:
         return CliRunner().invoke(app, ["reprocess", str(archive.file), *words]).output
 
     none = "the selection contains no scene of the archive"
-    assert none in said("--since", "2026-04-01")
-    assert none in said("--until", "2026-03-01", "--instrument", "poor")
+    assert none in output("--since", "2026-04-01")
+    assert none in output("--until", "2026-03-01", "--instrument", "poor")
     kind = ["--product", "homogeneous"]
     for words in (["--since", "2026-03-02"], kind, [*kind, "--instrument", "poor"]):
-        fresh = said(*words)
+        fresh = output(*words)
         assert "is fresh" in fresh
         assert none not in fresh
 
@@ -200,18 +200,18 @@ def test_a_product_is_reproduced_from_moved_raw_files(
     product = sorted((archive.folder / "out/products").rglob("poor/signal/**/*.nc"))[-1]
     raw = archive.folder / "raw" / "poor"
     (raw / "h10").rename(raw / "h-moved")
-    code, said = made(product)
+    code, output = made(product)
     assert code == 1
-    assert "input poor/h10: missing" in said
-    assert "--catalog" in said
+    assert "input poor/h10: missing" in output
+    assert "--catalog" in output
     # Another file takes the name of an input.
     (raw / "h11").rename(raw / "h-too")
     (raw / "h00").rename(raw / "h11")
     before = product.stat().st_mtime_ns
     CliRunner().invoke(app, ["reprocess", str(archive.file)])
     assert product.stat().st_mtime_ns == before
-    code, said = made(product)
-    assert code == 0, said
+    code, output = made(product)
+    assert code == 0, output
     # No input is left under its name.
     (raw / "h12").rename(raw / "h-last")
     (raw / "h11").rename(raw / "h-first")
@@ -223,10 +223,10 @@ def test_a_product_is_reproduced_from_moved_raw_files(
         assert made(elsewhere, "--archive", place)[0] == 1
         assert made(elsewhere, "--archive", place, "--catalog", catalog)[0] == 0
     (raw / "h-last").unlink()
-    code, said = made(product)
+    code, output = made(product)
     assert code == 1
-    assert "input poor/h12: missing" in said
-    assert "h10" not in said
+    assert "input poor/h12: missing" in output
+    assert "h10" not in output
     nothing = made(product, "--catalog", f"sqlite:///{archive.folder}/none.sqlite")
     assert nothing[0] == 1
     assert "there is no catalog yet" in nothing[1]
