@@ -17,8 +17,7 @@ from lidarops.flags import Quality
 _TAIL: Final = 0.1
 """Share of the bins, the farthest, whose power is the background."""
 _FEWEST: Final = 8
-"""Bins of the stretch that a profile needs to be tested; with fewer, one outlying bin would decide
-the significance."""
+"""Fewest bins of the stretch for a profile to be tested. No study is recorded that set it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,8 @@ _FIRST_GUESS: Final = 0.03**2
 _LEAST_GUESS: Final = 0.01
 """Smallest variance of the second fit, over the largest of all altitudes."""
 _FEWEST_FREEDOM: Final = 4.1
-"""Degrees of freedom below which Student's variance would diverge."""
+"""Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2. No study is
+recorded that set it."""
 OUTLYING: Final = 4.5
 """Least limit, in standard errors, beyond which a residual starts the robust passes."""
 FALSE_ALARM: Final = 0.01

@@ -43,7 +43,7 @@ EXPECTED: Final = 12
 COLUMNS: Final = 13
 
 TILE: Final = 256
-"""Altitudes processed together, so that their sums stay in the cache."""
+"""Altitudes processed together."""
 _SAME_PATH: Final = 1e-20
 """Variance of slant paths up to which they count as equal."""
 _OPPOSITE: Final = 1e-6

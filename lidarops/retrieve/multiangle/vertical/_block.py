@@ -36,7 +36,8 @@ _NEGLIGIBLE: Final = 1e-4
 _LEAST_FREEDOM_TO_REJECT: Final = 2.0
 """Degrees of freedom of 4 beams: with fewer, an outlying estimate cannot be identified."""
 _FEWEST_FREEDOM: Final = 4.1
-"""Degrees of freedom below which Student's variance would diverge."""
+"""Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2. No study is
+recorded that set it."""
 _DOWNWEIGHTED_BELOW: Final = 0.5
 """Share of its weight below which an estimate is reported as an outlier."""
 
