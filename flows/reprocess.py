@@ -41,17 +41,17 @@ from pydantic import Field
 from flows import WITH_FAILURES
 from flows.usage import plain_errors
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.campaign.product_settings import Instant
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
-from lidarops.records import ProductKind, RunRecord, SceneOutcome
+from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import run_page
 from lidarops.run import clusters
 from lidarops.run.archive import Options, Result, Selection, bring_up_to_date, report_run
 from lidarops.run.options import missing_report
 from lidarops.run.publication import publish_products
 from lidarops.run.selection import check_archive_and_catalog, check_selection, selects_no_scene
+from lidarops.settings import Instant
 
 _T = TypeVar("_T")
 
@@ -195,7 +195,7 @@ def reprocess(
     publish: str | None = None,
     catalog: str | None = None,
     stations: list[str] | None = None,
-    products: list[ProductKind] | None = None,
+    products: list[str] | None = None,
     memory_limit: clusters.Memory | None = None,
     *,
     full: bool = False,
@@ -269,7 +269,7 @@ def reprocess(
 def _selection(
     instruments: list[str] | None,
     stations: list[str] | None,
-    products: list[ProductKind] | None,
+    products: list[str] | None,
     since: datetime | None,
     until: datetime | None,
 ) -> Selection:
@@ -341,7 +341,7 @@ def main(
         list[str] | None, typer.Option(help="Only this one; may be repeated.")
     ] = None,
     product: Annotated[
-        list[ProductKind] | None, typer.Option(help="Only this kind of product; may be repeated.")
+        list[str] | None, typer.Option(help="Only this kind of product; may be repeated.")
     ] = None,
     since: Annotated[
         datetime | None, typer.Option(help="Only scenes that end after this UTC time.")

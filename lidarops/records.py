@@ -13,7 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any
+
+from lidarops.kinds import kinds
 
 
 class DetectionMode(StrEnum):
@@ -37,16 +39,6 @@ class Status(StrEnum):
 
     GOOD = "good"
     REFUSED = "refused"
-
-
-class ProductKind(StrEnum):
-    """Kind of product."""
-
-    SIGNAL = "signal"
-    HOMOGENEOUS = "homogeneous"
-    ELASTIC = "elastic"
-    MULTIANGLE = "multiangle"
-    VISIBILITY = "visibility"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +228,7 @@ class Provenance:
 
     campaign: str
     scene: str
-    kind: ProductKind
+    kind: str
     channel: str
     inputs: tuple[InputRecord, ...]
     plan: Plan
@@ -253,7 +245,7 @@ class ProductRecord:
 
     path: str
     """Relative to the product root, with forward slashes."""
-    kind: ProductKind
+    kind: str
     channel: str
     sha256: str
     size: int
@@ -265,13 +257,6 @@ class ProductRecord:
     """Number of values that carry no bit."""
     usable: int | None = None
     """Number of values without a rejecting bit; None where they were not counted."""
-
-
-EXPECTED_USABLE: Final = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
-"""Kinds of product of which a scene should have usable values.
-
-Not ``homogeneous``: its sections are retrieved in any air, and fog or darkness rejects all values.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,8 +288,13 @@ class SceneOutcome:
 
     @property
     def unusable(self) -> bool:
-        """Whether all values of the products in `EXPECTED_USABLE` are rejected."""
-        retrieved = [product for product in self.products if product.kind in EXPECTED_USABLE]
+        """Whether all values of the products that should have usable ones are rejected."""
+        known = kinds()
+        retrieved = [
+            product
+            for product in self.products
+            if product.kind in known and known[product.kind].expects_usable
+        ]
         return bool(retrieved) and all(product.usable == 0 for product in retrieved)
 
 

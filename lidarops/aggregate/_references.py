@@ -24,7 +24,7 @@ from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, opened, 
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.records import DetectionMode
 
 Refs = dict[str, Any]
 
@@ -76,7 +76,7 @@ class Part:
 class Template:
     """Variables and static coordinates of a group, from its first product."""
 
-    kind: ProductKind
+    kind: str
     variables: Mapping[str, xr.Variable]
     """Values are loaded only for coordinates that do not change with time."""
 

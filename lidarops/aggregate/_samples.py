@@ -23,7 +23,6 @@ from lidarops.aggregate.means_variables import (
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import QUALITY_FLAG, Row
-from lidarops.records import ProductKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +71,7 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
         )
 
 
-def _sample(product: xr.Dataset, kind: ProductKind, row: Row, usable: NDArray[np.bool_]) -> Sample:
+def _sample(product: xr.Dataset, kind: str, row: Row, usable: NDArray[np.bool_]) -> Sample:
     values = numbers(product, row.name)
     errors = numbers(product, f"{row.name}_standard_error")
     budget = budget_of(kind, row.name)
@@ -89,7 +88,7 @@ def _sample(product: xr.Dataset, kind: ProductKind, row: Row, usable: NDArray[np
 
 
 def _systematic_error(
-    product: xr.Dataset, kind: ProductKind, name: str, values: Array, errors: Array
+    product: xr.Dataset, kind: str, name: str, values: Array, errors: Array
 ) -> Array | None:
     """Return the systematic error that is not part of the standard error; None without one."""
     if name in INTERVALS:

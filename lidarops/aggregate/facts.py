@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import PROVENANCE
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import ProductKind
+from lidarops.kinds import kinds
+from lidarops.netcdf.variables import PROVENANCE, layout_of
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""
@@ -37,7 +36,7 @@ class Facts:
     path: str
     """Relative to the folder of the aggregate's products, with forward slashes."""
     id: str
-    kind: ProductKind
+    kind: str
     campaign: str
     station: str
     instrument: str
@@ -80,14 +79,14 @@ class Group:
 
     station: str
     instrument: str
-    kind: ProductKind
+    kind: str
     channel: str
     grid: str
 
     @property
     def name(self) -> str:
         """Name of the group in file names."""
-        return f"{self.station}_{self.instrument}_{self.kind.value}_{self.channel}_{self.grid[:8]}"
+        return f"{self.station}_{self.instrument}_{self.kind}_{self.channel}_{self.grid[:8]}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +101,7 @@ class Refused:
 class ProductSelection:
     """Selection of products; None selects all."""
 
-    kind: ProductKind | None = None
+    kind: str | None = None
     channel: str | None = None
     station: str | None = None
     instrument: str | None = None
@@ -113,7 +112,7 @@ class ProductSelection:
 
     def admits(
         self,
-        kind: ProductKind,
+        kind: str,
         station: str,
         instrument: str,
         channel: str,
@@ -309,7 +308,7 @@ def opened(file: Path) -> Iterator[xr.Dataset]:
         raise ProductError(f"cannot be read: {error}", file=file) from error
 
 
-def _kind_of(product: xr.Dataset, file: Path) -> ProductKind:
+def _kind_of(product: xr.Dataset, file: Path) -> str:
     """Return the kind of a product.
 
     Raises
@@ -318,22 +317,22 @@ def _kind_of(product: xr.Dataset, file: Path) -> ProductKind:
         If the file is not a product, or of an unknown kind.
     """
     kind = product.attrs.get("lidarops_kind")
-    if kind not in set(ProductKind):
+    if kind not in set(kinds()):
         problem = "is not a product of lidarops" if kind is None else f"has an unknown kind: {kind}"
         raise ProductError(problem, file=file)
     if PERIOD in product.attrs:
         raise ProductError("holds means of products and is not a product itself", file=file)
-    return ProductKind(kind)
+    return str(kind)
 
 
-def coordinate_names(kind: ProductKind) -> frozenset[str]:
+def coordinate_names(kind: str) -> frozenset[str]:
     """Return the names of the coordinates of a product kind, including bounds."""
-    rows = LAYOUTS[kind].coordinates
+    rows = layout_of(kind).coordinates
     bounds = (row.bounds for row in rows if row.bounds)
     return frozenset({*(row.name for row in rows), *bounds})
 
 
-def _grid_digest(product: xr.Dataset, kind: ProductKind) -> str:
+def _grid_digest(product: xr.Dataset, kind: str) -> str:
     """Return a digest of what must be equal in products that are joined along time.
 
     These are names, types, dimensions, units and flags of the variables, and the values of all
@@ -343,14 +342,14 @@ def _grid_digest(product: xr.Dataset, kind: ProductKind) -> str:
     ----------
     product : xr.Dataset
         Not decoded.
-    kind : ProductKind
+    kind : str
 
     Returns
     -------
     str
         16 hexadecimal digits.
     """
-    digest = hashlib.sha256(kind.value.encode())
+    digest = hashlib.sha256(kind.encode())
     coordinates = coordinate_names(kind)
     for name in sorted(str(name) for name in product.variables):
         if name in UNSHARED:
@@ -401,7 +400,7 @@ def grid_notes(all_groups: Iterable[Group]) -> list[str]:
     """
     grids: dict[tuple[str, str, str, str], list[str]] = {}
     for group in all_groups:
-        series = (group.station, group.instrument, group.kind.value, group.channel)
+        series = (group.station, group.instrument, group.kind, group.channel)
         grids.setdefault(series, []).append(group.grid[:8])
     return [
         f"{' '.join(series)}: products of {len(names)} grids, which are not joined:"

@@ -22,7 +22,6 @@ from lidarops.aggregate.facts import FOLDER, Facts, ProductSelection
 from lidarops.aggregate.selection import parse_selection
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.records import ProductKind
 from lidarops.system.files import write_atomically
 
 INDEX: Final = "products.parquet"
@@ -43,7 +42,7 @@ _ENCODINGS: Final = {
 
 _Cell = Callable[[Facts], Any]
 _COLUMNS: Final[Mapping[str, tuple[str, _Cell]]] = {
-    "kind": ("dictionary", lambda facts: facts.kind.value),
+    "kind": ("dictionary", lambda facts: facts.kind),
     "campaign": ("dictionary", lambda facts: facts.campaign),
     "station": ("dictionary", lambda facts: facts.station),
     "instrument": ("dictionary", lambda facts: facts.instrument),
@@ -143,7 +142,7 @@ def _flag_column(bit: Quality) -> str:
 def find_products(
     index: str | os.PathLike[str],
     *,
-    kind: ProductKind | str | None = None,
+    kind: str | None = None,
     channel: str | None = None,
     station: str | None = None,
     instrument: str | None = None,
@@ -231,7 +230,7 @@ def _filters(selection: ProductSelection) -> list[tuple[str, str, Any]] | None:
     names = ("channel", "station", "instrument")
     filters = [(name, "==", getattr(selection, name)) for name in names if getattr(selection, name)]
     if selection.kind is not None:
-        filters.append(("kind", "==", selection.kind.value))
+        filters.append(("kind", "==", selection.kind))
     if selection.since is not None:
         filters.append(("stop", ">", selection.since))
     if selection.until is not None:

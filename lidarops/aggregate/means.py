@@ -28,7 +28,6 @@ from lidarops.aggregate.means_variables import MeansDescription, Period, Weights
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf.write import write_product
-from lidarops.records import ProductKind
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
 
@@ -109,7 +108,7 @@ def write_means(
 class _PeriodSums:
     """Sums of all quantities over one period."""
 
-    kind: ProductKind
+    kind: str
     weights: Weights
     quantities: dict[str, Sums] = field(default_factory=dict)
     profiles: int = 0
@@ -250,7 +249,7 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
 
 
 def _path(group: Group, period: Period, weights: Weights, year: int) -> str:
-    folder = f"{group.station}/{group.instrument}/{group.kind.value}/{period.value}"
+    folder = f"{group.station}/{group.instrument}/{group.kind}/{period.value}"
     weighted = "" if weights is Weights.PLAIN else f"_{weights.value}"
     return f"{FOLDER}/means/{folder}/{group.name}_{period.value}{weighted}_{year}.nc"
 

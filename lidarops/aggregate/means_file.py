@@ -29,7 +29,7 @@ from lidarops.netcdf import variables as rows
 from lidarops.netcdf.build import bitround
 from lidarops.netcdf.provenance import NAMESPACE, code_version, package_versions
 from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.records import DetectionMode
 
 _MOVING: Final = ("zenith_angle", "azimuth")
 
@@ -38,7 +38,7 @@ _MOVING: Final = ("zenith_angle", "azimuth")
 class Frame:
     """Coordinates and attributes of means that are equal in all products of a group."""
 
-    kind: ProductKind
+    kind: str
     mode: DetectionMode
     variables: Mapping[str, xr.Variable]
     """Coordinates that do not change with time, and the station; in memory."""
@@ -233,7 +233,7 @@ def means_provenance(lineage: Lineage) -> str:
             "lidarops:means": {
                 "prov:type": _type("lidarops:Means"),
                 "lidarops:id": lineage.id,
-                "lidarops:kind": group.kind.value,
+                "lidarops:kind": group.kind,
                 "lidarops:channel": group.channel,
                 "lidarops:grid": group.grid,
             },

@@ -1,6 +1,6 @@
 """Variables that aggregates add to products, and the variables of means.
 
-Variables of means follow from the rows of `lidarops.products.layouts`, with the same units and
+Variables of means follow from the rows of `lidarops.netcdf.variables`, with the same units and
 names.
 """
 
@@ -23,9 +23,8 @@ from lidarops.netcdf.variables import (
     ErrorKind,
     Layout,
     Row,
+    layout_of,
 )
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import ProductKind
 
 PRODUCT: Final = Row(
     name="product",
@@ -96,28 +95,28 @@ _SHARED: Final = tuple(
     f"backscatter_error_{cause}" for cause in ("reference", "lidar_ratio", "molecular")
 )
 BUDGETS: Final = {
-    (ProductKind.ELASTIC, "backscatter"): Budget(_RANDOM, shared=_SHARED),
-    (ProductKind.ELASTIC, "extinction"): Budget(_RANDOM, times="lidar_ratio"),
-    (ProductKind.ELASTIC, "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
+    ("elastic", "backscatter"): Budget(_RANDOM, shared=_SHARED),
+    ("elastic", "extinction"): Budget(_RANDOM, times="lidar_ratio"),
+    ("elastic", "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
     # Noise of the calibration and noise of the bins are not stated separately.
-    (ProductKind.ELASTIC, "attenuated_backscatter"): Budget(()),
+    ("elastic", "attenuated_backscatter"): Budget(()),
     # Noise and smoothing error, which profiles of the same air share, are not stated separately.
-    (ProductKind.MULTIANGLE, "optical_depth"): Budget(()),
-    (ProductKind.MULTIANGLE, "extinction"): Budget(()),
-    (ProductKind.MULTIANGLE, "layer_optical_depth"): Budget(()),
+    ("multiangle", "optical_depth"): Budget(()),
+    ("multiangle", "extinction"): Budget(()),
+    ("multiangle", "layer_optical_depth"): Budget(()),
     # Most of the error comes from the prior, which all profiles share.
-    (ProductKind.VISIBILITY, "extinction"): Budget(()),
-    (ProductKind.VISIBILITY, "visibility_in_air"): Budget(()),
+    ("visibility", "extinction"): Budget(()),
+    ("visibility", "visibility_in_air"): Budget(()),
 }
 """Quantities whose errors are not independent between profiles."""
 
 
-def systematic(kind: ProductKind, name: str) -> str | None:
+def systematic(kind: str, name: str) -> str | None:
     """Return the variable of the systematic error that is not part of the standard error.
 
     Parameters
     ----------
-    kind : ProductKind
+    kind : str
     name : str
         Name of the quantity.
 
@@ -129,7 +128,7 @@ def systematic(kind: ProductKind, name: str) -> str | None:
     """
     if name in INTERVALS:
         return f"{name}_systematic_error"
-    names = (row.name for row in LAYOUTS[kind].data)
+    names = (row.name for row in layout_of(kind).data)
     errors = (error for error in names if error.startswith(f"{name}_") and error.endswith("_error"))
     return next(errors, None)
 
@@ -158,7 +157,7 @@ _ALL_SHARED: Final = (
 )
 
 
-def _error_comment(kind: ProductKind, name: str) -> str:
+def _error_comment(kind: str, name: str) -> str:
     """Return how the standard error of a mean is computed."""
     budget = budget_of(kind, name)
     if budget is None:
@@ -166,24 +165,24 @@ def _error_comment(kind: ProductKind, name: str) -> str:
     return _PARTLY if budget.random else _ALL_SHARED
 
 
-def budget_of(kind: ProductKind, name: str) -> Budget | None:
+def budget_of(kind: str, name: str) -> Budget | None:
     """Return the error budget of a quantity; None if errors are independent between profiles."""
-    row = LAYOUTS[kind].row(name)
+    row = layout_of(kind).row(name)
     independent = row.error_kind in (None, ErrorKind.RANDOM)
     return BUDGETS.get((kind, name), None if independent else Budget(()))
 
 
-def averaged(kind: ProductKind) -> tuple[Row, ...]:
+def averaged(kind: str) -> tuple[Row, ...]:
     """Return the rows of a product kind that are averaged: those with standard errors."""
-    return tuple(row for row in LAYOUTS[kind].data if row.uncertain and row.dims[:1] == ("time",))
+    return tuple(row for row in layout_of(kind).data if row.uncertain and row.dims[:1] == ("time",))
 
 
-def layout(kind: ProductKind, period: Period, weights: Weights) -> Layout:
+def layout(kind: str, period: Period, weights: Weights) -> Layout:
     """Return the layout of the means of a product kind.
 
     Parameters
     ----------
-    kind : ProductKind
+    kind : str
     period : Period
     weights : Weights
 
@@ -194,7 +193,7 @@ def layout(kind: ProductKind, period: Period, weights: Weights) -> Layout:
         ``<name>_observations`` of each quantity with standard errors; systematic errors;
         ``usable_share``, ``quality_flag`` and ``shots``.
     """
-    source = LAYOUTS[kind]
+    source = layout_of(kind)
     time = replace(TIME, long_name=f"middle of the {period.value}, UTC")
     return replace(
         source,
@@ -214,7 +213,7 @@ def layout(kind: ProductKind, period: Period, weights: Weights) -> Layout:
 _ADJECTIVE: Final = {Period.DAY: "Daily", Period.MONTH: "Monthly"}
 
 
-def _rows(source: Layout, kind: ProductKind, weights: Weights) -> Iterator[Row]:
+def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     flags = source.row("quality_flag")
     for row in averaged(kind):
         error = systematic(kind, row.name)
@@ -243,7 +242,7 @@ def _rows(source: Layout, kind: ProductKind, weights: Weights) -> Iterator[Row]:
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 
-def _mean_rows(row: Row, kind: ProductKind, weights: Weights, error: str | None) -> Iterator[Row]:
+def _mean_rows(row: Row, kind: str, weights: Weights, error: str | None) -> Iterator[Row]:
     """Yield the rows of the mean of a quantity."""
     weighting, errors = f"Weights: {weights.description}.", _error_comment(kind, row.name)
     count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
@@ -320,7 +319,7 @@ def _averaged_error(row: Row, quantity: Row) -> Row:
 
 
 def global_attributes(
-    shared: Mapping[str, Any], table: Layout, about: MeansDescription, kind: ProductKind
+    shared: Mapping[str, Any], table: Layout, about: MeansDescription, kind: str
 ) -> dict[str, Any]:
     """Return the global attributes of means, in the order in which they are written.
 
@@ -331,13 +330,13 @@ def global_attributes(
     table : Layout
         From `layout`.
     about : MeansDescription
-    kind : ProductKind
+    kind : str
 
     Returns
     -------
     dict of str to str, float or numpy scalar
     """
-    source = LAYOUTS[kind]
+    source = layout_of(kind)
     # The comment of a product ends with a sentence on its dates, which is replaced.
     comment = shared.get("comment", "").partition(" Dates of creation")[0]
     made, why = product_date(about.stop)

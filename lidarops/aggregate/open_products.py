@@ -31,7 +31,7 @@ from lidarops.aggregate.selection import parse_selection
 from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.records import DetectionMode
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -39,7 +39,7 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 def open_products(
     source: Paths,
     *,
-    kind: ProductKind | str | None = None,
+    kind: str | None = None,
     channel: str | None = None,
     station: str | None = None,
     instrument: str | None = None,
@@ -106,8 +106,7 @@ def _path_of(source: Paths) -> str | None:
 
 def _choices(all_groups: Iterable[Group]) -> str:
     return "; ".join(
-        f"{group.station} {group.instrument} {group.kind.value} {group.channel}"
-        f" grid {group.grid[:8]}"
+        f"{group.station} {group.instrument} {group.kind} {group.channel} grid {group.grid[:8]}"
         for group in all_groups
     )
 

@@ -8,11 +8,11 @@ from typing import TypeVar
 
 from lidarops.aggregate.facts import ProductSelection
 from lidarops.errors import RetrievalInputError
-from lidarops.records import ProductKind
+from lidarops.kinds import kinds
 
 
 def parse_selection(
-    kind: ProductKind | str | None,
+    kind: str | None,
     channel: str | None,
     station: str | None,
     instrument: str | None,
@@ -27,13 +27,28 @@ def parse_selection(
         If the kind is unknown or a time is not ISO 8601.
     """
     return ProductSelection(
-        None if kind is None else parse_choice(ProductKind, kind, "kind"),
+        None if kind is None else _known_kind(kind),
         channel,
         station,
         instrument,
         _parse_time(since, "since"),
         _parse_time(until, "until"),
     )
+
+
+def _known_kind(name: str) -> str:
+    """Return the name of a kind of product.
+
+    Raises
+    ------
+    RetrievalInputError
+        If there is no such kind.
+    """
+    if name not in kinds():
+        raise RetrievalInputError(
+            f"is {name!r}", field="kind", remedy=f"choose one of {', '.join(kinds())}"
+        )
+    return name
 
 
 def _parse_time(text: datetime | str | None, name: str) -> datetime | None:

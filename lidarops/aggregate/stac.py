@@ -12,8 +12,8 @@ from typing import Any, Final
 from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate.facts import FOLDER, Facts
 from lidarops.errors import ProductError
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import ProductKind
+from lidarops.kinds import kinds
+from lidarops.netcdf.variables import layout_of
 
 _NETCDF: Final = "application/x-netcdf"
 _PREFIX: Final = "lidarops"
@@ -55,8 +55,8 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
         description="Products of lidarops, one Collection for each kind.",
     )
     target = root / FOLDER / "stac"
-    for kind in ProductKind:
-        of_kind = sorted((p for p in products if p.kind is kind), key=lambda facts: facts.path)
+    for kind in kinds():
+        of_kind = sorted((p for p in products if p.kind == kind), key=lambda facts: facts.path)
         if of_kind:
             catalog.add_child(_collection(pystac, kind, of_kind))
     catalog.normalize_hrefs(target.resolve().as_posix(), skip_unresolved=False)
@@ -87,14 +87,14 @@ def _name(product: Facts) -> str:
     return PurePosixPath(product.path).stem
 
 
-def _collection(pystac: Any, kind: ProductKind, products: Sequence[Facts]) -> Any:
-    layout = LAYOUTS[kind]
+def _collection(pystac: Any, kind: str, products: Sequence[Facts]) -> Any:
+    layout = layout_of(kind)
     places = [(product.longitude, product.latitude) for product in products]
     west, south = (min(axis) for axis in zip(*places, strict=True))
     east, north = (max(axis) for axis in zip(*places, strict=True))
     times = [[min(p.start for p in products), max(p.stop for p in products)]]
     collection = pystac.Collection(
-        id=kind.value,
+        id=kind,
         title=layout.title,
         description=layout.summary,
         keywords=list(layout.keywords),
@@ -112,7 +112,7 @@ def _item(pystac: Any, product: Facts) -> Any:
     wavelength = product.wavelength if math.isfinite(product.wavelength) else None
     own = {
         "id": product.id,
-        "kind": product.kind.value,
+        "kind": product.kind,
         "channel": product.channel,
         "wavelength": wavelength,
         "station_altitude": product.altitude,

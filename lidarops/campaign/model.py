@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import (
@@ -20,43 +20,36 @@ from pydantic import (
     Field,
     PrivateAttr,
     ValidationError,
+    create_model,
     model_validator,
 )
 
-from lidarops.campaign.product_settings import (
+from lidarops.campaign.simulation import SimulationSettings
+from lidarops.campaign.yaml_errors import duplicate_keys, explain_yaml_error
+from lidarops.errors import CampaignError
+from lidarops.kinds import Scope, kinds_of
+from lidarops.settings import (
     IDENTIFIER,
-    ElasticSettings,
-    HomogeneousSettings,
+    ChannelProduct,
     Identifier,
     Inside,
     Instant,
     Metres,
-    MultiAngleSettings,
-    NetworkVisibilitySettings,
+    NetworkProduct,
     Patterns,
-    Products,
     SettingsModel,
-    SignalSettings,
     as_interval,
 )
-from lidarops.campaign.simulation import SimulationSettings
-from lidarops.campaign.yaml_errors import duplicate_keys, explain_yaml_error
-from lidarops.errors import CampaignError
 
 __all__ = [
     "Campaign",
     "ChannelFacts",
-    "ElasticSettings",
-    "HomogeneousSettings",
     "Instrument",
     "InstrumentFacts",
     "Metadata",
-    "MultiAngleSettings",
     "Network",
-    "NetworkVisibilitySettings",
     "Products",
     "Scenes",
-    "SignalSettings",
     "Station",
     "as_settings",
     "channel_facts",
@@ -124,6 +117,29 @@ class InstrumentFacts(SettingsModel):
         return self
 
 
+def _fields(scope: Scope) -> dict[str, Any]:
+    """Return the definition of one optional field for every kind of product of a scope."""
+    return {kind.name: (kind.settings | None, None) for kind in kinds_of(scope)}
+
+
+class ChannelProducts(SettingsModel):
+    """The requested products of an instrument; `Products` has a field for every kind."""
+
+    def requested(self) -> dict[str, ChannelProduct]:
+        """Return the settings of each requested kind of product, by its name."""
+        return {
+            name: settings
+            for name in type(self).model_fields
+            if (settings := getattr(self, name)) is not None
+        }
+
+
+if TYPE_CHECKING:
+    Products = ChannelProducts
+else:
+    Products = create_model("Products", __base__=ChannelProducts, **_fields(Scope.CHANNEL))
+
+
 class Instrument(SettingsModel):
     """A lidar: its station, its files, the facts about it and its requested products."""
 
@@ -151,21 +167,39 @@ class Instrument(SettingsModel):
         return InstrumentFacts()
 
 
-class Network(SettingsModel):
-    """Instruments whose beams cross, and the product that is retrieved from them together."""
+class NetworkMembers(SettingsModel):
+    """Instruments whose beams cross, and the products that are retrieved from them together.
+
+    `Network` has a field for every kind of product of a network.
+    """
 
     name: str = ""
     instruments: list[Identifier] = Field(min_length=2)
-    visibility: NetworkVisibilitySettings
 
     @model_validator(mode="after")
-    def _distinct_instruments(self) -> Self:
+    def _fitting_instruments(self) -> Self:
         if len(set(self.instruments)) < len(self.instruments):
             raise ValueError("instruments lists an instrument twice")
-        unknown = sorted(set(self.visibility.exponents) - set(self.instruments))
-        if unknown:
-            raise ValueError(f"exponents names {', '.join(unknown)}, not in instruments")
+        if not self.requested():
+            kinds = ", ".join(kind.name for kind in kinds_of(Scope.NETWORK))
+            raise ValueError(f"a network needs a product: {kinds}")
+        for settings in self.requested().values():
+            settings.check_members(self.instruments)
         return self
+
+    def requested(self) -> dict[str, NetworkProduct]:
+        """Return the settings of each requested kind of product, by its name."""
+        return {
+            kind.name: settings
+            for kind in kinds_of(Scope.NETWORK)
+            if (settings := getattr(self, kind.name)) is not None
+        }
+
+
+if TYPE_CHECKING:
+    Network = NetworkMembers
+else:
+    Network = create_model("Network", __base__=NetworkMembers, **_fields(Scope.NETWORK))
 
 
 class Metadata(SettingsModel):

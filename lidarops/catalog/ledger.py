@@ -30,8 +30,8 @@ from lidarops.catalog.schema import (
     VERDICT,
 )
 from lidarops.errors import CatalogError
+from lidarops.kinds import kinds
 from lidarops.records import (
-    EXPECTED_USABLE,
     Granule,
     InputRecord,
     ProductRecord,
@@ -294,7 +294,7 @@ class Ledger(Granules):
             "path": record.path,
             "scene": entry.outcome.scene,
             "day": entry.day,
-            "kind": record.kind.value,
+            "kind": record.kind,
             "channel": record.channel,
             "sha256": record.sha256,
             "size": record.size,
@@ -497,7 +497,7 @@ class Ledger(Granules):
         # Not stored with the scene: a run over a selection leaves its other products unchanged.
         judged = (
             _P.campaign == self.campaign,
-            _P.kind.in_([kind.value for kind in EXPECTED_USABLE]),
+            _P.kind.in_([kind.name for kind in kinds().values() if kind.expects_usable]),
         )
         # Paths are compared below, because a statement can hold only a limited number.
         candidates = sa.select(_P.scene).where(*judged, _P.usable == 0)

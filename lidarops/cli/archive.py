@@ -37,6 +37,7 @@ from lidarops.cli.app import (
 )
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 from lidarops.errors import LidarOpsError
+from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -362,19 +363,17 @@ def _selection(
     since: datetime | None,
     until: datetime | None,
 ) -> Selection:
-    from lidarops.records import ProductKind
     from lidarops.run.selection import Selection
 
-    kinds = [kind.value for kind in ProductKind]
     for name in products or ():
-        if name not in kinds:
+        if name not in kinds():
             raise typer.BadParameter(
-                f"{name!r} is not a kind of product; the kinds are {', '.join(kinds)}"
+                f"{name!r} is not a kind of product; the kinds are {', '.join(kinds())}"
             )
     return Selection(
         stations=tuple(stations or ()),
         instruments=tuple(instruments or ()),
-        kinds=tuple(ProductKind(name) for name in products or ()),
+        kinds=tuple(products or ()),
         since=utc(since),
         until=utc(until),
     )
@@ -417,7 +416,7 @@ def _time_table(tallies: Mapping[str, Tally]) -> Table:
 def _stale_table(title: str, judged: Judgement) -> Table:
     table = make_table(f"{title}: to be made", "product", "channel", "reason")
     for product in judged.stale:
-        add_row(table, product.kind.value, product.channel, product.reason)
+        add_row(table, product.kind, product.channel, product.reason)
     if judged.held:
         add_row(table, "none", "", f"not tried again, because nothing has changed: {judged.held}")
     return table
@@ -427,7 +426,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     from lidarops.plan.signal_rules import idle_window
 
     stale = [
-        {"kind": product.kind.value, "channel": product.channel, "reason": product.reason}
+        {"kind": product.kind, "channel": product.channel, "reason": product.reason}
         for product in judged.stale
     ]
     plan = judged.requested
@@ -493,7 +492,7 @@ def _print_result(campaign: Campaign, result: Result, *, removing: bool) -> None
     for scene in () if result.record is None else result.record.scenes:
         for product in scene.products:
             flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
-            name = (scene.scene, product.kind.value, product.channel)
+            name = (scene.scene, product.kind, product.channel)
             add_row(table, *name, product.values, product.unflagged, flags)
         if scene.error:
             add_row(table, scene.scene, "none", "", "", "", scene.error)

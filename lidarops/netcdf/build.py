@@ -25,12 +25,17 @@ from lidarops.netcdf.input_checks import (
     whole_numbers,
 )
 from lidarops.netcdf.provenance import prov_json
-from lidarops.netcdf.variables import Layout, Row, attributes
+from lidarops.netcdf.variables import Layout, Row, attributes, layout_of
 from lidarops.records import DetectionMode
 
-__all__ = ["Context", "bitround", "build_dataset", "product_path"]
+__all__ = ["Context", "bitround", "build_dataset", "build_product", "product_path"]
 
 _MANTISSA_BITS: Final = 23
+
+
+def build_product(data: xr.Dataset, context: Context) -> xr.Dataset:
+    """Return the encoded product of one scene, kind and channel: `build_dataset` by its kind."""
+    return build_dataset(data, context, layout_of(context.kind))
 
 
 def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Dataset:

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
-from lidarops.records import DetectionMode, ProductKind, Provenance
+from lidarops.records import DetectionMode, Provenance
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -17,7 +17,7 @@ _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 class Context:
     """Kind, channel, station, instrument, campaign, scene and provenance of a product."""
 
-    kind: ProductKind
+    kind: str
     channel: str
     mode: DetectionMode
     wavelength: float
@@ -59,7 +59,7 @@ def product_path(context: Context) -> str:
     """
     # The id of a scene without its instrument: start time, and key of the grid where there are two.
     when = context.scene.removeprefix(f"{context.instrument_key}_")
-    parts = (context.station_key, context.instrument_key, context.kind.value, context.channel, when)
+    parts = (context.station_key, context.instrument_key, context.kind, context.channel, when)
     for part in parts:
         if not _SAFE.fullmatch(part):
             raise ProductError(

@@ -123,7 +123,7 @@ def _history(context: Context, layout: Layout, date: datetime) -> str:
         for omission in plan.left_out
         if concerns(omission)
     ]
-    lines = [*done, *omitted, f"wrote the {context.kind.value} product"]
+    lines = [*done, *omitted, f"wrote the {context.kind} product"]
     return "\n".join(f"{_iso(date)} {' '.join(line.split())} [{program}]" for line in lines)
 
 
@@ -219,7 +219,7 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_scene": context.scene,
         "lidarops_window_start": _iso(context.start),
         "lidarops_window_end": _iso(context.stop),
-        "lidarops_kind": context.kind.value,
+        "lidarops_kind": context.kind,
         "lidarops_station": context.station_key,
         "lidarops_instrument": context.instrument_key,
         "lidarops_channel": context.channel,

@@ -123,7 +123,7 @@ def _product(provenance: Provenance) -> dict[str, Any]:
         "lidarops:id": product_id(provenance),
         "lidarops:campaign": provenance.campaign,
         "lidarops:scene": provenance.scene,
-        "lidarops:kind": provenance.kind.value,
+        "lidarops:kind": provenance.kind,
         "lidarops:channel": provenance.channel,
         "lidarops:settings": _canonical(dict(provenance.settings)),
     }
@@ -181,7 +181,7 @@ def product_id(provenance: Provenance) -> str:
         UUID version 5 of kind, channel, inputs' sha256, plan hash, settings and code version.
     """
     content = {
-        "kind": provenance.kind.value,
+        "kind": provenance.kind,
         "channel": provenance.channel,
         "plan": provenance.plan.hash,
         "settings": dict(provenance.settings),

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from lidarops import __version__
 from lidarops.errors import ProductError
 from lidarops.flags import Quality, Severity
+from lidarops.kinds import kind_of, kinds
 from lidarops.records import DetectionMode
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
@@ -162,6 +164,20 @@ class Layout:
                 remedy=f"its variables are {', '.join(rows)}",
             )
         return rows[name]
+
+
+@cache
+def layout_of(kind: str) -> Layout:
+    """Return the layout of a kind of product, by the name of the kind.
+
+    Raises
+    ------
+    LidarOpsError
+        If there is no such kind.
+    """
+    layout: Layout = kind_of(kind).part("variables", "LAYOUT")
+    # The step that makes a product has the name of its kind and serves no other kind.
+    return replace(layout, unused_steps=layout.unused_steps | (set(kinds()) - {kind}))
 
 
 def _with_derived(rows: tuple[Row, ...]) -> Iterator[Row]:

@@ -16,7 +16,7 @@ from typing import Final
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
 from lidarops.plan.rules import Decisions, Rule, StepName, applied
 from lidarops.plan.signal_rules import GLUED, glued_parts, joined_layout
-from lidarops.records import ChannelLayout, Holding, LeftOut, ProductKind, Unmet
+from lidarops.records import ChannelLayout, Holding, LeftOut, Unmet
 
 FACTS: Final = "facts"
 
@@ -90,9 +90,9 @@ def _absent(held: Held) -> Decisions:
         for name in names:
             if kind is StepName.HOMOGENEOUS and name.startswith(GLUED):
                 reason = "not made of glued channels: each record is fitted with its own background"
-                yield LeftOut(kind.value, name, reason)
+                yield LeftOut(kind, name, reason)
             elif name not in channels and name not in glued:
-                yield LeftOut(kind.value, name, _why_absent(name, channels))
+                yield LeftOut(kind, name, _why_absent(name, channels))
 
 
 def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
@@ -177,7 +177,7 @@ def unavailable_channels(
     holdings: Iterable[Holding],
     *,
     instruments: Collection[str] | None = None,
-    kinds: Collection[ProductKind] = (),
+    kinds: Collection[str] = (),
     since: datetime | None = None,
     until: datetime | None = None,
 ) -> tuple[Unmet, ...]:
@@ -193,7 +193,7 @@ def unavailable_channels(
         Of all files, cut at `validity_edges`.
     instruments : collection of str, optional
         Restricts the result to these instruments.
-    kinds : collection of ProductKind
+    kinds : collection of str
         Restricts requested channels to these kinds of product; all where empty.
     since, until : datetime, optional
         Restricts facts to periods that touch [since, until).
@@ -203,7 +203,7 @@ def unavailable_channels(
     tuple of Unmet
         Channels that no file holds come first.
     """
-    requested = {StepName(kind.value) for kind in kinds} or set(StepName)
+    requested = {StepName(kind) for kind in kinds} or set(StepName)
     all_files: dict[tuple[str, str], int] = defaultdict(int)
     lacking: dict[tuple[str, str, str], list[tuple[int, str]]] = defaultdict(list)
     held: dict[tuple[str, str], int] = defaultdict(int)

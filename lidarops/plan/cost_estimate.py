@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from lidarops.errors import CatalogError
+from lidarops.kinds import kinds
 from lidarops.plan.rules import StepName
 from lidarops.plan.signal_rules import GLUED, glued_parts, read_windows
 from lidarops.raw.model import count_bins
-from lidarops.records import Granule, Plan, ProductKind, Scene, Step
+from lidarops.records import Granule, Plan, Scene, Step
 
 _FORMAT: Final = "lidarops costs"
 _CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
@@ -207,7 +208,7 @@ class Tally:
 def load_term(kind: str) -> Term:
     """Return the term of the code that the first product of a kind loads."""
     # The signal product loads nothing beyond what all products load.
-    return Term.LOAD if kind == ProductKind.SIGNAL else Term(f"{kind}_load")
+    return Term.LOAD if kind == "signal" else Term(f"{kind}_load")
 
 
 def figure_term(kind: str) -> Term:
@@ -255,8 +256,8 @@ def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[Term, floa
 
 
 def _products(plan: Plan) -> list[Step]:
-    kinds = tuple(ProductKind)
-    return [step for step in plan.steps if step.name in kinds]
+    names = tuple(kinds())
+    return [step for step in plan.steps if step.name in names]
 
 
 def _subtracts_dark(plan: Plan, instrument: str) -> bool:
@@ -298,7 +299,7 @@ def _only_glued(channel: str, plan: Plan) -> bool:
 
 def _values(step: Step, scene: Scene, plan: Plan) -> float:
     settings = step.settings
-    if step.name == ProductKind.VISIBILITY:
+    if step.name == "visibility":
         seconds = _average(step, plan)
         members = {member.instrument: member for member in scene.members}
         return float(
@@ -306,15 +307,15 @@ def _values(step: Step, scene: Scene, plan: Plan) -> float:
                 for beam in settings["beams"])
         )  # fmt: skip
     profiles = len(scene.granules)
-    if step.name == ProductKind.HOMOGENEOUS:
+    if step.name == "homogeneous":
         width = min(channel.bin_width for channel in scene.layout)
         return float(profiles * sum((far - near) / width for near, far in settings["sections"]))
-    if step.name == ProductKind.MULTIANGLE:
+    if step.name == "multiangle":
         return float(profiles * settings["highest"] / settings["step"])
     by_channel = _bins(scene)
     names = glued_parts(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
     bins = min(by_channel[name] for name in names)
-    if step.name == ProductKind.ELASTIC:
+    if step.name == "elastic":
         return float(_intervals(scene.granules, _average(step, plan)) * bins)
     return float(profiles * bins)
 

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
-from lidarops.campaign.product_settings import NetworkVisibilitySettings, VisibilitySettings
 from lidarops.errors import RetrievalInputError
 from lidarops.plan.rules import (
     ALL_STEPS,
@@ -37,9 +36,11 @@ from lidarops.plan.signal_rules import (
     tail_mean_reason,
     wavelength,
 )
+from lidarops.products.visibility.settings import VisibilityProductSettings
 from lidarops.records import ChannelLayout, DetectionMode, Granule, LeftOut, Plan, Scene, Step
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.labeled import BEFORE_TAIL, BINS_BEYOND
+from lidarops.settings import VisibilitySettings
 
 SAME_POINTING: Final = 0.1
 """degree; pointings of one instrument within this angle are one beam (resolution of headers)."""
@@ -179,7 +180,7 @@ class _NetworkCase:
     campaign: Campaign
 
     @property
-    def settings(self) -> NetworkVisibilitySettings:
+    def settings(self) -> VisibilityProductSettings:
         """Settings of the product."""
         return self.campaign.networks[self.scene.instrument].visibility
 
@@ -201,7 +202,7 @@ class _MemberCase:
     scene: Scene
     """Scene of the member."""
     campaign: Campaign
-    settings: NetworkVisibilitySettings
+    settings: VisibilityProductSettings
 
     @property
     def facts(self) -> InstrumentFacts:
@@ -275,7 +276,7 @@ class _MemberCase:
 
 
 def _left(
-    settings: NetworkVisibilitySettings, member: str, reason: str, number: float | None = None
+    settings: VisibilityProductSettings, member: str, reason: str, number: float | None = None
 ) -> LeftOut:
     reason = f"{member}: {reason}"
     return LeftOut(StepName.VISIBILITY.value, settings.channel, reason, member, number=number)

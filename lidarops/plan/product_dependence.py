@@ -13,30 +13,31 @@ from dataclasses import replace
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
+from lidarops.kinds import kinds
 from lidarops.plan.rules import StepName
 from lidarops.plan.signal_rules import GLUED, glued_parts, required_by
-from lidarops.records import InputRecord, Plan, ProductKind, Role, Scene, Step
+from lidarops.records import InputRecord, Plan, Role, Scene, Step
 
-ProductKey = tuple[ProductKind, str]
+ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
-_KINDS: Final = frozenset(kind.value for kind in ProductKind)
+_KINDS: Final = frozenset(kind for kind in kinds())
 _ONLY_FOR: Final[Mapping[str, frozenset[str]]] = {
-    StepName.BACKGROUND: frozenset({ProductKind.SIGNAL, ProductKind.VISIBILITY}),
-    StepName.RANGE_WINDOW: frozenset({ProductKind.HOMOGENEOUS, ProductKind.VISIBILITY}),
-    StepName.LOOK: frozenset({ProductKind.HOMOGENEOUS}),
-    StepName.ALONG_PATH: frozenset({ProductKind.HOMOGENEOUS}),
-    StepName.GRADIENT: frozenset({ProductKind.MULTIANGLE}),
-    StepName.GRADIENT_REGRESSOR: frozenset({ProductKind.MULTIANGLE}),
-    StepName.ROBUST: frozenset({ProductKind.MULTIANGLE}),
-    StepName.VERTICAL: frozenset({ProductKind.MULTIANGLE}),
-    StepName.CORRELATION: frozenset({ProductKind.MULTIANGLE}),
-    StepName.LAYERS: frozenset({ProductKind.MULTIANGLE}),
-    StepName.PRIOR: frozenset({ProductKind.VISIBILITY}),
-    StepName.AVERAGE: frozenset({ProductKind.ELASTIC, ProductKind.VISIBILITY}),
-    StepName.MOLECULAR: frozenset({ProductKind.ELASTIC, ProductKind.MULTIANGLE}),
-    StepName.KNOWN_SHAPE: frozenset({ProductKind.ELASTIC}),
-    StepName.REFERENCE: frozenset({ProductKind.ELASTIC}),
+    StepName.BACKGROUND: frozenset({"signal", "visibility"}),
+    StepName.RANGE_WINDOW: frozenset({"homogeneous", "visibility"}),
+    StepName.LOOK: frozenset({"homogeneous"}),
+    StepName.ALONG_PATH: frozenset({"homogeneous"}),
+    StepName.GRADIENT: frozenset({"multiangle"}),
+    StepName.GRADIENT_REGRESSOR: frozenset({"multiangle"}),
+    StepName.ROBUST: frozenset({"multiangle"}),
+    StepName.VERTICAL: frozenset({"multiangle"}),
+    StepName.CORRELATION: frozenset({"multiangle"}),
+    StepName.LAYERS: frozenset({"multiangle"}),
+    StepName.PRIOR: frozenset({"visibility"}),
+    StepName.AVERAGE: frozenset({"elastic", "visibility"}),
+    StepName.MOLECULAR: frozenset({"elastic", "multiangle"}),
+    StepName.KNOWN_SHAPE: frozenset({"elastic"}),
+    StepName.REFERENCE: frozenset({"elastic"}),
 }
 """Steps that serve only some kinds of product. All other steps serve every kind."""
 
@@ -52,7 +53,7 @@ _PROFILES: Final = ("molecular_profile", "overlap_profile")
 
 def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
     """Return kind and channel of the products that a plan makes, in its order."""
-    keys = ((ProductKind(step.name), step.channel) for step in plan.steps if step.name in _KINDS)
+    keys = ((step.name, step.channel) for step in plan.steps if step.name in _KINDS)
     return tuple(dict.fromkeys(keys))
 
 
@@ -62,7 +63,7 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     Parameters
     ----------
     plan : Plan
-    products : collection of (ProductKind, str)
+    products : collection of (str, str)
         Kind and channel of each product.
 
     Returns
@@ -71,10 +72,10 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         The same for a product, whatever else the whole plan holds.
     """
     if any(step.instrument for step in plan.steps):
-        return _network_closure(plan, {kind.value for kind, _ in products})
+        return _network_closure(plan, {kind for kind, _ in products})
     kinds: dict[str, set[str]] = {}
     for kind, channel in products:
-        kinds.setdefault(channel, set()).add(kind.value)
+        kinds.setdefault(channel, set()).add(kind)
         for parent in glued_parts(channel) if channel.startswith(GLUED) else ():
             kinds.setdefault(parent, set())
     steps = tuple(
@@ -90,13 +91,13 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     return replace(plan, steps=steps, left_out=left_out)
 
 
-def plan_of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
+def plan_of_kinds(plan: Plan, kinds: Collection[str]) -> Plan:
     """Return the part of a plan that concerns some kinds of product: their steps and omissions.
 
     Parameters
     ----------
     plan : Plan
-    kinds : collection of ProductKind
+    kinds : collection of str
         All kinds where empty.
     """
     if not kinds:

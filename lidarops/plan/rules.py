@@ -8,12 +8,10 @@ from enum import StrEnum
 from typing import Any, Final
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts
-from lidarops.campaign.product_settings import (
-    ElasticSettings,
-    HomogeneousSettings,
-    MultiAngleSettings,
-    SignalSettings,
-)
+from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.products.homogeneous.settings import HomogeneousSettings
+from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.products.signal.settings import SignalSettings
 from lidarops.records import ChannelLayout, LeftOut, Scene, Step
 
 ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"

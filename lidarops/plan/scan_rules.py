@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.campaign.product_settings import MultiAngleSettings
 from lidarops.errors import RetrievalInputError
 from lidarops.plan.rules import NOT_REQUESTED, REQUESTED, ChannelCase, Decisions, Rule, StepName
 from lidarops.plan.signal_rules import no_scan
+from lidarops.products.multiangle.settings import MultiAngleSettings
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 

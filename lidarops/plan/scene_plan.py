@@ -13,12 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, channel_facts
-from lidarops.campaign.product_settings import (
-    ElasticSettings,
-    HomogeneousSettings,
-    MultiAngleSettings,
-    SignalSettings,
-)
+from lidarops.kinds import kinds
 from lidarops.plan import availability, network_plan, scan_rules
 from lidarops.plan.availability import glued_channels
 from lidarops.plan.rules import (
@@ -48,12 +43,15 @@ from lidarops.plan.signal_rules import (
     tail_mean_reason,
     wavelength,
 )
+from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.products.homogeneous.settings import HomogeneousSettings
+from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.products.signal.settings import SignalSettings
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
     LeftOut,
     Plan,
-    ProductKind,
     Scene,
     Step,
 )
@@ -121,8 +119,8 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
 
 def _drop_unused_channels(plan: Plan) -> Plan:
     """Return a plan without the channels of which no product is made."""
-    kinds = tuple(ProductKind)
-    used = {step.channel for step in plan.steps if step.name in kinds}
+    names = tuple(kinds())
+    used = {step.channel for step in plan.steps if step.name in names}
     for name in [name for name in used if name.startswith(GLUED)]:
         used.update(glued_parts(name))
     unused = {step.channel for step in plan.steps} - used
@@ -134,7 +132,7 @@ def _drop_unused_channels(plan: Plan) -> Plan:
             *(
                 omission
                 for omission in plan.left_out
-                if omission.channel not in unused or omission.name in kinds
+                if omission.channel not in unused or omission.name in names
             ),
             *(
                 LeftOut(step.name, step.channel, reason, rule=step.rule)

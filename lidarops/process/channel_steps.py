@@ -17,7 +17,7 @@ from lidarops.plan import scan_rules
 from lidarops.plan.preview import OMITTED
 from lidarops.plan.rules import WHOLE, StepName
 from lidarops.plan.signal_rules import GLUED, glued_parts
-from lidarops.records import Plan, ProductKind, Step
+from lidarops.records import Plan, Step
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -62,7 +62,7 @@ class SceneData:
         return {step.name: step for step in self.plan.steps if step.channel == channel}
 
 
-def process_channel(scene_data: SceneData, channel: str) -> dict[ProductKind, xr.Dataset]:
+def process_channel(scene_data: SceneData, channel: str) -> dict[str, xr.Dataset]:
     """Carry out the steps of a channel.
 
     Parameters
@@ -72,8 +72,8 @@ def process_channel(scene_data: SceneData, channel: str) -> dict[ProductKind, xr
 
     Returns
     -------
-    dict of ProductKind to xr.Dataset
-        In memory, with the variables of `lidarops.products.layouts` and the geometry of the beam.
+    dict of str to xr.Dataset
+        In memory, with the variables of `lidarops.netcdf.variables` and the geometry of the beam.
 
     Raises
     ------
@@ -85,29 +85,29 @@ def process_channel(scene_data: SceneData, channel: str) -> dict[ProductKind, xr
         read = glued_parts(channel) if channel.startswith(GLUED) else (channel,)
         scene_data = load_small(scene_data, read)
     source = channel_source(scene_data, channel)
-    lazy: dict[ProductKind, xr.Dataset] = {}
+    lazy: dict[str, xr.Dataset] = {}
     if StepName.SIGNAL in steps:
-        lazy[ProductKind.SIGNAL] = _signal(source, steps, scene_data.ancillaries)
+        lazy["signal"] = _signal(source, steps, scene_data.ancillaries)
     if StepName.HOMOGENEOUS in steps:
-        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(scene_data, channel, source)
+        lazy["homogeneous"] = _homogeneous(scene_data, channel, source)
     for kind, data in lazy.items():
         lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
     if StepName.ELASTIC in steps:
-        lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
+        lazy["elastic"] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
     if StepName.MULTIANGLE in steps:
-        lazy[ProductKind.MULTIANGLE] = _beams(source, steps, scene_data)
+        lazy["multiangle"] = _beams(source, steps, scene_data)
     # Computed together, so that the products of a channel share one reading of the files.
     computed = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
-    sections = computed.get(ProductKind.HOMOGENEOUS)
+    sections = computed.get("homogeneous")
     if sections is not None and "visibility" in steps[StepName.HOMOGENEOUS].settings:
-        computed[ProductKind.HOMOGENEOUS] = _with_visibility(sections, steps)
-    if ProductKind.ELASTIC in computed:
-        averages = source.glued(computed[ProductKind.ELASTIC])
-        computed[ProductKind.ELASTIC] = _elastic(averages, steps, scene_data)
-    if ProductKind.MULTIANGLE in computed:
+        computed["homogeneous"] = _with_visibility(sections, steps)
+    if "elastic" in computed:
+        averages = source.glued(computed["elastic"])
+        computed["elastic"] = _elastic(averages, steps, scene_data)
+    if "multiangle" in computed:
         settings = steps[StepName.MULTIANGLE].settings
-        computed[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
-            computed[ProductKind.MULTIANGLE],
+        computed["multiangle"] = labeled_multiangle.retrieve_optical_depth(
+            computed["multiangle"],
             station_altitude=scene_data.station_altitude,
             method=settings["method"],
             largest_gradient=settings["largest_gradient"],

@@ -23,7 +23,9 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, InstrumentFacts, Station, as_settings
 from lidarops.errors import LidarOpsError, ProductError, SceneError
 from lidarops.flags import Quality
+from lidarops.kinds import kinds
 from lidarops.netcdf import provenance, write
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.context import Context, product_path
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
@@ -31,7 +33,6 @@ from lidarops.plan.preview import refine_plan
 from lidarops.plan.rules import NO_PRODUCT, NOT_REQUESTED, StepName
 from lidarops.plan.signal_rules import read_windows
 from lidarops.process import channel_steps, network_steps
-from lidarops.products.layouts import build_product
 from lidarops.raw import licel
 from lidarops.raw.archive import count_bytes_read, open_archive
 from lidarops.raw.model import Stretches
@@ -41,7 +42,6 @@ from lidarops.records import (
     Granule,
     InputRecord,
     Plan,
-    ProductKind,
     ProductRecord,
     Provenance,
     Scene,
@@ -141,7 +141,7 @@ def failed_outcome(job: Job, error: str) -> SceneOutcome:
 
 def _process(job: Job, root: Path) -> SceneOutcome:
     clock = _Clock()
-    product_steps = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
+    product_steps = [step for step in job.plan.steps if step.name in tuple(kinds())]
     if not product_steps:
         return failed_outcome(job, nothing_to_do(job.plan))
     usable, inputs, refused, read = _digest(job, root)
@@ -178,13 +178,13 @@ def _process(job: Job, root: Path) -> SceneOutcome:
 
 def nothing_to_do(plan: Plan) -> str:
     """Return why a plan makes no product: omissions of requested steps, those of products first."""
-    kinds = tuple(ProductKind)
+    names = tuple(kinds())
     requested = [
         omission
         for omission in plan.left_out
         if not any(words in omission.reason for words in (NOT_REQUESTED, NO_PRODUCT))
     ]
-    omissions = sorted(requested or plan.left_out, key=lambda omission: omission.name not in kinds)
+    omissions = sorted(requested or plan.left_out, key=lambda omission: omission.name not in names)
     reasons = dict.fromkeys(
         f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
     )
@@ -384,7 +384,7 @@ def _network_product(
     first = next(m for m in job.scene.members if m.instrument == members[0].instrument)
     layout = network_plan.member_channel(first, retrieval.channel)
     wavelength = retrieval.settings["wavelength"]
-    context = _context(job, scene, ProductKind.VISIBILITY, layout, wavelength, inputs)
+    context = _context(job, scene, "visibility", layout, wavelength, inputs)
     return inputs, _written(job, context, data, clock)
 
 
@@ -397,7 +397,7 @@ def _layout(job: Job, scene: Scene, name: str) -> ChannelLayout:
 def _context(
     job: Job,
     scene: Scene,
-    kind: ProductKind,
+    kind: str,
     channel: ChannelLayout,
     wavelength: float,
     inputs: tuple[InputRecord, ...],
@@ -441,7 +441,7 @@ def _context(
     )
 
 
-def _campaign_settings(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[str, Any]:
+def _campaign_settings(job: Job, plan: Plan, kind: str, channel: str) -> dict[str, Any]:
     """Return the settings of stations and instruments on which a product depends."""
     campaign, scene = job.campaign, job.scene
     if not scene.members:
@@ -452,7 +452,7 @@ def _campaign_settings(job: Job, plan: Plan, kind: ProductKind, channel: str) ->
             # `lidarops reproduce` also needs these to make the same bytes.
             "instrument": instrument.name,
             "products": product_dependence.single_channel_settings(
-                as_settings(instrument.products).get(kind.value), channel
+                as_settings(instrument.products).get(kind), channel
             ),
         }
     return {
@@ -496,7 +496,7 @@ def _instrument_name(campaign: Campaign, scene: Scene) -> str:
 
 
 def _record(
-    kind: ProductKind, channel: str, path: str, written: write.Written, data: xr.Dataset
+    kind: str, channel: str, path: str, written: write.Written, data: xr.Dataset
 ) -> ProductRecord:
     flags = data["quality_flag"].to_numpy()
     # Few bits occur in a product: count only these.

@@ -47,7 +47,7 @@ from lidarops.figures.series_data import (
 )
 from lidarops.figures.wording import counted
 from lidarops.flags import Quality
-from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
+from lidarops.records import ProductRecord, Role, RunRecord, SceneOutcome
 from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40
@@ -56,11 +56,11 @@ _FLAG_ROWS: Final = 40
 _DARK_STEP: Final = "dark"
 """Name of the step of a plan that subtracts dark files."""
 _KIND_ORDER: Final = (
-    ProductKind.HOMOGENEOUS,
-    ProductKind.VISIBILITY,
-    ProductKind.MULTIANGLE,
-    ProductKind.ELASTIC,
-    ProductKind.SIGNAL,
+    "homogeneous",
+    "visibility",
+    "multiangle",
+    "elastic",
+    "signal",
 )
 Content = TypeVar("Content")
 Drawing = Callable[[], product_figures.Rendered]
@@ -111,7 +111,7 @@ class Gallery:
 class _Group:
     """All products of one kind, instrument and channel."""
 
-    kind: ProductKind
+    kind: str
     instrument: str
     channel: str
     members: tuple[tuple[SceneOutcome, ProductRecord], ...]
@@ -289,12 +289,12 @@ def missing_products(record: RunRecord) -> frozenset[str]:
 
 def _groups(record: RunRecord) -> list[_Group]:
     """Return the groups by kind; within a kind, the first channel of every instrument first."""
-    members: dict[tuple[ProductKind, str, str], list[tuple[SceneOutcome, ProductRecord]]]
+    members: dict[tuple[str, str, str], list[tuple[SceneOutcome, ProductRecord]]]
     members = defaultdict(list)
     for scene in record.scenes:
         for product in scene.products:
             members[product.kind, scene.instrument, product.channel].append((scene, product))
-    turns: Counter[tuple[ProductKind, str]] = Counter()
+    turns: Counter[tuple[str, str]] = Counter()
     ordered = []
     for (kind, instrument, channel), products in sorted(members.items()):
         turn = turns[kind, instrument]
@@ -305,16 +305,16 @@ def _groups(record: RunRecord) -> list[_Group]:
 
 
 def _draw(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
-    if group.kind is ProductKind.HOMOGENEOUS:
+    if group.kind == "homogeneous":
         if not full or sources.truth is not None:
             yield from _homogeneous(group, sources, full=full)
-    elif group.kind is ProductKind.VISIBILITY:
+    elif group.kind == "visibility":
         yield from _visibility(group, sources, full=full)
     elif full:
         return
-    elif group.kind is ProductKind.MULTIANGLE:
+    elif group.kind == "multiangle":
         yield from _multiangle(group, sources)
-    elif group.kind is ProductKind.ELASTIC:
+    elif group.kind == "elastic":
         yield from _elastic(group, sources)
     else:
         yield from _signal(group, sources)

@@ -11,7 +11,7 @@ from typing import Final
 from lidarops.figures.wording import counted, decided_on, duration, percent
 from lidarops.flags import Quality, Severity
 from lidarops.plan.signal_rules import idle_window
-from lidarops.records import LeftOut, ProductKind, RunRecord, SceneOutcome, Step
+from lidarops.records import LeftOut, RunRecord, SceneOutcome, Step
 
 _MOST_NAMES: Final = 8
 """Most names listed in one cell."""
@@ -236,9 +236,9 @@ def _decisions(
 
 def flags(record: RunRecord) -> list[FlagRow]:
     """Return one row per product kind and quality bit that its values carry."""
-    values: Counter[ProductKind] = Counter()
-    counts: dict[ProductKind, Counter[str]] = defaultdict(Counter)
-    products: Counter[tuple[ProductKind, str]] = Counter()
+    values: Counter[str] = Counter()
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    products: Counter[tuple[str, str]] = Counter()
     for scene in record.scenes:
         for product in scene.products:
             values[product.kind] += product.values
@@ -253,7 +253,7 @@ def flags(record: RunRecord) -> list[FlagRow]:
             severity, description = _about(name)
             rows.append(
                 FlagRow(
-                    kind=kind.value,
+                    kind=kind,
                     bit=name,
                     severity=severity,
                     description=description,
@@ -352,8 +352,8 @@ def _flagged_by_kind(record: RunRecord) -> list[tuple[str, int, int]]:
     flagged: Counter[str] = Counter()
     for scene in record.scenes:
         for product in scene.products:
-            values[product.kind.value] += product.values
-            flagged[product.kind.value] += product.values - product.unflagged
+            values[product.kind] += product.values
+            flagged[product.kind] += product.values - product.unflagged
     return [(kind, values[kind], flagged[kind]) for kind in sorted(values) if values[kind]]
 
 
@@ -361,10 +361,7 @@ def _instrument_row(
     station: str, name: str, scenes: Sequence[SceneOutcome], refused_before: int
 ) -> InstrumentRow:
     retrieved = [
-        product
-        for scene in scenes
-        for product in scene.products
-        if product.kind is not ProductKind.SIGNAL
+        product for scene in scenes for product in scene.products if product.kind != "signal"
     ]
     return InstrumentRow(
         station=station,

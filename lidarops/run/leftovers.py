@@ -9,14 +9,13 @@ from enum import StrEnum
 from functools import cached_property
 
 from lidarops.campaign.model import Campaign
-from lidarops.campaign.product_settings import Products
 from lidarops.catalog.ledger import RecordedProduct
 from lidarops.plan import product_dependence
 from lidarops.plan.rules import StepName
 from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.plan.signal_rules import GLUED
 from lidarops.process.scene import nothing_to_do
-from lidarops.records import Granule, InputRecord, Plan, ProductKind, Scene
+from lidarops.records import Granule, InputRecord, Plan, Scene
 
 Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""
@@ -116,7 +115,7 @@ def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> di
 def _of_networks_alone(scene: Scene, campaign: Campaign) -> list[str]:
     """Return the networks of an instrument that has no requested product of its own."""
     owner = campaign.instruments.get(scene.instrument)
-    if owner is None or owner.products != Products():
+    if owner is None or owner.products.requested():
         return []
     return [
         name
@@ -152,7 +151,7 @@ def orphaned_products(
     """
     scenes = {scene.id: (scene, plan) for scene, plan in planned}
     requested = {
-        (scene.id, kind.value, channel)
+        (scene.id, kind, channel)
         for scene, plan in planned
         for kind, channel in product_dependence.planned_products(plan)
     }
@@ -180,15 +179,12 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
     """Return whether the campaign requests a product of its instrument or network."""
     name, _ = parse_scene_id(product.scene)
     if name in campaign.networks:
-        channel = campaign.networks[name].visibility.channel
-        return (product.kind, product.channel) == (ProductKind.VISIBILITY.value, channel)
+        joint = campaign.networks[name].requested().get(product.kind)
+        return joint is not None and joint.channel == product.channel
     owner = campaign.instruments.get(name)
-    settings = None if owner is None else getattr(owner.products, product.kind, None)
-    if settings is None:
-        return False
-    if settings.channels == "all":
-        return not product.channel.startswith(GLUED)
-    return product.channel in settings.channels
+    settings = None if owner is None else owner.products.requested().get(product.kind)
+    of_files = not product.channel.startswith(GLUED)
+    return settings is not None and settings.covers(product.channel, of_files=of_files)
 
 
 def _why_left_out(plan: Plan, product: RecordedProduct) -> str:

@@ -386,7 +386,7 @@ def _made_again(origin: _Origin, root: Path, folder: Path, out: Path) -> Iterato
     if outcome.error:
         yield Difference("processing", origin.plan.scene, outcome.error)
         return
-    record = next((made for made in outcome.products if made.kind.value == kind), None)
+    record = next((made for made in outcome.products if made.kind == kind), None)
     if record is None:
         yield Difference("processing", origin.plan.scene, f"no longer gives a {kind} product")
         return

@@ -13,9 +13,10 @@ from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, CatalogError
+from lidarops.kinds import kinds
 from lidarops.plan import availability
 from lidarops.plan.scenes import cut_scenes, parse_scene_id, scene_stop, select_scenes
-from lidarops.records import ProductKind, Scene, Unmet
+from lidarops.records import Scene, Unmet
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class Selection:
 
     stations: tuple[str, ...] = ()
     instruments: tuple[str, ...] = ()
-    kinds: tuple[ProductKind, ...] = ()
+    kinds: tuple[str, ...] = ()
     since: datetime | None = None
     until: datetime | None = None
 
@@ -83,12 +84,12 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
                     f"the campaign has no {word} {name!r}",
                     remedy=f"known: {', '.join(sorted(set(names)))}",
                 )
-    kinds = _kinds(campaign)
+    requested = _requested_kinds(campaign)
     for kind in selection.kinds:
-        if kind not in kinds:
+        if kind not in requested:
             raise CampaignError(
-                f"no instrument or network of the campaign requests product {kind.value!r}",
-                remedy=f"requested: {', '.join(kinds) or 'none'}",
+                f"no instrument or network of the campaign requests product {kind!r}",
+                remedy=f"requested: {', '.join(requested) or 'none'}",
             )
     since, until = selection.since, selection.until
     if since is not None and until is not None and since >= until:
@@ -99,15 +100,14 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
         )
 
 
-def _kinds(campaign: Campaign) -> list[ProductKind]:
+def _requested_kinds(campaign: Campaign) -> list[str]:
     """Return the kinds of product that a campaign requests."""
-    requests = [instrument.products for instrument in campaign.instruments.values()]
-    return [
-        kind
-        for kind in ProductKind
-        if any(getattr(products, kind.value, None) is not None for products in requests)
-        or (kind is ProductKind.VISIBILITY and campaign.networks)
-    ]
+    requested: set[str] = set()
+    for instrument in campaign.instruments.values():
+        requested |= instrument.products.requested().keys()
+    for network in campaign.networks.values():
+        requested |= network.requested().keys()
+    return [kind for kind in kinds() if kind in requested]
 
 
 def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> None:

@@ -92,7 +92,7 @@ class Session:
         """
         for stale in judged.stale:
             reason = stale.reason
-            _LOG.info("%s %s of %s: %s", stale.kind.value, stale.channel, judged.scene.id, reason)
+            _LOG.info("%s %s of %s: %s", stale.kind, stale.channel, judged.scene.id, reason)
             if stale.before is not None and self._campaign.superseded == "keep":
                 path, sha256 = stale.before.path, stale.before.sha256
                 self._kept[path] = versions.keep(self._output, path, sha256)

@@ -27,7 +27,7 @@ from lidarops.plan import product_dependence
 from lidarops.plan.product_dependence import ProductKey
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
-from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
+from lidarops.records import Granule, InputRecord, Plan, Role, Scene
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection
@@ -46,7 +46,7 @@ _OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "si
 class Stale:
     """A product to be made, and the reason."""
 
-    kind: ProductKind
+    kind: str
     channel: str
     reason: str
     before: RecordedProduct | None = None
@@ -298,7 +298,7 @@ class Judge:
         stale = []
         requested = product_dependence.plan_of_kinds(whole, self._selection.kinds)
         for kind, channel in product_dependence.planned_products(requested):
-            known = made.get((scene.id, kind.value, channel))
+            known = made.get((scene.id, kind, channel))
             reason = self._reason(scene, whole, (kind, channel), known, touched)
             if reason:
                 stale.append(Stale(kind, channel, reason, known))
@@ -367,7 +367,7 @@ class Judge:
         judged : Judgement
         files : sequence of InputRecord
             Files that its products were made from.
-        made : mapping of (ProductKind, str) to Dependence
+        made : mapping of (str, str) to Dependence
             Dependences of each product, by kind and channel.
         """
         contents = {used.path: used.sha256 for used in files}

@@ -20,7 +20,6 @@ from lidarops.figures.time_axis import time_axis
 from lidarops.figures.wording import counted
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.records import ProductKind
 from lidarops.site import image_panels, network_map, profile_panels, series_panels, svg
 from lidarops.site.series_panels import Line
 from lidarops.site.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
@@ -304,9 +303,9 @@ def _lines(product: xr.Dataset, variable: xr.DataArray, table: Floats) -> list[L
 
 
 _DRAWERS: Final[Mapping[str, Callable[[xr.Dataset], _Parts]]] = {
-    ProductKind.SIGNAL.value: _signal,
-    ProductKind.HOMOGENEOUS.value: _homogeneous,
-    ProductKind.ELASTIC.value: _elastic,
-    ProductKind.MULTIANGLE.value: _multiangle,
-    ProductKind.VISIBILITY.value: _visibility,
+    "signal": _signal,
+    "homogeneous": _homogeneous,
+    "elastic": _elastic,
+    "multiangle": _multiangle,
+    "visibility": _visibility,
 }

@@ -15,7 +15,6 @@ from lidarops.aggregate._optional_packages import need
 from lidarops.cli import aggregate as _command  # noqa: F401  # registers the command
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError
-from lidarops.records import ProductKind
 
 pytest.importorskip("pyarrow")
 
@@ -29,7 +28,7 @@ def run(*arguments: object) -> tuple[int, str]:
 def test_everything_is_made(tmp_path: Path):
     for day in range(2):
         add_day(tmp_path, day)
-        add_day(tmp_path, day, ProductKind.ELASTIC)
+        add_day(tmp_path, day, "elastic")
     code, output = run(tmp_path, "--means", "month", "--stac", "--json")
     made = json.loads(output)
     assert code == 0
@@ -65,7 +64,7 @@ def test_a_damaged_product_is_listed_with_exit_code_1(tmp_path: Path):
 
 def test_a_selection_leaves_the_index_alone(tmp_path: Path):
     add_day(tmp_path, 0)
-    add_day(tmp_path, 0, ProductKind.SIGNAL)
+    add_day(tmp_path, 0, "signal")
     code, output = run(tmp_path, "--kind", "signal", "--since", "2026-01-01", "--json")
     made = json.loads(output)
     assert code == 0
@@ -79,7 +78,7 @@ def test_a_selection_leaves_the_index_alone(tmp_path: Path):
 
 def test_a_failed_average_is_reported_and_the_others_are_made(tmp_path: Path):
     add_day(tmp_path, 0, zenith=[0.0, 10.0, 20.0, 30.0, 40.0])
-    add_day(tmp_path, 1, ProductKind.SIGNAL)
+    add_day(tmp_path, 1, "signal")
     code, output = run(tmp_path, "--means", "day", "--json")
     made = json.loads(output)
     assert code == 1

@@ -26,7 +26,6 @@ from lidarops.aggregate.facts import (
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf.write import write_plain
-from lidarops.records import ProductKind
 
 
 def test_facts_are_those_of_the_file(tmp_path: Path):
@@ -125,9 +124,9 @@ def test_a_link_to_the_outside_is_refused(tmp_path: Path):
 def test_a_selection_admits_products_that_overlap_in_time(tmp_path: Path):
     for day in range(4):
         add_day(tmp_path, day)
-    add_day(tmp_path, 1, ProductKind.SIGNAL)
+    add_day(tmp_path, 1, "signal")
     selection = ProductSelection(
-        ProductKind.HOMOGENEOUS,
+        "homogeneous",
         since=datetime(2026, 3, 2, 10, 30, tzinfo=UTC),
         until=datetime(2026, 3, 3, 10, 10, tzinfo=UTC),
     )

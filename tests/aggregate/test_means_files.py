@@ -27,9 +27,9 @@ from lidarops.aggregate.means_variables import (
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import ErrorKind
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.kinds import kinds
+from lidarops.netcdf.variables import ErrorKind, layout_of
+from lidarops.records import DetectionMode
 from lidarops.retrieve.air.labeled import Definition, visibility_of_extinction
 from lidarops.retrieve.air.visibility import WavelengthLaw
 
@@ -116,7 +116,7 @@ def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
 
 
 def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Path):
-    add_day(tmp_path, 0, ProductKind.ELASTIC, profiles=9)
+    add_day(tmp_path, 0, "elastic", profiles=9)
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
     data = open_products(tmp_path).astype(np.float64).load()
     used = np.isfinite(data.backscatter)
@@ -154,11 +154,11 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
 @pytest.mark.parametrize(
     ("kind", "names"),
     [
-        (ProductKind.MULTIANGLE, ["optical_depth", "extinction", "layer_optical_depth"]),
-        (ProductKind.VISIBILITY, ["extinction", "visibility_in_air"]),
+        ("multiangle", ["optical_depth", "extinction", "layer_optical_depth"]),
+        ("visibility", ["extinction", "visibility_in_air"]),
     ],
 )
-def test_fully_shared_errors_are_averaged(kind: ProductKind, names: list[str], tmp_path: Path):
+def test_fully_shared_errors_are_averaged(kind: str, names: list[str], tmp_path: Path):
     """Smoothing of scans and the prior of networks affect all profiles alike."""
 
     def even(data: xr.Dataset) -> xr.Dataset:
@@ -182,7 +182,7 @@ def test_fully_shared_errors_are_averaged(kind: ProductKind, names: list[str], t
 
 
 def test_means_of_visibility_state_the_systematic_error_of_extinction(tmp_path: Path):
-    add_day(tmp_path, 0, ProductKind.VISIBILITY)
+    add_day(tmp_path, 0, "visibility")
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
     data = open_products(tmp_path, usable=1).astype(np.float64).load()
     # The synthetic retrieval has a systematic error of 3 percent and a random error of 2 percent.
@@ -256,7 +256,7 @@ def test_a_profile_belongs_to_the_day_of_its_middle(tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", list(MAKERS))
-def test_every_kind_has_means_with_attributes_of_the_table(kind: ProductKind, tmp_path: Path):
+def test_every_kind_has_means_with_attributes_of_the_table(kind: str, tmp_path: Path):
     add_day(tmp_path, 0, kind)
     means = only(tmp_path, means_of(tmp_path))
     for row in averaged(kind):
@@ -271,10 +271,8 @@ def test_every_kind_has_means_with_attributes_of_the_table(kind: ProductKind, tm
         assert name in means
 
 
-@pytest.mark.parametrize(
-    ("kind", "period"), [(ProductKind.SIGNAL, Period.DAY), (ProductKind.VISIBILITY, Period.MONTH)]
-)
-def test_means_comply(kind: ProductKind, period: Period, tmp_path: Path):
+@pytest.mark.parametrize(("kind", "period"), [("signal", Period.DAY), ("visibility", Period.MONTH)])
+def test_means_comply(kind: str, period: Period, tmp_path: Path):
     for day in range(2):
         add_day(tmp_path, day, kind)
     (file,) = means_of(tmp_path, period).files
@@ -345,9 +343,9 @@ def test_means_are_no_products(tmp_path: Path):
     assert not any(isinstance(product, Refused) for product in facts_of(tmp_path))
 
 
-@pytest.mark.parametrize("kind", list(ProductKind))
-def test_every_error_that_is_not_random_has_a_budget(kind: ProductKind):
-    source = LAYOUTS[kind]
+@pytest.mark.parametrize("kind", list(kinds()))
+def test_every_error_that_is_not_random_has_a_budget(kind: str):
+    source = layout_of(kind)
     for row in averaged(kind):
         if row.error_kind not in (None, ErrorKind.RANDOM):
             assert (kind, row.name) in BUDGETS

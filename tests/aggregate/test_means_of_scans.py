@@ -8,7 +8,6 @@ from support.oracles.angle_scenes import clear, estimates
 
 from lidarops.aggregate._sums import Sample, Sums
 from lidarops.aggregate.means_variables import budget_of
-from lidarops.records import ProductKind
 from lidarops.retrieve.multiangle.vertical import smooth_profile
 
 CYCLES = 48
@@ -31,7 +30,7 @@ def test_means_stay_within_their_errors(name: str):
             residuals=depths.residuals,
         )
         errors = getattr(smooth, f"{name}_standard_error")
-        budget = budget_of(ProductKind.MULTIANGLE, name)
+        budget = budget_of("multiangle", name)
         random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = ~(smooth.extrapolated | smooth.prior_dominated)
         day = Sample(getattr(smooth, name), errors, random, shared, None, usable)

@@ -15,14 +15,13 @@ from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import summarize_flags
-from lidarops.records import ProductKind
 
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("archive")
     for day in (1, 0, 2):
-        add_day(root, day, ProductKind.ELASTIC)
+        add_day(root, day, "elastic")
         add_day(root, day, sections=3)
     return root
 
@@ -37,7 +36,7 @@ def test_a_folder_opens_in_order_of_time_with_units_and_flags(archive: Path):
     assert {"altitude", "zenith_angle", "section_range"} <= set(data.coords)
     parts = []
     for facts in facts_of(archive):
-        if facts.kind is ProductKind.HOMOGENEOUS:
+        if facts.kind == "homogeneous":
             with xr.open_dataset(archive / facts.path) as product:
                 parts.append(product.load())
     for name in ("extinction", "quality_flag", "time_bnds"):
@@ -66,7 +65,7 @@ def test_variables_of_a_whole_product_have_the_dimension_product(tmp_path: Path)
         add_day(
             tmp_path,
             day,
-            ProductKind.ELASTIC,
+            "elastic",
             change=lambda data, day=day: data.assign(lidar_ratio=((), 40.0 + day)),
         )
     data = open_products(tmp_path)
@@ -113,7 +112,7 @@ def test_a_damaged_product_is_named(tmp_path: Path):
 
 
 def test_a_damaged_chunk_raises_an_error(tmp_path: Path):
-    path = tmp_path / add_day(tmp_path, 0, ProductKind.SIGNAL, profiles=30, bins=1000)
+    path = tmp_path / add_day(tmp_path, 0, "signal", profiles=30, bins=1000)
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
     content[middle : middle + 2000] = bytes(2000)

@@ -12,7 +12,6 @@ from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.stac import write_stac
 from lidarops.errors import ProductError
-from lidarops.records import ProductKind
 
 pystac = pytest.importorskip("pystac")
 
@@ -21,7 +20,7 @@ pystac = pytest.importorskip("pystac")
 def archive(tmp_path: Path) -> Path:
     for day in range(2):
         add_day(tmp_path / "out", day)
-        add_day(tmp_path / "out", day, ProductKind.SIGNAL)
+        add_day(tmp_path / "out", day, "signal")
     return tmp_path / "out"
 
 

@@ -11,7 +11,8 @@ import yaml
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from lidarops.campaign.model import Campaign, ElasticSettings, load_campaign
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
 

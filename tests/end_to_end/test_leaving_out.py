@@ -27,7 +27,7 @@ from lidarops.process import channel_steps
 from lidarops.process import scene as processing
 from lidarops.process.scene import Job, process_scene
 from lidarops.raw.licel import RawFile
-from lidarops.records import Plan, ProductKind, Role, RunRecord, Step
+from lidarops.records import Plan, Role, RunRecord, Step
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
@@ -329,7 +329,7 @@ def test_a_window_without_effect_states_why(products, why):
     assert ("photon_532o" in read_windows(plan.steps)) == (not why)
     assert not any(idle_window(step, plan.steps) for step in plan.steps if step is not window)
     # The product of sections states the same, whatever other products there are.
-    alone = product_dependence.plan_closure(plan, [(ProductKind.HOMOGENEOUS, "photon_532o")])
+    alone = product_dependence.plan_closure(plan, [("homogeneous", "photon_532o")])
     assert window in alone.steps
     assert not idle_window(window, alone.steps)
 

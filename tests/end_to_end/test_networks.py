@@ -15,7 +15,7 @@ from support.archives.scene_jobs import scene_jobs
 from lidarops.campaign.model import Campaign
 from lidarops.flags import Quality
 from lidarops.process.scene import process_scene
-from lidarops.records import ProductKind, RunRecord, SceneOutcome
+from lidarops.records import RunRecord, SceneOutcome
 from lidarops.run.archive import Options, Selection, reprocess
 
 AIRS = {"homogeneous": made.HOMOGENEOUS, "gradient": made.GRADIENT, "plume": made.PLUME}
@@ -23,7 +23,7 @@ AIRS = {"homogeneous": made.HOMOGENEOUS, "gradient": made.GRADIENT, "plume": mad
 
 def reprocess_network(campaign: Campaign, **options: int) -> RunRecord:
     """Make all visibility products of a campaign, also those that are up to date."""
-    selection = Selection(kinds=(ProductKind.VISIBILITY,))
+    selection = Selection(kinds=("visibility",))
     record = reprocess(campaign, selection=selection, options=Options(force=True, **options))
     assert record is not None
     return record

@@ -19,9 +19,9 @@ from lidarops.figures import product_figures
 from lidarops.figures.profile_data import CAUSES, clearest_profile
 from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import build_product
-from lidarops.records import ProductKind, RunRecord
+from lidarops.records import RunRecord
 from lidarops.reports import gallery
 
 MEGA = 1e6
@@ -30,7 +30,7 @@ QUANTITY = "attenuated_backscatter"
 
 def stored(path: Path, data: xr.Dataset) -> xr.Dataset:
     """Build and write a product, and read it back as a report does."""
-    write_product(build_product(data, context(ProductKind.ELASTIC)), path)
+    write_product(build_product(data, context("elastic")), path)
     with xr.open_dataset(path, decode_timedelta=False) as opened:
         return opened.load()
 
@@ -228,7 +228,7 @@ def _run(archive: Archive, *paths_and_data) -> RunRecord:
         path.parent.mkdir(parents=True, exist_ok=True)
         whole = stored(path, data)
         kept = path.read_bytes()
-        products.append(archive.write(name, whole, ProductKind.ELASTIC))
+        products.append(archive.write(name, whole, "elastic"))
         path.write_bytes(kept)
     scene = fab.outcome("horizontal_20240301T000000", START, products=tuple(products))
     return fab.run_record(archive.root, [scene])

@@ -30,7 +30,7 @@ from lidarops.errors import ProductError
 from lidarops.figures import product_figures, reading
 from lidarops.figures.raster import raster_variables, read_raster
 from lidarops.figures.reading import Readers, ReadFailure, ReadTask
-from lidarops.records import InputRecord, ProductKind, Role, RunRecord
+from lidarops.records import InputRecord, Role, RunRecord
 from lidarops.reports import gallery, run_page
 
 SCENES = 6
@@ -44,8 +44,8 @@ def many(archive: Archive, tmp_path: Path) -> RunRecord:
         time = times(START + timedelta(hours=3 * number), 12, 900.0)
         all_times.append(time)
         products = (
-            archive.write(f"e{number}.nc", homogeneous(time, seed=number), ProductKind.HOMOGENEOUS),
-            archive.write(f"s{number}.nc", signal(time, bins=80), ProductKind.SIGNAL),
+            archive.write(f"e{number}.nc", homogeneous(time, seed=number), "homogeneous"),
+            archive.write(f"s{number}.nc", signal(time, bins=80), "signal"),
         )
         inputs = tuple(
             InputRecord(f"raw/h{12 * number + i:05d}", Role.SIGNAL, "b" * 64) for i in range(12)
@@ -131,7 +131,7 @@ def deadly(product: xr.Dataset) -> int:
 @pytest.fixture
 def paths(archive: Archive) -> list[Path]:
     for count in range(2, 10):
-        archive.write(f"{count}.nc", signal(times(START, count, 60.0), bins=4), ProductKind.SIGNAL)
+        archive.write(f"{count}.nc", signal(times(START, count, 60.0), bins=4), "signal")
     return [archive.root / f"{count}.nc" for count in range(2, 10)]
 
 

@@ -14,7 +14,7 @@ from support.products.fabricated import CHANNEL, START, Archive, outcome, run_re
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures, scan_data
 from lidarops.flags import Quality
-from lidarops.records import ProductKind
+from lidarops.kinds import kinds
 from lidarops.reports import gallery
 
 STATION = 180.0
@@ -634,9 +634,7 @@ class TestRendering:
 class TestGallery:
     def run(self, tmp_path, products, truth=None):
         archive = Archive(tmp_path / "products")
-        records = tuple(
-            archive.write(name, data, ProductKind.MULTIANGLE) for name, data in products.items()
-        )
+        records = tuple(archive.write(name, data, "multiangle") for name, data in products.items())
         path = ""
         if truth is not None:
             path = str(tmp_path / "truth.nc")
@@ -679,4 +677,4 @@ class TestGallery:
             gallery._KIND_ORDER.index(kind) for kind in ("homogeneous", "multiangle", "elastic")
         ]
         assert ranks == sorted(ranks)
-        assert set(gallery._KIND_ORDER) == set(ProductKind)
+        assert set(gallery._KIND_ORDER) == set(kinds())

@@ -12,8 +12,8 @@ import xarray as xr
 from golden.cdl import dump
 from support.products.made_products import MAKERS, PLACED, context
 
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import build_product
 
 FOLDER = Path(__file__).parent
 BEAMS: dict[str, dict[str, Any]] = {

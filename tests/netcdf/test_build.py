@@ -29,24 +29,24 @@ from support.products.made_products import (
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.build import bitround, product_path
+from lidarops.netcdf.build import bitround, build_product, product_path
 from lidarops.netcdf.global_attributes import _duration
-from lidarops.products.layouts import LAYOUTS, build_product
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.netcdf.variables import layout_of
+from lidarops.records import DetectionMode
 from lidarops.retrieve.multiangle.labeled_altitudes import Background
 
 KINDS = list(MAKERS)
 
 
-def decoded(data: xr.Dataset, kind: ProductKind, **changes) -> xr.Dataset:
+def decoded(data: xr.Dataset, kind: str, **changes) -> xr.Dataset:
     return xr.decode_cf(build_product(data, context(kind, **changes)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_numbers_are_preserved(kind: ProductKind):
+def test_numbers_are_preserved(kind: str):
     data = MAKERS[kind]()
     product = decoded(data, kind)
-    for row in LAYOUTS[kind].variables:
+    for row in layout_of(kind).variables:
         if row.optional and row.name not in data:
             assert row.name not in product
             continue
@@ -66,7 +66,7 @@ def test_numbers_are_preserved(kind: ProductKind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_attributes_name_existing_variables_only(kind: ProductKind):
+def test_attributes_name_existing_variables_only(kind: str):
     product = build_product(MAKERS[kind](), context(kind))
     for name, variable in product.variables.items():
         for attribute in ("ancillary_variables", "coordinates", "bounds"):
@@ -75,10 +75,10 @@ def test_attributes_name_existing_variables_only(kind: ProductKind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_usable_is_the_worst_severity_of_the_bits(kind: ProductKind):
+def test_usable_is_the_worst_severity_of_the_bits(kind: str):
     data = MAKERS[kind]()
     flags = data["quality_flag"]
-    allowed = [0, *(LAYOUTS[kind].row("quality_flag").flags or Quality(0))]
+    allowed = [0, *(layout_of(kind).row("quality_flag").flags or Quality(0))]
     flags[...] = np.resize(np.array(allowed, np.int32), flags.shape)
     flags[0, 0] = int(allowed[1] | allowed[-1])
     # A value that is missing without a bit would be refused.
@@ -90,7 +90,7 @@ def test_usable_is_the_worst_severity_of_the_bits(kind: ProductKind):
     np.testing.assert_array_equal(product["usable"].values.ravel(), expected)
     assert product["usable"].dims == product["quality_flag"].dims
     assert product["usable"].dtype == np.int8
-    main = next(row for row in LAYOUTS[kind].variables if row.uncertain)
+    main = next(row for row in layout_of(kind).variables if row.uncertain)
     assert "quality_flag usable" in product[main.name].attrs["ancillary_variables"]
     decoded_flags = xr.decode_cf(product)["usable"]
     assert decoded_flags.attrs["flag_meanings"] == "good use_with_care do_not_use"
@@ -105,14 +105,14 @@ def test_usable_cannot_be_passed_in():
 
 
 def test_storage_types_and_fill_values():
-    product = build_product(signal(), context(ProductKind.SIGNAL))
+    product = build_product(signal(), context("signal"))
     assert product["signal"].dtype == np.float32
     assert product["time"].dtype == np.float64
     assert product["shots"].dtype == product["quality_flag"].dtype == np.int32
     fill = np.float32(9.969209968386869e36)
     assert product["signal"].values[0, 0] == fill
     for name, variable in product.variables.items():
-        is_data = name in {row.name for row in LAYOUTS[ProductKind.SIGNAL].variables}
+        is_data = name in {row.name for row in layout_of("signal").variables}
         assert ("_FillValue" in variable.attrs) == (is_data and variable.dtype.kind == "f"), name
     assert "calendar" not in product["time"].attrs
     assert not product["time_bnds"].attrs
@@ -128,21 +128,21 @@ def test_order_of_dimensions_does_not_matter():
 def test_the_input_is_not_changed():
     data = signal()
     before = data.copy(deep=True)
-    build_product(data, context(ProductKind.SIGNAL))
+    build_product(data, context("signal"))
     xr.testing.assert_identical(data, before)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
+def test_coordinates_are_listed_where_their_dimensions_are(kind: str):
     product = build_product(MAKERS[kind](zenith=30.0, azimuth=10.0), context(kind))
     for name, variable in product.variables.items():
         for listed in variable.attrs.get("coordinates", "").split():
             assert set(product[listed].dims) <= set(variable.dims), (name, listed)
         assert "station" not in variable.attrs.get("coordinates", "").split()
     main, beam = {
-        ProductKind.SIGNAL: ("signal", {"altitude", "zenith_angle", "azimuth"}),
-        ProductKind.MULTIANGLE: ("residual", {"beam_zenith_angle", "beam_azimuth"}),
-        ProductKind.VISIBILITY: (
+        "signal": ("signal", {"altitude", "zenith_angle", "azimuth"}),
+        "multiangle": ("residual", {"beam_zenith_angle", "beam_azimuth"}),
+        "visibility": (
             "extinction",
             {"latitude", "longitude", "altitude", "crossing_id"},
         ),
@@ -155,8 +155,8 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
 
 
 def test_variables_of_three_dimensions_name_no_position():
-    product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
-    for row in LAYOUTS[ProductKind.MULTIANGLE].variables:
+    product = build_product(multiangle(), context("multiangle"))
+    for row in layout_of("multiangle").variables:
         if row.name not in product:
             continue
         listed = set(product[row.name].attrs["coordinates"].split())
@@ -166,7 +166,7 @@ def test_variables_of_three_dimensions_name_no_position():
 
 
 def test_range_bounds_are_half_way_between_centres():
-    product = build_product(signal(), context(ProductKind.SIGNAL))
+    product = build_product(signal(), context("signal"))
     np.testing.assert_array_equal(product["range_bnds"][:, 0], 7.5 * np.arange(40))
     np.testing.assert_array_equal(product["range_bnds"][:, 1], 7.5 * np.arange(1, 41))
 
@@ -182,9 +182,7 @@ def test_altitude_is_that_of_a_straight_beam(zenith, altitude, start, width):
     data = signal(profiles=2, bins=5, zenith=zenith)
     centres = start + width * (np.arange(5) + 0.5)
     station = Station(name="s", latitude=1, longitude=2, altitude=altitude)
-    product = build_product(
-        data.assign_coords(range=centres), context(ProductKind.SIGNAL, station=station)
-    )
+    product = build_product(data.assign_coords(range=centres), context("signal", station=station))
     expected = [altitude + r * math.cos(math.radians(zenith)) for r in centres]
     assert product["altitude"].dims == ("range",)
     np.testing.assert_allclose(product["altitude"], expected, rtol=1e-6, atol=1e-3)
@@ -196,10 +194,10 @@ def test_altitude_is_that_of_a_straight_beam(zenith, altitude, start, width):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in PLACED])
-def test_a_moving_beam_gives_altitudes_over_time(kind: ProductKind):
+def test_a_moving_beam_gives_altitudes_over_time(kind: str):
     zenith = [0.0, 30.0, 60.0, 30.0, 90.0]
     product = decoded(MAKERS[kind](zenith=zenith), kind)
-    along = "section" if kind is ProductKind.HOMOGENEOUS else "range"
+    along = "section" if kind == "homogeneous" else "range"
     distance = product["range" if along == "range" else "section_range"]
     assert product["altitude"].dims == ("time", along)
     np.testing.assert_array_equal(product["zenith_angle"], zenith)
@@ -254,14 +252,14 @@ def test_dates_are_those_of_data_or_release_or_environment(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("kind", "steps"),
     [
-        (ProductKind.HOMOGENEOUS, ["read", "homogeneous"]),
-        (ProductKind.SIGNAL, ["read", "background"]),
-        (ProductKind.ELASTIC, ["read", "elastic"]),
-        (ProductKind.MULTIANGLE, ["read", "background", "multiangle"]),
-        (ProductKind.VISIBILITY, ["read", "background", "visibility"]),
+        ("homogeneous", ["read", "homogeneous"]),
+        ("signal", ["read", "background"]),
+        ("elastic", ["read", "elastic"]),
+        ("multiangle", ["read", "background", "multiangle"]),
+        ("visibility", ["read", "background", "visibility"]),
     ],
 )
-def test_history_has_one_line_for_each_step(kind: ProductKind, steps: list[str]):
+def test_history_has_one_line_for_each_step(kind: str, steps: list[str]):
     lines = build_product(MAKERS[kind](), context(kind)).attrs["history"].splitlines()
     assert all(line.startswith("2026-") and "lidarops" in line for line in lines)
     *done, omitted, last = lines
@@ -287,7 +285,7 @@ def test_no_attribute_is_empty():
 
 
 def test_paths():
-    path = product_path(context(ProductKind.SIGNAL))
+    path = product_path(context("signal"))
     assert path == ("odesa/lidar-1/signal/2026/odesa_lidar-1_signal_photon_532o_20260301T000000.nc")
     local = context(start=datetime.fromisoformat("2026-01-01T01:00:00+03:00"))
     assert product_path(local).startswith("odesa/lidar-1/homogeneous/2025/")
@@ -326,9 +324,9 @@ def put(name: str, value: float, where: tuple[int, ...] = ()) -> Callable[[xr.Da
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_missing_variable_is_named(kind: ProductKind):
+def test_every_missing_variable_is_named(kind: str):
     data = MAKERS[kind]()
-    rows = (*LAYOUTS[kind].coordinates, *LAYOUTS[kind].variables)
+    rows = (*layout_of(kind).coordinates, *layout_of(kind).variables)
     optional = {row.name for row in rows if row.optional and "standard_error" not in row.name}
     needed = [str(name) for name in data.variables if name not in optional]
     assert len(needed) > 9
@@ -396,7 +394,7 @@ def test_bad_results_are_refused(change, field, problem):
 )
 def test_bad_signals_are_refused(change, field, problem):
     with pytest.raises(ProductError, match=problem) as caught:
-        build_product(change(signal()), context(ProductKind.SIGNAL))
+        build_product(change(signal()), context("signal"))
     assert caught.value.field == field
 
 
@@ -419,10 +417,10 @@ def test_bad_scans_are_refused(change, field, problem):
     data = change(multiangle())
     if field is None:
         # A missing value with a bit, and coordinates that the kind does not have, do no harm.
-        assert "zenith_angle" not in build_product(data, context(ProductKind.MULTIANGLE))
+        assert "zenith_angle" not in build_product(data, context("multiangle"))
         return
     with pytest.raises(ProductError, match=problem) as caught:
-        build_product(data, context(ProductKind.MULTIANGLE))
+        build_product(data, context("multiangle"))
     assert caught.value.field == field
 
 
@@ -430,11 +428,11 @@ def test_a_missing_optical_depth_without_a_bit_is_refused():
     data = multiangle()
     data["quality_flag"][2] = 0
     with pytest.raises(ProductError, match="carry no quality bit"):
-        build_product(put("optical_depth", math.nan, (2, 2))(data), context(ProductKind.MULTIANGLE))
+        build_product(put("optical_depth", math.nan, (2, 2))(data), context("multiangle"))
 
 
 def test_layers_of_a_scan_reach_from_the_station_upwards():
-    product = build_product(multiangle(levels=4), context(ProductKind.MULTIANGLE))
+    product = build_product(multiangle(levels=4), context("multiangle"))
     assert product["altitude"].attrs["axis"] == "Z"
     assert product["altitude"].attrs["bounds"] == "altitude_bnds"
     tops = STATION.altitude + 60.0 * np.arange(5)
@@ -444,7 +442,7 @@ def test_layers_of_a_scan_reach_from_the_station_upwards():
 
 
 def test_a_product_states_the_steps_of_its_retrieval():
-    product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
+    product = build_product(multiangle(), context("multiangle"))
     assert product.attrs["lidarops_steps"] == "joint: extinction is requested"
     assert "lidarops_steps" not in build_product(homogeneous(), context()).attrs
 
@@ -452,12 +450,12 @@ def test_a_product_states_the_steps_of_its_retrieval():
 def test_a_single_bin_may_have_given_bounds():
     data = signal(bins=4).isel(range=[2])
     data = data.assign_coords(range_bnds=(("range", "nv"), [[15.0, 22.5]]))
-    product = build_product(data, context(ProductKind.SIGNAL))
+    product = build_product(data, context("signal"))
     np.testing.assert_array_equal(product["range_bnds"], [[15.0, 22.5]])
 
 
 @pytest.mark.parametrize(
-    "changes", [{"kind": ProductKind.SIGNAL}, {"channel": "analog_355o"}, {"scene": "scene-2"}]
+    "changes", [{"kind": "signal"}, {"channel": "analog_355o"}, {"scene": "scene-2"}]
 )
 def test_provenance_of_another_product_is_refused(changes):
     with pytest.raises(ProductError, match="provenance"):
@@ -466,7 +464,7 @@ def test_provenance_of_another_product_is_refused(changes):
 
 def test_a_missing_value_with_a_bit_is_written_as_missing():
     data = put("amplitude", 1e300, (0, 0))(homogeneous())
-    product = decoded(data, ProductKind.HOMOGENEOUS)
+    product = decoded(data, "homogeneous")
     assert np.isnan(product["amplitude"].values[0, 0])
     assert product["quality_flag"].values[0, 0] != 0
 
@@ -483,7 +481,7 @@ def test_a_missing_value_with_a_bit_is_written_as_missing():
                 np.int32,
                 (3, 4),
                 elements=st.lists(
-                    st.sampled_from(list(LAYOUTS[kind].row("quality_flag").flags))
+                    st.sampled_from(list(layout_of(kind).row("quality_flag").flags))
                 ).map(lambda bits: int(np.bitwise_or.reduce([0, *map(int, bits)]))),
             ),
         )
@@ -533,7 +531,7 @@ def test_profiles_may_follow_each_other_faster_than_a_millisecond():
         time=starts + np.timedelta64(250, "us"),
         time_bnds=(("time", "nv"), np.stack([starts, starts + np.timedelta64(500, "us")], -1)),
     )
-    times = decoded(data, ProductKind.HOMOGENEOUS)["time"].values
+    times = decoded(data, "homogeneous")["time"].values
     assert all(
         abs((later - sooner) / np.timedelta64(1, "us") - 500) < 1
         for sooner, later in pairwise(times)
@@ -578,7 +576,7 @@ def test_a_scan_goes_from_profiles_to_a_product():
         station_altitude=STATION.altitude,
         background=Background((5400.0, 6000.0)),
     )
-    product = decoded(found, ProductKind.MULTIANGLE)
+    product = decoded(found, "multiangle")
     assert {"time": 3, "altitude": 59, "beam": 4}.items() <= product.sizes.items()
     np.testing.assert_array_equal(product["quality_flag"], found["quality_flag"])
     np.testing.assert_allclose(product["beam_azimuth"], 90.0)

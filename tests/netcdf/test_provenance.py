@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from support.products.made_products import context, homogeneous, provenance
 
 from lidarops.errors import ProductError
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.provenance import (
     _digest,
     code_version,
@@ -26,8 +27,7 @@ from lidarops.netcdf.provenance import (
     read_provenance,
 )
 from lidarops.netcdf.write import write_plain, write_product
-from lidarops.products.layouts import build_product
-from lidarops.records import InputRecord, LeftOut, ProductKind, Role
+from lidarops.records import InputRecord, LeftOut, Role
 
 RELATIONS = {
     "wasGeneratedBy": {"prov:entity": "entity", "prov:activity": "activity"},
@@ -130,7 +130,7 @@ def test_identifiers_differ_where_content_may():
     base = provenance()
     plan = replace(base.plan, left_out=(*base.plan.left_out, LeftOut("x", "y", "z")))
     others = [
-        provenance(ProductKind.SIGNAL),
+        provenance("signal"),
         provenance(channel="analog_1064o"),
         provenance(inputs=base.inputs[1:]),
         provenance(inputs=(replace(base.inputs[0], sha256="e" * 64), *base.inputs[1:])),

@@ -25,6 +25,7 @@ from support.products.made_products import MAKERS, context, homogeneous, signal
 
 from lidarops.errors import ProductError
 from lidarops.netcdf import write as writer
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import (
     BULK_BYTES,
     CHUNK_BYTES,
@@ -32,8 +33,6 @@ from lidarops.netcdf.write import (
     write_plain,
     write_product,
 )
-from lidarops.products.layouts import build_product
-from lidarops.records import ProductKind
 
 HERE = Path(__file__).parent
 TESTS = HERE.parent
@@ -87,7 +86,7 @@ def of_noise(profiles: int = 299, bins: int = 2000) -> xr.Dataset:
                 data=error * rng.normal(1, 0.05, error.shape)
             ),
         ),
-        context(ProductKind.SIGNAL),
+        context("signal"),
     )
     assert found["signal"].nbytes > CHUNK_BYTES
     return found
@@ -214,7 +213,7 @@ def test_definitions_are_written_once(
 
 
 @pytest.mark.parametrize("kind", list(MAKERS))
-def test_xarray_decodes_times_flags_bounds_and_coordinates(kind: ProductKind, tmp_path: Path):
+def test_xarray_decodes_times_flags_bounds_and_coordinates(kind: str, tmp_path: Path):
     data = MAKERS[kind](zenith=0.0)
     path = tmp_path / "product.nc"
     write_product(build_product(data, context(kind)), path)
@@ -239,7 +238,7 @@ def test_every_variable_has_the_declared_chunks_and_filters(
     profiles: int, bins: int, tmp_path: Path
 ):
     path = tmp_path / "product.nc"
-    write_product(build_product(signal(profiles, bins), context(ProductKind.SIGNAL)), path)
+    write_product(build_product(signal(profiles, bins), context("signal")), path)
     with netCDF4.Dataset(path) as file:
         for name, variable in file.variables.items():
             if not variable.dimensions:
@@ -293,7 +292,7 @@ SHA = """
 import sys
 from support.products.made_products import MAKERS, context
 from test_write import of_noise, truth
-from lidarops.products.layouts import build_product
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product, write_plain
 for kind, maker in MAKERS.items():
     product = build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind))
@@ -380,7 +379,7 @@ KILLED = """
 import os, signal, sys
 from support.products.made_products import context, homogeneous
 from lidarops.netcdf import write as writer
-from lidarops.products.layouts import build_product
+from lidarops.netcdf.build import build_product
 writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)
 writer.write_product(build_product(homogeneous(), context()), sys.argv[1])
 """

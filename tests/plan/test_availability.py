@@ -18,7 +18,7 @@ from lidarops.plan.availability import (
     unavailable_channels,
     validity_edges,
 )
-from lidarops.records import Granule, ProductKind, Role, Unmet
+from lidarops.records import Granule, Role, Unmet
 
 DAY = 1440
 OLD = factories.PHOTON
@@ -116,8 +116,8 @@ def test_facts_of_a_time_without_files_are_not_reported(tmp_path: Path) -> None:
         ({}, {"photon_533o", "photon_999o"}),
         ({"since": datetime(2026, 3, 2, tzinfo=UTC)}, {"photon_999o"}),
         ({"until": datetime(2026, 3, 2, tzinfo=UTC)}, {"photon_533o", "photon_999o"}),
-        ({"kinds": (ProductKind.SIGNAL,)}, {"photon_533o", "photon_999o"}),
-        ({"kinds": (ProductKind.ELASTIC,)}, {"photon_533o"}),
+        ({"kinds": ("signal",)}, {"photon_533o", "photon_999o"}),
+        ({"kinds": ("elastic",)}, {"photon_533o"}),
         ({"instruments": {"another"}}, set()),
     ],
 )

@@ -17,12 +17,11 @@ from support import factories
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, Metadata
 from lidarops.flags import Quality
-from lidarops.netcdf.build import Context
+from lidarops.netcdf.build import Context, build_product
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.process import channel_steps
-from lidarops.products.layouts import build_product
-from lidarops.records import DetectionMode, Plan, ProductKind, Provenance, Role
+from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
 
 AIR = MolecularProfile.us_standard()
@@ -160,7 +159,7 @@ def elastic_products():
     """Return the elastic products of the photon-counting and the glued channel."""
     products = {"elastic": {**ELASTIC, "average": "10min"}}
     return {
-        channel: carry_out(products, channel=channel)[ProductKind.ELASTIC]
+        channel: carry_out(products, channel=channel)["elastic"]
         for channel in ("photon_532o", "glued_532o")
     }
 
@@ -204,7 +203,7 @@ def test_results_can_be_built_into_products(channel: str) -> None:
     plan = planned(campaign({"elastic": ELASTIC}))
     retrieved = elastic_products()[channel]
     settings = {
-        "kind": ProductKind.ELASTIC,
+        "kind": "elastic",
         "channel": channel,
         "mode": DetectionMode.PHOTON,
         "wavelength": 532e-9,
@@ -219,9 +218,7 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "scene": plan.scene,
         "start": datetime(2026, 3, 1, tzinfo=UTC),
         "stop": datetime(2026, 3, 1, tzinfo=UTC) + timedelta(days=1),
-        "provenance": Provenance(
-            "test", plan.scene, ProductKind.ELASTIC, channel, (), plan, {}, {}, "0"
-        ),
+        "provenance": Provenance("test", plan.scene, "elastic", channel, (), plan, {}, {}, "0"),
     }
     product = build_product(retrieved, Context(**settings))
     assert product["backscatter"].dims == ("time", "range")
@@ -239,14 +236,14 @@ def test_results_can_be_built_into_products(channel: str) -> None:
 def test_any_chunks_and_threads_give_the_same_bits(channel: str, chunk: int) -> None:
     products = {"elastic": {**ELASTIC, "average": "10min"}}
     with dask.config.set(scheduler="threads", num_workers=2):
-        product = carry_out(products, archive(chunk=chunk), channel=channel)[ProductKind.ELASTIC]
+        product = carry_out(products, archive(chunk=chunk), channel=channel)["elastic"]
     xr.testing.assert_identical(product, elastic_products()[channel])
 
 
 def test_a_slant_beam_recovers_the_same_truth() -> None:
     products = {"elastic": {**ELASTIC, "reference": {"lowest": 3000, "highest": 6000}}}
     raw = archive(zenith=30.0)
-    product = carry_out(products, raw, zenith_angle=30.0)[ProductKind.ELASTIC]
+    product = carry_out(products, raw, zenith_angle=30.0)["elastic"]
     altitude = STATION + np.cos(np.deg2rad(30.0)) * distance
     assert float(product["zenith_angle"]) == 30.0
     score = (product["backscatter"] - particles(altitude)) / product["backscatter_standard_error"]
@@ -267,7 +264,7 @@ def test_missing_profiles_give_flags_and_no_error() -> None:
     for channel in ("photon_532o", "glued_532o"):
         for kind, product in carry_out(products, raw, channel=channel).items():
             flag = product["quality_flag"].to_numpy()
-            name = "backscatter" if kind is ProductKind.ELASTIC else "signal"
+            name = "backscatter" if kind == "elastic" else "signal"
             assert (flag[np.isnan(product[name].to_numpy())] != 0).all()
             assert np.isnan(product[name].to_numpy()[-1]).all()
             assert np.isfinite(product[name].to_numpy()[0]).mean() > 0.9
@@ -290,17 +287,14 @@ def test_a_sounding_replaces_the_standard_atmosphere(tmp_path: Path) -> None:
     sounded = carry_out(products, raw, ancillaries=files, molecular_profile="molecular.csv")
     standard = carry_out(products, raw)
     np.testing.assert_allclose(
-        sounded[ProductKind.ELASTIC]["molecular_backscatter"],
+        sounded["elastic"]["molecular_backscatter"],
         air.backscatter(STATION + distance, 532e-9),
         rtol=1e-12,
     )
     inside = between(800, 1500)
-    assert np.sqrt(np.nanmean(deviation(sounded[ProductKind.ELASTIC], inside) ** 2)) < 1.4
-    standard_air = standard[ProductKind.ELASTIC]["molecular_backscatter"]
-    assert (
-        np.abs(standard_air / sounded[ProductKind.ELASTIC]["molecular_backscatter"] - 1.0).max()
-        > 0.02
-    )
+    assert np.sqrt(np.nanmean(deviation(sounded["elastic"], inside) ** 2)) < 1.4
+    standard_air = standard["elastic"]["molecular_backscatter"]
+    assert np.abs(standard_air / sounded["elastic"]["molecular_backscatter"] - 1.0).max() > 0.02
 
 
 OVERLAP = "range [m],overlap\n300,0.1\n600,0.4\n1200,0.8\n1800,1\n"
@@ -316,8 +310,8 @@ class TestOverlap:
     def test_the_signal_is_divided_by_it(self, tmp_path: Path) -> None:
         products = {"signal": {"channels": ["photon_532o"]}}
         files = read(tmp_path, overlap=OVERLAP)
-        whole = carry_out(products, self.raw(), ancillaries=files, **FACTS)[ProductKind.SIGNAL]
-        plain = carry_out(products, self.raw())[ProductKind.SIGNAL]
+        whole = carry_out(products, self.raw(), ancillaries=files, **FACTS)["signal"]
+        plain = carry_out(products, self.raw())["signal"]
         known = distance > 300.0
         for name in ("signal", "signal_standard_error"):
             np.testing.assert_allclose(
@@ -332,7 +326,7 @@ class TestOverlap:
     def test_elastic_is_unbiased_where_it_is_given(self, tmp_path: Path) -> None:
         files = read(tmp_path, overlap=OVERLAP)
         retrieved = carry_out({"elastic": ELASTIC}, self.raw(), ancillaries=files, **FACTS)
-        score = deviation(retrieved[ProductKind.ELASTIC], between(450, 1200))
+        score = deviation(retrieved["elastic"], between(450, 1200))
         assert np.isfinite(score).mean() > 0.9
         assert np.sqrt(np.nanmean(score**2)) < 1.4
 
@@ -340,7 +334,7 @@ class TestOverlap:
         files = read(tmp_path, overlap=OVERLAP)
         products = {"signal": {"channels": ["photon_532o", "glued_532o"]}}
         retrieved = carry_out(products, channel="glued_532o", ancillaries=files, **FACTS)
-        flag = retrieved[ProductKind.SIGNAL]["quality_flag"].to_numpy()
+        flag = retrieved["signal"]["quality_flag"].to_numpy()
         assert (flag[:, distance < 300.0] & int(Quality.INCOMPLETE_OVERLAP) != 0).all()
 
     def test_products_are_independent(self, tmp_path: Path) -> None:
@@ -349,7 +343,7 @@ class TestOverlap:
         alone = carry_out({"homogeneous": sections}, self.raw(), ancillaries=files, **FACTS)
         products = {"homogeneous": sections, "signal": {"channels": ["photon_532o"]}}
         beside = carry_out(products, self.raw(), ancillaries=files, **FACTS)
-        xr.testing.assert_identical(alone[ProductKind.HOMOGENEOUS], beside[ProductKind.HOMOGENEOUS])
+        xr.testing.assert_identical(alone["homogeneous"], beside["homogeneous"])
 
     def test_a_path_through_partial_overlap_is_corrected_or_flagged(self, tmp_path: Path) -> None:
         files = read(tmp_path, overlap=OVERLAP)
@@ -358,7 +352,7 @@ class TestOverlap:
         settings = {**FACTS, "zenith_angle": 90.0}
         product = carry_out(
             {"homogeneous": sections}, archive(level * SEEN), ancillaries=files, **settings
-        )[ProductKind.HOMOGENEOUS]
+        )["homogeneous"]
         right = np.abs(product["extinction"] - 3e-4) < 5 * product["extinction_standard_error"]
         assert (right | (product["quality_flag"] != 0)).all()
 
@@ -374,8 +368,8 @@ def _dark(profiles: int = 12, ripple: float = 0.5) -> xr.Dataset:
 def test_the_dark_signal_is_subtracted_and_its_error_included() -> None:
     products = {"signal": {"channels": ["analog_532o"]}}
     raw = archive(ripple=0.5)
-    uncorrected = carry_out(products, raw, channel="analog_532o")[ProductKind.SIGNAL]
-    corrected = carry_out(products, raw, channel="analog_532o", dark=_dark())[ProductKind.SIGNAL]
+    uncorrected = carry_out(products, raw, channel="analog_532o")["signal"]
+    corrected = carry_out(products, raw, channel="analog_532o", dark=_dark())["signal"]
     r2 = distance**2
     true = count_rate(distance) / RATIO * r2
     far = between(3000, 6000)
@@ -394,7 +388,7 @@ def test_means_of_many_profiles_keep_the_error_of_the_dark_signal() -> None:
     raw = archive(count_rate(distance, constant=4e13), profiles=120)
     errors = {}
     for name, dark in (("without", None), ("with", _dark(profiles=3, ripple=0.0))):
-        product = carry_out(products, raw, channel="analog_532o", dark=dark)[ProductKind.ELASTIC]
+        product = carry_out(products, raw, channel="analog_532o", dark=dark)["elastic"]
         assert product.sizes["time"] == 1
         inside = between(2000, 3000)
         errors[name] = np.nanmedian(product["backscatter_error_noise"].to_numpy()[0, inside])
@@ -408,7 +402,7 @@ def _glued(raw: xr.Dataset, **analog: object) -> xr.Dataset:
         "analog_532o": {"noise_variance": 4e-4, **analog},
     }
     products = {"signal": {"channels": ["glued_532o"]}}
-    return carry_out(products, raw, channel="glued_532o", channels=channels)[ProductKind.SIGNAL]
+    return carry_out(products, raw, channel="glued_532o", channels=channels)["signal"]
 
 
 @pytest.mark.parametrize(
@@ -450,18 +444,18 @@ def test_geometry_and_shots_go_with_every_product() -> None:
         "elastic": {**ELASTIC, "channels": ["photon_532o"]},
     }
     retrieved = carry_out(products, archive().assign_coords(azimuth=("time", np.full(20, 40.0))))
-    assert list(retrieved) == [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS, ProductKind.ELASTIC]
+    assert list(retrieved) == ["signal", "homogeneous", "elastic"]
     for data in retrieved.values():
         assert {"time", "time_bnds", "zenith_angle", "azimuth"} <= set(data.coords)
         assert data["shots"].dims == ("time",)
         assert all(array.chunks is None for array in data.variables.values())
-    assert int(retrieved[ProductKind.SIGNAL]["shots"][0]) == SHOTS
-    assert int(retrieved[ProductKind.ELASTIC]["shots"][0]) == 20 * SHOTS
+    assert int(retrieved["signal"]["shots"][0]) == SHOTS
+    assert int(retrieved["elastic"]["shots"][0]) == 20 * SHOTS
 
 
 def test_only_planned_products_are_made() -> None:
     retrieved = carry_out({"signal": {"channels": ["photon_532o"]}})
-    assert list(retrieved) == [ProductKind.SIGNAL]
+    assert list(retrieved) == ["signal"]
 
 
 def test_a_planned_product_can_be_made() -> None:
@@ -471,7 +465,7 @@ def test_a_planned_product_can_be_made() -> None:
     plan = planned(campaign(products), bins=534)
     names = [step.name for step in plan.steps if step.channel == "photon_532o"]
     if "elastic" in names:
-        assert carry_out(products, raw)[ProductKind.ELASTIC].sizes["time"] == 1
+        assert carry_out(products, raw)["elastic"].sizes["time"] == 1
 
 
 @pytest.mark.parametrize("zenith", [0.0, 20.0, 30.0, 60.0])
@@ -479,7 +473,7 @@ def test_a_single_window_that_the_plan_allows_is_used_at_any_angle(zenith: float
     window = {"lowest": 2500, "highest": 3500, "width": 1000, "relative_error": 0.0}
     product = carry_out(
         {"elastic": {**ELASTIC, "reference": window}}, archive(zenith=zenith), zenith_angle=zenith
-    )[ProductKind.ELASTIC]
+    )["elastic"]
     climb = np.cos(np.deg2rad(zenith))
     assert float(product["reference_bottom"][0]) * climb == pytest.approx(2500.0)
     assert float(product["reference_top"][0]) * climb == pytest.approx(3500.0)
@@ -493,7 +487,7 @@ def test_bins_nearer_than_full_overlap_are_flagged_and_excluded() -> None:
         for kind, data in retrieved.items():
             hit = (data["quality_flag"].to_numpy() & int(Quality.INCOMPLETE_OVERLAP)) != 0
             np.testing.assert_array_equal(hit, np.broadcast_to(near, hit.shape), err_msg=kind)
-        elastic = retrieved[ProductKind.ELASTIC]["backscatter"].to_numpy()
+        elastic = retrieved["elastic"]["backscatter"].to_numpy()
         assert np.isnan(elastic[:, near]).all()
         assert np.isfinite(elastic[:, between(900, 3000)]).all()
 
@@ -503,7 +497,7 @@ def test_the_background_follows_the_method_of_the_campaign() -> None:
     backgrounds = {}
     for method in ("known_shape", "tail_mean"):
         products = {"elastic": {**ELASTIC, "background": method}}
-        backgrounds[method] = float(carry_out(products, dim)[ProductKind.ELASTIC]["background"][0])
+        backgrounds[method] = float(carry_out(products, dim)["elastic"]["background"][0])
     tail_signal = count_rate(distance)[-120:].mean()
     assert backgrounds["known_shape"] == pytest.approx(SKY, abs=0.2 * tail_signal)
     assert backgrounds["tail_mean"] == pytest.approx(SKY + tail_signal, abs=0.2 * tail_signal)

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from support.products.made_products import MAKERS, context
 
 from lidarops.flags import Quality, Severity
-from lidarops.netcdf.variables import summarize_flags
+from lidarops.kinds import kinds
+from lidarops.netcdf.build import build_product
+from lidarops.netcdf.variables import layout_of, summarize_flags
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import LAYOUTS, build_product
-from lidarops.records import ProductKind
 from lidarops.retrieve.multiangle import labeled
 
 BITS = list(Quality)
@@ -110,7 +110,7 @@ def test_bits_are_distinct_powers_of_two_of_one_type():
     values = [int(bit) for bit in BITS]
     assert values == [1 << number for number in range(len(values))]
     assert max(values) <= np.iinfo(np.int32).max
-    assert {layout.row("quality_flag").dtype for layout in LAYOUTS.values()} == {"i4"}
+    assert {layout.row("quality_flag").dtype for layout in map(layout_of, kinds())} == {"i4"}
 
 
 @pytest.mark.parametrize("bit", BITS, ids=lambda bit: bit.name)
@@ -119,7 +119,7 @@ def test_every_bit_is_documented_in_some_kind_and_raised_by_some_scene(
 ):
     assert len(bit.description.split()) > 3
     assert bit.severity in Severity
-    assert any(bit & (layout.row("quality_flag").flags or 0) for layout in LAYOUTS.values())
+    assert any(bit & (layout.row("quality_flag").flags or 0) for layout in map(layout_of, kinds()))
     if bit in SCENES:
         assert f"Quality.{bit.name}" in source(repository, SCENES[bit])
     elif bit in BY_FIELD:
@@ -143,10 +143,10 @@ def test_usable_is_the_worst_of_any_set_of_bits(bits: set[Quality]):
 @given(data=st.data())
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_any_bits_come_back_from_a_file_by_mask_and_meaning(
-    kind: ProductKind, data: st.DataObject, tmp_path: Path
+    kind: str, data: st.DataObject, tmp_path: Path
 ):
     results = MAKERS[kind](profiles=2).fillna(1.0)
-    allowed = list(LAYOUTS[kind].row("quality_flag").flags or Quality(0))
+    allowed = list(layout_of(kind).row("quality_flag").flags or Quality(0))
     sets = data.draw(st.lists(st.sets(st.sampled_from(allowed)), min_size=1, max_size=8))
     values = np.array([sum(each) for each in sets], np.int32)
     shape = results["quality_flag"].shape

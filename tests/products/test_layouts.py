@@ -11,13 +11,22 @@ from compliance_checker.cfunits import Unit
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import PROVENANCE, Coverage, Row, attributes, station, units
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.kinds import kinds
+from lidarops.netcdf.variables import (
+    PROVENANCE,
+    Coverage,
+    Row,
+    attributes,
+    layout_of,
+    station,
+    units,
+)
+from lidarops.records import DetectionMode
 
 ROWS = [
     pytest.param(kind, row, id=f"{kind}-{row.name}")
-    for kind, layout in LAYOUTS.items()
+    for kind in kinds()
+    for layout in [layout_of(kind)]
     for row in (*layout.coordinates, *layout.variables, station(profiles=True), PROVENANCE)
 ]
 NAMED = [
@@ -55,9 +64,7 @@ def test_standard_names_exist_and_their_units_convert(
 
 @pytest.mark.parametrize(("kind", "row"), ROWS)
 @pytest.mark.parametrize("mode", list(DetectionMode))
-def test_every_unit_is_valid_and_no_placeholder_is_left(
-    kind: ProductKind, row: Row, mode: DetectionMode
-):
+def test_every_unit_is_valid_and_no_placeholder_is_left(kind: str, row: Row, mode: DetectionMode):
     found = attributes(row, mode=mode)
     assert found["long_name"]
     assert found["coverage_content_type"] in set(Coverage)
@@ -73,17 +80,18 @@ def test_variables_without_standard_name():
     gluing = {"glue_slope", "glue_slope_standard_error", "glue_bottom", "glue_top"}
     unnamed = {
         kind: {row.name for row in layout.variables if not row.standard_name}
-        for kind, layout in LAYOUTS.items()
+        for kind in kinds()
+        for layout in [layout_of(kind)]
     }
     assert unnamed == {
-        ProductKind.SIGNAL: {
+        "signal": {
             "signal",
             "signal_standard_error",
             "background",
             "background_standard_error",
             *gluing,
         },
-        ProductKind.ELASTIC: {
+        "elastic": {
             *(f"backscatter_error_{cause}" for cause in _CAUSES),
             "molecular_backscatter",
             "molecular_extinction",
@@ -96,7 +104,7 @@ def test_variables_without_standard_name():
             "scattering_ratio_standard_error",
             *gluing,
         },
-        ProductKind.MULTIANGLE: {
+        "multiangle": {
             *(
                 f"{quantity}{error}"
                 for quantity in ("optical_depth", "extinction", "layer_optical_depth")
@@ -112,7 +120,7 @@ def test_variables_without_standard_name():
             "effective_degrees_of_freedom",
             "reach",
         },
-        ProductKind.VISIBILITY: {
+        "visibility": {
             "visibility_in_air_lower",
             "visibility_in_air_upper",
             "extinction",
@@ -125,7 +133,7 @@ def test_variables_without_standard_name():
             "prior_deviation",
             "beam_range",
         },
-        ProductKind.HOMOGENEOUS: {
+        "homogeneous": {
             "visibility_in_air_lower",
             "visibility_in_air_upper",
             "extinction",
@@ -160,10 +168,10 @@ def test_no_standard_name_means_total_extinction_in_air(standard_names: dict[str
     ],
 )
 def test_units_of_the_signal_follow_the_mode(mode: DetectionMode, name: str, unit: str):
-    assert attributes(LAYOUTS[ProductKind.SIGNAL].row(name), mode=mode)["units"] == unit
+    assert attributes(layout_of("signal").row(name), mode=mode)["units"] == unit
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
+@pytest.mark.parametrize("layout", map(layout_of, kinds()), ids=list(kinds()))
 def test_ancillaries_and_standard_errors_are_consistent(layout):
     names = [row.name for row in (*layout.coordinates, *layout.variables)]
     assert len(set(names)) == len(names)
@@ -177,7 +185,7 @@ def test_ancillaries_and_standard_errors_are_consistent(layout):
     assert all(row.valid_min is None for row in layout.variables if row.uncertain)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
+@pytest.mark.parametrize("layout", map(layout_of, kinds()), ids=list(kinds()))
 def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
     row = layout.row("quality_flag")
     found = attributes(row, mode=DetectionMode.ANALOG)
@@ -192,11 +200,11 @@ def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
 
 
 def test_retrieved_quantities_keep_all_their_bits_and_signals_13():
-    bits = {row.name: row.significant_bits for row in LAYOUTS[ProductKind.SIGNAL].variables}
+    bits = {row.name: row.significant_bits for row in layout_of("signal").variables}
     assert bits["signal"] == 13
-    assert all(row.significant_bits is None for row in LAYOUTS[ProductKind.HOMOGENEOUS].variables)
+    assert all(row.significant_bits is None for row in layout_of("homogeneous").variables)
 
 
 def test_unknown_row_is_refused_with_the_choices():
     with pytest.raises(ProductError, match=r"bogus.*extinction_standard_error"):
-        LAYOUTS[ProductKind.HOMOGENEOUS].row("bogus")
+        layout_of("homogeneous").row("bogus")

@@ -13,11 +13,11 @@ from support.products.made_products import context
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
+from lidarops.netcdf.build import build_product
+from lidarops.netcdf.variables import layout_of
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import LAYOUTS, build_product
-from lidarops.records import ProductKind
 
-KIND = ProductKind.VISIBILITY
+KIND = "visibility"
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_a_value_may_not_be_missing_without_a_reason(data: xr.Dataset):
 
 
 def test_bits_are_those_that_a_network_can_raise(data: xr.Dataset):
-    flags = LAYOUTS[KIND].row("quality_flag").flags
+    flags = layout_of(KIND).row("quality_flag").flags
     assert flags is not None
     strange = data.copy(deep=True)
     strange["quality_flag"][0, 0] = int(Quality.CLOUD)

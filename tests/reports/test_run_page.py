@@ -27,7 +27,7 @@ from support.products.fabricated import (
 from lidarops.errors import CatalogError
 from lidarops.figures.wording import counted, duration, percent, size
 from lidarops.flags import Quality
-from lidarops.records import LeftOut, Plan, ProductKind, ProductRecord, Step, Unmet
+from lidarops.records import LeftOut, Plan, ProductRecord, Step, Unmet
 from lidarops.reports import run_page, run_tables
 from lidarops.reports import run_record as record
 
@@ -153,7 +153,7 @@ class TestSimulatedRun:
     def test_wrong_standard_errors_are_reported(self, simulated, tmp_path, archive):
         time = times(START, 96, 900.0)
         worse = archive.write(
-            "h/worse.nc", homogeneous(time, scale=3.0, flagged=0.0), ProductKind.HOMOGENEOUS
+            "h/worse.nc", homogeneous(time, scale=3.0, flagged=0.0), "homogeneous"
         )
         scene = replace(simulated.scenes[0], products=(worse,))
         page = built(replace(simulated, scenes=(scene,)), tmp_path / "report", figures=0)
@@ -186,16 +186,16 @@ class TestUnusableFiles:
         time = times(START, 6, 60.0)
         write = archive.write
         kinds = {
-            "gone.nc": write("gone.nc", homogeneous(time), ProductKind.HOMOGENEOUS),
-            "garbage.nc": write("garbage.nc", homogeneous(time), ProductKind.HOMOGENEOUS),
-            "cut.nc": write("cut.nc", signal(time), ProductKind.SIGNAL),
-            "foreign.nc": write("foreign.nc", homogeneous(time), ProductKind.HOMOGENEOUS),
+            "gone.nc": write("gone.nc", homogeneous(time), "homogeneous"),
+            "garbage.nc": write("garbage.nc", homogeneous(time), "homogeneous"),
+            "cut.nc": write("cut.nc", signal(time), "signal"),
+            "foreign.nc": write("foreign.nc", homogeneous(time), "homogeneous"),
             "swapped.nc": replace(
-                write("swapped.nc", homogeneous(time), ProductKind.HOMOGENEOUS),
-                kind=ProductKind.SIGNAL,
+                write("swapped.nc", homogeneous(time), "homogeneous"),
+                kind="signal",
             ),
-            "empty.nc": write("empty.nc", signal(time), ProductKind.SIGNAL),
-            "rotten.nc": write("rotten.nc", signal(time), ProductKind.SIGNAL),
+            "empty.nc": write("empty.nc", signal(time), "signal"),
+            "rotten.nc": write("rotten.nc", signal(time), "signal"),
         }
         (archive.root / "gone.nc").unlink()
         (archive.root / "garbage.nc").write_bytes(b"\x00garbage")
@@ -268,14 +268,14 @@ class TestDegenerateRuns:
         assert "20 no product" in page.text
 
     def test_product_without_values(self, tmp_path):
-        empty = ProductRecord("x.nc", ProductKind.HOMOGENEOUS, "c", "", 0, 0, {}, 0)
+        empty = ProductRecord("x.nc", "homogeneous", "c", "", 0, 0, {}, 0)
         page = built(run_record(tmp_path, [outcome("s", products=(empty,))]), tmp_path / "report")
         assert "x.nc" in page.text
 
     def test_a_scene_without_a_usable_value_is_a_problem_in_the_verdict(self, tmp_path):
-        bad = ProductRecord("x.nc", ProductKind.ELASTIC, "c", "", 0, 9, {}, 0, 0)
+        bad = ProductRecord("x.nc", "elastic", "c", "", 0, 9, {}, 0, 0)
         good = replace(bad, path="y.nc", usable=5)
-        idle = replace(bad, path="z.nc", kind=ProductKind.HOMOGENEOUS)
+        idle = replace(bad, path="z.nc", kind="homogeneous")
         scenes = [outcome("cloudy", products=(bad,)), outcome("clear", products=(good, idle))]
         run = run_record(tmp_path, scenes)
         verdict = "1 scene without a usable value: cloudy. 1 product without a usable value."
@@ -288,7 +288,7 @@ class TestDegenerateRuns:
         assert run_tables.verdict(only_idle).startswith("Every scene was processed")
 
     def test_unknown_bits_are_shown(self, tmp_path):
-        odd = ProductRecord("x.nc", ProductKind.SIGNAL, "c", "", 0, 10, {"cosmic": 4}, 6)
+        odd = ProductRecord("x.nc", "signal", "c", "", 0, 10, {"cosmic": 4}, 6)
         page = built(run_record(tmp_path, [outcome("s", products=(odd,))]), tmp_path / "report")
         assert "cosmic unknown bit unknown to this version of lidarops 4 40.0 % 1" in page.text
 
@@ -339,7 +339,7 @@ class TestManyScenes:
             products = ()
             if i % 50 == 0:
                 product = homogeneous(times(start, 30, 60.0), seed=i)
-                products = (archive.write(f"{i}.nc", product, ProductKind.HOMOGENEOUS),)
+                products = (archive.write(f"{i}.nc", product, "homogeneous"),)
             scenes.append(
                 outcome(
                     f"{name}_{i:03d}", start, instrument=name, products=products,
@@ -420,7 +420,7 @@ class TestManyScenes:
         names = [f"photon_{300 + i}o" for i in range(3)]
         products = tuple(
             replace(
-                archive.write(f"{name}.nc", signal(time, bins=50), ProductKind.SIGNAL),
+                archive.write(f"{name}.nc", signal(time, bins=50), "signal"),
                 channel=name,
             )
             for name in names
@@ -434,7 +434,7 @@ class TestManyScenes:
     def test_more_sections_than_a_panel_holds(self, archive, tmp_path):
         sections = tuple((1000.0 * k, 1000.0 * k + 900.0) for k in range(1, 8))
         product = homogeneous(times(START, 9, 60.0), sections=sections)
-        written = archive.write("x.nc", product, ProductKind.HOMOGENEOUS)
+        written = archive.write("x.nc", product, "homogeneous")
         run = run_record(archive.root, [outcome("s", products=(written,))])
         page = built(run, tmp_path / "report")
         assert len(page.sources) == 1 + 3
@@ -451,7 +451,7 @@ NASTY = [
 
 def nasty_run(nasty: str, archive):
     """Return a run with the same nasty text in every field."""
-    written = archive.write("x.nc", homogeneous(times(START, 4, 60.0)), ProductKind.HOMOGENEOUS)
+    written = archive.write("x.nc", homogeneous(times(START, 4, 60.0)), "homogeneous")
     scene = outcome(
         nasty,
         station=nasty,
@@ -492,7 +492,7 @@ def test_every_title_can_be_drawn(archive, tmp_path):
 
 def test_product_names_with_special_characters_are_linked(archive, tmp_path):
     name = "odd #1 %41?/a&b <c> \N{CYRILLIC SMALL LETTER ZHE}.nc"
-    written = archive.write(name, homogeneous(times(START, 4, 60.0)), ProductKind.HOMOGENEOUS)
+    written = archive.write(name, homogeneous(times(START, 4, 60.0)), "homogeneous")
     run = run_record(archive.root, [outcome("s", products=(written,))])
     page = built(run, tmp_path / "report folder")
     (link,) = [link for link in page.links if link.endswith(".nc")]

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from support.products import fabricated as fab
 
 from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.kinds import kinds
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
@@ -21,7 +22,6 @@ from lidarops.records import (
     InputRecord,
     LeftOut,
     Plan,
-    ProductKind,
     ProductRecord,
     Role,
     RunRecord,
@@ -88,7 +88,7 @@ plans = st.builds(
 products = st.builds(
     ProductRecord,
     path=text,
-    kind=st.sampled_from(ProductKind),
+    kind=st.sampled_from(list(kinds())),
     channel=text,
     sha256=text,
     size=whole,
@@ -202,9 +202,7 @@ def test_folder_that_cannot_be_made(tmp_path):
 
 
 def _tree(tmp_path: Path) -> tuple[Path, dict]:
-    scene = fab.outcome(
-        "s", products=(ProductRecord("p", ProductKind.SIGNAL, "c", "", 1, 2, {}, 2),)
-    )
+    scene = fab.outcome("s", products=(ProductRecord("p", "signal", "c", "", 1, 2, {}, 2),))
     path = save_run_record(fab.run_record(tmp_path, [scene]), tmp_path)
     return path, json.loads(path.read_text())
 

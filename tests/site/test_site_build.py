@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
 from lidarops.flags import Quality
-from lidarops.records import ProductKind
 from lidarops.site import paths
 from lidarops.site.build import build_site
 from lidarops.site.product_entry import Grade
@@ -207,7 +206,7 @@ def test_unchanged_pages_are_kept_and_pages_of_removed_products_deleted(
 
     tampered = next(path for path in pages if "elastic" in path.name)
     tampered.write_text("edited")
-    changed = add(output, ProductKind.SIGNAL, 1, title="Another title")
+    changed = add(output, "signal", 1, title="Another title")
     gone = next((output / "products").rglob("*homogeneous*2027*.nc"))
     gone.unlink()
     third = build_site(output)
@@ -225,8 +224,8 @@ def test_unchanged_pages_are_kept_and_pages_of_removed_products_deleted(
 
 def test_damaged_products_are_listed_and_the_others_shown(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    whole = add(output, ProductKind.SIGNAL)
-    cut = add(output, ProductKind.ELASTIC)
+    whole = add(output, "signal")
+    cut = add(output, "elastic")
     cut.write_bytes(cut.read_bytes()[:20_000])
     (output / "products" / "empty.nc").write_bytes(b"")
     foreign = add_unknown(output, "multiangle")
@@ -252,7 +251,7 @@ def test_damaged_products_are_listed_and_the_others_shown(tmp_path: Path) -> Non
 
 def test_damaged_provenance_is_a_problem(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    path = add(output, ProductKind.HOMOGENEOUS)
+    path = add(output, "homogeneous")
     with netCDF4.Dataset(path, "a") as file:
         file["provenance"][...] = (
             b"{" * file["provenance"].shape[0] if file["provenance"].ndim else "{"
@@ -283,7 +282,7 @@ def test_text_from_files_is_escaped(tmp_path: Path) -> None:
 
 def test_links_out_of_the_products_are_not_followed(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    kept = add(output, ProductKind.SIGNAL)
+    kept = add(output, "signal")
     outside = tmp_path / "outside.nc"
     shutil.copy(kept, outside)
     (output / "products" / "link.nc").symlink_to(outside)
@@ -295,7 +294,7 @@ def test_links_out_of_the_products_are_not_followed(tmp_path: Path) -> None:
 
 def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    add(output, ProductKind.SIGNAL)
+    add(output, "signal")
     (output / "site").mkdir()
     (output / "site" / "thesis.txt").write_text("mine")
     with pytest.raises(CatalogError, match="no site of lidarops"):
@@ -307,7 +306,7 @@ def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
 
 def test_pages_are_not_written_through_a_link(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    add(output, ProductKind.SIGNAL)
+    add(output, "signal")
     build_site(output)
     shutil.rmtree(output / "site/product")
     elsewhere = tmp_path / "elsewhere"
@@ -320,7 +319,7 @@ def test_pages_are_not_written_through_a_link(tmp_path: Path) -> None:
 
 def test_an_edited_manifest_only_costs_time(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    add(output, ProductKind.SIGNAL)
+    add(output, "signal")
     build_site(output)
     manifest = output / "site/manifest.json"
     whole = contents(output / "site")

@@ -30,7 +30,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         )
         fields = [closure.as_dict(), settings.of(job.scene, closure, channel), used]
         content = json.dumps(fields, sort_keys=True).encode()
-        path = f"{scene.instrument}/{scene.id}_{kind.value}_{channel}.nc"
+        path = f"{scene.instrument}/{scene.id}_{kind}_{channel}.nc"
         target = job.campaign.products_root / path
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.with_name(f".{target.name}.tmp")

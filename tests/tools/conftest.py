@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from support.products.made_products import MAKERS, context
 
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import build_product
-from lidarops.records import ProductKind
 
 BEAMS = {
     "vertical": {"zenith": 0.0},
@@ -21,11 +20,11 @@ CASES = [pytest.param((kind, beam), id=f"{kind}-{beam}") for kind in MAKERS for 
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str], Path]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
     """Return a function that gives the file of a kind and pointing, written once."""
     folder = tmp_path_factory.mktemp("products")
 
-    def path(kind: ProductKind, beam: str) -> Path:
+    def path(kind: str, beam: str) -> Path:
         file = folder / f"{kind}_{beam}.nc"
         if not file.exists():
             write_product(build_product(MAKERS[kind](**BEAMS[beam]), context(kind)), file)
@@ -35,6 +34,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str
 
 
 @pytest.fixture(scope="session", params=CASES)
-def product(request: pytest.FixtureRequest, made: Callable[[ProductKind, str], Path]) -> Path:
+def product(request: pytest.FixtureRequest, made: Callable[[str, str], Path]) -> Path:
     """The file of each kind and pointing."""
     return made(*request.param)

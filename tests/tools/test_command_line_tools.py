@@ -13,7 +13,6 @@ import pytest
 import xarray as xr
 
 from lidarops.netcdf.write import chunk_sizes
-from lidarops.records import ProductKind
 
 
 def needs(name: str) -> pytest.MarkDecorator:
@@ -60,7 +59,7 @@ def for_cdo(product: Path, tmp_path: Path) -> Path:
     CDO 2.1 skips series whose positions are not on a grid. It reads them without the attribute
     ``coordinates`` (``ncatted -a coordinates,,d,,``).
     """
-    if not product.stem.startswith(ProductKind.VISIBILITY):
+    if not product.stem.startswith("visibility"):
         return product
     plain = Path(shutil.copy(product, tmp_path / "plain.nc"))
     with netCDF4.Dataset(plain, "a") as file:
@@ -72,9 +71,9 @@ def for_cdo(product: Path, tmp_path: Path) -> Path:
 
 @needs("cdo")
 def test_cdo_reports_that_it_skips_series_of_many_positions(
-    made: Callable[[ProductKind, str], Path],
+    made: Callable[[str, str], Path],
 ):
-    shown = call("cdo", "showname", made(ProductKind.VISIBILITY, "horizontal"))
+    shown = call("cdo", "showname", made("visibility", "horizontal"))
     assert "skipped variable visibility_in_air!" in shown.stderr
 
 
@@ -176,10 +175,10 @@ def test_ncdump_shows_one_epoch_and_the_meanings_of_flags(product: Path):
 
 
 def test_chunks_have_the_declared_shape(
-    made: Callable[[ProductKind, str], Path],
+    made: Callable[[str, str], Path],
 ):
     # An unlimited dimension would give chunks of one profile, and aggregates 30 times slower.
-    with netCDF4.Dataset(made(ProductKind.SIGNAL, "scan")) as file:
+    with netCDF4.Dataset(made("signal", "scan")) as file:
         for variable in file.variables.values():
             if variable.dimensions:
                 expected = chunk_sizes(variable.shape, variable.dtype.itemsize)

@@ -13,8 +13,8 @@ from pathlib import Path
 import netCDF4
 import pytest
 
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import ProductKind
+from lidarops.kinds import kinds
+from lidarops.netcdf.variables import layout_of
 
 TEXT = (Path(__file__).parents[2] / "docs/products.md").read_text(encoding="utf-8")
 PYTHON = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
@@ -22,9 +22,9 @@ SHELL = re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)
 
 
 @pytest.fixture
-def files(made: Callable[[ProductKind, str], Path], tmp_path: Path) -> dict[str, str]:
+def files(made: Callable[[str, str], Path], tmp_path: Path) -> dict[str, str]:
     """A product, and one of the next day."""
-    product = made(ProductKind.HOMOGENEOUS, "horizontal")
+    product = made("homogeneous", "horizontal")
     later = Path(shutil.copy(product, tmp_path / "later.nc"))
     with netCDF4.Dataset(later, "a") as file:
         for name in ("time", "time_bnds"):
@@ -40,7 +40,7 @@ def test_the_tables_match_the_code(repository: Path):
     spec.loader.exec_module(module)
     _, found, rest = TEXT.partition(module.BEGIN)
     assert found + rest == module.tables(), "run python docs/products_table.py"
-    for layout in LAYOUTS.values():
+    for layout in map(layout_of, kinds()):
         for row in (*layout.coordinates, *layout.variables):
             assert f"| `{row.name}` |" in rest
 

@@ -11,8 +11,8 @@ import numpy as np
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
-from lidarops.campaign.product_settings import ReferenceSettings
 from lidarops.flags import Quality
+from lidarops.products.elastic.settings import ReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import known_shape
 from lidarops.retrieve.elastic import inversion, layers, outlying_bins, reference_window

@@ -35,11 +35,12 @@ from lidarops.bench.harness.benchmark import (
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
+from lidarops.kinds import kinds
 from lidarops.netcdf.write import write_plain
 from lidarops.plan import cost_estimate, product_dependence
 from lidarops.plan.cost_estimate import Costs, Term
 from lidarops.process.scene import Job, process_scene
-from lidarops.records import ProductKind, RunRecord
+from lidarops.records import RunRecord
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
 from lidarops.simulate.campaign import plan_simulation, write_simulation
@@ -243,7 +244,7 @@ def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
     """Return the costs of a report page, and of the figures of each kind of product."""
     page = _page(campaign, replace(record, scenes=()))
     costs = {Term.PAGE: page}
-    for kind in ProductKind:
+    for kind in kinds():
         scenes = sorted(
             (replace(scene, products=first_product)
              for scene in record.scenes
@@ -252,7 +253,7 @@ def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
         )  # fmt: skip
         smallest_cost = max(_page(campaign, replace(record, scenes=(scenes[0],))) - page, 0.0)
         costs[cost_estimate.figure_term(kind)] = smallest_cost
-        if kind is ProductKind.SIGNAL:
+        if kind == "signal":
             largest_cost = max(
                 _page(campaign, replace(record, scenes=(scenes[-1],))) - page, smallest_cost
             )
@@ -282,11 +283,11 @@ def first_times(path: str) -> None:
     for assessment in archive.assess(campaign, force=True):
         for kind, channel in product_dependence.planned_products(assessment.plan):
             plan = product_dependence.plan_closure(assessment.plan, [(kind, channel)])
-            jobs.setdefault(kind.value, Job(campaign, assessment.scene, plan))
+            jobs.setdefault(kind, Job(campaign, assessment.scene, plan))
     times = {}
     # Code that all kinds load counts for the first of them, signals.
-    for kind in ProductKind:
-        times[kind.value] = [process_scene(jobs[kind.value]).cpu_seconds for _ in range(2)]
+    for kind in kinds():
+        times[kind] = [process_scene(jobs[kind]).cpu_seconds for _ in range(2)]
     sys.stdout.write(json.dumps(times))
 
 

@@ -88,7 +88,7 @@ def _error_budget() -> Iterator[Row]:
 
 _BUDGET_TERMS: Final = tuple(f"backscatter_error_{source}" for source in _BUDGET)
 
-ELASTIC: Final = Layout(
+LAYOUT: Final = Layout(
     title="Aerosol backscatter and extinction from elastic signals",
     summary="Backscatter and extinction of aerosol from elastic lidar signals by the"
     " two-component inversion of Klett, Fernald and Sasano, with an error budget.",

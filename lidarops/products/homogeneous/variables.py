@@ -52,7 +52,7 @@ FLAGS: Final = (
     | Quality.NOT_LEVEL
 )
 
-HOMOGENEOUS: Final = Layout(
+LAYOUT: Final = Layout(
     title="Extinction of homogeneous range sections",
     summary="Background, amplitude and extinction of range sections in which the atmosphere is"
     " assumed homogeneous along the beam, from the signals of one lidar channel, with standard"

@@ -1,1 +1,16 @@
-"""The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
+"""Product kind ``multiangle``: optical depth and extinction from scans over zenith angle."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lidarops.kinds import Kind
+from lidarops.products.multiangle.settings import MultiAngleSettings
+
+KIND: Final = Kind(
+    name="multiangle",
+    title="Optical depth and extinction of scans",
+    package=__name__,
+    settings=MultiAngleSettings,
+    rank=30,
+)

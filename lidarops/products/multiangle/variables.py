@@ -109,7 +109,7 @@ def _gradient_error(quantity: str, words: str, units: str) -> Row:
     )
 
 
-MULTIANGLE: Final = Layout(
+LAYOUT: Final = Layout(
     title="Optical depth and extinction from scans over zenith angle",
     summary="Optical depth and extinction of molecules and particles together, from signals of one"
     " lidar channel at several zenith angles, without lidar ratio or reference value, with standard"

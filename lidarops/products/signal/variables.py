@@ -19,7 +19,7 @@ from lidarops.netcdf.variables import (
     shots,
 )
 
-SIGNAL: Final = Layout(
+LAYOUT: Final = Layout(
     title="Range-corrected lidar signals",
     summary="Background-subtracted and range-corrected signals of one lidar channel, with their"
     " standard errors.",

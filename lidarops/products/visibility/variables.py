@@ -116,7 +116,7 @@ def _time_series(name: str, long_name: str, comment: str) -> Row:
     )
 
 
-VISIBILITY: Final = Layout(
+LAYOUT: Final = Layout(
     title="Visibility and extinction at crossings of the beams of several lidars",
     summary="Extinction of molecules and particles together, and visibility, at the crossings of"
     " the beams of several lidars, without calibration, lidar ratio or reference value, with"

@@ -43,7 +43,7 @@ def test_campaigns_have_the_requested_size(size, tmp_path):
     record = reprocess(campaign)
     assert [scene.error for scene in record.scenes] == [""] * size.scenes
     assert [scene.granules for scene in record.scenes] == [size.profiles] * size.scenes
-    kinds = {product.kind.value for scene in record.scenes for product in scene.products}
+    kinds = {product.kind for scene in record.scenes for product in scene.products}
     assert kinds == {"signal", "multiangle" if size.angles else "homogeneous"}
     assert reprocess(campaign) is None
 

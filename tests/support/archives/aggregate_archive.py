@@ -11,10 +11,9 @@ import numpy as np
 import xarray as xr
 
 from lidarops.aggregate.facts import Facts, list_products, read_product_facts
+from lidarops.netcdf.build import build_product
 from lidarops.netcdf.context import product_path
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import build_product
-from lidarops.records import ProductKind
 from support.products.made_products import MAKERS, SCENE, START, context, provenance
 
 Change = Callable[[xr.Dataset], xr.Dataset]
@@ -23,7 +22,7 @@ Change = Callable[[xr.Dataset], xr.Dataset]
 def add_day(
     root: Path,
     day: int,
-    kind: ProductKind = ProductKind.HOMOGENEOUS,
+    kind: str = "homogeneous",
     *,
     change: Change = lambda data: data,
     of: dict[str, Any] | None = None,

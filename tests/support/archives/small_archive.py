@@ -108,7 +108,7 @@ class Archive:
 def made(record: RunRecord | None) -> set[str]:
     """Return instrument, day, kind and channel of a run's products, as ``rich 1 signal photon``."""
     return {
-        f"{scene.instrument} {scene.start.day} {product.kind.value} {product.channel[:6]}"
+        f"{scene.instrument} {scene.start.day} {product.kind} {product.channel[:6]}"
         for scene in (() if record is None else record.scenes)
         for product in scene.products
     }

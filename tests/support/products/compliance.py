@@ -10,8 +10,7 @@ from typing import Any
 import xarray as xr
 from compliance_checker.runner import CheckSuite, ComplianceChecker
 
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import ProductKind
+from lidarops.netcdf.variables import layout_of
 
 
 def findings(path: Path) -> tuple[set[str], set[str]]:
@@ -41,10 +40,10 @@ def _said(results: list[dict[str, Any]]) -> Iterator[str]:
         yield from _said(result["children"])
 
 
-def permitted(kind: ProductKind, data: xr.Dataset) -> set[str]:
+def permitted(kind: str, data: xr.Dataset) -> set[str]:
     """One finding for each quantity that CF has no standard name for; none is left out."""
     return {
         f'variable "{row.name}" missing the following attributes: standard_name'
-        for row in LAYOUTS[kind].variables
+        for row in layout_of(kind).variables
         if row.standard_name is None and (row.name in data or not row.optional)
     }

@@ -14,7 +14,6 @@ from lidarops.records import (
     Granule,
     LeftOut,
     Plan,
-    ProductKind,
     ProductRecord,
     Role,
     RunRecord,
@@ -179,7 +178,7 @@ class Archive:
 
     root: Path
 
-    def write(self, name: str, data: xr.Dataset, kind: ProductKind) -> ProductRecord:
+    def write(self, name: str, data: xr.Dataset, kind: str) -> ProductRecord:
         """Write a product and return its record, as the engine would."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)

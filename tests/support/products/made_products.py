@@ -16,7 +16,6 @@ from lidarops.records import (
     InputRecord,
     LeftOut,
     Plan,
-    ProductKind,
     Provenance,
     Role,
     Step,
@@ -34,7 +33,7 @@ METADATA = Metadata(
 )
 
 
-def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Provenance:
+def provenance(kind: str = "homogeneous", **changes: Any) -> Provenance:
     plan = Plan(
         scene=SCENE,
         steps=(
@@ -66,7 +65,7 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
     return Provenance(**(fields | changes))
 
 
-def context(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Context:
+def context(kind: str = "homogeneous", **changes: Any) -> Context:
     fields = {
         "kind": kind,
         "channel": "photon_532o",
@@ -354,11 +353,11 @@ def visibility(
 
 
 MAKERS = {
-    ProductKind.SIGNAL: signal,
-    ProductKind.HOMOGENEOUS: homogeneous,
-    ProductKind.ELASTIC: elastic,
-    ProductKind.MULTIANGLE: multiangle,
-    ProductKind.VISIBILITY: visibility,
+    "signal": signal,
+    "homogeneous": homogeneous,
+    "elastic": elastic,
+    "multiangle": multiangle,
+    "visibility": visibility,
 }
-PLACED = (ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
+PLACED = ("multiangle", "visibility")
 """Kinds whose values lie where several beams look, and not along one."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarops.records import InputRecord, ProductKind, Role, RunRecord
+from lidarops.records import InputRecord, Role, RunRecord
 from support.products.fabricated import (
     START,
     Archive,
@@ -32,8 +32,8 @@ def simulated(archive: Archive, tmp_path: Path) -> RunRecord:
     truth = tmp_path / "truth.nc"
     truth_of(time).to_netcdf(truth)
     products = (
-        archive.write("h/extinction.nc", homogeneous(time), ProductKind.HOMOGENEOUS),
-        archive.write("h/signal.nc", signal(time, bins=200), ProductKind.SIGNAL),
+        archive.write("h/extinction.nc", homogeneous(time), "homogeneous"),
+        archive.write("h/signal.nc", signal(time, bins=200), "signal"),
     )
     inputs = tuple(InputRecord(f"raw/h{i:05d}", Role.SIGNAL, "b" * 64) for i in range(96))
     scene = outcome("horizontal_20240301T000000", granules=96, products=products, inputs=inputs)

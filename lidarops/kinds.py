@@ -1,0 +1,127 @@
+"""Registry of the kinds of product, which are found by entry point.
+
+A kind of product is one package: its ``__init__`` holds a `Kind`, and its modules ``settings``,
+``steps``, ``variables``, ``flags`` and ``figures`` hold everything else about it. A package outside
+lidarops adds a kind by an entry point of the group ``lidarops.product_kinds``::
+
+    [project.entry-points."lidarops.product_kinds"]
+    integrated = "mypackage.integrated:KIND"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import MappingProxyType
+from typing import Any, Final
+
+from lidarops.errors import LidarOpsError
+from lidarops.settings import ChannelProduct, NetworkProduct
+
+GROUP: Final = "lidarops.product_kinds"
+"""Group of entry points."""
+
+
+class Scope(StrEnum):
+    """Data that one product is made of."""
+
+    CHANNEL = "channel"
+    """One channel of one instrument."""
+    NETWORK = "network"
+    """One channel of several instruments, whose beams cross."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of product."""
+
+    name: str
+    """Its name in campaign files, in paths of products and on the command line."""
+    title: str
+    """Heading of its products on pages."""
+    package: str
+    """Package of its modules."""
+    settings: type[ChannelProduct] | type[NetworkProduct]
+    """Model of its settings in a campaign file."""
+    rank: int
+    """Place on pages and in lists, smallest first."""
+    expects_usable: bool = True
+    """Whether a scene should give usable values. False where the method is applied to any air, so
+    that fog or darkness may reject all values."""
+
+    @property
+    def scope(self) -> Scope:
+        """Data that one product is made of."""
+        return Scope.NETWORK if issubclass(self.settings, NetworkProduct) else Scope.CHANNEL
+
+    def part(self, module: str, name: str) -> Any:
+        """Return an object of one of the modules of the kind, such as ``variables``.
+
+        Raises
+        ------
+        LidarOpsError
+            If the package lacks it.
+        """
+        path = f"{self.package}.{module}"
+        try:
+            return getattr(import_module(path), name)
+        except AttributeError as error:
+            raise LidarOpsError(
+                f"kind of product {self.name!r} is incomplete: {path} has no {name}",
+                remedy=f"complete or remove the package {self.package}",
+            ) from error
+
+
+@cache
+def kinds() -> Mapping[str, Kind]:
+    """Return all kinds of product by name, in the order of their rank.
+
+    Raises
+    ------
+    LidarOpsError
+        If an entry point cannot be loaded, or two have one name.
+    """
+    registered: dict[str, Kind] = {}
+    for point in entry_points(group=GROUP):
+        try:
+            kind = point.load()
+        except (ImportError, AttributeError) as error:
+            raise LidarOpsError(
+                f"kind of product {point.name!r} cannot be loaded from {point.value}: {error}",
+                remedy="repair or remove the package that registers it",
+            ) from error
+        if not isinstance(kind, Kind) or kind.name != point.name or kind.name in registered:
+            raise LidarOpsError(
+                f"kind of product {point.name!r} of {point.value} is no Kind of that name, or the"
+                " name is taken",
+                remedy="repair or remove the package that registers it",
+            )
+        registered[kind.name] = kind
+    order = sorted(registered.values(), key=lambda kind: (kind.rank, kind.name))
+    return MappingProxyType({kind.name: kind for kind in order})
+
+
+def kind_of(name: str) -> Kind:
+    """Return a kind of product by its name.
+
+    Raises
+    ------
+    LidarOpsError
+        If there is none of that name.
+    """
+    known = kinds()
+    if name not in known:
+        raise LidarOpsError(
+            f"there is no kind of product {name!r}",
+            remedy=f"kinds are {', '.join(known)}; install the package of any other kind",
+        )
+    return known[name]
+
+
+def kinds_of(scope: Scope) -> tuple[Kind, ...]:
+    """Return the kinds of product of a scope, in the order of their rank."""
+    return tuple(kind for kind in kinds().values() if kind.scope is scope)

@@ -1,0 +1,37 @@
+"""Settings of the product ``multiangle`` in a campaign file."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from lidarops.settings import ChannelProduct, Metres
+
+
+class MultiAngleSettings(ChannelProduct):
+    """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
+
+    channels: list[str] = Field(min_length=1)
+    highest: Metres = Field(default=6000.0, description="m above the station")
+    step: float = Field(default=60.0, ge=5, le=1000, description="m, between altitudes")
+    method: Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"] = "auto"
+    layers: list[tuple[float, float]] = Field(
+        default=[],
+        description="m above the station: bottom and top of layers whose optical depth is written",
+    )
+    largest_gradient: float = Field(
+        default=5e-5,
+        ge=0,
+        le=1e-2,
+        description="m-1, largest horizontal gradient of ln(backscatter) included in the error",
+    )
+
+    @model_validator(mode="after")
+    def _holds_altitudes(self) -> Self:
+        if self.highest < 10 * self.step:
+            raise ValueError("highest must be at least 10 times step")
+        for low, high in self.layers:
+            if not 0 <= low <= high - self.step or high > self.highest:
+                raise ValueError("layers must be at least one step deep, between 0 and highest")
+        return self

@@ -1,0 +1,24 @@
+"""Settings of the product ``signal`` in a campaign file."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from lidarops.settings import ChannelProduct, Metres
+
+
+class SignalSettings(ChannelProduct):
+    """The ``signal`` product: background-subtracted, range-corrected signals."""
+
+    channels: list[str] | Literal["all"] = "all"
+    background_range: tuple[Metres, Metres] | None = Field(
+        default=None, description="m; by default the last tenth of the bins"
+    )
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if self.background_range and self.background_range[0] >= self.background_range[1]:
+            raise ValueError("background_range must end farther than it starts")
+        return self

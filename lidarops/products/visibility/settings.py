@@ -1,0 +1,73 @@
+"""Settings of the product ``visibility`` in a campaign file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import timedelta
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from lidarops.settings import Metres, NetworkProduct, PartOfDay, VisibilitySettings
+
+
+class VisibilityProductSettings(NetworkProduct):
+    """The ``visibility`` product: extinction and visibility where beams of lidars cross."""
+
+    average: PartOfDay = Field(
+        default=timedelta(minutes=10), description="interval over which signals are averaged"
+    )
+    block: PartOfDay = Field(
+        default=timedelta(hours=6), description="interval of averages that share one mean field"
+    )
+    method: Literal["network", "cycle", "multiplier", "unbiased", "slope", "klett"] = "network"
+    prior: Literal["block", "none"] = "block"
+    visibility: VisibilitySettings = VisibilitySettings()
+    tolerance: float = Field(
+        default=15.0, gt=0, le=1000, description="m, largest distance of beams at a crossing"
+    )
+    smallest_angle: float = Field(default=2.0, gt=0, lt=90, description="degree between beams")
+    farthest: float | None = Field(
+        default=None, gt=0, description="m, largest range used; by default the last bin"
+    )
+    exponent: float = Field(
+        default=1.0, ge=0.1, le=10, description="m in backscatter ~ extinction^(1/m)"
+    )
+    exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = Field(
+        default={}, description="exponent of instruments that differ"
+    )
+    exponent_relative_error: float = Field(default=0.1, ge=0, le=0.5)
+    lidar_ratio_relative_error: float = Field(
+        default=0.02,
+        ge=0,
+        le=0.5,
+        description="relative error of the lidar ratio of a crossing against the others, from"
+        " aerosol mixtures and humidity",
+    )
+    overlap_relative_error: float = Field(
+        default=0.003,
+        ge=0,
+        le=0.5,
+        description="relative error of the overlap at the nearest crossing of a beam",
+    )
+    background_range: tuple[Metres, Metres] | None = Field(
+        default=None, description="m; by default the last tenth of the bins"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.block % self.average:
+            raise ValueError("block must be a multiple of average")
+        if self.background_range and self.background_range[0] >= self.background_range[1]:
+            raise ValueError("background_range must end farther than it starts")
+        return self
+
+    def check_members(self, instruments: Sequence[str]) -> None:
+        """Raise ValueError where `exponents` names an instrument that is not in the network."""
+        unknown = sorted(set(self.exponents) - set(instruments))
+        if unknown:
+            raise ValueError(f"exponents names {', '.join(unknown)}, not in instruments")
+
+    def exponent_of(self, instrument: str) -> float:
+        """Return the exponent m of the beams of an instrument."""
+        return self.exponents.get(instrument, self.exponent)
