@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -13,8 +14,67 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    WithJsonSchema,
     model_validator,
 )
+from pydantic_core import PydanticCustomError, PydanticUndefined
+
+NO_UNIT: Final = "1"
+"""Unit of a pure number or count."""
+IDENTIFIER: Final = r"^[A-Za-z0-9][A-Za-z0-9-]*$"
+
+
+def quantity(
+    default: Any = PydanticUndefined,
+    *,
+    unit: str,
+    description: str = "",
+    **limits: Any,
+) -> Any:
+    """Return the field of a number, or of numbers, that have a unit.
+
+    Error messages and the JSON schema take the unit from the key ``unit`` of its schema.
+
+    Parameters
+    ----------
+    default : object, optional
+        By default the field is required.
+    unit : str
+        Such as ``m-1``; `NO_UNIT` for a pure number or count.
+    description : str, optional
+        Meaning, without the unit.
+    **limits
+        Bounds and lengths, as of `pydantic.Field`.
+    """
+    shown = "" if unit == NO_UNIT else f"[{unit}]"
+    text = " ".join(part for part in (description, shown) if part)
+    return Field(default, description=text or None, json_schema_extra={"unit": unit}, **limits)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a question for the nearest known name, with a space behind it, or an empty text.
+
+    Case, hyphens and underscores do not count.
+    """
+    plain = {_plain(choice): choice for choice in known}
+    near = difflib.get_close_matches(_plain(name), plain, n=1)
+    return f"did you mean {plain[near[0]]!r}? " if near else ""
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("-", "_").replace(" ", "_")
+
+
+def located_error(problem: str, *keys: str | int) -> PydanticCustomError:
+    """Return an error for a validator of a model to raise, at keys below the model."""
+    return PydanticCustomError("located", "{problem}", {"problem": problem, "keys": keys})
+
+
+def _written_date(value: Any) -> Any:
+    # Pydantic would read a year as seconds since 1970.
+    if isinstance(value, int | float) or (isinstance(value, str) and value.isdecimal()):
+        raise ValueError("must be a time such as 2024-09-21T12:00:00Z, or a date")
+    return value
 
 
 def _utc(value: datetime) -> datetime:
@@ -46,21 +106,63 @@ def as_interval(value: Any) -> Any:
     return value
 
 
-Instant = Annotated[datetime, AfterValidator(_utc)]
-Patterns = Annotated[
-    list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(_as_list), Field()
+Instant = Annotated[
+    datetime,
+    BeforeValidator(_written_date),
+    AfterValidator(_utc),
+    # Without the format date-time, because a date alone is accepted too.
+    WithJsonSchema({"type": "string", "words": "a time such as 2024-09-21T12:00:00Z"}),
+]
+Interval = Annotated[
+    timedelta,
+    BeforeValidator(as_interval),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string", "words": "an interval such as 30min, 6h or 1d"},
+                {"type": "number", "unit": "s"},
+            ]
+        }
+    ),
 ]
 Inside = Annotated[str, AfterValidator(_clean_pattern)]
 """Path below the folder of the campaign file, relative to it."""
-IDENTIFIER = r"^[A-Za-z0-9][A-Za-z0-9-]*$"
-Identifier = Annotated[str, Field(pattern=IDENTIFIER, max_length=40)]
+Patterns = Annotated[
+    list[Inside], BeforeValidator(_as_list, json_schema_input_type=str | list[str])
+]
+Identifier = Annotated[
+    str,
+    Field(
+        pattern=IDENTIFIER,
+        max_length=40,
+        json_schema_extra={
+            "words": "letters, digits and hyphens that begin with a letter or a digit, at most 40"
+        },
+    ),
+]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class SettingsModel(BaseModel):
-    """Base of the models: frozen, and without unknown keys."""
+    """Base of the models: frozen, without unknown keys, and without booleans for numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_boolean(cls, values: Any) -> Any:
+        # YAML reads yes, no, on and off as booleans, and pydantic reads these as 1 and 0.
+        for key, value in values.items() if isinstance(values, dict) else ():
+            field = cls.model_fields.get(str(key))
+            if field is not None and field.annotation is not bool and _holds_boolean(value):
+                raise PydanticCustomError("no_boolean", "is a boolean", {"keys": (key,)})
+        return values
+
+
+def _holds_boolean(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return any(_holds_boolean(item) for item in value)
+    return isinstance(value, bool)
 
 
 def _divides_day(interval: timedelta) -> timedelta:
@@ -70,7 +172,7 @@ def _divides_day(interval: timedelta) -> timedelta:
     return interval
 
 
-PartOfDay = Annotated[timedelta, BeforeValidator(as_interval), AfterValidator(_divides_day)]
+PartOfDay = Annotated[Interval, AfterValidator(_divides_day)]
 
 
 class ChannelProduct(SettingsModel):
@@ -101,19 +203,21 @@ class NetworkProduct(SettingsModel):
 class VisibilitySettings(SettingsModel):
     """Definition of visibility: contrast, and conversion of extinction to 550 nm."""
 
-    contrast: Annotated[float, Field(gt=0, lt=1)] | Literal["paper"] = Field(
-        default=0.05,
-        description="threshold: 0.05 (meteorological optical range), 0.02 (Koschmieder), or"
-        " 'paper': exp(-3), the rounded constant of the multi-position papers",
+    contrast: Annotated[float, Field(gt=0, lt=1)] | Literal["paper"] = quantity(
+        0.05,
+        unit="1",
+        description="threshold: 0.05 (meteorological optical range), 0.02 (Koschmieder),"
+        " or 'paper': exp(-3), the rounded constant of the multi-position"
+        " papers",
     )
     law: Literal["none", "angstrom", "kruse"] = Field(
         default="none",
         description="conversion of extinction from the wavelength of the lidar to 550 nm; none"
         " keeps the wavelength of the lidar",
     )
-    angstrom_exponent: float | None = Field(default=None, ge=-1, le=5)
-    exponent_standard_error: float = Field(
-        default=0.0, ge=0, le=5, description="standard error of the exponent of the law"
+    angstrom_exponent: float | None = quantity(None, unit="1", ge=-1, le=5)
+    exponent_standard_error: float = quantity(
+        0.0, unit="1", ge=0, le=5, description="standard error of the exponent of the law"
     )
 
     @model_validator(mode="after")

@@ -16,29 +16,31 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import yaml
 from pydantic import (
     BaseModel,
-    BeforeValidator,
     Field,
     PrivateAttr,
     ValidationError,
     create_model,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from lidarops.campaign.simulation import SimulationSettings
 from lidarops.campaign.yaml_errors import duplicate_keys, explain_yaml_error
 from lidarops.errors import CampaignError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.settings import (
-    IDENTIFIER,
     ChannelProduct,
     Identifier,
     Inside,
     Instant,
+    Interval,
     Metres,
     NetworkProduct,
     Patterns,
     SettingsModel,
-    as_interval,
+    located_error,
+    nearest,
+    quantity,
 )
 
 __all__ = [
@@ -52,44 +54,47 @@ __all__ = [
     "Scenes",
     "Station",
     "as_settings",
+    "campaign_schema",
     "channel_facts",
     "load_campaign",
 ]
 
 ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
 CATALOG_VARIABLE = "LIDAROPS_CATALOG"
-_IDENTIFIERS = "letters, digits and hyphens that begin with a letter or a digit"
 
 
 class Station(SettingsModel):
     """A site of instruments."""
 
     name: str
-    latitude: float = Field(ge=-90, le=90, description="degrees north")
-    longitude: float = Field(ge=-180, le=180, description="degrees east")
-    altitude: float = Field(default=0.0, ge=-500, le=9000, description="m above the geoid")
+    latitude: float = quantity(unit="degree", ge=-90, le=90, description="north")
+    longitude: float = quantity(unit="degree", ge=-180, le=180, description="east")
+    altitude: float = quantity(0.0, unit="m", ge=-500, le=9000, description="above the geoid")
 
 
 class ChannelFacts(SettingsModel):
     """Facts about one channel in a validity period."""
 
-    wavelength: float | None = Field(
-        default=None, gt=1e-7, lt=2e-5, description="m, where the header is wrong"
+    wavelength: float | None = quantity(
+        None, unit="m", gt=1e-7, lt=2e-5, description="where the header is wrong"
     )
-    dead_time: float | None = Field(default=None, gt=0, lt=1e-6, description="s")
-    range_offset: float | None = Field(
-        default=None, ge=-500, le=500, description="m added to the range of every bin"
+    dead_time: float | None = quantity(None, unit="s", gt=0, lt=1e-6)
+    range_offset: float | None = quantity(
+        None, unit="m", ge=-500, le=500, description="added to the range of every bin"
     )
-    noise_variance: float | None = Field(
-        default=None,
+    noise_variance: float | None = quantity(
+        None,
+        unit="mV2",
         gt=0,
         allow_inf_nan=False,
-        description="analog noise variance of one profile, mV^2",
+        description="analog noise variance of one profile",
     )
-    lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = Field(
-        default=None,
-        description="bins by which the analog record lags the photon-counting record of the same"
-        " detector, besides range_offset; or 'estimate', for glued channels",
+    lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = quantity(
+        None,
+        unit="1",
+        description="bins by which the analog record lags the photon-counting record of"
+        " the same detector, besides range_offset; or 'estimate', for glued"
+        " channels",
     )
 
 
@@ -98,9 +103,9 @@ class InstrumentFacts(SettingsModel):
 
     valid_from: Instant = datetime.min.replace(tzinfo=UTC)
     valid_to: Instant = datetime.max.replace(tzinfo=UTC)
-    zenith_angle: float | None = Field(default=None, ge=0, le=180, description="degree")
-    azimuth: float | None = Field(default=None, ge=0, lt=360, description="degree")
-    full_overlap_range: Metres = Field(default=0.0, description="m")
+    zenith_angle: float | None = quantity(None, unit="degree", ge=0, le=180)
+    azimuth: float | None = quantity(None, unit="degree", ge=0, lt=360)
+    full_overlap_range: Metres = quantity(0.0, unit="m")
     overlap_profile: Inside | None = Field(
         default=None, description="CSV or NetCDF file of range (m) and overlap (0 to 1)"
     )
@@ -119,7 +124,10 @@ class InstrumentFacts(SettingsModel):
 
 def _fields(scope: Scope) -> dict[str, Any]:
     """Return the definition of one optional field for every kind of product of a scope."""
-    return {kind.name: (kind.settings | None, None) for kind in kinds_of(scope)}
+    return {
+        kind.name: (kind.settings | None, Field(default=None, description=kind.title))
+        for kind in kinds_of(scope)
+    }
 
 
 class ChannelProducts(SettingsModel):
@@ -137,7 +145,12 @@ class ChannelProducts(SettingsModel):
 if TYPE_CHECKING:
     Products = ChannelProducts
 else:
-    Products = create_model("Products", __base__=ChannelProducts, **_fields(Scope.CHANNEL))
+    Products = create_model(
+        "Products",
+        __base__=ChannelProducts,
+        __doc__="The requested products of an instrument.",
+        **_fields(Scope.CHANNEL),
+    )
 
 
 class Instrument(SettingsModel):
@@ -183,8 +196,14 @@ class NetworkMembers(SettingsModel):
         if not self.requested():
             kinds = ", ".join(kind.name for kind in kinds_of(Scope.NETWORK))
             raise ValueError(f"a network needs a product: {kinds}")
-        for settings in self.requested().values():
-            settings.check_members(self.instruments)
+        for kind, settings in self.requested().items():
+            try:
+                settings.check_members(self.instruments)
+            except PydanticCustomError as error:
+                keys = (error.context or {}).get("keys", ())
+                raise located_error(error.message(), kind, *keys) from error
+            except ValueError as error:
+                raise located_error(str(error), kind) from error
         return self
 
     def requested(self) -> dict[str, NetworkProduct]:
@@ -199,7 +218,12 @@ class NetworkMembers(SettingsModel):
 if TYPE_CHECKING:
     Network = NetworkMembers
 else:
-    Network = create_model("Network", __base__=NetworkMembers, **_fields(Scope.NETWORK))
+    Network = create_model(
+        "Network",
+        __base__=NetworkMembers,
+        __doc__="Instruments whose beams cross, and the products that are made of them together.",
+        **_fields(Scope.NETWORK),
+    )
 
 
 class Metadata(SettingsModel):
@@ -224,7 +248,7 @@ class Metadata(SettingsModel):
 class Scenes(SettingsModel):
     """How granules are grouped into scenes."""
 
-    window: Annotated[Literal["day"] | timedelta, BeforeValidator(as_interval)] = "day"
+    window: Literal["day"] | Interval = "day"
 
     @model_validator(mode="after")
     def _divides_day(self) -> Self:
@@ -267,9 +291,12 @@ class Campaign(SettingsModel):
         for key, instrument in self.instruments.items():
             if instrument.station not in self.stations:
                 known = ", ".join(sorted(self.stations))
-                raise ValueError(
-                    f"instrument {key!r} names unknown station {instrument.station!r};"
-                    f" known stations: {known}"
+                raise located_error(
+                    f"unknown station {instrument.station!r};"
+                    f" {nearest(instrument.station, self.stations)}known stations: {known}",
+                    "instruments",
+                    key,
+                    "station",
                 )
         return self
 
@@ -277,13 +304,17 @@ class Campaign(SettingsModel):
     def _known_members(self) -> Self:
         for key, network in self.networks.items():
             if key in self.instruments or key in self.stations:
-                raise ValueError(f"network {key!r} has the key of an instrument or station")
-            for member in network.instruments:
+                raise located_error("is the key of an instrument or station", "networks", key)
+            for index, member in enumerate(network.instruments):
                 if member not in self.instruments:
                     known = ", ".join(sorted(self.instruments))
-                    raise ValueError(
-                        f"network {key!r} names unknown instrument {member!r};"
-                        f" known instruments: {known}"
+                    raise located_error(
+                        f"unknown instrument {member!r};"
+                        f" {nearest(member, self.instruments)}known instruments: {known}",
+                        "networks",
+                        key,
+                        "instruments",
+                        index,
                     )
         return self
 
@@ -313,6 +344,16 @@ class Campaign(SettingsModel):
     def truth_path(self) -> Path:
         """The truth file of a simulated campaign."""
         return Path(self.archive) / "truth.nc"
+
+
+def campaign_schema() -> dict[str, Any]:
+    """Return the JSON schema of campaign files, with the settings of every kind of product.
+
+    Besides the standard keywords, ``unit`` is the unit of a number and of the numbers below, and
+    ``words`` describes valid texts.
+    """
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **Campaign.model_json_schema()}
 
 
 def load_campaign(
@@ -377,7 +418,7 @@ def load_campaign(
     try:
         campaign = Campaign.model_validate(raw)
     except ValidationError as error:
-        lines = explain_yaml_error(error, tree, Campaign, {IDENTIFIER: _IDENTIFIERS})
+        lines = explain_yaml_error(error, tree, campaign_schema())
         raise CampaignError(_listed("is not a valid campaign:", lines), file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):

@@ -19,25 +19,28 @@ from lidarops.campaign.simulation_base import (
     Metres,
     NotNegative,
     Period,
-    SimulationModel,
 )
+from lidarops.settings import SettingsModel, quantity
 
 
-class Aerosol(SimulationModel):
+class Aerosol(SettingsModel):
     """Optical properties of an aerosol type."""
 
-    lidar_ratio: float = Field(default=50.0, ge=5, le=150, description="sr")
-    angstrom_exponent: float = Field(default=1.3, ge=-1, le=4, description="of extinction")
+    lidar_ratio: float = quantity(50.0, unit="sr", ge=5, le=150)
+    angstrom_exponent: float = quantity(1.3, unit="1", ge=-1, le=4, description="of extinction")
 
 
-class BoundaryLayer(SimulationModel):
+class BoundaryLayer(SettingsModel):
     """Aerosol, well mixed from the ground to a top that varies over the day."""
 
     aerosol: Aerosol = Aerosol()
-    extinction: NotNegative = Field(default=1.0e-4, le=0.1, description="m-1 at 532 nm")
-    height: DiurnalCourse = DiurnalCourse(minimum=500.0, maximum=1600.0, hour_of_maximum=14.0)
-    """m above the ground."""
-    entrainment_depth: float = Field(default=100.0, gt=0, le=2000, description="m")
+    extinction: float = quantity(1.0e-4, unit="m-1", ge=0, le=0.1, description="at 532 nm")
+    height: DiurnalCourse = quantity(
+        DiurnalCourse(minimum=500.0, maximum=1600.0, hour_of_maximum=14.0),
+        unit="m",
+        description="above the ground",
+    )
+    entrainment_depth: float = quantity(100.0, unit="m", gt=0, le=2000)
 
 
 class Layer(Period):
@@ -45,19 +48,27 @@ class Layer(Period):
 
     name: str
     aerosol: Aerosol = Aerosol()
-    extinction: float = Field(gt=0, le=1.0, description="m-1 at 532 nm at the centre")
-    height: float = Field(gt=0, le=30_000, description="m above the ground, of the centre")
-    depth: float = Field(gt=0, le=10_000, description="m, standard deviation of the Gaussian")
+    extinction: float = quantity(unit="m-1", gt=0, le=1.0, description="at 532 nm at the centre")
+    height: float = quantity(
+        unit="m", gt=0, le=30_000, description="above the ground, of the centre"
+    )
+    depth: float = quantity(
+        unit="m", gt=0, le=10_000, description="standard deviation of the Gaussian"
+    )
 
 
 class Cloud(Period):
     """Layer of constant extinction between a sharp base and top that exists for a period."""
 
     name: str = "cloud"
-    extinction: Extinction = Field(gt=0, description="m-1, the same at every wavelength")
-    base: float = Field(ge=0, le=30_000, description="m above the ground")
-    top: float = Field(gt=0, le=30_000, description="m above the ground")
-    lidar_ratio: float = Field(default=18.8, ge=5, le=150, description="sr; 18.8 for water clouds")
+    extinction: float = quantity(
+        unit="m-1", gt=0, le=1.0, description="the same at every wavelength"
+    )
+    base: float = quantity(unit="m", ge=0, le=30_000, description="above the ground")
+    top: float = quantity(unit="m", gt=0, le=30_000, description="above the ground")
+    lidar_ratio: float = quantity(
+        18.8, unit="sr", ge=5, le=150, description="18.8 for water clouds"
+    )
 
     @model_validator(mode="after")
     def _upright(self) -> Self:
@@ -66,49 +77,53 @@ class Cloud(Period):
         return self
 
 
-class Gradient(SimulationModel):
+class Gradient(SettingsModel):
     """Aerosol with a horizontal gradient.
 
     The extinction is that at the origin times exp(distance / scale) towards `azimuth`.
     """
 
     aerosol: Aerosol = Aerosol()
-    extinction: Extinction = Field(gt=0, description="m-1 at 532 nm, at the origin")
-    azimuth: Azimuth = Field(default=90.0, description="degree, direction of increase")
-    scale: Length = Field(description="m, distance of an increase by a factor of e")
-    top: Length = Field(default=1e5, description="m above the ground")
+    extinction: float = quantity(unit="m-1", gt=0, le=1.0, description="at 532 nm, at the origin")
+    azimuth: Azimuth = quantity(90.0, unit="degree", description="direction of increase")
+    scale: Length = quantity(unit="m", description="distance of an increase by a factor of e")
+    top: Length = quantity(1e5, unit="m", description="above the ground")
 
 
-class Plume(SimulationModel):
+class Plume(SettingsModel):
     """Gaussian cloud of aerosol that drifts with the wind."""
 
     aerosol: Aerosol = Aerosol()
-    extinction: Extinction = Field(gt=0, description="m-1 at 532 nm, at the centre")
-    east: Metres = Field(default=0.0, description="m, of the centre at the start")
-    north: Metres = Field(default=0.0, description="m, of the centre at the start")
-    height: NotNegative = Field(default=0.0, description="m above the ground, of the centre")
-    horizontal_depth: Length = Field(description="m, standard deviation")
-    vertical_depth: Length = Field(description="m, standard deviation")
-    wind_east: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
-    wind_north: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
+    extinction: float = quantity(unit="m-1", gt=0, le=1.0, description="at 532 nm, at the centre")
+    east: Metres = quantity(0.0, unit="m", description="of the centre at the start")
+    north: Metres = quantity(0.0, unit="m", description="of the centre at the start")
+    height: NotNegative = quantity(0.0, unit="m", description="above the ground, of the centre")
+    horizontal_depth: Length = quantity(unit="m", description="standard deviation")
+    vertical_depth: Length = quantity(unit="m", description="standard deviation")
+    wind_east: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
+    wind_north: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
 
 
-class Turbulence(SimulationModel):
+class Turbulence(SettingsModel):
     """Log-normal random factor on the aerosol that drifts with the wind."""
 
-    deviation: float = Field(gt=0, le=3, description="standard deviation of the logarithm")
-    horizontal_length: Length = Field(description="m, correlation length")
-    vertical_length: Length = Field(description="m, correlation length")
-    wind_east: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
-    wind_north: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
+    deviation: float = quantity(
+        unit="1", gt=0, le=3, description="standard deviation of the logarithm"
+    )
+    horizontal_length: Length = quantity(unit="m", description="correlation length")
+    vertical_length: Length = quantity(unit="m", description="correlation length")
+    wind_east: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
+    wind_north: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
 
 
-class Profile(SimulationModel):
+class Profile(SettingsModel):
     """Aerosol extinction at given heights, linear between them and zero above the last."""
 
     aerosol: Aerosol = Aerosol()
-    height: list[NotNegative] = Field(min_length=2, description="m above the ground, ascending")
-    extinction: list[Extinction] = Field(min_length=2, description="m-1 at 532 nm")
+    height: list[NotNegative] = quantity(
+        unit="m", min_length=2, description="above the ground, ascending"
+    )
+    extinction: list[Extinction] = quantity(unit="m-1", min_length=2, description="at 532 nm")
 
     @model_validator(mode="after")
     def _ascends(self) -> Self:
@@ -119,12 +134,14 @@ class Profile(SimulationModel):
         return self
 
 
-class Sounding(SimulationModel):
+class Sounding(SettingsModel):
     """Pressure and temperature of the air, in place of the US Standard Atmosphere."""
 
-    altitude: list[float] = Field(min_length=2, description="m above mean sea level, ascending")
-    pressure: list[float] = Field(min_length=2, description="Pa")
-    temperature: list[float] = Field(min_length=2, description="K")
+    altitude: list[float] = quantity(
+        unit="m", min_length=2, description="above mean sea level, ascending"
+    )
+    pressure: list[float] = quantity(unit="Pa", min_length=2)
+    temperature: list[float] = quantity(unit="K", min_length=2)
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -139,11 +156,11 @@ class Sounding(SimulationModel):
         return self
 
 
-class Homogeneous(SimulationModel):
+class Homogeneous(SettingsModel):
     """Aerosol that is the same everywhere and varies over the day."""
 
     aerosol: Aerosol = Aerosol()
-    extinction: DiurnalCourse = Field(description="m-1 at 532 nm")
+    extinction: DiurnalCourse = quantity(unit="m-1", description="at 532 nm")
     molecules_constant: bool = Field(
         default=False,
         description="whether molecules have the density of the origin at any height, which makes"
@@ -157,7 +174,7 @@ class Homogeneous(SimulationModel):
         return self
 
 
-class AtmosphereSettings(SimulationModel):
+class AtmosphereSettings(SettingsModel):
     """Atmosphere: molecules, and the sum of all aerosol and clouds given here."""
 
     homogeneous: Homogeneous | None = None

@@ -13,8 +13,8 @@ from lidarops.campaign.simulation_base import (
     BinWidth,
     Instant,
     Period,
-    SimulationModel,
 )
+from lidarops.settings import SettingsModel, quantity
 
 DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud"]
 
@@ -97,27 +97,29 @@ _HANDLING = {
 }
 
 
-class Damage(SimulationModel):
+class Damage(SettingsModel):
     """Damage of one file."""
 
     kind: DamageKind
-    index: int = Field(ge=0, description="index of the signal file of the instrument, from 0")
+    index: int = quantity(
+        unit="1", ge=0, description="index of the signal file of the instrument, from 0"
+    )
 
 
-class RandomDamage(SimulationModel):
+class RandomDamage(SettingsModel):
     """Damage of files that the seed of the simulation selects."""
 
-    fraction: float = Field(gt=0, le=1, description="share of the signal files")
+    fraction: float = quantity(unit="1", gt=0, le=1, description="share of the signal files")
     kinds: list[DamageKind] = Field(min_length=1)
 
 
-class Pointing(SimulationModel):
+class Pointing(SettingsModel):
     """Pointing of the beam: zenith angles of one cycle, one per file, repeated."""
 
-    zenith_angles: list[Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]] = Field(
-        min_length=1, description="degree, 0 = up"
+    zenith_angles: list[Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]] = quantity(
+        unit="degree", min_length=1, description="0 = up"
     )
-    azimuth: Azimuth = Field(default=0.0, description="degree, clockwise from north")
+    azimuth: Azimuth = quantity(0.0, unit="degree", description="clockwise from north")
     two_sided: bool = Field(
         default=False,
         description="whether the scan starts on the other side of the zenith (azimuth + 180) and"
@@ -142,32 +144,33 @@ class Pointing(SimulationModel):
         return (*((zenith, opposite) for zenith in tilted), *sorted(this_side))
 
 
-class ClockJump(SimulationModel):
+class ClockJump(SettingsModel):
     """From a given time on, the clock of the computer has this error."""
 
     at: Instant = Field(description="true time")
-    offset: int = Field(ge=-86400, le=86400, description="s, clock minus true time")
+    offset: int = quantity(unit="s", ge=-86400, le=86400, description="clock minus true time")
 
 
-class Change(SimulationModel):
+class Change(SettingsModel):
     """From a given time on, files have other bins or shots."""
 
     at: Instant
-    bins: int | None = Field(default=None, ge=16, le=16_384)
-    bin_width: BinWidth | None = Field(default=None, description="m")
-    shots: int | None = Field(default=None, ge=1, le=999_999)
+    bins: int | None = quantity(None, unit="1", ge=16, le=16_384)
+    bin_width: BinWidth | None = quantity(None, unit="m")
+    shots: int | None = quantity(None, unit="1", ge=1, le=999_999)
 
 
-class Acquisition(SimulationModel):
+class Acquisition(SettingsModel):
     """How an instrument records its files."""
 
-    interval: float = Field(default=300.0, ge=1, le=86400, description="s from start to start")
-    shots: int = Field(default=600, ge=1, le=999_999, description="laser shots in a file")
-    repetition_rate: float = Field(default=10.0, gt=0, le=10_000, description="Hz")
-    bins: int = Field(default=2000, ge=16, le=16_384)
-    bin_width: BinWidth = Field(default=7.5, description="m")
-    dark_files: int = Field(
-        default=0,
+    interval: float = quantity(300.0, unit="s", ge=1, le=86400, description="from start to start")
+    shots: int = quantity(600, unit="1", ge=1, le=999_999, description="laser shots in a file")
+    repetition_rate: float = quantity(10.0, unit="Hz", gt=0, le=10_000)
+    bins: int = quantity(2000, unit="1", ge=16, le=16_384)
+    bin_width: BinWidth = quantity(7.5, unit="m")
+    dark_files: int = quantity(
+        0,
+        unit="1",
         ge=0,
         le=100,
         description="files with a covered telescope: half before the first signal file, half after",

@@ -7,37 +7,39 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.campaign.simulation_base import BinWidth, NotNegative, SimulationModel
+from lidarops.campaign.simulation_base import BinWidth, NotNegative
+from lidarops.settings import SettingsModel, quantity
 
 
-class PhotonCounter(SimulationModel):
+class PhotonCounter(SettingsModel):
     """Photon-counting output of a detector; its dead time is a fact of the campaign."""
 
-    discriminator_level: int = Field(default=8, ge=1, le=63, description="Licel level")
+    discriminator_level: int = quantity(8, unit="1", ge=1, le=63, description="Licel level")
     paralyzable: bool = Field(
         default=False, description="whether a lost photon prolongs the dead time"
     )
 
 
-class AnalogRecorder(SimulationModel):
+class AnalogRecorder(SettingsModel):
     """Analog output of a detector."""
 
-    gain: float = Field(gt=0, le=100, description="mV per MHz of photoelectrons")
-    excess_noise: float = Field(
-        default=1.2,
+    gain: float = quantity(unit="mV MHz-1", gt=0, le=100, description="per rate of photoelectrons")
+    excess_noise: float = quantity(
+        1.2,
+        unit="1",
         ge=1,
         le=10,
         description="mean square of the charge of a photoelectron over the square of its mean",
     )
-    noise: float = Field(
-        gt=0, le=1000, description="electronic noise of one sample of one shot, mV"
+    noise: float = quantity(
+        unit="mV", gt=0, le=1000, description="electronic noise of one sample of one shot"
     )
-    dark_offset: NotNegative = Field(description="mV, without light")
-    dark_drift: float = Field(
-        default=0.0, ge=-100, le=100, description="mV per hour, drift of the dark offset"
+    dark_offset: NotNegative = quantity(unit="mV", description="without light")
+    dark_drift: float = quantity(
+        0.0, unit="mV h-1", ge=-100, le=100, description="drift of the dark offset"
     )
-    adc_range: float = Field(default=500.0, ge=1, le=10_000, description="mV at full scale")
-    adc_bits: int = Field(default=12, ge=8, le=16)
+    adc_range: float = quantity(500.0, unit="mV", ge=1, le=10_000, description="at full scale")
+    adc_bits: int = quantity(12, unit="1", ge=8, le=16)
 
     @property
     def step(self) -> float:
@@ -61,11 +63,13 @@ class AnalogRecorder(SimulationModel):
         return self
 
 
-class Background(SimulationModel):
+class Background(SettingsModel):
     """Sky background on a detector."""
 
-    night: NotNegative = Field(description="MHz of photoelectrons")
-    day: NotNegative = Field(description="MHz of photoelectrons with the sun at the zenith")
+    night: NotNegative = quantity(unit="MHz", description="of photoelectrons")
+    day: NotNegative = quantity(
+        unit="MHz", description="of photoelectrons with the sun at the zenith"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -74,13 +78,13 @@ class Background(SimulationModel):
         return self
 
 
-class Optics(SimulationModel):
+class Optics(SettingsModel):
     """Laser and telescope, which determine the strength of a signal."""
 
-    energy: float = Field(gt=0, le=100, description="J, of one pulse")
-    area: float = Field(gt=0, le=1000, description="m2, of the telescope")
-    efficiency: float = Field(
-        gt=0, le=1, description="photoelectrons per photon entering the telescope"
+    energy: float = quantity(unit="J", gt=0, le=100, description="of one pulse")
+    area: float = quantity(unit="m2", gt=0, le=1000, description="of the telescope")
+    efficiency: float = quantity(
+        unit="1", gt=0, le=1, description="photoelectrons per photon entering the telescope"
     )
 
     def signal_rate(self, wavelength: float) -> float:
@@ -94,29 +98,30 @@ class Optics(SimulationModel):
         return photons * self.efficiency * self.area * 299_792_458.0 / 2.0 * 1e-6 / 1e6 * 1e-6
 
 
-class Detector(SimulationModel):
+class Detector(SettingsModel):
     """Detector of one wavelength with an analog recorder, a photon counter or both."""
 
-    wavelength: int = Field(ge=200, le=3000, description="nm, as in the headers")
+    wavelength: int = quantity(unit="nm", ge=200, le=3000, description="as in the headers")
     polarisation: Literal["o", "p", "s"] = "o"
-    high_voltage: int = Field(default=800, ge=0, le=9999, description="V")
-    signal_rate: float | None = Field(
-        default=None,
+    high_voltage: int = quantity(800, unit="V", ge=0, le=9999)
+    signal_rate: float | None = quantity(
+        None,
+        unit="MHz",
         gt=0,
         le=1e5,
         allow_inf_nan=False,
-        description="MHz of photoelectrons from a backscatter coefficient of 1e-6 m-1 sr-1 at a"
-        " range of 1 km, with full overlap and without extinction",
+        description="of photoelectrons from a backscatter coefficient of 1e-6 m-1 sr-1 at"
+        " a range of 1 km, with full overlap and without extinction",
     )
     optics: Optics | None = Field(default=None, description="alternative to signal_rate")
     background: Background
     photon: PhotonCounter | None = None
     analog: AnalogRecorder | None = None
-    bins: int | None = Field(
-        default=None, ge=16, le=16_384, description="by default those of the acquisition"
+    bins: int | None = quantity(
+        None, unit="1", ge=16, le=16_384, description="by default those of the acquisition"
     )
-    bin_width: BinWidth | None = Field(
-        default=None, description="m; by default that of the acquisition"
+    bin_width: BinWidth | None = quantity(
+        None, unit="m", description="by default that of the acquisition"
     )
 
     @property
@@ -145,24 +150,24 @@ class Detector(SimulationModel):
         return self
 
 
-class LaserDrift(SimulationModel):
+class LaserDrift(SettingsModel):
     """Changes of the laser energy: drift, and jitter from file to file and shot to shot."""
 
-    per_hour: float = Field(
-        default=0.0, ge=-0.5, le=0.5, description="relative change of the energy in an hour"
+    per_hour: float = quantity(
+        0.0, unit="h-1", ge=-0.5, le=0.5, description="relative change of the energy in an hour"
     )
-    jitter: float = Field(
-        default=0.0, ge=0, le=0.3, description="relative standard deviation from file to file"
+    jitter: float = quantity(
+        0.0, unit="1", ge=0, le=0.3, description="relative standard deviation from file to file"
     )
-    shot_jitter: float = Field(
-        default=0.0, ge=0, le=0.5, description="relative standard deviation from shot to shot"
+    shot_jitter: float = quantity(
+        0.0, unit="1", ge=0, le=0.5, description="relative standard deviation from shot to shot"
     )
 
 
-class Pulse(SimulationModel):
+class Pulse(SettingsModel):
     """Shape of the laser pulse in time; time zero is its centroid."""
 
     shape: Literal["rectangle", "gaussian", "exponential"] = "gaussian"
-    width: float = Field(
-        gt=0, le=1e-5, description="s: full width at half maximum; decay time of exponential"
+    width: float = quantity(
+        unit="s", gt=0, le=1e-5, description="full width at half maximum; decay time of exponential"
     )

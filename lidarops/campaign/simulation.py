@@ -38,7 +38,8 @@ from lidarops.campaign.simulated_instrument import (
     PhotonCounter,
     Pulse,
 )
-from lidarops.campaign.simulation_base import DiurnalCourse, Instant, SimulationModel
+from lidarops.campaign.simulation_base import DiurnalCourse, Instant
+from lidarops.settings import SettingsModel, located_error, quantity
 
 __all__ = [
     "Acquisition",
@@ -74,7 +75,7 @@ _DAMAGE_OF_OUTPUT = {
 }
 
 
-class _Instrument(SimulationModel):
+class _Instrument(SettingsModel):
     acquisition: Acquisition = Acquisition()
     detectors: list[Detector] = Field(min_length=1)
     damage: tuple[Damage, ...] = ()
@@ -146,7 +147,7 @@ class HorizontalPath(_Instrument):
 
     kind: Literal["horizontal"]
     aerosol: Aerosol = Aerosol()
-    aerosol_extinction: DiurnalCourse = Field(description="m-1 at 532 nm")
+    aerosol_extinction: DiurnalCourse = quantity(unit="m-1", description="at 532 nm")
 
     @property
     def air(self) -> AtmosphereSettings:
@@ -214,30 +215,32 @@ InstrumentSimulation = Annotated[
 ]
 
 
-class TruthSettings(SimulationModel):
+class TruthSettings(SettingsModel):
     """Resolution of the true profiles along the beams."""
 
-    cells: int | None = Field(
-        default=None,
+    cells: int | None = quantity(
+        None,
+        unit="1",
         ge=0,
         le=2048,
-        description="number of range cells of equal length, with one mean each; by default cells of"
-        " 30 m up to 12 km and longer ones beyond",
+        description="number of range cells of equal length, with one mean each; by"
+        " default cells of 30 m up to 12 km and longer ones beyond",
     )
-    profiles: int = Field(
-        default=512,
+    profiles: int = quantity(
+        512,
+        unit="1",
         ge=1,
         le=100_000,
         description="largest number of profiles per instrument, evenly spread in time",
     )
 
 
-class SimulationSettings(SimulationModel):
+class SimulationSettings(SettingsModel):
     """Settings of a simulated campaign."""
 
-    seed: int = Field(ge=0, lt=2**63)
+    seed: int = quantity(unit="1", ge=0, lt=2**63)
     start: Instant
-    duration: float = Field(gt=0, le=366 * 86400.0 * 30, description="s")
+    duration: float = quantity(unit="s", gt=0, le=366 * 86400.0 * 30)
     atmosphere: AtmosphereSettings | None = Field(
         default=None, description="shared by instruments of kind 'lidar'"
     )
@@ -258,15 +261,20 @@ class SimulationSettings(SimulationModel):
         for key, instrument in self.instruments.items():
             files = self.files(key)
             if not files:
-                raise ValueError(
-                    f"instruments.{key}: no file fits into {self.duration:g} s:"
-                    " make the campaign longer or the files shorter"
+                raise located_error(
+                    f"no file fits into {self.duration:g} s:"
+                    " make the campaign longer or the files shorter",
+                    "instruments",
+                    key,
                 )
             for damage in instrument.damage:
                 if damage.index >= files:
-                    raise ValueError(
-                        f"instruments.{key}: damage at index {damage.index}, but the files have"
-                        f" indices 0 to {files - 1}"
+                    raise located_error(
+                        f"damage at index {damage.index}, but the files have indices 0 to"
+                        f" {files - 1}",
+                        "instruments",
+                        key,
+                        "damage",
                     )
         return self
 
@@ -274,9 +282,10 @@ class SimulationSettings(SimulationModel):
     def _air_exists(self) -> Self:
         for key in self.instruments:
             if self.instruments[key].air is None and self.atmosphere is None:
-                raise ValueError(
-                    f"instruments.{key}: has no atmosphere: give it one, or give"
-                    " simulation.atmosphere for all"
+                raise located_error(
+                    "has no atmosphere: give it one, or give simulation.atmosphere for all",
+                    "instruments",
+                    key,
                 )
         return self
 

@@ -1,15 +1,14 @@
-"""Base model and value types of the simulation settings."""
+"""Value types of the simulation settings."""
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-
-def _utc(value: datetime) -> datetime:
-    return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+from lidarops import settings
+from lidarops.settings import SettingsModel, quantity
 
 
 def _whole_seconds(value: datetime) -> datetime:
@@ -33,12 +32,7 @@ def _four_characters(value: float) -> float:
     return value
 
 
-Instant = Annotated[
-    datetime,
-    AfterValidator(_utc),
-    AfterValidator(_whole_seconds),
-    AfterValidator(_laser_era),
-]
+Instant = Annotated[settings.Instant, AfterValidator(_whole_seconds), AfterValidator(_laser_era)]
 BinWidth = Annotated[float, Field(ge=0.5, le=150), AfterValidator(_four_characters)]
 """m."""
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
@@ -50,13 +44,7 @@ Azimuth = Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 
-class SimulationModel(BaseModel):
-    """Base of all simulation settings: frozen, and without unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Period(SimulationModel):
+class Period(SettingsModel):
     """Time interval from `start` to `stop`, without `stop`."""
 
     start: Instant
@@ -73,12 +61,13 @@ class Period(SimulationModel):
         return start < self.stop and stop > self.start
 
 
-class DiurnalCourse(SimulationModel):
+class DiurnalCourse(SettingsModel):
     """A quantity that varies with the hour of the day (UTC) as a cosine."""
 
+    # The unit of both is that of the field that holds the course.
     minimum: NotNegative
     maximum: NotNegative
-    hour_of_maximum: Hour = 5.0
+    hour_of_maximum: Hour = quantity(5.0, unit="h", description="UTC")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -1,18 +1,24 @@
-"""Explain errors in a YAML file: the line, the key, and the valid choices."""
+"""Explain errors in a YAML file: the line, the key, the value, and what is expected there."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, get_args, get_origin
+from collections.abc import Iterator
+from typing import Any, Final
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
+
+from lidarops.campaign.expected import Expected
+from lidarops.settings import nearest
 
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
 """Appended by pydantic to the location of an invalid key."""
+_OWN_WORDS: Final = ("value_error", "located")
+"""Types of errors whose message comes from a validator."""
+_LONGEST: Final = 60
+"""Characters of a value that a message shows."""
 
 
 def duplicate_keys(tree: yaml.Node | None) -> list[str]:
@@ -53,99 +59,128 @@ def duplicate_keys(tree: yaml.Node | None) -> list[str]:
 
 
 def explain_yaml_error(
-    error: ValidationError, tree: yaml.Node | None, model: type[BaseModel], words: Mapping[str, str]
+    error: ValidationError, tree: yaml.Node | None, schema: dict[str, Any]
 ) -> list[str]:
-    """Return one message for each error, with its line and the valid choices.
+    """Return one message for each place of an error: line, key, what is expected, and the value.
 
     Parameters
     ----------
     error : ValidationError
     tree : yaml.Node or None
         Nodes of the file.
-    model : type
-        Model of the file.
-    words : mapping of str to str
-        Pattern of a text -> description of the texts that match it.
+    schema : dict
+        JSON schema of the file, with units.
 
     Returns
     -------
     list of str
     """
-    lines = []
-    for problem in error.errors():
-        keys = [str(key) for key in problem["loc"] if key != _KEY]
-        line = _line_of(tree, keys)
-        place = ".".join(keys) or "top level"
-        message = _message(problem, keys, model, words)
-        lines.append(f"{f'line {line}: ' if line else ''}{place}: {message}")
-    return lines
+    problems = [_Problem(details, tree, Expected.root(schema)) for details in error.errors()]
+    messages: dict[str, str] = {}
+    for problem in problems:
+        # Pydantic names an error for each member of a union: the nested ones say more.
+        nested = any(_is_below(other.keys, problem.keys) for other in problems)
+        if not (problem.of_union and nested):
+            messages.setdefault(problem.place, problem.message())
+    return list(messages.values())
 
 
-def _message(
-    problem: ErrorDetails, keys: list[str], model: type[BaseModel], words: Mapping[str, str]
-) -> str:
-    pattern = str(problem.get("ctx", {}).get("pattern"))
-    if problem["type"] == "string_pattern_mismatch" and pattern in words:
-        return f"must be {words[pattern]}, not {problem['input']!r}"
-    if problem["type"] == "extra_forbidden":
-        known = _known_keys(model, keys[:-1])
-        if known:
-            near = difflib.get_close_matches(keys[-1], known, n=3)
-            others = [name for name in known if name not in near]
-            return f"unknown key; keys here are {', '.join([*near, *others])}"
-    return problem["msg"]
+def _is_below(keys: list[str], above: list[str]) -> bool:
+    return len(keys) > len(above) and keys[: len(above)] == above
 
 
-def _known_keys(model: type[BaseModel], keys: Sequence[str]) -> list[str]:
-    """Return the valid keys at a location of a file, sorted."""
-    candidates: list[Any] = [model]
+class _Problem:
+    """One error of pydantic, its place in the file, and what the schema expects there."""
+
+    def __init__(self, details: ErrorDetails, tree: yaml.Node | None, root: Expected) -> None:
+        self.details = details
+        self.of_key = details["loc"][-1:] == (_KEY,)
+        location = [str(key) for key in details["loc"] if key != _KEY]
+        location += [str(key) for key in details.get("ctx", {}).get("keys", ())]
+        unknown = location.pop() if details["type"] == "extra_forbidden" else None
+        self.keys: list[str] = []
+        self.expected = root
+        self.of_union = False
+        self.mapping = root
+        for key in location:
+            below = self.expected.below(key)
+            # A location key that the schema lacks names the member of a union that was tried.
+            self.of_union = below is None
+            if below is None:
+                self.expected = self.expected.member(key)
+            else:
+                self.mapping, self.expected = self.expected, below
+                self.keys.append(key)
+        self.unknown = unknown
+        self.keys += [] if unknown is None else [unknown]
+        self.line, self.node, names = _find(tree, self.keys)
+        self.place = ".".join(names) or "top level"
+
+    def message(self) -> str:
+        """Return the line, the key and the text."""
+        line = f"line {self.line}: " if self.line else ""
+        return f"{line}{self.place}: {self._text()}"
+
+    def _text(self) -> str:
+        kind = self.details["type"]
+        if self.unknown is not None:
+            return self._on_unknown_key(self.unknown)
+        if self.of_key:
+            return f"must be {self.mapping.words_of_keys()}, not {self.keys[-1]!r}"
+        if kind == "missing":
+            return f"is required: {self.expected.words()}"
+        if kind == "no_boolean":
+            text = self.node.value if isinstance(self.node, yaml.ScalarNode) else "a boolean"
+            words = self.expected.words()
+            return f"must be {words}, not {text}; YAML reads it as a boolean: quote a text"
+        if kind in _OWN_WORDS or kind.startswith("union_tag"):
+            return self.details["msg"].removeprefix("Value error, ")
+        return f"must be {self.expected.words()}, not {self._value()}{self._hint()}"
+
+    def _on_unknown_key(self, key: str) -> str:
+        known = self.expected.keys()
+        question = nearest(key, known)
+        near = [name for name in known if repr(name) in question]
+        others = [name for name in known if name not in near]
+        return f"unknown key; {question}keys here are {', '.join([*near, *others])}"
+
+    def _value(self) -> str:
+        """Return the value as it is written in the file."""
+        value = self.details["input"]
+        if isinstance(value, dict):
+            return "a mapping"
+        if isinstance(value, str) or not isinstance(self.node, yaml.ScalarNode):
+            text = repr(value)
+        else:
+            text = self.node.value or "empty"
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+    def _hint(self) -> str:
+        """Return the nearest valid choice, or why YAML reads another type than was meant."""
+        value = self.details["input"]
+        question = nearest(str(value), self.expected.choices()) if isinstance(value, str) else ""
+        return f"; {question.strip()}" if question else ""
+
+
+def _find(
+    node: yaml.Node | None, keys: list[str]
+) -> tuple[int | None, yaml.Node | None, list[str]]:
+    """Return line and node of the last key that the file has, and the keys as written there."""
+    line, names, value = None, [], node
     for key in keys:
-        below = [inner for kind in candidates for inner in _below(kind, key)]
-        # A location key without a node names the member of a union that pydantic tried.
-        candidates = below or [kind for kind in candidates if _is_kind(kind, key)] or candidates
-    return sorted({name for kind in candidates for name in kind.model_fields if _is_model(kind)})
+        entry = next((entry for entry in _children(value) if _is_key(entry, key)), None)
+        names.append(key if entry is None else entry[0])
+        if entry is not None:
+            line, value = entry[1].line + 1, entry[2]
+        else:
+            value = None
+    return line, value, names
 
 
-def _below(kind: Any, key: str) -> list[Any]:
-    if _is_model(kind):
-        field = kind.model_fields.get(key)
-        return [] if field is None else _models(field.annotation)
-    origin, held = get_origin(kind), get_args(kind)
-    if origin is dict:
-        return _models(held[1])
-    if origin in (list, tuple) and key.isdecimal():
-        return [inner for annotation in held for inner in _models(annotation)]
-    return []
-
-
-def _models(annotation: Any) -> list[Any]:
-    """Return the models, lists and mappings that an annotation allows."""
-    if _is_model(annotation) or get_origin(annotation) in (dict, list, tuple):
-        return [annotation]
-    return [inner for argument in get_args(annotation) for inner in _models(argument)]
-
-
-def _is_model(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def _is_kind(kind: Any, tag: str) -> bool:
-    if not _is_model(kind):
-        return False
-    return kind.__name__ == tag or any(
-        tag in get_args(field.annotation) for field in kind.model_fields.values()
-    )
-
-
-def _line_of(node: yaml.Node | None, keys: list[str]) -> int | None:
-    line = None
-    for key in keys:
-        # A key that names a member of a union is not in the file: keep the node.
-        for name, mark, value in _children(node):
-            if name == key:
-                line, node = mark.line + 1, value
-                break
-    return line
+def _is_key(entry: tuple[str, yaml.Mark, yaml.Node], key: str) -> bool:
+    # PyYAML reads keys such as no and on as booleans.
+    read = yaml.SafeLoader.bool_values.get(entry[0].lower())
+    return key in (entry[0], str(read))
 
 
 def _children(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Mark, yaml.Node]]:

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
+from lidarops.products.elastic.settings import ElasticSettings
 
 MINIMAL = """\
 name: small

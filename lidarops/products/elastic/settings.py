@@ -7,18 +7,18 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, PartOfDay, SettingsModel
+from lidarops.settings import ChannelProduct, Metres, PartOfDay, SettingsModel, quantity
 
 
 class ReferenceSettings(SettingsModel):
     """Limits of the reference window, and the scattering ratio there."""
 
-    lowest: Metres = Field(default=3000.0, description="m above the station")
-    highest: Metres = Field(default=12_000.0, description="m above the station")
-    width: float = Field(default=1000.0, ge=100, le=20_000, description="m")
-    scattering_ratio: float = Field(default=1.0, ge=1, le=10)
-    relative_error: float = Field(
-        default=0.02, ge=0, le=1, description="standard error of the scattering ratio, relative"
+    lowest: Metres = quantity(3000.0, unit="m", description="above the station")
+    highest: Metres = quantity(12_000.0, unit="m", description="above the station")
+    width: float = quantity(1000.0, unit="m", ge=100, le=20_000)
+    scattering_ratio: float = quantity(1.0, unit="1", ge=1, le=10)
+    relative_error: float = quantity(
+        0.02, unit="1", ge=0, le=1, description="standard error of the scattering ratio, relative"
     )
 
     @model_validator(mode="after")
@@ -35,11 +35,11 @@ class ElasticSettings(ChannelProduct):
         min_length=1,
         description="glued_532o is glued from analog_532o and photon_532o of the files",
     )
-    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = Field(default=50.0, description="sr")
-    lidar_ratio_standard_error: float = Field(default=10.0, ge=0, le=100, description="sr")
+    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = quantity(50.0, unit="sr")
+    lidar_ratio_standard_error: float = quantity(10.0, unit="sr", ge=0, le=100)
     average: PartOfDay = timedelta(minutes=30)
     background: Literal["known_shape", "tail_mean"] = "known_shape"
     reference: ReferenceSettings = ReferenceSettings()
-    molecular_relative_error: float = Field(
-        default=0.01, ge=0, le=1, description="standard error of the density of the air, relative"
+    molecular_relative_error: float = quantity(
+        0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
     )

@@ -6,14 +6,14 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, VisibilitySettings
+from lidarops.settings import ChannelProduct, Metres, VisibilitySettings, quantity
 
 
 class HomogeneousSettings(ChannelProduct):
     """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
 
     channels: list[str] = Field(min_length=1)
-    sections: list[tuple[Metres, Metres]] = Field(min_length=1, description="m")
+    sections: list[tuple[Metres, Metres]] = quantity(unit="m", min_length=1)
     method: Literal["auto", "direct", "cubic"] = "auto"
     visibility: VisibilitySettings | None = Field(
         default=None, description="if given, adds visibility along the sections"

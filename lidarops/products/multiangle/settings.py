@@ -6,25 +6,27 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres
+from lidarops.settings import ChannelProduct, Metres, quantity
 
 
 class MultiAngleSettings(ChannelProduct):
     """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
 
     channels: list[str] = Field(min_length=1)
-    highest: Metres = Field(default=6000.0, description="m above the station")
-    step: float = Field(default=60.0, ge=5, le=1000, description="m, between altitudes")
+    highest: Metres = quantity(6000.0, unit="m", description="above the station")
+    step: float = quantity(60.0, unit="m", ge=5, le=1000, description="between altitudes")
     method: Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"] = "auto"
-    layers: list[tuple[float, float]] = Field(
-        default=[],
-        description="m above the station: bottom and top of layers whose optical depth is written",
+    layers: list[tuple[float, float]] = quantity(
+        [],
+        unit="m",
+        description="above the station: bottom and top of layers whose optical depth is written",
     )
-    largest_gradient: float = Field(
-        default=5e-5,
+    largest_gradient: float = quantity(
+        5e-5,
+        unit="m-1",
         ge=0,
         le=1e-2,
-        description="m-1, largest horizontal gradient of ln(backscatter) included in the error",
+        description="largest horizontal gradient of ln(backscatter) included in the error",
     )
 
     @model_validator(mode="after")

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from lidarops.settings import ChannelProduct, Metres
+from lidarops.settings import ChannelProduct, Metres, quantity
 
 
 class SignalSettings(ChannelProduct):
     """The ``signal`` product: background-subtracted, range-corrected signals."""
 
     channels: list[str] | Literal["all"] = "all"
-    background_range: tuple[Metres, Metres] | None = Field(
-        default=None, description="m; by default the last tenth of the bins"
+    background_range: tuple[Metres, Metres] | None = quantity(
+        None, unit="m", description="by default the last tenth of the bins"
     )
 
     @model_validator(mode="after")

@@ -8,7 +8,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import Metres, NetworkProduct, PartOfDay, VisibilitySettings
+from lidarops.settings import (
+    Metres,
+    NetworkProduct,
+    PartOfDay,
+    VisibilitySettings,
+    located_error,
+    nearest,
+    quantity,
+)
 
 
 class VisibilityProductSettings(NetworkProduct):
@@ -23,35 +31,41 @@ class VisibilityProductSettings(NetworkProduct):
     method: Literal["network", "cycle", "multiplier", "unbiased", "slope", "klett"] = "network"
     prior: Literal["block", "none"] = "block"
     visibility: VisibilitySettings = VisibilitySettings()
-    tolerance: float = Field(
-        default=15.0, gt=0, le=1000, description="m, largest distance of beams at a crossing"
+    tolerance: float = quantity(
+        15.0, unit="m", gt=0, le=1000, description="largest distance of beams at a crossing"
     )
-    smallest_angle: float = Field(default=2.0, gt=0, lt=90, description="degree between beams")
-    farthest: float | None = Field(
-        default=None, gt=0, description="m, largest range used; by default the last bin"
+    smallest_angle: float = quantity(2.0, unit="degree", gt=0, lt=90, description="between beams")
+    farthest: float | None = quantity(
+        None, unit="m", gt=0, description="largest range used; by default the last bin"
     )
-    exponent: float = Field(
-        default=1.0, ge=0.1, le=10, description="m in backscatter ~ extinction^(1/m)"
+    exponent: float = quantity(
+        1.0,
+        unit="1",
+        ge=0.1,
+        le=10,
+        description="m in backscatter proportional to extinction^(1/m)",
     )
-    exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = Field(
-        default={}, description="exponent of instruments that differ"
+    exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = quantity(
+        {}, unit="1", description="exponent of instruments that differ"
     )
-    exponent_relative_error: float = Field(default=0.1, ge=0, le=0.5)
-    lidar_ratio_relative_error: float = Field(
-        default=0.02,
+    exponent_relative_error: float = quantity(0.1, unit="1", ge=0, le=0.5)
+    lidar_ratio_relative_error: float = quantity(
+        0.02,
+        unit="1",
         ge=0,
         le=0.5,
-        description="relative error of the lidar ratio of a crossing against the others, from"
-        " aerosol mixtures and humidity",
+        description="relative error of the lidar ratio of a crossing against the others,"
+        " from aerosol mixtures and humidity",
     )
-    overlap_relative_error: float = Field(
-        default=0.003,
+    overlap_relative_error: float = quantity(
+        0.003,
+        unit="1",
         ge=0,
         le=0.5,
         description="relative error of the overlap at the nearest crossing of a beam",
     )
-    background_range: tuple[Metres, Metres] | None = Field(
-        default=None, description="m; by default the last tenth of the bins"
+    background_range: tuple[Metres, Metres] | None = quantity(
+        None, unit="m", description="by default the last tenth of the bins"
     )
 
     @model_validator(mode="after")
@@ -66,7 +80,12 @@ class VisibilityProductSettings(NetworkProduct):
         """Raise ValueError where `exponents` names an instrument that is not in the network."""
         unknown = sorted(set(self.exponents) - set(instruments))
         if unknown:
-            raise ValueError(f"exponents names {', '.join(unknown)}, not in instruments")
+            raise located_error(
+                f"not in instruments; {nearest(unknown[0], instruments)}known instruments:"
+                f" {', '.join(instruments)}",
+                "exponents",
+                unknown[0],
+            )
 
     def exponent_of(self, instrument: str) -> float:
         """Return the exponent m of the beams of an instrument."""
