@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -346,6 +347,7 @@ class Campaign(SettingsModel):
         return Path(self.archive) / "truth.nc"
 
 
+@cache
 def campaign_schema() -> dict[str, Any]:
     """Return the JSON schema of campaign files, with the settings of every kind of product.
 

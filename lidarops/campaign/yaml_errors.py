@@ -114,6 +114,7 @@ class _Problem:
         self.unknown = unknown
         self.keys += [] if unknown is None else [unknown]
         self.line, self.node, names = _find(tree, self.keys)
+        self.name = names[-1] if names else ""
         self.place = ".".join(names) or "top level"
 
     def message(self) -> str:
@@ -126,7 +127,7 @@ class _Problem:
         if self.unknown is not None:
             return self._on_unknown_key(self.unknown)
         if self.of_key:
-            return f"must be {self.mapping.words_of_keys()}, not {self.keys[-1]!r}"
+            return f"must be {self.mapping.words_of_keys()}, not {self.name!r}"
         if kind == "missing":
             return f"is required: {self.expected.words()}"
         if kind == "no_boolean":
@@ -178,9 +179,9 @@ def _find(
 
 
 def _is_key(entry: tuple[str, yaml.Mark, yaml.Node], key: str) -> bool:
-    # PyYAML reads keys such as no and on as booleans.
+    # PyYAML reads keys such as no and on as booleans, whose location pydantic gives as 0 or 1.
     read = yaml.SafeLoader.bool_values.get(entry[0].lower())
-    return key in (entry[0], str(read))
+    return key == entry[0] or (read is not None and key == str(int(read)))
 
 
 def _children(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Mark, yaml.Node]]:
