@@ -185,7 +185,7 @@ def test_a_number_without_a_point_is_read(tmp_path: Path) -> None:
     assert facts.channels["photon_532o"].dead_time == 4e-9
 
 
-Place = tuple[tuple[str | int, ...], dict[str, Any], str | None]
+Place = tuple[tuple[Any, ...], dict[str, Any], str | None]
 
 
 def _numbers(
