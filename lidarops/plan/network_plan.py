@@ -38,8 +38,9 @@ from lidarops.plan.signal_rules import (
 )
 from lidarops.products.visibility.settings import VisibilityProductSettings
 from lidarops.records import ChannelLayout, DetectionMode, Granule, LeftOut, Plan, Scene, Step
+from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.labeled import BEFORE_TAIL, BINS_BEYOND
+from lidarops.retrieve.network.labeled import BINS_BEYOND
 from lidarops.settings import VisibilitySettings
 
 SAME_POINTING: Final = 0.1
@@ -460,7 +461,7 @@ def _member_window(case: _MemberCase, farthest: float) -> Step | LeftOut:
     if case.campaign.all_steps:
         return counts.without(StepName.RANGE_WINDOW, ALL_STEPS)
     width, (start, stop) = channel.bin_width, case.tail
-    low, high = (share * (start + width) for share in BEFORE_TAIL)
+    low, high = window_before(start + width)
     near = bins_with_noise(0.0, farthest + BINS_BEYOND * width, counts)
     far = (bins_within(low - width, high, counts), bins_within(start, stop, counts))
     kept = _merged([near, *far], channel.bins)

@@ -5,7 +5,7 @@ In this order: outlying bins, background, clouds, reference window, inversion, q
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ from lidarops.retrieve.air.molecular import (
     molecular_lidar_ratio,
     rayleigh_cross_section,
 )
-from lidarops.retrieve.background import cubic_and_tail as _background
+from lidarops.retrieve.background import cubic_and_tail, estimate
 from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic import layers as _layers
@@ -152,8 +152,6 @@ def invert_elastic(
     means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
     signal, clouds = _signal_and_clouds(means, known_shape=known_shape)
     window = _window(signal.power, distance, means.variance, air, reference, clouds.mask)
-    if not known_shape:
-        signal = _mark_biased_backgrounds(signal, window, air)
     solution = _elastic.invert_elastic(
         signal.power,
         distance,
@@ -224,7 +222,7 @@ class _Means:
 
     def _bridge_outliers(self) -> None:
         """Replace outlying bins before the background and the window depend on them."""
-        rough = _background.tail_mean(self.raw, self.distance, variance=self.noise).background
+        rough = cubic_and_tail.tail_mean(self.raw, self.distance, variance=self.noise).background
         usable = np.where((self.quality & _WITHHELD) != 0, np.nan, self.raw)
         bridged = _outlying_bins.bridge_outliers(
             usable, self.distance, self.noise, background=np.nan_to_num(rough, nan=0.0)
@@ -272,29 +270,13 @@ def _subtract_background(
     means: _Means, usable: npt.NDArray[np.bool_], *, known_shape: bool
 ) -> _Signal:
     raw, noise, r = means.raw, means.noise, means.distance
-    tail = _background.tail_mean(raw, r, variance=noise)
-    background, error = tail.background, tail.background_standard_error
-    uncertain = np.zeros(background.shape, dtype=bool)
-    if known_shape:
-        fit = _known_shape.fit_known_shape(raw, r, means.air.shape, variance=noise, mask=usable)
-        fitted = ~fit.singular & np.isfinite(fit.background)
-        background = np.where(fitted, fit.background, background)
-        # Differences of neighbouring bins underestimate noise that is correlated between them.
-        excess = fit.chi2 / np.maximum(fit.degrees_of_freedom, 1)
-        scale = np.sqrt(np.maximum(np.nan_to_num(excess, nan=1.0), 1.0))
-        error = np.where(fitted, fit.background_standard_error * scale, error)
-        uncertain = ~fitted | fit.poor_fit
-    return _Signal(means.minus(background), background, error, uncertain)
-
-
-def _mark_biased_backgrounds(
-    signal: _Signal, window: _reference.ReferenceWindow, air: _Air
-) -> _Signal:
-    """Mark a background as uncertain if the signal of air in its bins exceeds its error."""
-    shape = air.shape[-max(air.shape.size // 10, 1) :].mean()
-    with np.errstate(invalid="ignore"):
-        biased = window.scale * shape > signal.background_standard_error
-    return replace(signal, uncertain=signal.uncertain | biased)
+    if not known_shape:
+        sky = estimate.from_tail(raw, r, noise)
+    else:
+        sky = estimate.from_known_shape(raw, r, noise, means.air.shape, mask=usable)
+    # Differences of neighbouring bins underestimate noise that is correlated between them.
+    error = sky.standard_error * np.sqrt(np.maximum(sky.reduced_chi2, 1.0))
+    return _Signal(means.minus(sky.background), sky.background, error, sky.uncertain)
 
 
 def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:

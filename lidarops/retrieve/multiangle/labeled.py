@@ -11,6 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
+from lidarops.retrieve.background.left_signal import shifts
 from lidarops.retrieve.multiangle import optical_depth, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
 from lidarops.retrieve.multiangle.optical_depth import (
@@ -40,9 +41,6 @@ _QUALITY_OF_FLAG: Final = {
     "outlier": Quality.OUTLIER,
 }
 """Of `MultiAngleFlags`; `saturated` is included in `prior_dominated`."""
-_SHARE_OF_ERROR: Final = 0.5
-"""Largest shift of an optical depth by signal left in the background that raises no flag, over
-its standard error."""
 _PER_PROFILE: Final = ("effective_degrees_of_freedom", "reach")
 _PER_ALTITUDE: Final = (
     "optical_depth",
@@ -245,5 +243,4 @@ def _shifted_by_background(
         arm = weight * (path - mean[:, np.newaxis, :])
         change = np.where(used, change, 0.0)
         shift = 0.5 * (arm * change).sum(axis=1) / (arm * path).sum(axis=1)
-        shifted = np.abs(shift) > _SHARE_OF_ERROR * retrieval.optical_depth_standard_error
-    return np.asarray(shifted, dtype=np.int32)
+    return shifts(shift, retrieval.optical_depth_standard_error).astype(np.int32)

@@ -19,8 +19,7 @@ from lidarops.retrieve.air.molecular import (
     molecular_lidar_ratio,
     rayleigh_cross_section,
 )
-from lidarops.retrieve.background import cubic_and_tail as _background
-from lidarops.retrieve.background import known_shape
+from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._common_altitude import to_altitude
 from lidarops.retrieve.signal import averaging
@@ -42,12 +41,6 @@ _AT_ONCE: Final = 32
 """Profiles whose background is estimated together: their arrays fit into the processor cache."""
 _BESIDE: Final = 4
 """Bins beside an altitude that an interpolation may need."""
-_BEFORE_TAIL: Final = (0.6, 0.7)
-"""Window, as fractions of the start of the tail, from which the signal left in the tail is
-estimated."""
-_SHAPE_ERROR: Final = 0.2
-"""Relative error of the signal in the tail as computed from the shape of clean air, caused by
-aerosol in the far range (haze of 12 percent of the air there, simulated)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,56 +369,21 @@ def _without_background(
 ) -> _NetProfiles:
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
     distance = settings.distance
-    start, stop = settings.background.range
-    tail = (distance >= start) & (distance <= stop)
-    if not tail.any():
-        raise RetrievalInputError(
-            f"has no bin from {start:g} to {stop:g} m",
-            field="background",
-            remedy=f"ranges end at {distance[-1]:g} m",
+    front = settings.in_front
+    data = (values[:, front], distance[front], variance[:, front])
+    sky = (
+        estimate.from_tail(*data, settings.background.range)
+        if settings.shapes is None
+        else estimate.from_known_shape(
+            *data, settings.shapes[beam][:, front], settings.background.range
         )
-    sky = _background.tail_mean(
-        values[:, tail], distance[tail], start=start, variance=variance[:, tail]
     )
-    background, error = sky.background, sky.background_standard_error
-    left = _left_in_tail(values - background[:, np.newaxis], distance, start, tail)
-    uncertain = np.isfinite(background) & ~np.isfinite(left)
-    if settings.shapes is not None:
-        bins = settings.in_front
-        shapes = settings.shapes[beam]
-        fit = known_shape.fit_known_shape(
-            values[:, bins], distance[bins], shapes[:, bins], variance=variance[:, bins]
-        )
-        usable = ~fit.singular & np.isfinite(fit.background)
-        background = np.where(usable, fit.background, background)
-        error = np.where(usable, fit.background_standard_error, error)
-        left = np.where(usable, _SHAPE_ERROR * np.abs(sky.background - background), left)
-        uncertain = np.where(usable, fit.poor_fit, uncertain)
-    values = values - background[:, np.newaxis]
-    noise = variance + error[:, np.newaxis] ** 2
+    values = values - sky.background[:, np.newaxis]
+    noise = variance + sky.standard_error[:, np.newaxis] ** 2
     if settings.overlap is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             values, noise = values / settings.overlap, noise / settings.overlap**2
-    return _NetProfiles(values, noise, left, uncertain)
-
-
-def _left_in_tail(net: Array, distance: Array, start: float, tail: npt.NDArray[np.bool_]) -> Array:
-    """Return the largest signal that may be left in the tail.
-
-    In front of the tail the net signal is S - L, where L is the mean signal in the tail, which was
-    subtracted with the background. Unless the air becomes more turbid, S falls at least with the
-    square of range; this bounds L.
-    """
-    low, high = (share * start for share in _BEFORE_TAIL)
-    before = (distance >= low) & (distance < high)
-    if not before.any():
-        return np.full(len(net), np.nan)
-    fall = np.mean(distance[tail] ** -2.0) / np.mean(distance[before] ** -2.0)
-    known = np.isfinite(net[:, before])
-    count = known.sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        mean = np.where(known, net[:, before], 0.0).sum(axis=1) / count
-    return np.asarray(mean * fall / (1.0 - fall))
+    return _NetProfiles(values, noise, sky.left.most, sky.unjudged)
 
 
 def _shapes(

@@ -14,7 +14,8 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air import labeled
 from lidarops.retrieve.air.labeled import Definition
-from lidarops.retrieve.background import cubic_and_tail as _background
+from lidarops.retrieve.background.estimate import from_tail
+from lidarops.retrieve.background.left_signal import shifts
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.geometry import Network
@@ -44,10 +45,6 @@ _QUALITY_OF_FLAG: Final = {
     "not_measured": Quality.INPUT_MISSING,
 }
 """Quality bits of `CrossingFlags`. `not_finite` is used where no other flag rejects the value."""
-BEFORE_TAIL: Final = (0.6, 0.7)
-"""Window, as fractions of the start of the tail, where the signal before the tail is measured."""
-_DETECTED_SIGMAS: Final = 3.0
-"""Standard errors by which a signal before the tail is detected."""
 _RELATIVE_CHANGE: Final = 1e-2
 """Relative change of signals for sensitivities."""
 BINS_BEYOND: Final = 200
@@ -55,8 +52,6 @@ BINS_BEYOND: Final = 200
 _MOST_SEPARATE_BEAMS: Final = 16
 """Largest number of beams whose errors are computed one by one. With more, beams of one instrument
 are changed together."""
-_UNFLAGGED_SHARE: Final = 0.5
-"""Largest shift of extinction by signal in the background without a flag, in standard errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +112,7 @@ class _Signals:
     tail_signal: Array
     """(interval, beam) largest signal that may have been subtracted with the background."""
     warnings: Flags
-    """(interval, beam) warning bits of the bins between the crossings of the beam."""
+    """(interval, beam) warning bits of the bins between the crossings, and of the background."""
     overlap: Array
     """(beam, bin)."""
 
@@ -209,25 +204,20 @@ def _gather_signals(
         quality = data["quality"].to_numpy()
         values = np.where((quality & int(_UNUSABLE)) != 0, np.nan, data["power"].to_numpy())
         noise = data["variance"].to_numpy()
-        start, stop = beam.background_range
-        tail = (distance >= start) & (distance <= stop)
-        background = _background.tail_mean(
-            values[:, tail], distance[tail], start=start, variance=noise[:, tail]
-        )
+        sky = from_tail(values, distance, noise, beam.background_range)
         beam_bins = slice(distance.size)
-        power[rows, index, beam_bins] = values - background.background[:, np.newaxis]
+        power[rows, index, beam_bins] = values - sky.background[:, np.newaxis]
         variance[rows, index, beam_bins] = noise
         grid[index, beam_bins] = distance
         if beam.overlap is not None:
             # Bins nearer than the first known overlap are not used anyway.
             overlap[index, beam_bins] = np.nan_to_num(beam.overlap)
-        error[rows, index] = background.background_standard_error
-        tail_signal[rows, index] = _signal_in_tail(
-            power[rows, index, beam_bins], noise, distance, tail
-        )
+        error[rows, index] = sky.standard_error
+        tail_signal[rows, index] = sky.left.detected
         ranges = network.on_beam(index)[1]
         used = (distance >= ranges[0]) & (distance <= ranges[-1])
         warnings[rows, index] = np.bitwise_or.reduce(quality[:, used] & np.int32(_WARNINGS), axis=1)
+        warnings[rows, index] |= sky.unjudged * np.int32(Quality.BACKGROUND_UNCERTAIN)
     # Farther bins do not matter, and the network is solved many times.
     used_bins = slice(_bins_used(grid, network))
     return _Signals(
@@ -245,32 +235,6 @@ def _bins_used(grid: Array, network: Network) -> int:
     """Return the number of bins up to the farthest crossing of any beam, and a margin."""
     reached = [int(np.sum(row <= network.on_beam(index)[1][-1])) for index, row in enumerate(grid)]
     return max(reached) + BINS_BEYOND
-
-
-def _signal_in_tail(
-    signal: Array, noise: Array, distance: Array, tail: npt.NDArray[np.bool_]
-) -> Array:
-    """Return (interval,) the largest signal that the tail may contain; 0 if none is detected.
-
-    The signal before the tail is S - L, where L is the signal in the tail that was subtracted.
-    S decreases at least with the square of range.
-    """
-    tail_start = distance[tail][0] if tail.any() else 0.0
-    low, high = (share * tail_start for share in BEFORE_TAIL)
-    before_tail = (distance >= low) & (distance < high)
-    if not before_tail.any():
-        return np.zeros(len(signal))
-    tail_ratio = np.mean(distance[tail] ** -2.0) / np.mean(distance[before_tail] ** -2.0)
-    known = np.isfinite(signal) & np.isfinite(noise)
-    known_noise, counted = np.where(known, noise, 0.0), known.astype(np.int64)
-    mean = np.where(known, signal, 0.0)[:, before_tail].sum(axis=1)
-    variance = sum(
-        known_noise[:, window].sum(axis=1) / np.maximum(counted[:, window].sum(axis=1), 1) ** 2
-        for window in (before_tail, tail)
-    )
-    mean = mean / np.maximum(counted[:, before_tail].sum(axis=1), 1)
-    detected = mean > _DETECTED_SIGMAS * np.sqrt(variance)
-    return np.asarray(np.where(detected, mean * tail_ratio / (1.0 - tail_ratio), 0.0))
 
 
 class _Solver:
@@ -426,8 +390,8 @@ def _quality_flags(
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
         bits[:, crossing] |= signals.warnings[:, index]
     with np.errstate(invalid="ignore"):
-        background_doubt = errors.tail_signal > _UNFLAGGED_SHARE * errors.random
         uncertain = ~(np.hypot(errors.random, errors.systematic) < result.extinction)
+    background_doubt = shifts(errors.tail_signal, errors.random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(
         uncertain & np.isfinite(result.extinction), np.int32(Quality.POORLY_DETERMINED), np.int32(0)

@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.flags import Quality
 from lidarops.records import DetectionMode
-from lidarops.retrieve.background import cubic_and_tail
+from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.counts_to_signal import Signal
 from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
@@ -37,10 +36,10 @@ _RANGE_CORRECTED_DTYPES: Final[list[np.dtype[Any]]] = [
     np.dtype(np.float64),
     np.dtype(np.float64),
 ]
-_FEWEST: Final = 8
-"""Fewest bins before the tail for a test of whether the signal still falls."""
-_FALLS: Final = 4.0
-"""Standard errors by which the mean of these bins must exceed that of the tail."""
+_BACKGROUNDS: Final[dict[str, Callable[..., Background]]] = {
+    "tail_mean": from_tail,
+    "cubic": from_cubic,
+}
 _PROFILES_IN_CACHE: Final = 64
 """Profiles processed together; their arrays fit the processor cache."""
 
@@ -104,6 +103,7 @@ def range_corrected_signals(
     channel: str,
     *,
     background_range: tuple[float, float],
+    background_method: str = "tail_mean",
     dead_time: float | None = None,
     noise_variance: float | None = None,
     dark: DarkSignals | None = None,
@@ -117,8 +117,8 @@ def range_corrected_signals(
 
     Parameters
     ----------
-    background_range : (float, float)
-        m; as in `correct_for_range`.
+    background_range, background_method
+        As in `correct_for_range`.
     archive, channel, dead_time, noise_variance, dark, range_offset, full_overlap_range
         As in `condition`.
 
@@ -142,27 +142,39 @@ def range_corrected_signals(
         plain=2,
         dtypes=_RANGE_CORRECTED_DTYPES,
         background_range=background_range,
+        background_method=background_method,
     )
     return _named(arrays)
 
 
-def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
-    """Return signals minus the mean of far bins, multiplied by the square of range.
+def correct_for_range(
+    conditioned: xr.Dataset,
+    background_range: tuple[float, float],
+    background_method: str = "tail_mean",
+) -> xr.Dataset:
+    """Return signals minus their background, multiplied by the square of range.
 
     Parameters
     ----------
     conditioned : xr.Dataset
         From `condition`.
     background_range : (float, float)
-        m; the bins whose mean is the background.
+        m; the bins whose mean is the background, or the homogeneous section of the cubic.
+    background_method : {"tail_mean", "cubic"}
+        See `lidarops.retrieve.background.estimate`.
 
     Returns
     -------
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
         over (time, range), ``background`` and ``background_standard_error`` over time.
-        INPUT_MISSING without a background. BACKGROUND_UNCERTAIN where the bins before those are
-        brighter by 4 standard errors, which means that the background contains signal.
+        INPUT_MISSING without a background, or NO_REAL_SOLUTION where the cubic has no admissible
+        root. BACKGROUND_UNCERTAIN where the background may contain signal.
+
+    Raises
+    ------
+    RetrievalInputError
+        If no bin lies in the range of the background, or the method is another.
     """
     arrays = xr.apply_ufunc(
         _corrected,
@@ -172,6 +184,7 @@ def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, fl
         kwargs={
             "range": conditioned["range"].to_numpy().astype(np.float64),
             "background_range": background_range,
+            "background_method": background_method,
         },
         dask="parallelized",
         output_dtypes=_RANGE_CORRECTED_DTYPES,
@@ -335,52 +348,24 @@ def _corrected(
     *,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
+    background_method: str,
 ) -> tuple[_Block, ...]:
-    start, stop = background_range
-    far = slice(*np.searchsorted(range, (start, np.nextafter(stop, np.inf))))
-    tail = cubic_and_tail.tail_mean(
-        power[..., far], range[far], start=start, variance=variance[..., far]
-    )
+    sky = _BACKGROUNDS[background_method](power, range, variance, background_range)
     result = counts_to_signal.range_corrected(
         Signal(power, variance, np.empty(0, np.int32)),
         range,
-        background=tail.background,
-        background_variance=tail.background_standard_error**2,
+        background=sky.background,
+        background_variance=sky.standard_error**2,
         dtype=np.float32,
     )
-    bits = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
-    falling = _still_falls(power, variance, range, background_range, tail)
-    bits |= np.where(falling, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     # Noise is far above the precision of float32, which halves the memory of a day of profiles.
     return (
         result.power,
         np.sqrt(result.variance, out=result.variance),
-        quality | bits[..., np.newaxis],
-        tail.background,
-        tail.background_standard_error,
+        quality | sky.quality[..., np.newaxis],
+        sky.background,
+        sky.standard_error,
     )
-
-
-def _still_falls(
-    power: _Block,
-    variance: _Block,
-    range: _Block,  # noqa: A002
-    background_range: tuple[float, float],
-    tail: cubic_and_tail.BackgroundResult,
-) -> _Block:
-    """Return which profiles are brighter in as many bins before the tail as it has."""
-    start, stop = background_range
-    first, past = np.searchsorted(range, (2.0 * start - stop, start))
-    if past - first < _FEWEST:
-        return np.zeros(power.shape[:-1], dtype=bool)
-    near = slice(first, past)
-    before = cubic_and_tail.tail_mean(
-        power[..., near], range[near], start=float(range[first]), variance=variance[..., near]
-    )
-    error = np.hypot(before.background_standard_error, tail.background_standard_error)
-    with np.errstate(invalid="ignore"):
-        falls: _Block = before.background - tail.background > _FALLS * error
-    return falls
 
 
 def _signals(
@@ -388,6 +373,7 @@ def _signals(
     *other_inputs: _Block,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
+    background_method: str,
     **settings: Any,
 ) -> tuple[_Block, ...]:
     chunks = [
@@ -397,6 +383,7 @@ def _signals(
             ),
             range=range,
             background_range=background_range,
+            background_method=background_method,
         )
         for first in np.arange(0, max(len(counts), 1), _PROFILES_IN_CACHE)
         for rows in [slice(first, first + _PROFILES_IN_CACHE)]

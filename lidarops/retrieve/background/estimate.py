@@ -1,0 +1,212 @@
+"""Estimate the background of profiles by one of three methods, and judge the signal left in it.
+
+`from_tail` averages the far bins, `from_known_shape` fits background and amplitude of clear air,
+`from_cubic` solves the cubic of a homogeneous section. All return a `Background`: value, standard
+error, the most signal that may have been subtracted with it (`left_signal`), and quality bits.
+The result of a profile does not depend on the other profiles, to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.background.left_signal import THRESHOLDS, LeftSignal, left_in_tail, shifts
+from lidarops.retrieve.common import inputs
+
+Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
+Flags = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """Background of every profile, with the leading axes of the power."""
+
+    background: Array
+    """In the unit of the power; NaN where there is none."""
+    standard_error: Array
+    left: LeftSignal
+    """The most signal that may have been subtracted with the background."""
+    unjudged: Booleans
+    """The far range does not fit the method, or `left` cannot be estimated."""
+    uncertain: Booleans
+    """`unjudged`, or `left` is detected and matters beside the standard error."""
+    quality: Flags
+    """BACKGROUND_UNCERTAIN where `uncertain`; INPUT_MISSING, or for the cubic NO_REAL_SOLUTION,
+    where there is no background."""
+    reduced_chi2: Array
+    """Mean squared residual of a fit over the noise; 1 where nothing is fitted."""
+
+
+def from_tail(
+    power: Array,
+    range: Array,  # noqa: A002 - the field's word
+    variance: Array,
+    span: tuple[float, float] | None = None,
+) -> Background:
+    """Return the mean of far bins, and the most signal that it may contain.
+
+    Parameters
+    ----------
+    power, variance : (..., range) float
+        In one unit and its square; bins are skipped where either is not finite.
+    range : (range,) float
+        m, ascending.
+    span : (float, float), optional
+        m; ranges of the bins that are averaged, both ends included. The last tenth of the bins
+        where not given.
+
+    Raises
+    ------
+    RetrievalInputError
+        If no bin lies there.
+    """
+    tail = _bins(range, span)
+    mean = cubic_and_tail.tail_mean(
+        power[..., tail], range[tail], start=float(range[tail][0]), variance=variance[..., tail]
+    )
+    value, error = mean.background, mean.background_standard_error
+    left = left_in_tail(power, range, variance, tail, value, error)
+    missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    return _judged(value, error, left, np.isnan(left.most), missing)
+
+
+def from_known_shape(
+    power: Array,
+    range: Array,  # noqa: A002 - the field's word
+    variance: Array,
+    shape: Array,
+    span: tuple[float, float] | None = None,
+    *,
+    mask: Booleans | None = None,
+) -> Background:
+    """Return the background fitted with the shape of clean air; `from_tail` where that fails.
+
+    Parameters
+    ----------
+    power, range, variance, span
+        As for `from_tail`; ranges must be positive.
+    shape : (..., range) float
+        From `lidarops.retrieve.background.molecular_shape`.
+    mask : (..., range) bool, optional
+        True where a bin may be fitted.
+
+    Raises
+    ------
+    RetrievalInputError
+        If no bin lies in `span`.
+    """
+    tail = from_tail(power, range, variance, span)
+    fit = known_shape.fit_known_shape(power, range, shape, variance=variance, mask=mask)
+    usable = ~fit.singular & np.isfinite(fit.background)
+    value = np.where(usable, fit.background, tail.background)
+    error = np.where(usable, fit.background_standard_error, tail.standard_error)
+    in_tail = THRESHOLDS.shape_error * np.abs(tail.background - value)
+    in_tail_error = THRESHOLDS.shape_error * np.hypot(tail.standard_error, error)
+    left = LeftSignal(
+        np.where(usable, in_tail, tail.left.most),
+        np.where(usable, in_tail_error, tail.left.standard_error),
+    )
+    unjudged = np.where(usable, fit.poor_fit, tail.unjudged)
+    uncertain = np.where(usable, fit.poor_fit, tail.uncertain)
+    misfit = fit.chi2 / np.maximum(fit.degrees_of_freedom, 1)
+    misfit = np.where(usable & np.isfinite(misfit), misfit, 1.0)
+    missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    return Background(value, error, left, unjudged, uncertain, _bits(uncertain, missing), misfit)
+
+
+def from_cubic(
+    power: Array,
+    range: Array,  # noqa: A002 - the field's word
+    variance: Array,
+    span: tuple[float, float] | None = None,
+) -> Background:
+    """Return the background of a homogeneous section that holds signal, by the cubic.
+
+    The bins of a triple lie at a distance of 0.4 of the section (`cubic_and_tail.cubic`). Where
+    the section is homogeneous, triples of half that distance give the same background but for
+    noise. The difference is the most signal that may have been subtracted.
+
+    Parameters
+    ----------
+    power, range, variance
+        As for `from_tail`; all bins of the section must be finite, and their range uniform.
+    span : (float, float), optional
+        m; ranges of the section, both ends included. The last tenth of the bins where not given.
+
+    Returns
+    -------
+    Background
+        NO_REAL_SOLUTION where the cubic has no admissible root, or the section is constant.
+        BACKGROUND_UNCERTAIN also where noise may have led to another root, and below 8 bins.
+
+    Raises
+    ------
+    RetrievalInputError
+        If no bin lies in the section, or its ranges are not uniform.
+    """
+    section = _bins(range, span)
+    grid = inputs.range_grid(range[section])
+    rows, leading = inputs.profiles(power[..., section], grid)
+    noise = inputs.variance_rows(variance[..., section], grid, leading)
+    lag = cubic_and_tail.default_lag(grid.size)
+    (whole, whole_gradients), (half, half_gradients) = (
+        cubic_and_tail.solve_cubic(
+            rows, grid.values, lag_, noise, known_variance=True, want_gradients=True
+        )
+        for lag_ in (lag, max(lag // 2, 1))
+    )
+    usable = np.isfinite(whole.background_standard_error)
+    value = np.where(usable, whole.background, np.nan)
+    error = whole.background_standard_error
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt(np.sum((whole_gradients - half_gradients) ** 2 * noise, axis=-1))
+    left = LeftSignal(np.abs(value - half.background), spread)
+    doubts = np.int32(Quality.LOW_SIGNAL | Quality.TOO_FEW_BINS)
+    absent = np.where(
+        (whole.quality & np.int32(Quality.INPUT_MISSING)) != 0,
+        np.int32(Quality.INPUT_MISSING),
+        np.int32(Quality.NO_REAL_SOLUTION),
+    )
+    unjudged = np.isnan(left.most) | ((whole.quality & doubts) != 0)
+    return _judged(
+        value.reshape(leading),
+        error.reshape(leading),
+        LeftSignal(left.most.reshape(leading), left.standard_error.reshape(leading)),
+        unjudged.reshape(leading),
+        np.where(usable, np.int32(0), absent).reshape(leading),
+    )
+
+
+def _judged(
+    value: Array, error: Array, left: LeftSignal, unjudged: Booleans, absent: Flags
+) -> Background:
+    unjudged = unjudged & np.isfinite(value)
+    uncertain = unjudged | shifts(left.detected, error)
+    bits = _bits(uncertain, absent)
+    return Background(value, error, left, unjudged, uncertain, bits, np.ones(value.shape))
+
+
+def _bits(uncertain: Booleans, absent: Flags) -> Flags:
+    doubt = np.where(uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
+    return np.asarray(absent | doubt, dtype=np.int32)
+
+
+def _bins(range_: Array, span: tuple[float, float] | None) -> slice:
+    if span is None:
+        return slice(range_.size - max(range_.size // 10, 1), range_.size)
+    start, stop = span
+    first, past = np.searchsorted(range_, (start, np.nextafter(stop, np.inf)))
+    if first == past:
+        raise RetrievalInputError(
+            f"has no bin from {start:g} to {stop:g} m",
+            field="background",
+            remedy=f"ranges end at {range_[-1]:g} m",
+        )
+    return slice(int(first), int(past))
