@@ -153,7 +153,10 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     ),
     Quality.BACKGROUND_UNCERTAIN: (
         Severity.CARE,
-        ("the far range does not look like aerosol-free air, so the background may contain signal"),
+        (
+            "the background may contain signal: signal before the far range implies some there, or "
+            "the bins of the background do not look like what its method assumes"
+        ),
     ),
     Quality.NO_GLUING: (
         Severity.REJECT,

@@ -13,7 +13,7 @@ from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValue
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.bench.stability.stiff_signals import RANGE
 from lidarops.flags import Quality
-from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.simulate import counting
 
@@ -137,15 +137,9 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Errors:
 
 def _tail(rng: Random, profiles: int) -> Errors:
     sky, _, counts, variance, level = _far(rng, profiles)
-    result = cubic_and_tail.tail_mean(counts, sky.range, variance=variance)
+    result = estimate.from_tail(counts, sky.range, np.broadcast_to(variance, counts.shape))
     error = result.background - level
-    return (
-        "background, mean of the tail",
-        error,
-        result.background_standard_error,
-        None,
-        result.quality,
-    )
+    return "background, mean of the tail", error, result.standard_error, None, result.quality
 
 
 def _cubic(rng: Random, profiles: int) -> Errors:
@@ -160,7 +154,6 @@ def _cubic(rng: Random, profiles: int) -> Errors:
     return "background, cubic", error, result.background_standard_error, None, result.quality
 
 
-_SIGNAL_IN_TAIL: Final = "signal in the tail adds to its mean and cannot be separated from it"
 _WRONG_DEAD_TIME: Final = "a wrong dead time distorts the rates and leaves no trace in one profile"
 _AMBIGUOUS: Final = "two rates give the same counts"
 _ROUNDING: Final = (
@@ -188,7 +181,7 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Random, int], Errors]], ...]] = (
     ),
     (Failure("none, known shape", satisfied=True), _known_shape),
     (Failure("shape of hazy air"), partial(_known_shape, haze=3.0)),
-    (Failure("mean of a tail with signal in it", unseen=_SIGNAL_IN_TAIL), _tail),
+    (Failure("mean of a tail with signal in it"), _tail),
     (Failure("none, cubic", satisfied=True), _cubic),
     (
         Failure("analog noise below half a step, a single bin"),
@@ -206,7 +199,7 @@ def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
         yield (
             ScoredValues(
                 failure, quantity, error, random, 0.0, np.asarray(bits), solvable=solvable,
-                hidden=hidden,
+                uncertain=(bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0, hidden=hidden,
             ),
             profiles,
         )  # fmt: skip

@@ -27,7 +27,7 @@ LAYOUT: Final = Layout(
     processing_level="L1: calibrated in range and time, not in power",
     references=("Licel GmbH (2023): Licel raw data format.",),
     comment="The standard errors of all range bins of a profile include the error of its"
-    " background, which is common to them.",
+    " background, which is common to them. lidarops_steps states the method of the background.",
     sampled="range",
     unused_steps=frozenset({"average", "molecular", "known_shape", "reference"}),
     coordinates=coordinates((RANGE,), altitude("range")),
@@ -53,6 +53,7 @@ LAYOUT: Final = Layout(
             | Quality.SATURATED
             | Quality.PILE_UP
             | Quality.INCOMPLETE_OVERLAP
+            | Quality.NO_REAL_SOLUTION
             | Quality.BACKGROUND_UNCERTAIN
             | Quality.NO_GLUING,
         ),

@@ -1,10 +1,11 @@
 """Background of a profile: the power that a recorder shows without backscatter.
 
-Choose one of three estimates: `tail_mean` averages the far bins, `cubic` solves the cubic of a
-homogeneous path in closed form, `fit_known_shape` fits background and amplitude of clear air
-(`molecular_shape`). Beside them, `photon_counts` gives the variance of counts, and
-`detectable_light` tests on a few profiles whether a stretch of range holds any backscatter.
-Kernels are in the modules with an underscore.
+`estimate` gives background, standard error and flags by one of three methods, and judges with
+`left_signal` how much signal may have been subtracted with the background. The methods alone:
+`tail_mean` averages the far bins, `cubic` solves the cubic of a homogeneous path in closed form,
+`fit_known_shape` fits background and amplitude of clear air (`molecular_shape`). Beside them,
+`photon_counts` gives the variance of counts, and `detectable_light` tests on a few profiles
+whether a stretch of range holds any backscatter. Kernels are in the modules with an underscore.
 """
 
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, cubic, tail_mean

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.background._section_fit import fit_section, groups
 from lidarops.retrieve.background.left_signal import THRESHOLDS, LeftSignal, left_in_tail, shifts
 from lidarops.retrieve.common import inputs
 
@@ -129,9 +131,9 @@ def from_cubic(
 ) -> Background:
     """Return the background of a homogeneous section that holds signal, by the cubic.
 
-    The bins of a triple lie at a distance of 0.4 of the section (`cubic_and_tail.cubic`). Where
-    the section is homogeneous, triples of half that distance give the same background but for
-    noise. The difference is the most signal that may have been subtracted.
+    The result is judged by least squares of the same bins: the difference of the two backgrounds
+    is the most signal that may have been subtracted, and its variance is the difference of their
+    variances (hausman1978). Backscatter that bends along the section passes for a background.
 
     Parameters
     ----------
@@ -144,7 +146,9 @@ def from_cubic(
     -------
     Background
         NO_REAL_SOLUTION where the cubic has no admissible root, or the section is constant.
-        BACKGROUND_UNCERTAIN also where noise may have led to another root, and below 8 bins.
+        BACKGROUND_UNCERTAIN also where the residuals of the least squares vary systematically
+        along range (1e-4 false alarms), where noise may have led to another root, and below 8
+        bins.
 
     Raises
     ------
@@ -155,26 +159,22 @@ def from_cubic(
     grid = inputs.range_grid(range[section])
     rows, leading = inputs.profiles(power[..., section], grid)
     noise = inputs.variance_rows(variance[..., section], grid, leading)
-    lag = cubic_and_tail.default_lag(grid.size)
-    (whole, whole_gradients), (half, half_gradients) = (
-        cubic_and_tail.solve_cubic(
-            rows, grid.values, lag_, noise, known_variance=True, want_gradients=True
-        )
-        for lag_ in (lag, max(lag // 2, 1))
-    )
-    usable = np.isfinite(whole.background_standard_error)
-    value = np.where(usable, whole.background, np.nan)
-    error = whole.background_standard_error
+    root, _ = cubic_and_tail.solve_cubic(rows, grid.values, None, noise, known_variance=True)
+    error = root.background_standard_error
+    usable = np.isfinite(error)
+    value = np.where(usable, root.background, np.nan)
+    fit = fit_section(rows.astype(np.float64, copy=False), grid.values, noise, value)
     with np.errstate(invalid="ignore"):
-        spread = np.sqrt(np.sum((whole_gradients - half_gradients) ** 2 * noise, axis=-1))
-    left = LeftSignal(np.abs(value - half.background), spread)
+        spread = np.sqrt(np.maximum(error**2 - fit.variance, 0.0))
+    left = LeftSignal(np.abs(value - fit.background), spread)
     doubts = np.int32(Quality.LOW_SIGNAL | Quality.TOO_FEW_BINS)
     absent = np.where(
-        (whole.quality & np.int32(Quality.INPUT_MISSING)) != 0,
+        (root.quality & np.int32(Quality.INPUT_MISSING)) != 0,
         np.int32(Quality.INPUT_MISSING),
         np.int32(Quality.NO_REAL_SOLUTION),
     )
-    unjudged = np.isnan(left.most) | ((whole.quality & doubts) != 0)
+    calm = fit.waves <= special.chdtri(groups(grid.size) - 3.0, known_shape.FALSE_ALARM)
+    unjudged = np.isnan(left.most) | ~calm | ((root.quality & doubts) != 0)
     return _judged(
         value.reshape(leading),
         error.reshape(leading),

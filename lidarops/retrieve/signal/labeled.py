@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,7 @@ import xarray as xr
 
 from lidarops.records import DetectionMode
 from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
+from lidarops.retrieve.common import inputs
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.counts_to_signal import Signal
 from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
@@ -36,12 +38,22 @@ _RANGE_CORRECTED_DTYPES: Final[list[np.dtype[Any]]] = [
     np.dtype(np.float64),
     np.dtype(np.float64),
 ]
-_BACKGROUNDS: Final[dict[str, Callable[..., Background]]] = {
-    "tail_mean": from_tail,
-    "cubic": from_cubic,
-}
 _PROFILES_IN_CACHE: Final = 64
 """Profiles processed together; their arrays fit the processor cache."""
+
+
+class BackgroundMethod(StrEnum):
+    """Methods for the background of the product ``signal``."""
+
+    TAIL_MEAN = "tail_mean"
+    CUBIC = "cubic"
+
+
+_BACKGROUNDS: Final[dict[BackgroundMethod, tuple[Callable[..., Background], str]]] = {
+    BackgroundMethod.TAIL_MEAN: (from_tail, "mean of the bins"),
+    BackgroundMethod.CUBIC: (from_cubic, "cubic of a homogeneous section"),
+}
+"""Function of each method, and the words of ``steps``."""
 
 
 def condition(
@@ -136,15 +148,16 @@ def range_corrected_signals(
         range_offset=range_offset,
         full_overlap_range=full_overlap_range,
     )
+    method = inputs.choice(background_method, BackgroundMethod, "background_method")
     arrays = source.mapped(
         _signals,
         ranged=3,
         plain=2,
         dtypes=_RANGE_CORRECTED_DTYPES,
         background_range=background_range,
-        background_method=background_method,
+        background_method=method,
     )
-    return _named(arrays)
+    return _named(arrays, method, background_range)
 
 
 def correct_for_range(
@@ -167,7 +180,8 @@ def correct_for_range(
     -------
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
-        over (time, range), ``background`` and ``background_standard_error`` over time.
+        over (time, range), ``background`` and ``background_standard_error`` over time; the
+        attribute ``steps`` states the method of the background.
         INPUT_MISSING without a background, or NO_REAL_SOLUTION where the cubic has no admissible
         root. BACKGROUND_UNCERTAIN where the background may contain signal.
 
@@ -176,6 +190,7 @@ def correct_for_range(
     RetrievalInputError
         If no bin lies in the range of the background, or the method is another.
     """
+    method = inputs.choice(background_method, BackgroundMethod, "background_method")
     arrays = xr.apply_ufunc(
         _corrected,
         *(conditioned[name] for name in _SIGNAL_NAMES),
@@ -184,12 +199,12 @@ def correct_for_range(
         kwargs={
             "range": conditioned["range"].to_numpy().astype(np.float64),
             "background_range": background_range,
-            "background_method": background_method,
+            "background_method": method,
         },
         dask="parallelized",
         output_dtypes=_RANGE_CORRECTED_DTYPES,
     )
-    return _named(arrays)
+    return _named(arrays, method, background_range)
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
@@ -197,10 +212,14 @@ def channel_unit(archive: xr.Dataset, channel: str) -> str:
     return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
 
 
-def _named(arrays: Sequence[xr.DataArray]) -> xr.Dataset:
+def _named(
+    arrays: Sequence[xr.DataArray], method: BackgroundMethod, background_range: tuple[float, float]
+) -> xr.Dataset:
     names = ("signal", "signal_standard_error", "quality_flag")
     along_time = ("background", "background_standard_error")
-    return xr.Dataset(dict(zip((*names, *along_time), arrays, strict=True)))
+    start, stop = background_range
+    words = f"background: {_BACKGROUNDS[method][1]} from {start:g} to {stop:g} m"
+    return xr.Dataset(dict(zip((*names, *along_time), arrays, strict=True)), attrs={"steps": words})
 
 
 class _Source:
@@ -348,9 +367,9 @@ def _corrected(
     *,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
-    background_method: str,
+    background_method: BackgroundMethod,
 ) -> tuple[_Block, ...]:
-    sky = _BACKGROUNDS[background_method](power, range, variance, background_range)
+    sky = _BACKGROUNDS[background_method][0](power, range, variance, background_range)
     result = counts_to_signal.range_corrected(
         Signal(power, variance, np.empty(0, np.int32)),
         range,
@@ -373,7 +392,7 @@ def _signals(
     *other_inputs: _Block,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
-    background_method: str,
+    background_method: BackgroundMethod,
     **settings: Any,
 ) -> tuple[_Block, ...]:
     chunks = [
