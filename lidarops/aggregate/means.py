@@ -239,7 +239,7 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
         start, stop = (_datetime(moment) for moment in (bounds[0, 0], bounds[-1, 1]))
         lineage = Lineage(tuple(year.inputs.values()), period, weights, start, stop)
         about = MeansDescription(
-            lineage.id, period, weights, start, stop, len(year.inputs), means_version()
+            lineage.id, period, weights, start, stop, len(year.inputs), means_version(group.kind)
         )
         periods = Periods(bounds.astype(np.float64), year.records)
         dataset = encode_means(frame, periods, year.shared or {}, about, means_provenance(lineage))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 from uuid import NAMESPACE_URL, uuid5
@@ -27,7 +25,8 @@ from lidarops.aggregate.means_variables import (
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.build import bitround
-from lidarops.netcdf.provenance import NAMESPACE, code_version, package_versions
+from lidarops.netcdf.code_version import code_version
+from lidarops.netcdf.provenance import NAMESPACE, package_versions
 from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
 from lidarops.records import DetectionMode
 
@@ -207,7 +206,7 @@ class Lineage:
             "means": {"period": self.period.value, "weights": self.weights.value},
             "inputs": sorted(facts.sha256 for facts in self.inputs),
             "time": [self.start.isoformat(), self.stop.isoformat()],
-            "code_version": means_version(),
+            "code_version": means_version(self.inputs[0].group.kind),
         }
         return str(uuid5(NAMESPACE_URL, NAMESPACE + _canonical(content)))
 
@@ -258,7 +257,7 @@ def means_provenance(lineage: Lineage) -> str:
         "agent": {
             "lidarops:software": {
                 "prov:type": _type("prov:SoftwareAgent"),
-                "lidarops:code_version": means_version(),
+                "lidarops:code_version": means_version(group.kind),
                 "lidarops:versions": software,
             }
         },
@@ -285,13 +284,9 @@ def means_provenance(lineage: Lineage) -> str:
     return _canonical(document)
 
 
-@cache
-def means_version() -> str:
-    """Return a digest of the code of products and means."""
-    digest = hashlib.sha256(code_version().encode())
-    for file in sorted(Path(__file__).resolve().parent.glob("*.py")):
-        digest.update(f"{file.name}\0".encode() + file.read_bytes().replace(b"\r\n", b"\n"))
-    return digest.hexdigest()[:16]
+def means_version(kind: str) -> str:
+    """Return a digest of the code that makes products of a kind and their means."""
+    return code_version(kind, "lidarops.aggregate.means")
 
 
 def _type(name: str) -> dict[str, str]:

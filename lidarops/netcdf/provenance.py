@@ -1,12 +1,11 @@
-"""Provenance of a product: W3C PROV-JSON, identifier, code version and date."""
+"""Provenance of a product: W3C PROV-JSON, identifier, versions of packages and date."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import UTC, date, datetime, time
 from functools import cache
 from importlib.metadata import version
@@ -31,25 +30,6 @@ NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
 _quoted: Final = json.JSONEncoder().encode
 
 _PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
-_NOT_COMPUTING: Final = (
-    "__main__.py",
-    "aggregate/",
-    "bench/",
-    "campaign/expected.py",
-    "campaign/simulat",
-    "campaign/yaml_errors.py",
-    "catalog/",
-    "cli/",
-    "figures/",
-    "netcdf/read.py",
-    "plan/cost_estimate.py",
-    "reports/",
-    "run/",
-    "simulate/",
-    "site/",
-    "system/",
-)
-"""Sources of lidarops that cannot change a product. All others may."""
 
 
 def prov_json(provenance: Provenance) -> str:
@@ -241,37 +221,6 @@ def _is_netcdf(path: Path) -> bool:
         return False
     except OSError:
         return True
-
-
-@cache
-def code_version() -> str:
-    """Return a digest of the sources that can change a product.
-
-    All modules count except those listed in `_NOT_COMPUTING`, so a new module counts by default.
-    A change of the others, such as figures, makes no product stale.
-
-    Returns
-    -------
-    str
-        16 hexadecimal digits.
-    """
-    return _digest(Path(__file__).resolve().parents[1])
-
-
-def _digest(root: Path) -> str:
-    digest = hashlib.sha256()
-    for name, source in _sources(root):
-        # Line endings depend on the checkout.
-        content = source.read_bytes().replace(b"\r\n", b"\n")
-        digest.update(f"{name}\0{len(content)}\0".encode() + content)
-    return digest.hexdigest()[:16]
-
-
-def _sources(root: Path) -> Iterator[tuple[str, Path]]:
-    names = {source.relative_to(root).as_posix(): source for source in root.rglob("*.py")}
-    for name in sorted(names):
-        if not name.startswith(_NOT_COMPUTING):
-            yield name, names[name]
 
 
 @cache

@@ -26,6 +26,7 @@ from lidarops.flags import Quality
 from lidarops.kinds import kinds
 from lidarops.netcdf import provenance, write
 from lidarops.netcdf.build import build_product
+from lidarops.netcdf.code_version import code_version
 from lidarops.netcdf.context import Context, product_path
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
@@ -436,7 +437,7 @@ def _context(
                 "window": [scene.start.isoformat(), scene.stop.isoformat()],
             },
             versions=provenance.package_versions(),
-            code_version=provenance.code_version(),
+            code_version=code_version(kind),
         ),
     )
 

@@ -19,7 +19,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
-from lidarops.netcdf.provenance import code_version
+from lidarops.netcdf.code_version import joint_code_version
 from lidarops.process.scene import Job, attempt, failed_outcome
 from lidarops.records import SceneOutcome
 from lidarops.run import worker
@@ -268,14 +268,14 @@ def process_one_by_one(
 
 def _submit(client: Client, job: Job) -> Future:
     # As bytes: the scheduler would unpickle and pickle a job.
-    return client.submit(_on_worker, pickle.dumps(job), code_version(), pure=False)
+    return client.submit(_on_worker, pickle.dumps(job), joint_code_version(), pure=False)
 
 
 def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool] | str:
     """Process a scene; return its outcome and whether it is final, or why it was not tried."""
     # First, because other code may not be able to unpickle the job.
-    if code_version() != code:
-        return f"the worker has other code of lidarops: {code_version()}, not {code}"
+    if joint_code_version() != code:
+        return f"the worker has other code of lidarops: {joint_code_version()}, not {code}"
     job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
     return attempt(job)
 

@@ -21,9 +21,9 @@ from pydantic import ValidationError
 from lidarops.campaign.model import CATALOG_VARIABLE, Campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
+from lidarops.netcdf.code_version import code_version
 from lidarops.netcdf.provenance import (
     EPOCH_VARIABLE,
-    code_version,
     package_versions,
     read_provenance,
 )
@@ -362,8 +362,9 @@ def _changed(folder: Path, records: Iterable[InputRecord], place: str) -> Iterat
 
 
 def _software(origin: _Origin) -> Iterator[Difference]:
-    if origin.code_version != code_version():
-        yield Difference("code", "lidarops", f"{code_version()}, was {origin.code_version}")
+    code = code_version(str(origin.attributes["lidarops:kind"]))
+    if origin.code_version != code:
+        yield Difference("code", "lidarops", f"{code}, was {origin.code_version}")
     now = package_versions()
     for name in sorted({*origin.versions, *now}):
         if origin.versions.get(name) != now.get(name):

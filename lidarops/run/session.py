@@ -17,7 +17,7 @@ from lidarops.catalog import versions
 from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.netcdf.provenance import code_version
+from lidarops.netcdf.code_version import joint_code_version
 from lidarops.plan import cost_estimate
 from lidarops.plan.product_dependence import ProductKey
 from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
@@ -76,7 +76,7 @@ class Session:
             status=RunStatus.RUNNING,
             holder=Lock.holder_name(),
             version=__version__,
-            code_version=code_version(),
+            code_version=joint_code_version(),
         )
         self._store.begin_run(run, self._lock.token)
 

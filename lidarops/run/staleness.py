@@ -22,7 +22,7 @@ from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.netcdf.provenance import code_version
+from lidarops.netcdf.code_version import code_version, joint_code_version
 from lidarops.plan import product_dependence
 from lidarops.plan.product_dependence import ProductKey
 from lidarops.plan.scene_plan import plan_scene
@@ -40,6 +40,9 @@ if workers process the scenes, the next group."""
 _PROFILE_ROLES: Final = {"molecular_profile": Role.MOLECULAR, "overlap_profile": Role.OVERLAP}
 # Settings that change neither the scenes nor the content of a product.
 _OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "simulation"})
+_PLANNING: Final = ("lidarops.plan.scene_plan", "lidarops.plan.scenes")
+"""Modules that decide which scenes and plans a day has. A product records its own scene and plan,
+so that a change of these modules makes it stale only if they changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +195,7 @@ class Judge:
         return product_dependence.digest(
             [
                 {key: value for key, value in settings.items() if key not in _OPERATION},
-                code_version(),
+                joint_code_version(_requested_kinds(self._campaign), *_PLANNING),
                 [[name, self._profile(name)] for name in names],
             ]
         )
@@ -332,7 +335,7 @@ class Judge:
         return product_dependence.digest(
             [
                 whole.hash,
-                code_version(),
+                joint_code_version(_kinds(whole)),
                 [self._settings.of(scene, whole, channel) for channel in _channels(whole)],
                 [
                     [granule.path, granule.size, granule.mtime_ns]
@@ -353,7 +356,7 @@ class Judge:
             plan_hash=closure.hash,
             settings_hash=product_dependence.digest(settings),
             inputs_hash=product_dependence.inputs_digest(used),
-            code_version=code_version(),
+            code_version=code_version(product[0]),
         )
         return dependence, used
 
@@ -404,12 +407,13 @@ class Judge:
         recorded = known.depends_on
         closure = product_dependence.plan_closure(whole, [product])
         settings = product_dependence.digest(self._settings.of(scene, closure, product[1]))
+        code = code_version(product[0])
         if (recorded.code_version, recorded.plan_hash, recorded.settings_hash) != (
-            code_version(),
+            code,
             closure.hash,
             settings,
         ):
-            return _changed(recorded, closure.hash)
+            return _changed(recorded, closure.hash, code)
         # Last, because files may have to be read for it.
         used = product_dependence.product_inputs(closure, self._files(scene, whole, self._content))
         if recorded.inputs_hash != product_dependence.inputs_digest(used):
@@ -494,6 +498,19 @@ def _profiles(whole: Plan) -> tuple[tuple[str, Role], ...]:
     return tuple(sorted(profiles))
 
 
+def _requested_kinds(campaign: Campaign) -> set[str]:
+    """Return the kinds of product that a campaign requests of any instrument or network."""
+    instruments, networks = campaign.instruments.values(), campaign.networks.values()
+    return {
+        *(kind for instrument in instruments for kind in instrument.products.requested()),
+        *(kind for network in networks for kind in network.requested()),
+    }
+
+
+def _kinds(whole: Plan) -> set[str]:
+    return {kind for kind, _ in product_dependence.planned_products(whole)}
+
+
 def _channels(whole: Plan) -> list[str]:
     return sorted({channel for _, channel in product_dependence.planned_products(whole)})
 
@@ -513,9 +530,9 @@ def _counts(
     )
 
 
-def _changed(recorded: Dependence, plan_hash: str) -> str:
-    if recorded.code_version != code_version():
-        return f"the code changed, from {recorded.code_version} to {code_version()}"
+def _changed(recorded: Dependence, plan_hash: str, code: str) -> str:
+    if recorded.code_version != code:
+        return f"the code changed, from {recorded.code_version} to {code}"
     if recorded.plan_hash != plan_hash:
         return "its plan changed"
     return "its settings in the campaign changed"

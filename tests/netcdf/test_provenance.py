@@ -1,4 +1,4 @@
-"""Provenance of a product, and the version of the code."""
+"""Provenance of a product, and the versions of packages."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from support.products.made_products import context, homogeneous, provenance
 from lidarops.errors import ProductError
 from lidarops.netcdf.build import build_product
 from lidarops.netcdf.provenance import (
-    _digest,
-    code_version,
     package_versions,
     product_date,
     product_id,
@@ -162,56 +160,7 @@ def test_files_without_provenance_are_refused(tmp_path: Path):
         read_provenance(tmp_path / "array.nc")
 
 
-@pytest.fixture
-def sources(tmp_path: Path) -> Path:
-    for name in (
-        "flags.py",
-        "retrieve/solver.py",
-        "reports/page.py",
-        "cli/app.py",
-        "bench/speed.py",
-    ):
-        path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(f"# {name}\n".encode())
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("name", "matters"),
-    [
-        ("flags.py", True),
-        ("retrieve/solver.py", True),
-        ("retrieve/unheard_of.py", True),
-        ("unheard_of.py", True),
-        ("reports/page.py", False),
-        ("cli/app.py", False),
-        ("run/executor.py", False),
-        ("catalog/scan.py", False),
-        ("site/pages.py", False),
-        ("bench/speed.py", False),
-        ("simulate/signal.py", False),
-        ("reports/templates/page.html", False),
-    ],
-)
-def test_only_sources_that_compute_change_the_code_version(sources: Path, name: str, matters: bool):
-    before = _digest(sources)
-    (sources / name).parent.mkdir(parents=True, exist_ok=True)
-    (sources / name).write_bytes(b"# changed\n")
-    assert (_digest(sources) != before) == matters
-
-
-def test_code_version_depends_on_lines_and_not_on_line_ends(sources: Path):
-    before = _digest(sources)
-    (sources / "flags.py").write_bytes(b"# flags.py\r\n")
-    assert _digest(sources) == before
-    (sources / "flags.py").rename(sources / "marks.py")
-    assert _digest(sources) != before
-
-
-def test_code_version_and_packages_of_this_installation():
-    assert len(code_version()) == 16
-    assert int(code_version(), 16) >= 0
+def test_packages_of_this_installation():
     versions = package_versions()
     assert versions["numpy"] == np.__version__
     assert {"lidarops", "netCDF4", "numba", "python", "scipy", "xarray"} <= set(versions)

@@ -243,7 +243,7 @@ def test_workers_that_join_later_get_scenes_before_any_has_ended(
 def test_a_worker_with_other_code_makes_nothing(
     archive: Archive, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(executor, "code_version", lambda: "newer")
+    monkeypatch.setattr(executor, "joint_code_version", lambda: "newer")
     campaign = archive.write()
     ended = list(process_jobs(scene_jobs(campaign)[:1], client=client))
     assert [each.final for each in ended] == [False]

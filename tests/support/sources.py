@@ -1,0 +1,48 @@
+"""A copy of the sources of lidarops that a test may change."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from lidarops.kinds import kinds
+from lidarops.netcdf.code_version import sources_in, version_of
+from lidarops.system.source_closure import Sources
+
+
+class Copy:
+    """A copy of the package.
+
+    Parameters
+    ----------
+    repository : Path
+        Root of the checkout.
+    folder : Path
+        Folder for the copy.
+    cache : Path
+        Folder for facts about sources. Copies may share it.
+    """
+
+    def __init__(self, repository: Path, folder: Path, cache: Path) -> None:
+        self.root = folder / "lidarops"
+        self._cache = cache
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(repository / "lidarops", self.root, ignore=ignored)
+
+    def sources(self) -> Sources:
+        """Return the sources as they are now."""
+        return sources_in({"lidarops": (self.root,)}, self._cache)
+
+    def versions(self) -> dict[str, str]:
+        """Return the code version of every kind."""
+        sources = self.sources()
+        return {name: version_of(kind, sources) for name, kind in kinds().items()}
+
+    def write(self, module: str, text: str) -> None:
+        """Write a module, or another file of the package."""
+        (self.root / module).write_text(text, encoding="utf-8")
+
+    def change(self, module: str, statement: str = "_UNHEARD_OF = 1") -> None:
+        """Append a statement to a module, by default one that changes its syntax tree."""
+        with (self.root / module).open("a", encoding="utf-8") as file:
+            file.write(f"\n{statement}\n")
