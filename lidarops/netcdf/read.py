@@ -23,7 +23,7 @@ from xarray.core import indexing
 
 from lidarops.errors import ProductError
 from lidarops.netcdf._deflate import inflate_chunk
-from lidarops.netcdf.write import BULK_BYTES
+from lidarops.netcdf.write import OTHER_DIMENSION
 
 _ATTRIBUTES: Final = (
     "units",
@@ -38,8 +38,8 @@ _ATTRIBUTES: Final = (
 )
 """Attributes needed to decode values. Reading all attributes takes longer than the values."""
 _NO_VARIABLE: Final = b"This is a netCDF dimension but not a netCDF variable"
-_OTHER_DIMENSION: Final = "_nc4_non_coord_"
-"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
+LAZY_BYTES: Final = 1 << 14
+"""Smallest variable that is not read at once."""
 _FILTERS: Final = [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
 
 
@@ -142,7 +142,7 @@ class _File:
         return {name: self._decoded(name, variable) for name, variable in stored.items()}
 
     def _stored(self, name: str, present: Container[str]) -> xr.Variable | None:
-        foreign = f"{_OTHER_DIMENSION}{name}"
+        foreign = f"{OTHER_DIMENSION}{name}"
         inside = foreign if foreign in present else name
         if inside not in present:
             return None
@@ -152,7 +152,7 @@ class _File:
             return None
         dims, attributes = _dimensions(dataset, name), _attributes(dataset)
         fill = _own_fill(dataset.dtype, attributes)
-        if dataset.size * dataset.dtype.itemsize < BULK_BYTES:
+        if dataset.size * dataset.dtype.itemsize < LAZY_BYTES:
             # Small variables are read at once: most are used several times.
             values = _unfilled(np.asarray(dataset[()]), fill)
             return xr.Variable(dims, values, attributes, fastpath=True)
@@ -164,7 +164,7 @@ class _File:
             return stored
         try:
             decoded = xr.conventions.decode_cf_variable(name, stored, decode_timedelta=False)
-            return decoded if stored.nbytes >= BULK_BYTES else decoded.load()
+            return decoded if stored.nbytes >= LAZY_BYTES else decoded.load()
         except (ValueError, TypeError, OverflowError) as error:
             raise ProductError(
                 f"cannot be decoded: {error}", file=self._path, field=name

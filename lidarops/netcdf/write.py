@@ -1,11 +1,17 @@
-"""The only writer of NetCDF files: writes atomically, with the same bytes for the same data."""
+"""The only writer of NetCDF files: writes atomically, with the same bytes for the same data.
+
+The chunks of a file are deflated and written as soon as their rows are there, so memory does not
+grow with the file. Their order depends on the data only, not on how many rows came at a time.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import secrets
-from collections.abc import Container, Iterator
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,20 +21,23 @@ import h5py
 import netCDF4
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.netcdf._deflate import Offset, deflate_chunks
+from lidarops.netcdf._deflate import deflate_chunks
+from lidarops.netcdf._quiet_file import QuietFile
+from lidarops.netcdf._row_blocks import Block, RowBlocks
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
 """Largest chunk: a chunk is the whole variable, or as many whole rows as fit."""
 
-BULK_BYTES: Final = 1 << 14
-"""Smallest variable that ISA-L deflates: ten times faster, and a little larger in the file."""
+OTHER_DIMENSION: Final = "_nc4_non_coord_"
+"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 
 _TYPES: Final = {"S1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"}
-_Chunks = dict[str, list[tuple[Offset, bytes]]]
+_Array = NDArray[Any]
 _Format = Literal["NETCDF4", "NETCDF4_CLASSIC"]
 
 
@@ -40,17 +49,44 @@ class Written:
     size: int
 
 
+@dataclass(frozen=True, slots=True)
+class Skeleton:
+    """All of a file except the values of its rows, which come later.
+
+    The rows are those along the unlimited dimension, of variables that have it first.
+    """
+
+    variables: Mapping[str, xr.Variable]
+    """Encoded, in the order of the file. The values of variables of rows are not used."""
+    attributes: Mapping[str, Any]
+    unlimited: str | None
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Length of every dimension, in the order of the file."""
+        return {
+            str(dim): size
+            for variable in self.variables.values()
+            for dim, size in variable.sizes.items()
+        }
+
+    def has_rows(self, name: str) -> bool:
+        """Whether the values of a variable come row by row."""
+        return self.unlimited is not None and self.variables[name].dims[:1] == (self.unlimited,)
+
+
 def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
-    """Write a product.
+    """Write an encoded dataset that is in memory.
 
     The file appears under its name when it is complete and on disk, or not at all; a former file
-    stays until then. Equal datasets give equal bytes with equal versions of netCDF4, h5py and isal
-    on one processor architecture. Thread-safe, unlike netCDF4.
+    stays until then. Equal datasets give equal bytes with equal versions of netCDF4, h5py, isal
+    and zlib on one processor architecture. Thread-safe, unlike netCDF4.
 
     Parameters
     ----------
     dataset : xr.Dataset
-        From `lidarops.netcdf.build.build_dataset`: encoded, in memory.
+        Encoded, in memory, for example from `lidarops.netcdf.build.build_dataset`; with at most
+        one unlimited dimension.
     path : path or str
         Path of the file; missing folders are created.
 
@@ -63,7 +99,9 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     ProductError
         If the dataset is not in memory, or the file cannot be written.
     """
-    return _write(dataset, Path(path), "NETCDF4_CLASSIC")
+    _refuse_lazy(dataset, path)
+    unlimited = next((str(name) for name in dataset.encoding.get("unlimited_dims", ())), None)
+    return _write(dataset, unlimited, Path(path), "NETCDF4_CLASSIC")
 
 
 def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
@@ -93,7 +131,7 @@ def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
         raise ProductError(f"cannot be encoded: {error}", file=path) from error
     # All as data variables: xarray would encode coordinates a second time.
     plain = {str(name): _as_chars(path, str(name), var) for name, var in encoded.items()}
-    return _write(xr.Dataset(plain, attrs=dict(attributes)), Path(path), "NETCDF4")
+    return _write(xr.Dataset(plain, attrs=dict(attributes)), None, Path(path), "NETCDF4")
 
 
 def _as_chars(path: str | Path, name: str, variable: xr.Variable) -> xr.Variable:
@@ -128,7 +166,7 @@ def chunk_sizes(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
     """
     chunk = list(shape)
     for axis in range(len(chunk)):
-        rest = int(np.prod(chunk[axis + 1 :], dtype=np.int64)) * itemsize
+        rest = math.prod(chunk[axis + 1 :]) * itemsize
         chunk[axis] = max(1, min(chunk[axis], CHUNK_BYTES // max(rest, 1)))
         if rest <= CHUNK_BYTES:
             break
@@ -146,80 +184,216 @@ def _refuse_lazy(dataset: xr.Dataset, path: str | Path) -> None:
             )
 
 
-def _write(dataset: xr.Dataset, path: Path, model: _Format) -> Written:
-    _refuse_lazy(dataset, path)
-    _refuse_unstorable(dataset, path)
-    bulk = [str(name) for name in dataset.variables if _is_bulk(dataset, str(name))]
-    with _replacing(path) as temporary:
+def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Format) -> Written:
+    variables = {str(name): variable for name, variable in dataset.variables.items()}
+    skeleton = Skeleton(variables, dataset.attrs, unlimited)
+    with create_file(skeleton, path, model) as file:
+        rows = {name: var.values for name, var in variables.items() if skeleton.has_rows(name)}
+        if rows:
+            file.add(rows)
+    return file.written
+
+
+@contextmanager
+def create_file(
+    skeleton: Skeleton, path: Path, model: _Format = "NETCDF4_CLASSIC"
+) -> Iterator[RowFile]:
+    """Yield a file to which rows are added; at the end it is complete, on disk and has its name.
+
+    Several threads may write files at once.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    path : Path
+        Missing folders are created. A former file is replaced at the end, and stays if anything
+        fails.
+    model : str
+        Data model of netCDF.
+
+    Yields
+    ------
+    RowFile
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be written, or lacks rows at the end.
+    """
+    _refuse_unstorable(skeleton, path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        with _disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with NETCDF4_PYTHON_LOCK:
+                _store(skeleton, temporary, model)
+            stream = QuietFile(temporary)
+        with stream:
+            file = RowFile(skeleton, path, stream)
+            try:
+                file.write_fixed()
+                yield file
+                file.complete()
+            finally:
+                file.close()
+        with _disk_errors(path):
+            file.written = _settle(temporary)
+            temporary.replace(path)
+            _sync(path.parent)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+class RowFile:
+    """A file that is being written; see `create_file`."""
+
+    written: Written
+    """Set when the file is complete and has its name."""
+
+    def __init__(self, skeleton: Skeleton, path: Path, stream: QuietFile) -> None:
+        self._skeleton = skeleton
+        self._path = path
+        self._stream = stream
+        self._rows = 0
+        self._columns = {
+            name: RowBlocks(name, variable.shape[0], _chunk(variable)[0])
+            for name, variable in skeleton.variables.items()
+            if skeleton.has_rows(name)
+        }
+        self._total = skeleton.sizes[str(skeleton.unlimited)] if self._columns else 0
+        with _disk_errors(path), NETCDF4_PYTHON_LOCK:
+            self._file = h5py.File(stream, "r+")
+            self._targets = dict(self._open_targets())
+
+    def write_fixed(self) -> None:
+        """Write the variables that have no rows."""
+        with _disk_errors(self._path):
+            self._write(
+                Block(name, 0, self._skeleton.variables[name].values)
+                for name in self._targets
+                if name not in self._columns
+            )
+
+    def _open_targets(self) -> Iterator[tuple[str, Any]]:
+        """Yield the HDF5 datasets that consist of chunks, with their final lengths."""
+        sizes = self._skeleton.sizes
+        for name, variable in self._skeleton.variables.items():
+            if variable.dims:
+                other = name in sizes and variable.dims[0] != name
+                inside = unicodedata.normalize("NFC", f"{OTHER_DIMENSION if other else ''}{name}")
+                target = h5py.h5d.open(self._file.id, inside.encode())
+                target.set_extent(variable.shape)
+                yield name, target
+
+    def add(self, rows: Mapping[str, _Array]) -> None:
+        """Write the next rows.
+
+        Parameters
+        ----------
+        rows : mapping of str to ndarray, shape (n, ...)
+            Values of every variable that has rows, with its type; n is at least 1.
+
+        Raises
+        ------
+        ProductError
+            If rows do not fit the file, or cannot be written.
+        """
+        count = self._count(rows)
+        blocks = [
+            block for name, column in self._columns.items() for block in column.take(rows[name])
+        ]
+        # Among blocks with the same last row, the order of variables stays.
+        blocks.sort(key=lambda block: block.end)
+        with _disk_errors(self._path):
+            self._write(blocks)
+        self._rows += count
+
+    def _count(self, rows: Mapping[str, _Array]) -> int:
+        """Return the number of rows, if they fit the file."""
+        if rows.keys() != self._columns.keys():
+            name = min(rows.keys() ^ self._columns.keys())
+            raise ProductError("is missing or unknown", file=self._path, field=name)
+        count = len(next(iter(rows.values())))
+        for name, values in rows.items():
+            declared = self._skeleton.variables[name]
+            expected = (count, *declared.shape[1:])
+            if values.shape != expected or values.dtype != declared.dtype:
+                raise ProductError(
+                    f"has rows {values.dtype} {values.shape}, not {declared.dtype} {expected}",
+                    file=self._path,
+                    field=name,
+                )
+        if not 0 < count <= self._total - self._rows:
+            raise ProductError(
+                f"gets {count} rows, but {self._total - self._rows} of {self._total} are missing",
+                file=self._path,
+            )
+        return count
+
+    def _write(self, blocks: Iterable[Block]) -> None:
+        for block in blocks:
+            variable = self._skeleton.variables[block.name]
+            native = variable.dtype.newbyteorder("=")
+            fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
+            values = block.values.astype(native, copy=False)
+            # Deflated without the lock, so that other threads go on.
+            for (first, *others), data in deflate_chunks(values, _chunk(variable), fill):
+                with NETCDF4_PYTHON_LOCK:
+                    target = self._targets[block.name]
+                    target.write_direct_chunk((block.first + first, *others), data)
+                self._stream.check()
+
+    def complete(self) -> None:
+        """Check that all rows came and are in the file, and close it.
+
+        Raises
+        ------
+        ProductError
+            If they are not.
+        """
+        if self._rows != self._total:
+            raise ProductError(f"has {self._rows} of {self._total} rows", file=self._path)
+        with _disk_errors(self._path):
+            with NETCDF4_PYTHON_LOCK:
+                self._file.close()
+            self._stream.check()
+
+    def close(self) -> None:
+        """Close the file; where it is not complete, write nothing more."""
+        self._stream.discard()
         with NETCDF4_PYTHON_LOCK:
-            _store(dataset, temporary, model, without=bulk)
-        if bulk:
-            # No lock: ISA-L lets the other threads go on.
-            chunks = {name: _deflated(dataset.variables[name]) for name in bulk}
-            temporary.write_bytes(_filled(temporary.read_bytes(), dataset, chunks))
-        return _settle(temporary)
+            self._file.close()
 
 
-def _is_bulk(dataset: xr.Dataset, name: str) -> bool:
-    variable = dataset.variables[name]
-    # netCDF renames variables in HDF5 whose names are not ASCII, or are those of other dimensions.
-    same_name = name.isascii() and (name not in dataset.sizes or variable.dims[:1] == (name,))
-    return variable.nbytes >= BULK_BYTES and same_name
+def _chunk(variable: xr.Variable) -> tuple[int, ...]:
+    return chunk_sizes(variable.shape, variable.dtype.itemsize)
 
 
-def _deflated(variable: xr.Variable) -> list[tuple[Offset, bytes]]:
-    native = variable.dtype.newbyteorder("=")
-    fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
-    chunk = chunk_sizes(variable.shape, native.itemsize)
-    return list(deflate_chunks(variable.values.astype(native, copy=False), chunk, fill))
-
-
-def _filled(image: bytes, dataset: xr.Dataset, chunks: _Chunks) -> bytes:
-    """Return the image of a file with the chunks of its still empty variables filled in."""
-    with NETCDF4_PYTHON_LOCK, h5py.File.in_memory(image, block_size=CHUNK_BYTES) as file:
-        for name, parts in chunks.items():
-            target = file[name]
-            # The unlimited dimension has no length yet.
-            target.resize(dataset.variables[name].shape)
-            for offset, data in parts:
-                target.id.write_direct_chunk(offset, data)
-        file.flush()
-        complete: bytes = file.id.get_file_image()
-        return complete
-
-
-def _refuse_unstorable(dataset: xr.Dataset, path: Path) -> None:
-    for name, variable in dataset.variables.items():
+def _refuse_unstorable(skeleton: Skeleton, path: Path) -> None:
+    for name, variable in skeleton.variables.items():
         if variable.dtype.str[1:] not in _TYPES:
             raise ProductError(
                 f"has data of type {variable.dtype}, which NetCDF cannot hold",
                 file=path,
-                field=str(name),
+                field=name,
                 remedy="encode it first",
             )
         if variable.size == 0:
-            raise ProductError("is empty", file=path, field=str(name))
+            raise ProductError("is empty", file=path, field=name)
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary file that replaces `path` at the end, and is removed on failure."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+def _disk_errors(path: Path) -> Iterator[None]:
+    """Raise errors of disks and libraries as `ProductError`."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        temporary.replace(path)
-        _sync(path.parent)
-    # netCDF4 reports a full disk as RuntimeError.
+        yield
     except (OSError, RuntimeError) as error:
         raise ProductError(
             f"cannot be written: {error}",
             file=path,
             remedy="check that the folder is writable and the disk has space, then run again",
         ) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:
@@ -252,24 +426,22 @@ class _DefinedAtOnce(netCDF4.Dataset):
         super()._enddef()  # type: ignore[misc]  # not in its stubs
 
 
-def _store(dataset: xr.Dataset, path: Path, model: _Format, *, without: Container[str]) -> None:
-    """Write everything except the data of the variables in `without`."""
-    unlimited = dataset.encoding.get("unlimited_dims", ())
+def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
+    """Write all definitions and scalars, but no chunk."""
     # In memory until the end, because HDF5 may crash on a full disk.
     with _DefinedAtOnce(
         path, "w", format=model, clobber=False, diskless=True, persist=True
     ) as file:
-        file.setncatts(dataset.attrs)
-        for name, size in dataset.sizes.items():
-            file.createDimension(str(name), None if name in unlimited else size)
+        file.setncatts(skeleton.attributes)
+        for name, size in skeleton.sizes.items():
+            file.createDimension(name, None if name == skeleton.unlimited else size)
         targets = {
-            str(name): _define(file, str(name), variable)
-            for name, variable in dataset.variables.items()
+            name: _define(file, name, variable) for name, variable in skeleton.variables.items()
         }
         file.end_definitions()
         for name, target in targets.items():
-            if name not in without:
-                target[...] = dataset.variables[name].values
+            if not skeleton.variables[name].dims:
+                target[...] = skeleton.variables[name].values
 
 
 def _define(file: netCDF4.Dataset, name: str, variable: xr.Variable) -> Any:
@@ -280,7 +452,7 @@ def _define(file: netCDF4.Dataset, name: str, variable: xr.Variable) -> Any:
             "compression": "zlib",
             "complevel": COMPRESSION_LEVEL,
             "shuffle": True,
-            "chunksizes": chunk_sizes(variable.shape, variable.dtype.itemsize),
+            "chunksizes": _chunk(variable),
         }
     target = file.createVariable(
         name,

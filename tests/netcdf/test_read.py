@@ -19,7 +19,7 @@ from lidarops.flags import Quality
 from lidarops.netcdf import read
 from lidarops.netcdf.build import build_product
 from lidarops.netcdf.read import open_product, profiles_in
-from lidarops.netcdf.write import BULK_BYTES, write_product
+from lidarops.netcdf.write import write_product
 
 
 def by_xarray(path: Path) -> xr.Dataset:
@@ -218,7 +218,7 @@ class TestDamage:
         path = tmp_path / "rotten.nc"
         whole = bytearray(chunked.read_bytes())
         with h5py.File(chunked) as file:
-            assert file["signal"].nbytes > BULK_BYTES
+            assert file["signal"].nbytes > read.LAZY_BYTES
             place = file["signal"].id.get_chunk_info(1)
             first = place.chunk_offset[0]
         middle = place.byte_offset + place.size // 2
