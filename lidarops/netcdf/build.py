@@ -6,6 +6,7 @@ that do not match the layout of the kind are refused.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 import numpy as np
@@ -25,36 +26,25 @@ from lidarops.netcdf.input_checks import (
     whole_numbers,
 )
 from lidarops.netcdf.provenance import prov_json
+from lidarops.netcdf.skeleton import Skeleton
 from lidarops.netcdf.variables import Layout, Row, attributes, layout_of
 from lidarops.records import DetectionMode
 
-__all__ = ["Context", "bitround", "build_dataset", "build_product", "product_path"]
+__all__ = ["Context", "ProductEncoder", "bitround", "build_product", "product_path"]
 
 _MANTISSA_BITS: Final = 23
+_TIME: Final = rows.TIME.name
 
 
 def build_product(data: xr.Dataset, context: Context) -> xr.Dataset:
-    """Return the encoded product of one scene, kind and channel: `build_dataset` by its kind."""
-    return build_dataset(data, context, layout_of(context.kind))
-
-
-def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Dataset:
     """Return the encoded product of one scene, kind and channel.
 
     Parameters
     ----------
     data : xr.Dataset
-        Every variable of `layout`, in memory, with ``time`` and ``time_bnds`` (datetime64, UTC),
-        ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over time). For ``signal``
-        also ``range`` (m, bin centres) and optionally ``range_bnds``; for ``homogeneous`` also
-        ``section``, ``section_range`` and ``section_bounds`` (m); for ``multiangle``, instead of
-        the angles, ``altitude`` (m above the geoid), ``beam``, ``beam_zenith_angle`` and optionally
-        ``beam_azimuth`` (degree). An attribute ``steps`` becomes ``lidarops_steps``. NaN is
-        missing.
+        Frame and rows of `ProductEncoder` in one.
     context : Context
         Kind, channel, station, instrument, campaign, scene and provenance of the product.
-    layout : Layout
-        Layout of the kind of product.
 
     Returns
     -------
@@ -64,23 +54,194 @@ def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Data
     Raises
     ------
     ProductError
-        If a variable is missing, unknown, lazy, or has wrong dimensions or type; if a value is out
-        of its valid range, carries a bit that the kind does not have, or is missing without a
-        quality bit; if coordinates are not finite or not rising.
+        As `ProductEncoder` does.
     """
-    _refuse_mismatch(context)
-    source = CheckedInput(data, layout)
-    coordinates, extents = locate_product(source, layout, context)
+    encoder = ProductEncoder(data, context)
+    encoded = encoder.encode(data)
+    skeleton = encoder.skeleton(encoded)
     product = xr.Dataset(
         {
-            **_place(coordinates, context.mode),
-            **_measured(source, layout, coordinates, context.mode),
-            **_about(layout, context, profiles=extents.vertical),
+            name: variable.copy(deep=False, data=encoded.get(name, variable.values))
+            for name, variable in skeleton.variables.items()
         },
-        attrs=global_attributes(context, layout, extents) | _steps(data),
+        attrs=dict(skeleton.attributes),
     )
-    product.encoding["unlimited_dims"] = {"time"}
+    product.encoding["unlimited_dims"] = {_TIME}
     return product
+
+
+class ProductEncoder:
+    """The encoding of one product: its profiles, some at a time, and the rest of its file.
+
+    Parameters
+    ----------
+    frame : xr.Dataset
+        What is known before the first profile, in memory: ``time`` and ``time_bnds`` (datetime64,
+        UTC) of all profiles, ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over
+        time), and the variables of the kind's layout without time. For ``signal`` also ``range`` (m, bin
+        centres) and optionally ``range_bnds``; for ``homogeneous`` also ``section``,
+        ``section_range`` and ``section_bounds`` (m); for ``multiangle``, instead of the angles,
+        ``altitude`` (m above the geoid), ``beam``, ``beam_zenith_angle`` and optionally
+        ``beam_azimuth`` (degree). An attribute ``steps`` becomes ``lidarops_steps``. NaN is
+        missing. Other variables of the layout are not used.
+    context : Context
+        Kind, channel, station, instrument, campaign, scene and provenance of the product.
+
+    Raises
+    ------
+    ProductError
+        If a variable is missing, unknown, lazy, or has wrong dimensions or type; if a value is out
+        of its valid range; if coordinates are not finite or not rising.
+    """
+
+    def __init__(self, frame: xr.Dataset, context: Context) -> None:
+        _refuse_mismatch(context)
+        layout = layout_of(context.kind)
+        source = CheckedInput(frame, layout)
+        self._layout = layout
+        self._context = context
+        self._coordinates, self._extents = locate_product(source, layout, context)
+        self._steps = _steps(frame)
+        self._times = frame.variables[_TIME].values
+        self._profiles = 0
+        self._names: frozenset[str] = frozenset()
+        self._fixed = {
+            row.name: _stored(source, row)
+            for row in layout.variables
+            if not _over_time(row.dims) and not (row.optional and row.name not in source)
+        }
+        self._sizes = {
+            dim: size
+            for dims, values in self._known_shapes()
+            for dim, size in zip(dims, values.shape, strict=True)
+        }
+
+    def _known_shapes(self) -> Iterator[tuple[tuple[str, ...], Values]]:
+        for coordinate in self._coordinates:
+            yield coordinate.dims, coordinate.values
+        for name, values in self._fixed.items():
+            yield self._layout.row(name).dims, values
+
+    def encode(self, profiles: xr.Dataset) -> dict[str, Values]:
+        """Return the next profiles as they are stored, with their coordinates.
+
+        Parameters
+        ----------
+        profiles : xr.Dataset
+            Every variable of the layout with time, in memory. Optional variables are in all
+            profiles or in none. Variables without time are not used.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n, ...)
+
+        Raises
+        ------
+        ProductError
+            If a variable is missing, unknown, lazy, or has wrong dimensions or type; if a value is
+            out of its valid range, carries a bit that the kind does not have, or is missing
+            without a quality bit; if there are more profiles than times, or others.
+        """
+        span = self._span(profiles)
+        measured = self._measured(CheckedInput(profiles, self._layout))
+        self._names = self._names or frozenset(measured)
+        for name in sorted(self._names ^ measured.keys()):
+            raise ProductError("is in some profiles, but not in others", field=name)
+        self._profiles = span.stop
+        return dict(self._located(span)) | measured
+
+    def _span(self, profiles: xr.Dataset) -> slice:
+        first = self._profiles
+        span = slice(first, first + profiles.sizes.get(_TIME, 0))
+        if span.stop > self._times.size:
+            raise ProductError(
+                f"has {self._times.size} values, but there are more profiles", field=_TIME
+            )
+        times = profiles.variables.get(_TIME)
+        if times is not None and not np.array_equal(times.values, self._times[span]):
+            raise ProductError(
+                f"of profiles does not continue after the first {first}",
+                field=_TIME,
+                remedy="add all profiles in the order of time",
+            )
+        return span
+
+    def _located(self, span: slice) -> Iterator[tuple[str, Values]]:
+        for coordinate in self._coordinates:
+            row = coordinate.row
+            if _over_time(coordinate.dims):
+                yield row.name, coordinate.profiles(span)
+                if row.bounds and coordinate.bounds is not None:
+                    yield row.bounds, coordinate.bounds[span]
+
+    def _measured(self, source: CheckedInput) -> dict[str, Values]:
+        judged = self._layout.row(rows.QUALITY_FLAG)
+        flags = whole_numbers(judged, source.take(judged.name, judged.dims))
+        check_flags(judged, flags)
+        encoded: dict[str, Values] = {}
+        for row in self._layout.variables:
+            if not _over_time(row.dims) or (row.optional and row.name not in source):
+                continue
+            if row.summary:
+                encoded[row.name] = rows.summarize_flags(flags)
+                continue
+            # Bits refer to retrieved values; an optional derived value may be missing without one.
+            judging = row.dims == judged.dims and not row.optional
+            encoded[row.name] = _stored(source, row, flags if judging else None)
+            self._refuse_other_sizes(row, encoded[row.name])
+        return encoded
+
+    def _refuse_other_sizes(self, row: Row, values: Values) -> None:
+        for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
+            if self._sizes.setdefault(dim, size) != size:
+                raise ProductError(
+                    f"has {size} values along {dim}, not {self._sizes[dim]}", field=row.name
+                )
+
+    def skeleton(self, encoded: Mapping[str, Values]) -> Skeleton:
+        """Return all of the file except the values of profiles.
+
+        Parameters
+        ----------
+        encoded : mapping of str to ndarray
+            The first profiles, from `encode`; which variables they have and of what type counts.
+
+        Returns
+        -------
+        Skeleton
+
+        Raises
+        ------
+        ProductError
+            If an optional variable is present without its ancillary variables.
+        """
+        layout, context = self._layout, self._context
+        attrs = global_attributes(context, layout, self._extents) | self._steps
+        variables = {
+            **_place(self._coordinates, context.mode),
+            **dict(self._declared(encoded)),
+            **_about(layout, context, profiles=self._extents.vertical),
+        }
+        _refuse_without_ancillaries(layout, variables)
+        return Skeleton(variables, attrs, _TIME)
+
+    def _declared(self, encoded: Mapping[str, Values]) -> Iterator[tuple[str, xr.Variable]]:
+        for row in self._layout.variables:
+            if row.name in encoded:
+                first = encoded[row.name]
+                shape = (self._times.size, *first.shape[1:])
+                values = np.broadcast_to(np.zeros((), first.dtype), shape)
+            elif row.name in self._fixed:
+                values = self._fixed[row.name]
+            else:
+                continue
+            auxiliary = _auxiliary_names(row, self._coordinates)
+            attrs = attributes(row, mode=self._context.mode, coordinates=auxiliary)
+            yield row.name, xr.Variable(row.dims, values, attrs)
+
+
+def _over_time(dims: tuple[str, ...]) -> bool:
+    return dims[:1] == (_TIME,)
 
 
 def _refuse_mismatch(context: Context) -> None:
@@ -109,23 +270,6 @@ def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.V
     return variables
 
 
-def _measured(
-    source: CheckedInput, layout: Layout, coordinates: list[Coordinate], mode: DetectionMode
-) -> dict[str, xr.Variable]:
-    judged = layout.row(rows.QUALITY_FLAG)
-    flags = whole_numbers(judged, source.take(judged.name, judged.dims))
-    check_flags(judged, flags)
-    variables = {}
-    for row in layout.variables:
-        if row.optional and row.name not in source:
-            continue
-        stored = rows.summarize_flags(flags) if row.summary else _stored(source, row, judged, flags)
-        attrs = attributes(row, mode=mode, coordinates=_auxiliary_names(row, coordinates))
-        variables[row.name] = xr.Variable(row.dims, stored, attrs)
-    _refuse_without_ancillaries(layout, variables)
-    return variables
-
-
 def _refuse_without_ancillaries(layout: Layout, variables: dict[str, xr.Variable]) -> None:
     """Raise an error if a variable is present but one of its ancillary variables is not."""
     for row in layout.variables:
@@ -134,14 +278,14 @@ def _refuse_without_ancillaries(layout: Layout, variables: dict[str, xr.Variable
             raise ProductError("is missing", field=missing[0], remedy=f"{row.name} needs it")
 
 
-def _stored(source: CheckedInput, row: Row, judged: Row, flags: Values) -> Values:
+def _stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Values:
+    """Return a variable as stored; with `flags`, a missing value must carry a bit."""
     values = source.take(row.name, row.dims)
     check_range(row, values)
     if row.dtype.startswith("i"):
         return whole_numbers(row, values)
     stored = _rounded(row, values)
-    # Bits refer to retrieved values; an optional derived value may be missing without a bit.
-    if row.dims == judged.dims and not row.optional:
+    if flags is not None:
         check_flagged(row, stored, flags)
     stored[~np.isfinite(stored)] = rows.FILL_VALUE
     return stored

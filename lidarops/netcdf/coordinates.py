@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final
@@ -19,7 +19,39 @@ from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
 NEAR_VERTICAL: Final = 10.0
 """degree. A beam within this angle of the vertical gives profiles in the sense of CF chapter 9."""
 
+_SAME_STEP: Final = 1e-6
+"""Relative difference up to which vertical steps are equal."""
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+
+
+@dataclass(frozen=True, slots=True)
+class BeamAltitude:
+    """Altitude of the air along a beam."""
+
+    station: float
+    """m above the geoid."""
+    rise: Values
+    """Cosine of the zenith angle: one number, or one for every profile."""
+    along: Values
+    """m along the beam."""
+
+    def exact(self, along: Values, profiles: slice | None = None) -> Values:
+        """Return altitudes before rounding, m: at `along`, for all or some profiles."""
+        rise = self.rise if profiles is None else self.rise[profiles]
+        altitude: Values = self.station + rise[..., np.newaxis] * along
+        return altitude
+
+    def extremes(self) -> Values:
+        """Return the lowest and highest altitude, and others between them."""
+        # Rounding keeps the order, so the extremes lie at those of both factors.
+        rise, along = self.rise, self.along
+        ends = np.array([rise.min(), rise.max()])[:, np.newaxis] * [along.min(), along.max()]
+        extremes: Values = self.station + ends
+        return extremes
+
+    def step(self) -> float | None:
+        """Return the vertical distance of neighbouring values, m; None where it varies."""
+        return _common_step(self.station + rise * self.along for rise in self.rise.flat)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +62,14 @@ class Coordinate:
     dims: tuple[str, ...]
     values: Values
     bounds: Values | None = None
+    moving: BeamAltitude | None = None
+    """Where the beam moves: what gives the values, of which `values` has only shape and type."""
+
+    def profiles(self, which: slice) -> Values:
+        """Return the values of some profiles, for a coordinate over time."""
+        if self.moving is None:
+            return self.values[which]
+        return self.moving.exact(self.moving.along, which).astype(self.values.dtype)
 
     @property
     def auxiliary(self) -> bool:
@@ -87,9 +127,9 @@ class _Vertical:
     """Vertical coverage of a product."""
 
     altitude: Values
-    """m, as stored."""
-    exact: Values
-    """m, before rounding."""
+    """m, as stored; the lowest, the highest and any others."""
+    step: float | None
+    """m, between neighbouring values; None where it varies."""
     profiles: bool
     """Whether the beam is fixed and near the vertical, as CF profiles require."""
 
@@ -102,13 +142,11 @@ def _beam_place(source: CheckedInput, layout: Layout, station: float, profiles: 
     names = _ALONG[layout.sampled]
     by_name = {name: _along(source, layout.row(name)) for name in names}
     zenith = _beam(source, layout.row("zenith_angle"), profiles)
-    altitude, exact = _altitude(layout.row("altitude"), by_name[names[-1]], zenith, station)
+    altitude, vertical = _altitude(layout.row("altitude"), by_name[names[-1]], zenith, station)
     by_name |= {"altitude": altitude, "zenith_angle": zenith}
     if "azimuth" in source:
         by_name["azimuth"] = _beam(source, layout.row("azimuth"), profiles)
-    tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
-    vertical = zenith.dims == () and bool(tilt <= NEAR_VERTICAL)
-    return by_name, _Vertical(altitude.values, exact, vertical)
+    return by_name, vertical
 
 
 def _air_positions(
@@ -152,7 +190,7 @@ def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles:
         )
     tops = np.append(station, values)
     by_name["altitude"] = _with_bounds(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
-    return by_name, _Vertical(values, values, profiles=False)
+    return by_name, _Vertical(values, _common_step([values]), profiles=False)
 
 
 def _network_place(source: CheckedInput, layout: Layout, _station: float, _profiles: int) -> _Place:
@@ -163,7 +201,7 @@ def _network_place(source: CheckedInput, layout: Layout, _station: float, _profi
     by_name = {name: _along(source, layout.row(name)) for name in names}
     altitude = by_name["altitude"].values
     # Crossings are not ordered by altitude, so there is no vertical step.
-    return by_name, _Vertical(altitude, altitude[:, np.newaxis], profiles=False)
+    return by_name, _Vertical(altitude, None, profiles=False)
 
 
 _PLACES: Final = {"altitude": _scan_place, "crossing": _network_place}
@@ -271,24 +309,45 @@ def _beam(source: CheckedInput, row: Row, profiles: int) -> Coordinate:
 
 def _altitude(
     row: Row, along: Coordinate, zenith: Coordinate, station: float
-) -> tuple[Coordinate, Values]:
-    """Return the altitude as stored, and before rounding."""
-    rise = np.cos(np.deg2rad(zenith.values))[..., np.newaxis]
-    exact = station + rise * along.values
-    bounds = None
-    if row.bounds and along.bounds is not None and not zenith.dims:
-        bounds = (station + rise * along.bounds).astype(row.dtype)
-    else:
+) -> tuple[Coordinate, _Vertical]:
+    """Return the altitude along a beam, and its vertical coverage."""
+    rise = np.asarray(np.cos(np.deg2rad(zenith.values)))
+    beam = BeamAltitude(station, rise, along.values)
+    extremes = beam.extremes().astype(row.dtype)
+    if zenith.dims:
         # Cell bounds that also change with time would have to be polygons (CF, section 7.1).
         row = replace(row, bounds=None)
-    return Coordinate(row, (*zenith.dims, *row.dims), exact.astype(row.dtype), bounds), exact
+        shape = (*zenith.values.shape, *along.values.shape)
+        declared = np.broadcast_to(np.zeros((), row.dtype), shape)
+        altitude = Coordinate(row, (*zenith.dims, *row.dims), declared, moving=beam)
+        return altitude, _Vertical(extremes, beam.step(), profiles=False)
+    bounds = None
+    if row.bounds and along.bounds is not None:
+        bounds = beam.exact(along.bounds).astype(row.dtype)
+    else:
+        row = replace(row, bounds=None)
+    tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
+    altitude = Coordinate(row, row.dims, beam.exact(along.values).astype(row.dtype), bounds)
+    return altitude, _Vertical(extremes, beam.step(), profiles=bool(tilt <= NEAR_VERTICAL))
+
+
+def _common_step(profiles: Iterable[Values]) -> float | None:
+    """Return the distance of neighbouring altitudes of all profiles, m; None where it varies."""
+    first, smallest, largest = None, np.inf, 0.0
+    for altitudes in profiles:
+        steps = np.abs(np.diff(altitudes))
+        if steps.size == 0:
+            return None
+        first = float(steps[0]) if first is None else first
+        smallest, largest = min(smallest, steps.min()), max(largest, steps.max())
+        if largest - smallest > _SAME_STEP * largest:
+            return None
+    return first
 
 
 def _extents(source: CheckedInput, vertical: _Vertical, horizontal: list[Values]) -> Extents:
     moments, bounds = _moments(source)
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
-    steps = np.abs(np.diff(vertical.exact, axis=-1))
-    constant = steps.size > 0 and bool(np.ptp(steps) <= 1e-6 * steps.max())
     return Extents(
         start=_datetime(bounds[:, 0].min()),
         stop=_datetime(bounds[:, 1].max()),
@@ -297,7 +356,7 @@ def _extents(source: CheckedInput, vertical: _Vertical, horizontal: list[Values]
         longitudes=(float(horizontal[1].min()), float(horizontal[1].max())),
         lowest=float(vertical.altitude.min()),
         highest=float(vertical.altitude.max()),
-        step=float(steps.flat[0]) if constant else None,
+        step=vertical.step,
         vertical=vertical.profiles,
     )
 

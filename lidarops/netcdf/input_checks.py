@@ -102,6 +102,8 @@ def check_range(row: Row, values: Values) -> None:
     ProductError
         If any value lies outside; missing values do not count.
     """
+    if row.valid_min is None and row.valid_max is None:
+        return
     low = -np.inf if row.valid_min is None else row.valid_min
     high = np.inf if row.valid_max is None else row.valid_max
     outside = int(np.count_nonzero((values < low) | (values > high)))

@@ -11,7 +11,7 @@ import math
 import os
 import secrets
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,7 @@ from lidarops.errors import ProductError
 from lidarops.netcdf._deflate import deflate_chunks
 from lidarops.netcdf._quiet_file import QuietFile
 from lidarops.netcdf._row_blocks import Block, RowBlocks
+from lidarops.netcdf.skeleton import Skeleton
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
@@ -49,32 +50,6 @@ class Written:
     size: int
 
 
-@dataclass(frozen=True, slots=True)
-class Skeleton:
-    """All of a file except the values of its rows, which come later.
-
-    The rows are those along the unlimited dimension, of variables that have it first.
-    """
-
-    variables: Mapping[str, xr.Variable]
-    """Encoded, in the order of the file. The values of variables of rows are not used."""
-    attributes: Mapping[str, Any]
-    unlimited: str | None
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Length of every dimension, in the order of the file."""
-        return {
-            str(dim): size
-            for variable in self.variables.values()
-            for dim, size in variable.sizes.items()
-        }
-
-    def has_rows(self, name: str) -> bool:
-        """Whether the values of a variable come row by row."""
-        return self.unlimited is not None and self.variables[name].dims[:1] == (self.unlimited,)
-
-
 def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     """Write an encoded dataset that is in memory.
 
@@ -85,7 +60,7 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     Parameters
     ----------
     dataset : xr.Dataset
-        Encoded, in memory, for example from `lidarops.netcdf.build.build_dataset`; with at most
+        Encoded, in memory, for example from `lidarops.netcdf.build.build_product`; with at most
         one unlimited dimension.
     path : path or str
         Path of the file; missing folders are created.
@@ -188,7 +163,7 @@ def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Forma
     variables = {str(name): variable for name, variable in dataset.variables.items()}
     skeleton = Skeleton(variables, dataset.attrs, unlimited)
     with create_file(skeleton, path, model) as file:
-        rows = {name: var.values for name, var in variables.items() if skeleton.has_rows(name)}
+        rows = {name: variable.values for name, variable in skeleton.with_rows().items()}
         if rows:
             file.add(rows)
     return file.written
@@ -236,10 +211,7 @@ def create_file(
                 file.complete()
             finally:
                 file.close()
-        with _disk_errors(path):
-            file.written = _settle(temporary)
-            temporary.replace(path)
-            _sync(path.parent)
+        file.settle(temporary)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -248,43 +220,40 @@ def create_file(
 class RowFile:
     """A file that is being written; see `create_file`."""
 
-    written: Written
-    """Set when the file is complete and has its name."""
-
     def __init__(self, skeleton: Skeleton, path: Path, stream: QuietFile) -> None:
-        self._skeleton = skeleton
+        self._variables = skeleton.variables
         self._path = path
         self._stream = stream
         self._rows = 0
+        self._written: Written | None = None
+        self._chunks = {name: _chunk(var) for name, var in skeleton.variables.items() if var.dims}
         self._columns = {
-            name: RowBlocks(name, variable.shape[0], _chunk(variable)[0])
-            for name, variable in skeleton.variables.items()
-            if skeleton.has_rows(name)
+            name: RowBlocks(name, variable.shape[0], self._chunks[name][0])
+            for name, variable in skeleton.with_rows().items()
         }
-        self._total = skeleton.sizes[str(skeleton.unlimited)] if self._columns else 0
+        sizes = skeleton.sizes()
+        self._total = sizes[str(skeleton.unlimited)] if self._columns else 0
         with _disk_errors(path), NETCDF4_PYTHON_LOCK:
             self._file = h5py.File(stream, "r+")
-            self._targets = dict(self._open_targets())
+            self._targets = {name: self._open_target(name, sizes) for name in self._chunks}
+
+    def _open_target(self, name: str, dimensions: Container[str]) -> Any:
+        """Return the HDF5 dataset of a variable, with its final length."""
+        variable = self._variables[name]
+        other = name in dimensions and variable.dims[0] != name
+        inside = unicodedata.normalize("NFC", f"{OTHER_DIMENSION if other else ''}{name}")
+        target = h5py.h5d.open(self._file.id, inside.encode())
+        target.set_extent(variable.shape)
+        return target
 
     def write_fixed(self) -> None:
         """Write the variables that have no rows."""
         with _disk_errors(self._path):
             self._write(
-                Block(name, 0, self._skeleton.variables[name].values)
+                Block(name, 0, self._variables[name].values)
                 for name in self._targets
                 if name not in self._columns
             )
-
-    def _open_targets(self) -> Iterator[tuple[str, Any]]:
-        """Yield the HDF5 datasets that consist of chunks, with their final lengths."""
-        sizes = self._skeleton.sizes
-        for name, variable in self._skeleton.variables.items():
-            if variable.dims:
-                other = name in sizes and variable.dims[0] != name
-                inside = unicodedata.normalize("NFC", f"{OTHER_DIMENSION if other else ''}{name}")
-                target = h5py.h5d.open(self._file.id, inside.encode())
-                target.set_extent(variable.shape)
-                yield name, target
 
     def add(self, rows: Mapping[str, _Array]) -> None:
         """Write the next rows.
@@ -316,7 +285,7 @@ class RowFile:
             raise ProductError("is missing or unknown", file=self._path, field=name)
         count = len(next(iter(rows.values())))
         for name, values in rows.items():
-            declared = self._skeleton.variables[name]
+            declared = self._variables[name]
             expected = (count, *declared.shape[1:])
             if values.shape != expected or values.dtype != declared.dtype:
                 raise ProductError(
@@ -333,12 +302,12 @@ class RowFile:
 
     def _write(self, blocks: Iterable[Block]) -> None:
         for block in blocks:
-            variable = self._skeleton.variables[block.name]
+            variable = self._variables[block.name]
             native = variable.dtype.newbyteorder("=")
             fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
             values = block.values.astype(native, copy=False)
             # Deflated without the lock, so that other threads go on.
-            for (first, *others), data in deflate_chunks(values, _chunk(variable), fill):
+            for (first, *others), data in deflate_chunks(values, self._chunks[block.name], fill):
                 with NETCDF4_PYTHON_LOCK:
                     target = self._targets[block.name]
                     target.write_direct_chunk((block.first + first, *others), data)
@@ -364,6 +333,33 @@ class RowFile:
         self._stream.discard()
         with NETCDF4_PYTHON_LOCK:
             self._file.close()
+
+    def settle(self, temporary: Path) -> None:
+        """Give the closed file its name, when it is on disk.
+
+        Raises
+        ------
+        ProductError
+            If the file system refuses.
+        """
+        with _disk_errors(self._path):
+            written = _settle(temporary)
+            temporary.replace(self._path)
+            _sync(self._path.parent)
+        self._written = written
+
+    @property
+    def written(self) -> Written:
+        """The file, when it is complete and has its name.
+
+        Raises
+        ------
+        ProductError
+            If it is not.
+        """
+        if self._written is None:
+            raise ProductError("is not written", file=self._path)
+        return self._written
 
 
 def _chunk(variable: xr.Variable) -> tuple[int, ...]:
@@ -433,7 +429,7 @@ def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
         path, "w", format=model, clobber=False, diskless=True, persist=True
     ) as file:
         file.setncatts(skeleton.attributes)
-        for name, size in skeleton.sizes.items():
+        for name, size in skeleton.sizes().items():
             file.createDimension(name, None if name == skeleton.unlimited else size)
         targets = {
             name: _define(file, name, variable) for name, variable in skeleton.variables.items()

@@ -11,23 +11,21 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import dask.config
-import numpy as np
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, InstrumentFacts, Station, as_settings
 from lidarops.errors import LidarOpsError, ProductError, SceneError
-from lidarops.flags import Quality
 from lidarops.kinds import kinds
-from lidarops.netcdf import provenance, write
-from lidarops.netcdf.build import build_product
+from lidarops.netcdf import provenance
 from lidarops.netcdf.code_version import code_version
 from lidarops.netcdf.context import Context, product_path
+from lidarops.netcdf.product_file import create_product
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
 from lidarops.plan.preview import refine_plan
@@ -354,9 +352,10 @@ def _channel_products(
 
 def _written(job: Job, context: Context, data: xr.Dataset, clock: _Clock) -> ProductRecord:
     path = product_path(context)
-    written = write.write_product(build_product(data, context), job.campaign.products_root / path)
+    with create_product(data, context, job.campaign.products_root / path) as writer:
+        writer.add(data)
     clock.lap("write")
-    return _record(context.kind, context.channel, path, written, data)
+    return ProductRecord(path, context.kind, context.channel, **asdict(writer.written))
 
 
 def _network_product(
@@ -494,25 +493,6 @@ def _instrument_name(campaign: Campaign, scene: Scene) -> str:
     if scene.members:
         return "network of " + ", ".join(_instrument_name(campaign, m) for m in scene.members)
     return campaign.instruments[scene.instrument].name or scene.instrument
-
-
-def _record(
-    kind: str, channel: str, path: str, written: write.Written, data: xr.Dataset
-) -> ProductRecord:
-    flags = data["quality_flag"].to_numpy()
-    # Few bits occur in a product: count only these.
-    occurring = Quality(int(np.bitwise_or.reduce(flags, axis=None)))
-    return ProductRecord(
-        path=path,
-        kind=kind,
-        channel=channel,
-        sha256=written.sha256,
-        size=written.size,
-        values=int(flags.size),
-        flagged={str(bit.name): int(np.count_nonzero(flags & np.int32(bit))) for bit in occurring},
-        unflagged=flags.size - int(np.count_nonzero(flags)),
-        usable=flags.size - int(np.count_nonzero(flags & np.int32(Quality.rejecting()))),
-    )
 
 
 class _Archive:
