@@ -34,11 +34,14 @@ class QuietFile(io.FileIO):
         size = rest.nbytes
         try:
             while rest and self._error is None:
-                # A disk that is almost full takes a part.
-                rest = rest[super().write(rest) :]
+                rest = rest[self._write_some(rest) :]
         except OSError as error:
             self._error = error
         return size
+
+    def _write_some(self, data: memoryview) -> int:
+        """Write as much as the disk takes at once, and return its length."""
+        return super().write(data)
 
     def truncate(self, size: int | None = None, /) -> int:
         """Set the size of the file, unless it failed before."""

@@ -78,7 +78,7 @@ class ProductEncoder:
     frame : xr.Dataset
         What is known before the first profile, in memory: ``time`` and ``time_bnds`` (datetime64,
         UTC) of all profiles, ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over
-        time), and the variables of the kind's layout without time. For ``signal`` also ``range`` (m, bin
+        time), and the variables of the layout without time. For ``signal`` also ``range`` (m, bin
         centres) and optionally ``range_bnds``; for ``homogeneous`` also ``section``,
         ``section_range`` and ``section_bounds`` (m); for ``multiangle``, instead of the angles,
         ``altitude`` (m above the geoid), ``beam``, ``beam_zenith_angle`` and optionally
@@ -193,7 +193,10 @@ class ProductEncoder:
 
     def _refuse_other_sizes(self, row: Row, values: Values) -> None:
         for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
-            if self._sizes.setdefault(dim, size) != size:
+            if dim not in self._sizes:
+                along = (other.name for other in self._layout.coordinates if other.dims == (dim,))
+                raise ProductError("is missing", field=next(along, dim))
+            if size != self._sizes[dim]:
                 raise ProductError(
                     f"has {size} values along {dim}, not {self._sizes[dim]}", field=row.name
                 )

@@ -180,7 +180,7 @@ def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles:
     names = ["beam", "beam_zenith_angle"]
     names += [name for name in ("beam_azimuth",) if name in source]
     # Layers are optional, and so is their coordinate.
-    names += ["layer_altitude"] if "layer_optical_depth" in source else []
+    names += [name for name in ("layer_altitude",) if name in source]
     by_name = {name: _along(source, layout.row(name)) for name in names}
     row = layout.row("altitude")
     values = _along(source, replace(row, bounds=None)).values
