@@ -1,4 +1,4 @@
-"""Build the encoded CF dataset of a product from arrays and context, without any file or clock.
+"""Encode a product after CF from arrays and context, without any file or clock.
 
 The result fixes everything in the file: order, types, fill values, attributes and extents. Data
 that do not match the layout of the kind are refused.
@@ -30,44 +30,10 @@ from lidarops.netcdf.skeleton import Skeleton
 from lidarops.netcdf.variables import Layout, Row, attributes, layout_of
 from lidarops.records import DetectionMode
 
-__all__ = ["Context", "ProductEncoder", "bitround", "build_product", "product_path"]
+__all__ = ["Context", "ProductEncoder", "bitround", "product_path"]
 
 _MANTISSA_BITS: Final = 23
 _TIME: Final = rows.TIME.name
-
-
-def build_product(data: xr.Dataset, context: Context) -> xr.Dataset:
-    """Return the encoded product of one scene, kind and channel.
-
-    Parameters
-    ----------
-    data : xr.Dataset
-        Frame and rows of `ProductEncoder` in one.
-    context : Context
-        Kind, channel, station, instrument, campaign, scene and provenance of the product.
-
-    Returns
-    -------
-    xr.Dataset
-        Encoded, as `xarray.open_dataset(..., decode_cf=False)` shows the file.
-
-    Raises
-    ------
-    ProductError
-        As `ProductEncoder` does.
-    """
-    encoder = ProductEncoder(data, context)
-    encoded = encoder.encode(data)
-    skeleton = encoder.skeleton(encoded)
-    product = xr.Dataset(
-        {
-            name: variable.copy(deep=False, data=encoded.get(name, variable.values))
-            for name, variable in skeleton.variables.items()
-        },
-        attrs=dict(skeleton.attributes),
-    )
-    product.encoding["unlimited_dims"] = {_TIME}
-    return product
 
 
 class ProductEncoder:

@@ -60,8 +60,7 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     Parameters
     ----------
     dataset : xr.Dataset
-        Encoded, in memory, for example from `lidarops.netcdf.build.build_product`; with at most
-        one unlimited dimension.
+        Encoded, in memory; with at most one unlimited dimension.
     path : path or str
         Path of the file; missing folders are created.
 

@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib.collections import QuadMesh
 from PIL import Image
 from support.products import fabricated as fab
+from support.products.encoded_products import build_product
 from support.products.fabricated import CHANNEL, START, Archive
 from support.products.made_products import context, elastic
 
@@ -19,7 +20,6 @@ from lidarops.figures import product_figures
 from lidarops.figures.profile_data import CAUSES, clearest_profile
 from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
 from lidarops.records import RunRecord
 from lidarops.reports import gallery

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from golden.cdl import dump
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, PLACED, context
 
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
 
 FOLDER = Path(__file__).parent

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from support.oracles.angle_scenes import retrieve_scan
+from support.products.encoded_products import build_product
 from support.products.made_products import (
     MAKERS,
     PLACED,
@@ -29,7 +30,7 @@ from support.products.made_products import (
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.build import bitround, build_product, product_path
+from lidarops.netcdf.build import bitround, product_path
 from lidarops.netcdf.global_attributes import _duration
 from lidarops.netcdf.variables import layout_of
 from lidarops.records import DetectionMode

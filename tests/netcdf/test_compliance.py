@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.products.compliance import findings, permitted
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context, homogeneous
 
 from lidarops.flags import Quality
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
 from lidarops.records import DetectionMode
 

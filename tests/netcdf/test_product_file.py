@@ -12,12 +12,12 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context, elastic, homogeneous, signal
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf import write as writer
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.product_file import ProductWriter, WrittenProduct, create_product
 from lidarops.netcdf.write import CHUNK_BYTES, write_product
 

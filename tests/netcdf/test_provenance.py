@@ -13,10 +13,10 @@ import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.products.encoded_products import build_product
 from support.products.made_products import context, homogeneous, provenance
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.provenance import (
     package_versions,
     product_date,

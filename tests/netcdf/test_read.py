@@ -12,12 +12,12 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context, signal
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf import read
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.read import open_product, profiles_in
 from lidarops.netcdf.write import write_product
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, STATION, context
 
 from lidarops.campaign.model import Station
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.sounded_air import beam_positions
 
 SEMI_MAJOR, INVERSE_FLATTENING = 6378137.0, 298.257223563

@@ -21,11 +21,11 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context, homogeneous, signal
 
 from lidarops.errors import ProductError
 from lidarops.netcdf import write as writer
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import (
     CHUNK_BYTES,
     chunk_sizes,
@@ -294,7 +294,7 @@ SHA = """
 import sys
 from support.products.made_products import MAKERS, context
 from test_write import of_noise, truth
-from lidarops.netcdf.build import build_product
+from support.products.encoded_products import build_product
 from lidarops.netcdf.write import write_product, write_plain
 for kind, maker in MAKERS.items():
     product = build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind))
@@ -381,7 +381,7 @@ KILLED = """
 import os, signal, sys
 from support.products.made_products import context, homogeneous
 from lidarops.netcdf import write as writer
-from lidarops.netcdf.build import build_product
+from support.products.encoded_products import build_product
 writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)
 writer.write_product(build_product(homogeneous(), context()), sys.argv[1])
 """

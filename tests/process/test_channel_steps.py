@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from support import factories
+from support.products.encoded_products import build_product
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, Metadata
 from lidarops.flags import Quality
-from lidarops.netcdf.build import Context, build_product
+from lidarops.netcdf.build import Context
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.process import channel_steps

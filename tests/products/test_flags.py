@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
 from lidarops.flags import Quality, Severity
 from lidarops.kinds import kinds
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.variables import layout_of, summarize_flags
 from lidarops.netcdf.write import write_product
 from lidarops.retrieve.multiangle import labeled

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.products.encoded_products import build_product
 from support.products.made_products import context, multiangle
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.build import build_product
 
 
 def test_layers_have_their_errors():

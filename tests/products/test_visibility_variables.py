@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.products.compliance import findings, permitted
+from support.products.encoded_products import build_product
 from support.products.made_network import product as made
 from support.products.made_products import context
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.variables import layout_of
 from lidarops.netcdf.write import write_product
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
 from lidarops.reports.inspection import describe, tables
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.write import write_product
 
 BEAMS = {

@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 
 from lidarops.aggregate.facts import Facts, list_products, read_product_facts
-from lidarops.netcdf.build import build_product
 from lidarops.netcdf.context import product_path
 from lidarops.netcdf.write import write_product
+from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, SCENE, START, context, provenance
 
 Change = Callable[[xr.Dataset], xr.Dataset]
