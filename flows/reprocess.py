@@ -284,13 +284,11 @@ def _selection(
 
 def _log_problems(campaign: Campaign, result: Result) -> str:
     """Log refused and failed files and scenes, some by name; return their numbers as text."""
-    scenes = () if result.record is None else result.record.scenes
-    failed = {**result.failures, **{scene.scene: scene.error for scene in scenes if scene.error}}
     problems = {
-        "scenes failed": failed,
+        "scenes ended with an internal error": result.internal_errors,
+        "scenes failed": result.failed_scenes,
         "scenes without a usable value": dict.fromkeys(
-            (*result.unusable, *(scene.scene for scene in scenes if scene.unusable)),
-            "its retrievals gave no usable value",
+            result.unusable_scenes, "its retrievals gave no usable value"
         ),
         "files refused": _refused(campaign, result),
         "scenes without product": result.empty_scenes,
@@ -308,6 +306,8 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
             logger.warning("%s: %s", name, reason)
         if len(reasons) > _MOST_NAMED:
             logger.warning("... and %d more %s", len(reasons) - _MOST_NAMED, kind)
+    for name, trace in list(result.internal.items())[:_MOST_NAMED]:
+        logger.error("scene %s, internal error: please report it\n%s", name, trace)
     numbers = {kind: len(reasons) for kind, reasons in problems.items()}
     numbers["more unused scenes and files on unchanged days"] = result.more_unused
     summary = ", ".join(f"{number} {kind}" for kind, number in numbers.items() if number)

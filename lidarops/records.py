@@ -286,6 +286,9 @@ class SceneOutcome:
     left_out: tuple[LeftOut, ...] = ()
     """Requested steps that are not in `plan`, because their product or channel was not made."""
 
+    internal: str = ""
+    """Traceback of the internal error (a bug of lidarops) that `error` names; else empty."""
+
     @property
     def unusable(self) -> bool:
         """Whether all values of the products that should have usable ones are rejected."""

@@ -116,6 +116,8 @@ class LastTry:
 
     key: str
     error: str
+    internal: str
+    """Traceback if the error is internal, a bug of lidarops; else empty."""
     final: bool
     crashes: int
     day: int
@@ -215,7 +217,7 @@ class Ledger(Granules):
         """Note the start of a scene; the note stays if the process dies."""
         row = {
             "campaign": self.campaign, "scene": scene, "day": day, "key": "", "run": run,
-            "error": "", "final": False, "crashes": 1,
+            "error": "", "internal": "", "final": False, "crashes": 1,
         }  # fmt: skip
         with self.transaction() as connection:
             self._hold(connection, token)
@@ -340,8 +342,8 @@ class Ledger(Granules):
         outcome = entry.outcome
         row = {
             "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
-            "key": entry.key, "run": run, "error": outcome.error, "final": entry.final,
-            "crashes": 0,
+            "key": entry.key, "run": run, "error": outcome.error, "internal": outcome.internal,
+            "final": entry.final, "crashes": 0,
         }  # fmt: skip
         connection.execute(self.upsert(SCENE), row)
         stages = [
@@ -462,7 +464,13 @@ class Ledger(Granules):
         """Return the result of the last try of every scene on days `first` to `last`."""
         known = SCENE.c
         query = sa.select(
-            known.scene, known.key, known.error, known.final, known.crashes, known.day
+            known.scene,
+            known.key,
+            known.error,
+            known.internal,
+            known.final,
+            known.crashes,
+            known.day,
         ).where(known.campaign == self.campaign, known.day.between(first, last))
         with self.transaction() as connection:
             return {row[0]: LastTry(*row[1:]) for row in connection.execute(query)}
@@ -485,6 +493,15 @@ class Ledger(Granules):
         )
         with self.transaction() as connection:
             return {row.scene: row.error for row in connection.execute(query)}
+
+    def internal_errors(self) -> dict[str, str]:
+        """Return scene -> traceback of the scenes whose last try ended with an internal error."""
+        known = SCENE.c
+        query = sa.select(known.scene, known.internal).where(
+            known.campaign == self.campaign, known.internal != ""
+        )
+        with self.transaction() as connection:
+            return {row.scene: row.internal for row in connection.execute(query)}
 
     def unusable_scenes(self, *, without: Collection[str] = ()) -> list[str]:
         """Return the scenes whose retrievals gave no usable value; see `SceneOutcome.unusable`.

@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 5
+SCHEMA_VERSION: Final = 6
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -144,6 +144,8 @@ SCENE = sa.Table(
     sa.Column("key", _DIGEST, nullable=False),
     sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
     sa.Column("error", sa.Text, nullable=False),
+    # Traceback if the error is internal, a bug of lidarops; else empty.
+    sa.Column("internal", sa.Text, nullable=False),
     # Whether another try on the same inputs would fail again.
     sa.Column("final", sa.Boolean, nullable=False),
     # Number of tries that started and did not end because the process died.

@@ -295,8 +295,8 @@ def reprocess(
             summary = _run_summary(settings, result, page)
             summary |= {"no_scene_selected": no_scene, "removed": removed or 0}
             typer.echo(json.dumps({**summary, "unreported": report_note}, indent=2))
-        elif page is not None:
-            typer.echo(f"report:   {page}")
+        else:
+            _print_places(result, page)
     if removed is not None and not as_json:
         show(_orphans_table(result, removed))
     if result.signal:
@@ -454,9 +454,10 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "status": result.status.value,
         "report": None if page is None else str(page),
         "scenes": len(scenes),
-        "failed_scenes": {
-            **result.failures,
-            **{scene.scene: scene.error for scene in scenes if scene.error},
+        "failed_scenes": dict(result.failed_scenes),
+        "internal_errors": {
+            scene: {"error": error, "traceback": result.internal[scene]}
+            for scene, error in result.internal_errors.items()
         },
         "unusable_scenes": list(result.unusable_scenes),
         "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
@@ -474,6 +475,22 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             orphan.path: orphan.reason for orphan in result.orphans if orphan.requested
         },
     }
+
+
+def _print_places(result: Result, page: Path | None) -> None:
+    """Print where the report and the tracebacks of internal errors are."""
+    from lidarops.figures.wording import counted
+
+    if page is not None:
+        typer.echo(f"report:   {page}")
+    if result.internal:
+        on_page = page is not None and set(result.internal) <= _processed_scenes(result)
+        scenes = counted(len(result.internal), "scene")
+        place = page if on_page else "the output of the same command with --json"
+        typer.echo(
+            f"{scenes} ended with an internal error: please report it,"
+            f" with the traceback in {place}"
+        )
 
 
 def _refused(campaign: Campaign, result: Result) -> list[Granule]:

@@ -112,14 +112,38 @@ def sources_in(roots: Mapping[str, Sequence[Path]], cache_folder: Path | None = 
 
 
 @cache
+def source_version() -> str:
+    """Return a digest of all sources of lidarops and of packages with kinds of product.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits; changes also with sources that can change no product.
+    """
+    digest = hashlib.sha256()
+    for package, folders in _roots().items():
+        for folder in folders:
+            for path in sorted(folder.rglob("*.py")):
+                content = path.read_bytes()
+                name = path.relative_to(folder).as_posix()
+                digest.update(f"{package}/{name}\0{len(content)}\0".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+@cache
 def _installed() -> Sources:
+    return sources_in(_roots(), _cache_folder())
+
+
+def _roots() -> dict[str, tuple[Path, ...]]:
+    """Return the folders of lidarops and of the packages with kinds of product."""
     packages = {"lidarops", *(kind.package.partition(".")[0] for kind in kinds().values())}
     roots: dict[str, tuple[Path, ...]] = {}
     for package in sorted(packages):
         spec = find_spec(package)
         locations = spec.submodule_search_locations if spec else None
         roots[package] = tuple(Path(location) for location in locations or ())
-    return sources_in(roots, _cache_folder())
+    return roots
 
 
 def _cache_folder() -> Path | None:

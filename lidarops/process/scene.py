@@ -9,6 +9,7 @@ import hashlib
 import os
 import tempfile
 import time
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -20,7 +21,7 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, InstrumentFacts, Station, as_settings
-from lidarops.errors import LidarOpsError, ProductError, SceneError
+from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.kinds import kinds
 from lidarops.netcdf import provenance
 from lidarops.netcdf.code_version import code_version
@@ -48,20 +49,7 @@ from lidarops.records import (
     Status,
     Step,
 )
-from lidarops.system.stores import RemoteStore
-
-# Raised by damaged data, disks or libraries. Anything else is a bug of lidarops, which must not
-# end up as an entry of a report.
-_SCENE_ERRORS = (
-    LidarOpsError,
-    OSError,
-    ValueError,
-    ArithmeticError,
-    LookupError,
-    RuntimeError,
-    MemoryError,
-)
-
+from lidarops.system.stores import RemoteStore, without_keys
 
 _VANISHED: Final = "vanished after it was catalogued (run lidarops catalog again)"
 
@@ -98,7 +86,8 @@ def process_scene(job: Job) -> SceneOutcome:
     Returns
     -------
     SceneOutcome
-        Also for damaged data or a failing disk, which do not raise: `error` states the cause.
+        Also for damaged data, a failing disk or a bug, which do not raise: `error` states the
+        cause, and `internal` the traceback of a bug.
     """
     return attempt(job)[0]
 
@@ -116,12 +105,15 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     try:
         with _Archive.of(job.campaign.archive).local(job.scene) as root:
             outcome = _process(job, root)
-        return replace(outcome, cpu_seconds=time.thread_time() - begin), True
-    except _SCENE_ERRORS as error:
-        text = str(error) if isinstance(error, LidarOpsError | OSError) else repr(error)
-        return failed_outcome(job, text), not isinstance(
-            error, ProductError | OSError | MemoryError
-        )
+    except LidarOpsError as error:
+        may_pass = isinstance(error, CatalogError | ProductError) and not error.wrong_use
+        return failed_outcome(job, str(error)), not may_pass
+    except MemoryError as error:
+        return failed_outcome(job, str(_too_large(error))), False
+    except Exception as error:  # noqa: BLE001 - a bug in one scene must not stop the others
+        # A disk may have failed where its error is not expected.
+        return internal_error(job, error), not isinstance(error, OSError)
+    return replace(outcome, cpu_seconds=time.thread_time() - begin), True
 
 
 def failed_outcome(job: Job, error: str) -> SceneOutcome:
@@ -135,6 +127,26 @@ def failed_outcome(job: Job, error: str) -> SceneOutcome:
         granules=len(scene.granules),
         plan=job.plan,
         error=error,
+    )
+
+
+def internal_error(job: Job, error: BaseException) -> SceneOutcome:
+    """Return the outcome of a scene that was ended by a bug of lidarops, with its traceback."""
+    words = _storable("".join(traceback.format_exception_only(error)).strip())
+    outcome = failed_outcome(job, f"internal error: {words} (a bug of lidarops, not of the data)")
+    return replace(outcome, internal=_storable("".join(traceback.format_exception(error))))
+
+
+def _storable(text: str) -> str:
+    """Return a text without keys, and with escapes for what a database cannot hold."""
+    return without_keys(text).encode("utf-8", "backslashreplace").decode().replace("\0", r"\0")
+
+
+def _too_large(error: MemoryError) -> SceneError:
+    return SceneError(
+        f"the scene does not fit in memory: {error or 'no memory left'}",
+        remedy="process fewer profiles at a time with a smaller --profiles-per-chunk, or give each"
+        " worker more memory",
     )
 
 
@@ -517,6 +529,17 @@ class _RemoteArchive(_Archive):
     @contextmanager
     def local(self, scene: Scene) -> Iterator[Path]:
         paths = [granule.path for granule in (*scene.granules, *scene.dark)]
-        with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        with self._temporary_folder() as folder:
             RemoteStore(self._root).fetch(paths, Path(folder))
             yield Path(folder)
+
+    @staticmethod
+    def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
+        try:
+            # What cannot be removed does not make the products wrong.
+            return tempfile.TemporaryDirectory(prefix="lidarops-", ignore_cleanup_errors=True)
+        except OSError as error:
+            raise CatalogError(
+                f"no temporary folder for fetched raw files can be made: {error}",
+                remedy="make space, or set TMPDIR to a folder you can write to",
+            ) from error

@@ -104,7 +104,11 @@ class RawFile:
             self._descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
         except (OSError, ValueError) as error:
             raise RawFormatError(f"cannot be opened: {error}", file=self.path) from None
-        status = os.fstat(self._descriptor)
+        try:
+            status = os.fstat(self._descriptor)
+        except OSError as error:
+            os.close(self._descriptor)
+            raise self._unreadable(error) from None
         self.size = status.st_size
         self.mtime_ns = status.st_mtime_ns
         if not stat.S_ISREG(status.st_mode):

@@ -82,6 +82,8 @@ class InstrumentRow:
     instrument: str
     scenes: int
     failed: int
+    """Without those that ended with an internal error."""
+    internal: int
     granules: int
     refused: int
     products: int
@@ -98,7 +100,8 @@ class InstrumentRow:
 def summary(record: RunRecord) -> list[tuple[str, str]]:
     """Return the terms and values at the head of the report."""
     done = [scene for scene in record.scenes if not scene.error]
-    failed = len(record.scenes) - len(done)
+    failed, internal = len(failed_scenes(record)), len(internal_errors(record))
+    ended_internally = f", {internal:,} with an internal error" if internal else ""
     processed = sum(max(scene.granules - len(scene.refused), 0) for scene in done)
     refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
     products = Counter(p.kind for scene in record.scenes for p in scene.products)
@@ -110,7 +113,10 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
         ("Started", moment(record.started)),
         ("Duration", duration((record.finished - record.started).total_seconds())),
         *_cpu_time(record),
-        ("Scenes", counted(len(record.scenes), "scene") + f", {failed:,} failed"),
+        (
+            "Scenes",
+            counted(len(record.scenes), "scene") + f", {failed:,} failed{ended_internally}",
+        ),
         ("Products", f"{products.total():,}" + (f": {kinds}" if kinds else "")),
         ("Granules", f"{processed:,} processed, {refused:,} refused"),
         *(
@@ -118,6 +124,16 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
             for kind, values, flagged in _flagged_by_kind(record)
         ),
     ]
+
+
+def failed_scenes(record: RunRecord) -> list[SceneOutcome]:
+    """Return the scenes that failed, without those that ended with an internal error."""
+    return [scene for scene in record.scenes if scene.error and not scene.internal]
+
+
+def internal_errors(record: RunRecord) -> list[SceneOutcome]:
+    """Return the scenes that ended with an internal error, a bug of lidarops."""
+    return [scene for scene in record.scenes if scene.internal]
 
 
 def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
@@ -138,7 +154,7 @@ def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
 
 def verdict(record: RunRecord) -> str:
     """Return the outcome of the run in one sentence."""
-    failed = sum(bool(scene.error) for scene in record.scenes)
+    failed, internal = len(failed_scenes(record)), len(internal_errors(record))
     refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
     if not record.scenes:
         tail = f" {counted(refused, 'granule')} refused." if refused else ""
@@ -148,7 +164,8 @@ def verdict(record: RunRecord) -> str:
         p.usable == 0 for scene in record.scenes if not scene.unusable for p in scene.products
     )
     tail = f" {counted(rest, 'product')} without a usable value." if rest else ""
-    parts = [f"{counted(failed, 'scene')} failed"] if failed else []
+    parts = [f"{counted(internal, 'scene')} ended with an internal error"] if internal else []
+    parts += [f"{counted(failed, 'scene')} failed"] if failed else []
     parts += [f"{counted(refused, 'granule')} refused"] if refused else []
     if unusable:
         number = counted(len(unusable), "scene")
@@ -331,7 +348,7 @@ def moment(time: datetime) -> str:
 def outcome_word(scene: SceneOutcome) -> str:
     """Return the outcome of a scene in a word or two."""
     if scene.error:
-        return "failed"
+        return "internal error" if scene.internal else "failed"
     if scene.unusable:
         return "no usable value"
     return "done" if scene.products else "no product"
@@ -367,7 +384,8 @@ def _instrument_row(
         station=station,
         instrument=name,
         scenes=len(scenes),
-        failed=sum(bool(scene.error) for scene in scenes),
+        failed=sum(bool(scene.error) and not scene.internal for scene in scenes),
+        internal=sum(bool(scene.internal) for scene in scenes),
         granules=sum(scene.granules for scene in scenes),
         refused=refused_before + sum(len(scene.refused) for scene in scenes),
         products=sum(len(scene.products) for scene in scenes),

@@ -9,7 +9,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
@@ -296,6 +296,7 @@ class _Pass:
             fresh=gathered.fresh,
             orphans=tuple(gathered.orphans),
             failures=self._store.failures(),
+            internal=self._store.internal_errors(),
             # Orphans are never made again, so they would be reported for ever.
             unusable=tuple(
                 self._store.unusable_scenes(without={orphan.path for orphan in gathered.orphans})
@@ -487,9 +488,8 @@ class _Pass:
             return None
         for judged in self._gathered.held:
             job = Job(self._campaign, judged.scene, judged.plan)
-            self._session.add(
-                failed_outcome(job, f"{judged.held} (not tried again, because nothing has changed)")
-            )
+            error = f"{judged.held} (not tried again, because nothing has changed)"
+            self._session.add(replace(failed_outcome(job, error), internal=judged.internal))
         empty_scenes = {
             judged.scene.id: judged.empty_reason for judged in self._gathered.empty_scenes
         }

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
 from lidarops.netcdf.code_version import joint_code_version
-from lidarops.process.scene import Job, attempt, failed_outcome
+from lidarops.process.scene import Job, attempt, failed_outcome, internal_error
 from lidarops.records import SceneOutcome
 from lidarops.run import worker
 from lidarops.system.processes import keep_memory, start_method
@@ -412,7 +412,10 @@ def _outcome_of(future: Future, job: Job) -> EndedScene | None:
         return EndedScene(job, *result)
     if isinstance(error, KilledWorker):
         return None
-    return EndedScene(job, failed_outcome(job, f"the worker failed: {error!r}"), final=False)
+    if isinstance(error, OSError | ImportError | MemoryError):
+        return EndedScene(job, failed_outcome(job, f"the worker failed: {error!r}"), final=False)
+    error = error.with_traceback(future.traceback())
+    return EndedScene(job, internal_error(job, error), final=False)
 
 
 def _error_of(future: Future) -> BaseException | None:

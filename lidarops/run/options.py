@@ -55,6 +55,8 @@ class Result:
     orphans: tuple[Orphan, ...]
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""
+    internal: Mapping[str, str]
+    """Scene -> traceback, of those that ended with an internal error: a bug of lidarops."""
     unusable: tuple[str, ...]
     """Scenes whose retrievals gave no usable value; orphaned products do not count."""
     empty_scenes: Mapping[str, str]
@@ -68,6 +70,23 @@ class Result:
     comes first."""
     signal: int = 0
     """The signal that stopped the run."""
+
+    @property
+    def failed_scenes(self) -> Mapping[str, str]:
+        """Scene -> error, now or since an earlier run, without internal errors."""
+        return self._errors(internal=False)
+
+    @property
+    def internal_errors(self) -> Mapping[str, str]:
+        """Scene -> internal error, now or since an earlier run."""
+        return self._errors(internal=True)
+
+    def _errors(self, *, internal: bool) -> Mapping[str, str]:
+        scenes = () if self.record is None else self.record.scenes
+        errors = {**self.failures, **{scene.scene: scene.error for scene in scenes if scene.error}}
+        return {
+            scene: error for scene, error in errors.items() if (scene in self.internal) is internal
+        }
 
     @property
     def unusable_scenes(self) -> tuple[str, ...]:

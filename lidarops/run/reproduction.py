@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 import tempfile
@@ -31,6 +32,8 @@ from lidarops.process.scene import Job, process_scene
 from lidarops.raw import licel
 from lidarops.records import Granule, InputRecord, LeftOut, Plan, Role, Scene, Status, Step
 from lidarops.system.stores import RemoteStore, is_url
+
+_LOG = logging.getLogger(__name__)
 
 _RAW: Final = (Role.SIGNAL, Role.DARK)
 """Roles of files in the archive; paths of other inputs start from the campaign folder."""
@@ -384,6 +387,8 @@ def _made_again(origin: _Origin, root: Path, folder: Path, out: Path) -> Iterato
                 only=channel,
             )
         )
+    if outcome.internal:
+        _LOG.error("scene %s: %s\n%s", outcome.scene, outcome.error, outcome.internal)
     if outcome.error:
         yield Difference("processing", origin.plan.scene, outcome.error)
         return

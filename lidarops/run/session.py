@@ -111,7 +111,7 @@ class Session:
         entry = SceneEntry(
             outcome=outcome,
             day=judged.day,
-            key=self._judge.key(judged),
+            key=self._judge.key(judged, internal=bool(outcome.internal)),
             final=final,
             products=tuple(new),
             digests=_unknown_digests(judged.scene, outcome),
@@ -243,7 +243,10 @@ class Session:
             "products": [record.path for record in outcome.products],
             "seconds": dict(outcome.seconds),
         }
-        if outcome.error:
+        if outcome.internal:
+            words = (outcome.scene, outcome.error, outcome.internal)
+            _LOG.error("scene %s: %s\n%s", *words, extra=fields)
+        elif outcome.error:
             _LOG.error("scene %s failed: %s", outcome.scene, outcome.error, extra=fields)
         else:
             _LOG.info(

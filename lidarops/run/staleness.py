@@ -22,7 +22,8 @@ from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.netcdf.code_version import code_version, joint_code_version
+from lidarops.netcdf.code_version import code_version, joint_code_version, source_version
+from lidarops.netcdf.provenance import package_versions
 from lidarops.plan import product_dependence
 from lidarops.plan.product_dependence import ProductKey
 from lidarops.plan.scene_plan import plan_scene
@@ -72,6 +73,8 @@ class Judgement:
     fresh: int
     held: str = ""
     """Why the scene is not tried again although products are missing."""
+    internal: str = ""
+    """Traceback if it is not tried again because of an internal error; else empty."""
     suspect: bool = False
     """Whether an earlier try killed its process."""
     empty_reason: str = ""
@@ -242,7 +245,9 @@ class Judge:
         orphans = leftovers.orphaned_products(
             planned, made.values(), self._campaign, self._other_files, fates.of
         )
-        orphaned = {product.day for product, _ in orphans}
+        unsettled = {product.day for product, _ in orphans}
+        # The signature of a day does not hold all that may end an internal error.
+        unsettled |= {judged.day for judged in judgements if judged.internal}
         digests, self._digests = self._digests, {}
         counts = _counts(judgements, cut.set_aside)
         gone = {judged.scene.id for judged in judgements if self._healed(judged, tried)}
@@ -260,7 +265,7 @@ class Judge:
                 if self._selection.product(product, self._campaign)
             ),
             set_aside=cut.set_aside,
-            unused={day: counts[day] for day in days if day not in orphaned}
+            unused={day: counts[day] for day in days if day not in unsettled}
             if self._selection.everything
             else {},
             open=frozenset(judged.day for judged in judgements if judged.stale),
@@ -315,9 +320,12 @@ class Judge:
         )
         if last is None or self._force or not stale:
             return judged
-        if last.final and last.error and last.key == judged.key:
-            return replace(judged, stale=(), held=last.error)
-        return judged
+        if not (last.final and last.error):
+            return judged
+        key = self.key(judged, internal=True) if last.internal else judged.key
+        if last.key != key:
+            return judged
+        return replace(judged, stale=(), held=last.error, internal=last.internal)
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement by which every product of a scene is stale."""
@@ -325,15 +333,24 @@ class Judge:
         stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
         return Judgement(scene, whole, whole, day_of(scene.start), "", stale, 0)
 
-    def key(self, judged: Judgement) -> str:
+    def key(self, judged: Judgement, *, internal: bool = False) -> str:
         """Return the digest of everything that may change the outcome of a scene.
 
         Raw files enter by size and modification time, because their contents become known at
         different moments. A scene whose files were touched is therefore tried once more.
+
+        Parameters
+        ----------
+        judged : Judgement
+        internal : bool
+            Whether the outcome is an internal error. Its cause may lie in any source of lidarops
+            or in another package, so the key depends on all of them.
         """
         scene, whole = judged.scene, judged.plan
+        software = [source_version(), package_versions()] if internal else []
         return product_dependence.digest(
             [
+                *software,
                 whole.hash,
                 joint_code_version(_kinds(whole)),
                 [self._settings.of(scene, whole, channel) for channel in _channels(whole)],

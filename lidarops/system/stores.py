@@ -28,13 +28,17 @@ _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
 
-# Exceptions of drivers besides OSError; only loaded drivers can raise them.
+# Exceptions of drivers besides OSError and EOFError; only loaded drivers can raise them.
 _DRIVER_ERRORS: Final = (
     ("aiohttp", "ClientError"),
     ("botocore.exceptions", "BotoCoreError"),
     ("botocore.exceptions", "ClientError"),
     ("google.auth.exceptions", "GoogleAuthError"),
     ("gcsfs.retry", "HttpError"),
+    ("ftplib", "Error"),
+    ("paramiko", "SSHException"),
+    ("zipfile", "BadZipFile"),
+    ("zlib", "error"),
 )
 
 
@@ -80,7 +84,7 @@ class RemoteStore:
     Raises
     ------
     CatalogError
-        If fsspec does not know the URL or lacks its driver.
+        If fsspec does not know the URL or lacks its driver, or the store cannot be reached.
     """
 
     def __init__(self, url: str) -> None:
@@ -90,7 +94,9 @@ class RemoteStore:
         """The URL without credentials."""
         self._scheme = url.partition("://")[0]
         try:
-            self._fs, prefix = fsspec.core.url_to_fs(url)
+            # Some drivers connect here.
+            with self._errors_as(CatalogError, "cannot be reached"):
+                self._fs, prefix = fsspec.core.url_to_fs(url)
         except (ValueError, ImportError) as error:
             raise CatalogError(
                 f"the URL cannot be opened: {without_keys(str(error))}",
@@ -170,9 +176,9 @@ class RemoteStore:
             If the store cannot be reached.
         """
         pairs = [(self._name(path), str(folder / path)) for path in paths]
-        for path in paths:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
         with self._errors_as(CatalogError, "cannot be read"):
+            for path in paths:
+                (folder / path).parent.mkdir(parents=True, exist_ok=True)
             try:
                 self._fs.get(*_columns(pairs), batch_size=_BATCH)
             except FileNotFoundError:
@@ -327,7 +333,11 @@ def _append_journal(journal: Path, products: Mapping[str, str]) -> None:
 
 def _failures() -> tuple[type[Exception], ...]:
     loaded = ((sys.modules.get(module), name) for module, name in _DRIVER_ERRORS)
-    return (OSError, *(getattr(module, name) for module, name in loaded if module is not None))
+    return (
+        OSError,
+        EOFError,
+        *(getattr(module, name) for module, name in loaded if module is not None),
+    )
 
 
 def _stamp(info: dict[str, Any]) -> int:

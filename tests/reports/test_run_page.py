@@ -263,6 +263,23 @@ class TestDegenerateRuns:
         assert (row["scenes"], row["failed"], row["refused"]) == (3, 3, 9)
         assert row["flagged"] == "no value"
 
+    def test_internal_errors_stand_apart_from_failed_scenes(self, tmp_path):
+        trace = "Traceback (most recent call last):\n  File <a>\nTypeError: no"
+        bug = outcome("s1", error="internal error: TypeError: no", internal=trace, seconds={})
+        scenes = [outcome("s0", error="bad data", seconds={}), bug]
+        run = run_record(tmp_path, scenes)
+        page = built(run, tmp_path / "report")
+        assert "1 scene ended with an internal error and 1 scene failed." in page.text
+        failed, _, internal = page.text.partition("Internal errors These scenes")
+        assert "bad data" in failed.rpartition("Failed scenes")[2]
+        assert "TypeError" not in failed.rpartition("Failed scenes")[2]
+        assert "traceback Traceback (most recent call last): File <a> TypeError: no" in internal
+        (row,) = run_page.summary_rows(run)
+        assert (row["scenes"], row["failed"], row["internal errors"]) == (2, 1, 1)
+        assert run_tables.outcome_word(bug) == "internal error"
+        without = built(run_record(tmp_path, scenes[:1]), tmp_path / "without")
+        assert "internal" not in without.ids
+
     def test_a_scene_without_products_is_not_done(self, tmp_path):
         page = built(run_record(tmp_path, [outcome("quiet")]), tmp_path / "report")
         assert "20 no product" in page.text
@@ -523,6 +540,7 @@ def test_summary_rows_are_plain(simulated):
         "instrument": "horizontal",
         "scenes": 1,
         "failed": 0,
+        "internal errors": 0,
         "granules": 96,
         "refused": 0,
         "products": 2,

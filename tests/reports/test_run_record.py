@@ -108,6 +108,7 @@ outcomes = st.builds(
     refused=some(granules),
     inputs=some(st.builds(InputRecord, text, st.sampled_from(Role), text)),
     error=text,
+    internal=text,
     seconds=st.dictionaries(text, st.floats(allow_nan=False, allow_infinity=False), max_size=3),
     left_out=some(left_out),
 )

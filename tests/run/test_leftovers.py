@@ -47,6 +47,7 @@ def _json_output(archive: Archive) -> dict[str, object]:
     summary = json.loads(result.stdout)
     reasons = (
         "failed_scenes",
+        "internal_errors",
         "unusable_scenes",
         "refused_files",
         "files_set_aside",

@@ -1,0 +1,200 @@
+"""A bug of lidarops ends its scene only, and is reported apart from bad data."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support import bugs
+from support.archives.scene_jobs import scene_jobs
+from support.archives.small_archive import Archive
+from typer.testing import CliRunner
+
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.process.scene import process_scene
+from lidarops.records import RunRecord
+from lidarops.run import staleness
+from lidarops.run.archive import Options, bring_up_to_date, reprocess
+from lidarops.run.executor import local_client
+
+DAY = "2026-03-02"
+SCENE = "rich_20260302T000000"
+OTHERS = {"rich_20260301T000000", "poor_20260301T000000", "poor_20260302T000000"}
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """A small archive of four scenes, one of which will meet the bug."""
+    return Archive(tmp_path, days=2)
+
+
+def _made_in(record: RunRecord) -> set[str]:
+    return {scene.scene for scene in record.scenes if scene.products and not scene.error}
+
+
+@pytest.mark.parametrize("kind", [TypeError, KeyError, AssertionError, IndexError])
+def test_a_bug_ends_its_scene_only_and_its_traceback_is_kept(
+    archive: Archive, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bugs.insert(kind("no such thing"), DAY, monkeypatch)
+    log = archive.folder / "log"
+    command = ["reprocess", str(archive.file), "--log-file", str(log)]
+    run = CliRunner().invoke(app, [*command, "--json"])
+    assert run.exit_code == 1
+    summary = json.loads(run.stdout)
+    (scene,) = summary["internal_errors"]
+    found = summary["internal_errors"][scene]
+    assert (scene, summary["failed_scenes"]) == (SCENE, {})
+    assert f"internal error: {kind.__name__}: " in found["error"]
+    assert "a bug of lidarops, not of the data" in found["error"]
+    assert found["traceback"].startswith("Traceback (most recent call last)")
+    assert "in fit_with_a_bug" in found["traceback"]
+    assert "ERROR" in log.read_text()
+    assert found["traceback"].strip() in log.read_text()
+    with Store(archive.write().catalog_url, "small") as store:
+        assert store.internal_errors() == {SCENE: found["traceback"]}
+        assert {row["scene"] for row in store.products()} == OTHERS
+    page = Path(summary["report"]).read_text()
+    assert "1 scene ended with an internal error" in page
+    assert "in fit_with_a_bug" in page
+    shown = CliRunner().invoke(app, [*command, "--force"])
+    assert shown.exit_code == 1
+    assert "1 scene ended with an internal error: please report it" in shown.stdout
+    assert "index.html" in shown.stdout.partition("with the traceback in")[2]
+
+
+def test_a_bug_is_met_again_only_after_the_code_has_changed(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        bugs.insert(TypeError("no such thing"), DAY, patch)
+        first = bring_up_to_date(archive.write())
+    again = bring_up_to_date(archive.write())
+    assert again.record is None
+    assert again.has_failures
+    assert again.internal == first.internal
+    assert (set(again.internal_errors), again.failed_scenes) == ({SCENE}, {})
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    assert shown.exit_code == 1
+    assert "with the traceback in the output of the same command with --json" in shown.stdout
+    monkeypatch.setattr(staleness, "source_version", lambda: "with the bug mended")
+    healed = bring_up_to_date(archive.write())
+    assert _made_in(healed.record) == {SCENE}
+    assert not healed.failures
+
+
+def test_a_changed_input_is_tried_again(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        bugs.insert(TypeError("no such thing"), DAY, patch)
+        bring_up_to_date(archive.write())
+    archive.flip("raw/rich/h11")
+    assert not bring_up_to_date(archive.write()).failures
+
+
+def test_a_scene_that_is_not_tried_again_keeps_its_traceback_in_the_next_report(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bugs.insert(TypeError("no such thing"), DAY, monkeypatch)
+    first = bring_up_to_date(archive.write())
+    archive.flip("raw/poor/h11")
+    (held,) = (scene for scene in reprocess(archive.write()).scenes if scene.internal)
+    assert {held.scene: held.internal} == first.internal
+    assert "not tried again" in held.error
+
+
+@pytest.mark.parametrize("insert", [bugs.insert, bugs.insert_in_the_worker])
+def test_a_bug_on_a_worker_comes_back_with_the_traceback_of_the_worker(
+    archive: Archive, insert: Callable[[Exception, str], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    archive.raw("rich/h20", 2 * 1440 + 600, seed=3)
+    with local_client(1) as client:
+        client.run(insert, KeyError("no such thing"), DAY)
+        result = bring_up_to_date(archive.write(), client=client)
+    assert _made_in(result.record) >= {"rich_20260301T000000", "rich_20260303T000000"}
+    assert SCENE in result.internal_errors
+    assert "internal error: KeyError: 'no such thing'" in result.internal_errors[SCENE]
+    assert "_with_a_bug" in result.internal[SCENE]
+    assert "executor.py" in result.internal[SCENE] or "scene.py" in result.internal[SCENE]
+    assert result.internal[SCENE] in caplog.text
+    assert not result.failed_scenes
+
+
+def test_too_little_memory_is_no_bug(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    bugs.insert(MemoryError("Unable to allocate 9 TiB"), DAY, monkeypatch)
+    result = bring_up_to_date(archive.write())
+    assert not result.internal
+    assert "does not fit in memory: Unable to allocate 9 TiB" in result.failed_scenes[SCENE]
+    assert "--profiles-per-chunk" in result.failed_scenes[SCENE]
+
+
+def test_an_unexpected_error_of_a_disk_is_tried_again(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        bugs.insert(OSError(errno.EIO, "Input/output error"), DAY, patch)
+        assert set(bring_up_to_date(archive.write()).internal) == {SCENE}
+    assert not bring_up_to_date(archive.write()).failures
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit])
+def test_a_request_to_stop_is_no_error(
+    archive: Archive, kind: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bugs.insert(kind(), DAY, monkeypatch)
+    (job,) = (job for job in scene_jobs(archive.write()) if job.scene.id == SCENE)
+    with pytest.raises(kind):
+        process_scene(job)
+
+
+def _cut(archive: Archive) -> None:
+    path = archive.folder / "raw/rich/h10"
+    path.write_bytes(path.read_bytes()[:500])
+
+
+def _blank(archive: Archive) -> None:
+    path = archive.folder / "raw/rich/h10"
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def _shift(archive: Archive) -> None:
+    """Move the counts by one byte, so that no CRLF follows them."""
+    path = archive.folder / "raw/rich/h10"
+    data = path.read_bytes()
+    path.write_bytes(data[:-9000] + b"\0" + data[-9000:-1])
+
+
+def _no_sounding(archive: Archive) -> None:
+    (archive.folder / "air.csv").unlink()
+
+
+def _no_overlap(archive: Archive) -> None:
+    (archive.folder / "overlap.csv").write_bytes(b"\xff\xfe\0range")
+
+
+def _no_folder(archive: Archive) -> None:
+    shutil.rmtree(archive.folder / "out/products", ignore_errors=True)
+    (archive.folder / "out/products").write_text("a file where a folder should be")
+
+
+@pytest.mark.parametrize(
+    "damage", [_cut, _blank, _shift, _no_sounding, _no_overlap, _no_folder]
+)  # fmt: skip
+def test_damage_after_the_scan_is_bad_data_and_no_bug(
+    archive: Archive, damage: Callable[[Archive], None]
+) -> None:
+    damaged = []
+
+    def damage_once(_granules: int) -> None:
+        if not damaged:
+            damage(archive)
+            damaged.append(True)
+
+    result = bring_up_to_date(archive.write(), options=Options(expect=damage_once))
+    assert result.has_failures
+    assert not result.internal
+    assert any(scene.error or scene.refused for scene in result.record.scenes)
