@@ -20,6 +20,7 @@ import hashlib
 import os
 import stat
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from types import TracebackType
 from typing import Any, Self
@@ -124,7 +125,9 @@ class RawFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        os.close(self._descriptor)
+        # What was read is right, whether the file can be closed or not.
+        with suppress(OSError):
+            os.close(self._descriptor)
 
     def read_header(self) -> Header:
         """Read and check the header.

@@ -241,6 +241,22 @@ def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
     assert forced.record is not None
 
 
+@pytest.mark.usefixtures("prefect_server")
+def test_an_internal_error_is_reported_apart_with_its_traceback(
+    campaign_file: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **_settings: object) -> None:
+        raise TypeError("no such thing")
+
+    # The scene shows no signal, so its section is left empty.
+    monkeypatch.setattr("lidarops.retrieve.homogeneous.labeled.empty_fit", broken)
+    state = reprocess(str(campaign_file), return_state=True)
+    assert (state.name, state.type) == (WITH_FAILURES, StateType.COMPLETED)
+    assert state.message == "1 scenes ended with an internal error, 1 files refused"
+    assert "internal error: TypeError: no such thing" in caplog.text
+    assert "in broken" in caplog.text
+
+
 def without_profile(campaign_file: Path) -> None:
     """Make the scene of the campaign fail by a missing overlap function."""
     tree = yaml.safe_load(campaign_file.read_text())
