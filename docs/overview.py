@@ -6,7 +6,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidarops.figures.product_figures import overview
+from lidarops.products.homogeneous.report_figures import overview
 
 DEMO = Path(__file__).resolve().parents[1] / "demo"
 

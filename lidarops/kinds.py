@@ -1,8 +1,9 @@
 """Registry of the kinds of product, which are found by entry point.
 
 A kind of product is one package: its ``__init__`` holds a `Kind`, and its modules ``settings``,
-``steps``, ``variables``, ``flags`` and ``figures`` hold everything else about it. A package outside
-lidarops adds a kind by an entry point of the group ``lidarops.product_kinds``::
+``steps``, ``variables``, ``flags``, ``figures`` and ``report_figures`` hold everything else about
+it. Without the last two, its main variable is drawn. A package outside lidarops adds a kind by an
+entry point of the group ``lidarops.product_kinds``::
 
     [project.entry-points."lidarops.product_kinds"]
     integrated = "mypackage.integrated:KIND"
@@ -16,6 +17,8 @@ from enum import StrEnum
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from math import inf
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -75,6 +78,11 @@ class Kind:
                 remedy=f"complete or remove the package {self.package}",
             ) from error
 
+    def optional_part(self, module: str, name: str) -> Any | None:
+        """Return an object of one of the modules of the kind; None if it has no such module."""
+        has = find_spec(f"{self.package}.{module}") is not None
+        return self.part(module, name) if has else None
+
 
 @cache
 def kinds() -> Mapping[str, Kind]:
@@ -125,3 +133,9 @@ def kind_of(name: str) -> Kind:
 def kinds_of(scope: Scope) -> tuple[Kind, ...]:
     """Return the kinds of product of a scope, in the order of their rank."""
     return tuple(kind for kind in kinds().values() if kind.scope is scope)
+
+
+def rank_of(name: str) -> float:
+    """Return the rank of a kind of product by its name; infinite if there is none."""
+    known = kinds().get(name)
+    return known.rank if known else inf

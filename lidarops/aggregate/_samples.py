@@ -13,16 +13,10 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened, within
-from lidarops.aggregate.means_variables import (
-    INTERVALS,
-    Budget,
-    averaged,
-    budget_of,
-    systematic,
-)
+from lidarops.aggregate.means_variables import averaged, budget_of, systematic
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import QUALITY_FLAG, Row
+from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +68,7 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
 def _sample(product: xr.Dataset, kind: str, row: Row, usable: NDArray[np.bool_]) -> Sample:
     values = numbers(product, row.name)
     errors = numbers(product, f"{row.name}_standard_error")
-    budget = budget_of(kind, row.name)
+    budget = budget_of(row)
     random, shared = (errors, ()) if budget is None else _divide(product, budget, errors)
     has_flags = row.dims == product[QUALITY_FLAG].dims
     return Sample(
@@ -82,26 +76,28 @@ def _sample(product: xr.Dataset, kind: str, row: Row, usable: NDArray[np.bool_])
         errors,
         random,
         shared,
-        _systematic_error(product, kind, row.name, values, errors),
+        _systematic_error(product, kind, row, values, errors),
         usable if has_flags else np.ones(values.shape, np.bool_),
     )
 
 
 def _systematic_error(
-    product: xr.Dataset, kind: str, name: str, values: Array, errors: Array
+    product: xr.Dataset, kind: str, row: Row, values: Array, errors: Array
 ) -> Array | None:
     """Return the systematic error that is not part of the standard error; None without one."""
-    if name in INTERVALS:
+    if row.lower_end:
         with np.errstate(divide="ignore", invalid="ignore"):
-            whole = values / numbers(product, INTERVALS[name]) - 1.0
+            whole = values / numbers(product, row.lower_end) - 1.0
             # With hardly any systematic error, rounding may give a negative difference.
             error: Array = values * np.sqrt(np.maximum(whole**2 - (errors / values) ** 2, 0.0))
         return error
-    variable = systematic(kind, name)
+    variable = systematic(kind, row.name)
     return numbers(product, variable) if variable and variable in product else None
 
 
-def _divide(product: xr.Dataset, budget: Budget, errors: Array) -> tuple[Array, tuple[Array, ...]]:
+def _divide(
+    product: xr.Dataset, budget: ErrorBudget, errors: Array
+) -> tuple[Array, tuple[Array, ...]]:
     """Divide a standard error into a part independent between profiles and shared parts."""
     variance = np.zeros_like(errors)
     for name in budget.random:

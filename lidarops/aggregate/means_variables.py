@@ -20,6 +20,7 @@ from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     TIME,
     Coverage,
+    ErrorBudget,
     ErrorKind,
     Layout,
     Row,
@@ -72,45 +73,6 @@ class Weights(StrEnum):
         }[self.value]
 
 
-@dataclass(frozen=True, slots=True)
-class Budget:
-    """Division of a standard error into a part independent between profiles and shared parts.
-
-    The independent part has the variance sum(random^2) x factor^2. The rest of the squared standard
-    error is an error that all profiles share.
-    """
-
-    random: tuple[str, ...]
-    """Variables of the error budget that are independent between profiles."""
-    shared: tuple[str, ...] = ()
-    """Signed variables that all profiles share; if empty, the rest of the error is shared."""
-    times: str | None = None
-    """Variable without time that `random` is multiplied by."""
-    over: str | None = None
-    """Variable without time that `random` is divided by."""
-
-
-_RANDOM: Final = ("backscatter_error_noise", "backscatter_error_background")
-_SHARED: Final = tuple(
-    f"backscatter_error_{cause}" for cause in ("reference", "lidar_ratio", "molecular")
-)
-BUDGETS: Final = {
-    ("elastic", "backscatter"): Budget(_RANDOM, shared=_SHARED),
-    ("elastic", "extinction"): Budget(_RANDOM, times="lidar_ratio"),
-    ("elastic", "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
-    # Noise of the calibration and noise of the bins are not stated separately.
-    ("elastic", "attenuated_backscatter"): Budget(()),
-    # Noise and smoothing error, which profiles of the same air share, are not stated separately.
-    ("multiangle", "optical_depth"): Budget(()),
-    ("multiangle", "extinction"): Budget(()),
-    ("multiangle", "layer_optical_depth"): Budget(()),
-    # Most of the error comes from the prior, which all profiles share.
-    ("visibility", "extinction"): Budget(()),
-    ("visibility", "visibility_in_air"): Budget(()),
-}
-"""Quantities whose errors are not independent between profiles."""
-
-
 def systematic(kind: str, name: str) -> str | None:
     """Return the variable of the systematic error that is not part of the standard error.
 
@@ -123,22 +85,15 @@ def systematic(kind: str, name: str) -> str | None:
     Returns
     -------
     str or None
-        Such as ``extinction_model_error``; a variable of products or, for `INTERVALS`, of means
-        only.
+        Such as ``extinction_model_error``; a variable of products or, for a quantity with an
+        interval (`Row.lower_end`), of means only.
     """
-    if name in INTERVALS:
+    table = layout_of(kind)
+    if table.row(name).lower_end:
         return f"{name}_systematic_error"
-    names = (row.name for row in layout_of(kind).data)
+    names = (row.name for row in table.data)
     errors = (error for error in names if error.startswith(f"{name}_") and error.endswith("_error"))
     return next(errors, None)
-
-
-INTERVALS: Final = {"visibility_in_air": "visibility_in_air_lower"}
-"""Quantities whose systematic error follows only from the lower end of an interval.
-
-They are reciprocals of a quantity with the relative random and systematic errors r and s; the value
-divided by the lower end is 1 + sqrt(r^2 + s^2).
-"""
 
 
 _INDEPENDENT: Final = (
@@ -146,30 +101,24 @@ _INDEPENDENT: Final = (
     " sqrt(sum(weight^2 standard_error^2)) / sum(weight). It may be too small, because errors that"
     " profiles of a scene share, such as that of a dark signal, are not stated separately."
 )
-_PARTLY: Final = (
-    "Errors from noise and background are independent between profiles. Errors from reference,"
-    " lidar ratio and molecules are assumed to be shared by all profiles, so that they are averaged"
-    " and do not decrease with the number of profiles."
-)
 _ALL_SHARED: Final = (
     "The errors of the profiles are assumed to be shared: they are averaged. Their noise, which"
     " would decrease with the number of profiles, is not stated separately."
 )
 
 
-def _error_comment(kind: str, name: str) -> str:
+def _error_comment(row: Row) -> str:
     """Return how the standard error of a mean is computed."""
-    budget = budget_of(kind, name)
+    budget = budget_of(row)
     if budget is None:
         return _INDEPENDENT
-    return _PARTLY if budget.random else _ALL_SHARED
+    return budget.comment or _ALL_SHARED
 
 
-def budget_of(kind: str, name: str) -> Budget | None:
+def budget_of(row: Row) -> ErrorBudget | None:
     """Return the error budget of a quantity; None if errors are independent between profiles."""
-    row = layout_of(kind).row(name)
     independent = row.error_kind in (None, ErrorKind.RANDOM)
-    return BUDGETS.get((kind, name), None if independent else Budget(()))
+    return row.budget or (None if independent else ErrorBudget())
 
 
 def averaged(kind: str) -> tuple[Row, ...]:
@@ -217,11 +166,9 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     flags = source.row("quality_flag")
     for row in averaged(kind):
         error = systematic(kind, row.name)
-        yield from _mean_rows(row, kind, weights, error)
+        yield from _mean_rows(row, weights, error)
         if error:
-            systematic_row = (
-                _interval_error(row, error) if row.name in INTERVALS else source.row(error)
-            )
+            systematic_row = _interval_error(row, error) if row.lower_end else source.row(error)
             yield _averaged_error(systematic_row, row)
     yield Row(
         name="usable_share",
@@ -242,9 +189,9 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 
-def _mean_rows(row: Row, kind: str, weights: Weights, error: str | None) -> Iterator[Row]:
+def _mean_rows(row: Row, weights: Weights, error: str | None) -> Iterator[Row]:
     """Yield the rows of the mean of a quantity."""
-    weighting, errors = f"Weights: {weights.description}.", _error_comment(kind, row.name)
+    weighting, errors = f"Weights: {weights.description}.", _error_comment(row)
     count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
     ancillaries: tuple[str, ...] = (spread, count)
     if error:
@@ -291,7 +238,6 @@ def _cell_methods(row: Row, method: str) -> str:
 
 def _interval_error(row: Row, name: str) -> Row:
     """Return the row of the systematic error that follows from the interval of a quantity."""
-    lower = INTERVALS[row.name]
     return replace(
         row,
         name=name,
@@ -303,8 +249,8 @@ def _interval_error(row: Row, name: str) -> Row:
         uncertain=False,
         error_kind=ErrorKind.SYSTEMATIC,
         comment=f"Not part of {row.name}_standard_error: {row.name} times the relative systematic"
-        f" error of extinction, sqrt(({row.name} / {lower} - 1)^2 - ({row.name}_standard_error /"
-        f" {row.name})^2) in each profile. {NO_STANDARD_NAME}",
+        f" error of extinction, sqrt(({row.name} / {row.lower_end} - 1)^2 -"
+        f" ({row.name}_standard_error / {row.name})^2) in each profile. {NO_STANDARD_NAME}",
     )
 
 

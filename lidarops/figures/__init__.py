@@ -1,12 +1,13 @@
-"""Data reduction and drawing of products, for the report and the site.
+"""Data reduction and drawing that kinds of product share, for the report and the site.
 
-Two layers of modules:
+Three layers of modules:
 
-- Data reduction, without matplotlib: ``*_data.py`` take what a figure shows out of a product, as
-  plain arrays; ``raster.py`` reduces images to block means; ``time_axis.py`` lays out time axes;
-  ``reading.py`` reads products in parallel; ``wording.py`` formats numbers and names. The report
-  and the site both use these modules.
-- Drawing with matplotlib: ``panels.py`` and ``*_panels.py`` draw into one panel,
-  ``*_figures.py`` compose panels to figures, ``charts.py`` draws the charts of benchmarks. The
-  report uses these modules; the site draws SVG of its own (`lidarops.site.svg`).
+- Data reduction: ``series_data.py`` and ``raster.py`` hold what figures show as plain arrays;
+  ``time_axis.py`` lays out time axes; ``reading.py`` and ``report_sources.py`` read products in
+  parallel; ``wording.py`` formats numbers and names. The report and the site both use them.
+- Drawing: ``svg.py`` and ``svg_*.py`` for the site, without matplotlib; ``panels.py``,
+  ``product_figures.py`` and ``charts.py`` with matplotlib for reports.
+- Kinds: ``kind_figures.py`` is what a kind of product states about its figures in its modules
+  ``figures`` and ``report_figures``; ``kind_images.py`` is the image that several have;
+  ``any_kind.py`` and ``any_kind_report.py`` draw products of a kind that states nothing.
 """

@@ -1,15 +1,15 @@
-"""Homogeneous products as plain arrays by section, with the simulated truth.
+"""Quantities over time as plain arrays, compared with the simulated truth.
 
-Also compares retrieved values with the truth, and checks and reads variables of any product.
+Also checks and reads variables of any product.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import TypeVar
 
 import numpy as np
 import xarray as xr
@@ -20,9 +20,6 @@ from lidarops.figures.time_axis import Times, segments
 from lidarops.flags import Quality
 
 Floats = NDArray[np.float64]
-
-QUANTITIES: Final = ("extinction", "background", "amplitude")
-"""Retrieved quantities, as the names of their variables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +36,9 @@ class SeriesEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
-    """The quantities retrieved from one range section, over time."""
+class Series:
+    """The quantities of one series over time."""
 
-    near: float
-    """m"""
-    far: float
-    """m"""
     time: Times
     """(time,) Middles of profiles, UTC, rising."""
     flag: NDArray[np.int64]
@@ -54,9 +47,14 @@ class Section:
     """By name of the quantity."""
 
     @property
+    def key(self) -> tuple[float, ...]:
+        """Identity and place among the series of a product."""
+        return ()
+
+    @property
     def label(self) -> str:
-        """Range of the section in km, for legends."""
-        return f"{self.near / 1e3:g}\N{EN DASH}{self.far / 1e3:g} km"
+        """Name in legends."""
+        return ""
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -64,13 +62,46 @@ class Section:
         return np.asarray((self.flag & int(Quality.rejecting())) != 0)
 
 
-_ALONG_BOTH: Final = (
-    *QUANTITIES,
-    *(f"{name}_standard_error" for name in QUANTITIES),
-    "quality_flag",
-)
-SECTION_VARIABLES: Final = ("time", *_ALONG_BOTH, "section_bounds")
-"""Variables that `read_sections` needs."""
+@dataclass(frozen=True, slots=True)
+class Section(Series):
+    """The quantities retrieved from one range section, over time."""
+
+    near: float
+    """m"""
+    far: float
+    """m"""
+
+    @property
+    def key(self) -> tuple[float, ...]:
+        """The bounds."""
+        return self.near, self.far
+
+    @property
+    def label(self) -> str:
+        """Range of the section in km."""
+        return f"{self.near / 1e3:g}\N{EN DASH}{self.far / 1e3:g} km"
+
+
+@dataclass(frozen=True, slots=True)
+class NumberedSeries(Series):
+    """The quantities at one index of another dimension than time."""
+
+    noun: str
+    """What is numbered; may be empty."""
+    number: int
+
+    @property
+    def key(self) -> tuple[float, ...]:
+        """The number."""
+        return (self.number,)
+
+    @property
+    def label(self) -> str:
+        """Noun and number."""
+        return f"{self.noun} {self.number}".strip()
+
+
+AnySeries = TypeVar("AnySeries", bound=Series)
 
 
 class Verdict(StrEnum):
@@ -130,88 +161,26 @@ class Comparison:
         return Verdict.OVERSTATED if self.spread < 1.0 - chance else Verdict.AS_STATED
 
 
-def read_sections(
-    product: xr.Dataset,
-    truth: xr.Dataset | None = None,
-    *,
-    instrument: str = "",
-    channel: str = "",
-    paths: Sequence[str] = (),
-    dark_subtracted: bool = True,
-) -> list[Section]:
-    """Return the sections of a homogeneous product.
+def join(series: Iterable[AnySeries]) -> list[AnySeries]:
+    """Join series of the same key in time.
 
     Parameters
     ----------
-    product : Dataset
-        Kind ``homogeneous``, dims (time, section).
-    truth : Dataset, optional
-        Truth of a simulated campaign, dimension granule.
-    instrument, channel : str, optional
-        Select the truth; empty for any instrument.
-    paths : sequence of str, optional
-        Raw files of the profiles, in their order. If there is one per profile, the truth is
-        matched by path, else by time.
-    dark_subtracted : bool, optional
-        Whether the dark signal was subtracted. If not, it is part of the retrieved background
-        and of its truth.
-
-    Returns
-    -------
-    list of Section
-        Sorted by near end; truth is NaN where unknown.
-
-    Raises
-    ------
-    ProductError
-        If a variable is missing or has other dimensions or units.
-    """
-    _check(product)
-    order = np.argsort(product["time"].values, kind="stable")
-    time = product["time"].values.astype("datetime64[ns]")[order]
-    ordered = [paths[i] for i in order] if len(paths) == time.size else []
-    true_values = {
-        name: _truth(truth, time, instrument, ordered, variables)
-        for name, variables in _true_variables(channel, dark_subtracted=dark_subtracted).items()
-    }
-    flags = quality_bits(product["quality_flag"])[order]
-    bounds = product["section_bounds"].values.astype(np.float64)
-    sections = []
-    for k in np.argsort(bounds[:, 0], kind="stable"):
-        estimates = {
-            name: SeriesEstimate(
-                value=float_values(product, name)[order, k],
-                standard_error=float_values(product, f"{name}_standard_error")[order, k],
-                truth=true_values[name],
-                units=str(product[name].attrs.get("units", "")),
-            )
-            for name in QUANTITIES
-        }
-        near, far = float(bounds[k, 0]), float(bounds[k, 1])
-        sections.append(Section(near, far, time, flags[:, k], estimates))
-    return sections
-
-
-def join(sections: Iterable[Section]) -> list[Section]:
-    """Join sections with the same bounds in time.
-
-    Parameters
-    ----------
-    sections : iterable of Section
+    series : iterable of Series
         Of one instrument and channel, from any number of products.
 
     Returns
     -------
-    list of Section
-        One per pair of bounds, sorted by near end.
+    list of Series
+        One per key, sorted by key.
     """
-    groups: dict[tuple[float, float], list[Section]] = {}
-    for section in sections:
-        groups.setdefault((section.near, section.far), []).append(section)
+    groups: dict[tuple[float, ...], list[AnySeries]] = {}
+    for part in series:
+        groups.setdefault(part.key, []).append(part)
     return [_joined(group) for _, group in sorted(groups.items())]
 
 
-def compare(section: Section, quantity: str) -> Comparison | None:
+def compare(section: Series, quantity: str) -> Comparison | None:
     """Compare the unflagged values of a section with the truth.
 
     Returns
@@ -239,7 +208,7 @@ def compare(section: Section, quantity: str) -> Comparison | None:
     )
 
 
-def normalised_error(section: Section, quantity: str) -> Floats:
+def normalised_error(section: Series, quantity: str) -> Floats:
     """Return (retrieved - truth) / standard error, shape (time,); NaN where undefined."""
     estimate = section.estimates[quantity]
     stated = np.isfinite(estimate.standard_error) & (estimate.standard_error > 0)
@@ -247,7 +216,7 @@ def normalised_error(section: Section, quantity: str) -> Floats:
     return np.asarray((estimate.value - estimate.truth) / error)
 
 
-def thin(section: Section, points: int) -> Section:
+def thin(section: AnySeries, points: int) -> AnySeries:
     """Reduce the unflagged profiles of a section to about `points` block means for drawing.
 
     A block has the mean of its unflagged profiles, the standard error of that mean (as if errors
@@ -256,13 +225,13 @@ def thin(section: Section, points: int) -> Section:
 
     Parameters
     ----------
-    section : Section
+    section : Series
     points : int
         Each gap may add one block.
 
     Returns
     -------
-    Section
+    Series
         Unflagged profiles only; block means if there are more than `points`.
     """
     good = _where(section, section.flag == 0)
@@ -273,9 +242,8 @@ def thin(section: Section, points: int) -> Section:
     block = np.searchsorted(edges, np.flatnonzero(section.flag == 0), side="right")
     starts = np.flatnonzero(np.diff(block, prepend=0))
     elapsed = (good.time - good.time[0]) / np.timedelta64(1, "ns")
-    return Section(
-        near=good.near,
-        far=good.far,
+    return replace(
+        good,
         time=good.time[0] + _block_mean(np.asarray(elapsed), starts).astype("timedelta64[ns]"),
         flag=np.zeros(starts.size, dtype=np.int64),
         estimates={
@@ -290,10 +258,9 @@ def thin(section: Section, points: int) -> Section:
     )
 
 
-def _where(section: Section, keep: NDArray[np.bool_]) -> Section:
-    return Section(
-        near=section.near,
-        far=section.far,
+def _where(section: AnySeries, keep: NDArray[np.bool_]) -> AnySeries:
+    return replace(
+        section,
         time=section.time[keep],
         flag=section.flag[keep],
         estimates={
@@ -321,44 +288,27 @@ def _block_error(errors: Floats, starts: NDArray[np.intp]) -> Floats:
     return np.sqrt(_block_mean(errors**2, starts) / np.maximum(counts, 1))
 
 
-def _joined(group: list[Section]) -> Section:
+def _joined(group: list[AnySeries]) -> AnySeries:
     if len(group) == 1:
         return group[0]
-    time = np.concatenate([section.time for section in group])
+    time = np.concatenate([series.time for series in group])
     order = np.argsort(time, kind="stable")
-    return Section(
-        near=group[0].near,
-        far=group[0].far,
-        time=time[order],
-        flag=np.concatenate([section.flag for section in group])[order],
-        estimates=join_estimates(group, order),
-    )
 
-
-def join_estimates(
-    sections: Sequence[Section], order: NDArray[np.intp]
-) -> dict[str, SeriesEstimate]:
-    """Concatenate the estimates of sections in time, then sort them by `order`."""
-    return {
-        name: SeriesEstimate(
-            value=np.concatenate([s.estimates[name].value for s in sections])[order],
-            standard_error=np.concatenate([s.estimates[name].standard_error for s in sections])[
-                order
-            ],
-            truth=np.concatenate([s.estimates[name].truth for s in sections])[order],
-            units=estimate.units,
+    def joined(name: str) -> SeriesEstimate:
+        parts = [series.estimates[name] for series in group]
+        return SeriesEstimate(
+            value=np.concatenate([part.value for part in parts])[order],
+            standard_error=np.concatenate([part.standard_error for part in parts])[order],
+            truth=np.concatenate([part.truth for part in parts])[order],
+            units=parts[0].units,
         )
-        for name, estimate in sections[0].estimates.items()
-    }
 
-
-def _check(product: xr.Dataset) -> None:
-    require(product, {"time": ("time",)} | dict.fromkeys(_ALONG_BOTH, ("time", "section")))
-    if "section_bounds" not in product or product["section_bounds"].shape[1:] != (2,):
-        raise ProductError("has no section bounds", field="section_bounds")
-    units = product["extinction"].attrs.get("units")
-    if units != "m-1":
-        raise ProductError(f"has the units {units!r}, not 'm-1'", field="extinction")
+    return replace(
+        group[0],
+        time=time[order],
+        flag=np.concatenate([series.flag for series in group])[order],
+        estimates={name: joined(name) for name in group[0].estimates},
+    )
 
 
 def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
@@ -390,70 +340,3 @@ def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
         # Where there are fill values, xarray decodes integers as floats with NaN.
         values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
     return np.asarray(values, dtype=np.int64)
-
-
-def _true_variables(channel: str, *, dark_subtracted: bool) -> Mapping[str, Sequence[str]]:
-    """Return for each quantity the variables of the truth that add up to its true value."""
-    offset = () if dark_subtracted else (f"dark_offset_{channel}",)
-    return {
-        "extinction": ("extinction",),
-        "background": (f"background_{channel}", *offset),
-        "amplitude": (f"amplitude_{channel}",),
-    }
-
-
-def _truth(
-    truth: xr.Dataset | None,
-    time: Times,
-    instrument: str,
-    paths: Sequence[str],
-    variables: Sequence[str],
-) -> Floats:
-    if truth is None or variables[0] not in truth.variables or truth.sizes["granule"] == 0:
-        return np.full(time.size, np.nan)
-    # Photon counting has no dark offset.
-    terms = [float_values(truth, name) for name in variables if name in truth.variables]
-    index = _match(time, truth, instrument, paths)
-    return np.where(index >= 0, np.sum(terms, axis=0)[index], np.nan)
-
-
-def _match(
-    time: Times, truth: xr.Dataset, instrument: str, paths: Sequence[str]
-) -> NDArray[np.intp]:
-    """Return the index of the truth of every profile, -1 without one."""
-    granules = np.arange(truth.sizes["granule"])
-    if instrument:
-        granules = granules[_texts(truth["instrument"]) == instrument]
-    if paths:
-        index = {
-            path: int(i) for i, path in zip(granules, _texts(truth["path"])[granules], strict=True)
-        }
-        matched = np.array([index.get(path, -1) for path in paths], dtype=np.intp)
-        if (matched >= 0).all():
-            return matched
-    return _nearest(time, truth["time"].values.astype("datetime64[ns]")[granules], granules)
-
-
-def _nearest(time: Times, known: Times, granules: NDArray[np.intp]) -> NDArray[np.intp]:
-    if known.size == 0:
-        return np.full(time.size, -1, dtype=np.intp)
-    order = np.argsort(known, kind="stable")
-    known, granules = known[order], granules[order]
-    after = np.clip(np.searchsorted(known, time), 1, max(known.size - 1, 1))
-    after = np.minimum(after, known.size - 1)
-    before = np.maximum(after - 1, 0)
-    to_before, to_after = np.abs(time - known[before]), np.abs(time - known[after])
-    # The truth may state starts of granules, but profiles have middles: of two about equally
-    # near neighbours, the earlier one is taken.
-    step = np.median(np.diff(known)) if known.size > 1 else np.timedelta64(120, "s")
-    earlier = to_before <= to_after + step * 0.1
-    best = np.where(earlier, before, after)
-    near = np.where(earlier, to_before, to_after) <= step * 0.6
-    return np.where(near, granules[best], -1)
-
-
-def _texts(strings: xr.DataArray) -> NDArray[np.str_]:
-    values = strings.values
-    if values.dtype.kind == "S":
-        return np.char.decode(values, "utf-8")
-    return np.asarray(values, dtype=np.str_)

@@ -6,6 +6,8 @@ import math
 import unicodedata
 from typing import Final
 
+import numpy as np
+
 from lidarops.flags import Quality
 from lidarops.records import Unmet
 
@@ -52,6 +54,11 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
+
+
+def utc(time: np.datetime64) -> str:
+    """Return a time to the second."""
+    return str(time.astype("datetime64[s]")).replace("T", " ") + " UTC"
 
 
 def counted(count: int, noun: str) -> str:

@@ -61,6 +61,26 @@ class Coverage(StrEnum):
     COORDINATE = "coordinate"
 
 
+@dataclass(frozen=True, slots=True)
+class ErrorBudget:
+    """Division of a standard error into a part independent between profiles and shared parts.
+
+    The independent part has the variance sum(random^2) x factor^2. The rest of the squared standard
+    error is an error that all profiles share.
+    """
+
+    random: tuple[str, ...] = ()
+    """Variables of the error budget that are independent between profiles."""
+    shared: tuple[str, ...] = ()
+    """Signed variables that all profiles share; if empty, the rest of the error is shared."""
+    times: str | None = None
+    """Variable without time that `random` is multiplied by."""
+    over: str | None = None
+    """Variable without time that `random` is divided by."""
+    comment: str = ""
+    """How the standard error of a mean follows; empty where all profiles share the error."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """Description of one variable of a product."""
@@ -96,6 +116,13 @@ class Row:
     """Whether it is `usable`, which is computed from the flags and never passed in."""
     error_kind: ErrorKind | None = None
     """Kind of the error that the variable holds, or else of the variable's standard error."""
+    budget: ErrorBudget | None = None
+    """How the standard error averages over time. None: by its kind, which is independent between
+    profiles if random, else shared by all."""
+    lower_end: str | None = None
+    """Variable with the lower end of the interval that the systematic error follows from. The
+    quantity is the reciprocal of one with the relative random and systematic errors r and s; the
+    value divided by the lower end is 1 + sqrt(r^2 + s^2)."""
     cf_role: str | None = None
     algorithm: str | None = None
     comment: str | None = None
@@ -115,6 +142,8 @@ class Row:
             significant_bits=self.significant_bits and _ERROR_BITS,
             uncertain=False,
             error_kind=self.error_kind or ErrorKind.RANDOM,
+            budget=None,
+            lower_end=None,
             comment=None if self.standard_name else NO_STANDARD_NAME,
         )
 
@@ -178,6 +207,14 @@ def layout_of(kind: str) -> Layout:
     layout: Layout = kind_of(kind).part("variables", "LAYOUT")
     # The step that makes a product has the name of its kind and serves no other kind.
     return replace(layout, unused_steps=layout.unused_steps | (set(kinds()) - {kind}))
+
+
+def is_retrieved(kind: str) -> bool:
+    """Return whether a kind of product holds retrieved quantities, not signals.
+
+    An unknown kind is taken to be retrieved.
+    """
+    return kind not in kinds() or not layout_of(kind).processing_level.startswith("L1")
 
 
 def _with_derived(rows: tuple[Row, ...]) -> Iterator[Row]:

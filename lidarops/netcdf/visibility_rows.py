@@ -33,6 +33,7 @@ def visibility_rows(
             cell_methods="time: mean",
             ancillaries=(*limits, *ancillaries),
             uncertain=True,
+            lower_end=limits[0],
             optional=optional,
             comment="-ln(contrast) / extinction of the averaging interval, not a mean of"
             " visibilities. lidarops_steps states the contrast and, where applied, the conversion"

@@ -5,66 +5,29 @@ A missing or unreadable product does not stop the report; it is listed as a prob
 
 from __future__ import annotations
 
-import functools
 import re
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final
 
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.figures import network_figures, panels, product_figures
-from lidarops.figures.network_data import (
-    CROSSING_VARIABLES,
-    MAP_VARIABLES,
-    instruments_of,
-    join_crossings,
-    read_crossings,
-    read_map,
-)
-from lidarops.figures.profile_data import PROFILE_VARIABLES, clearest_profile
-from lidarops.figures.raster import COLUMNS, Raster, raster_variables, read_raster
-from lidarops.figures.reading import UNREADABLE, Readers, ReadFailure, ReadTask, reason
-from lidarops.figures.scan_data import (
-    CYCLE_VARIABLES,
-    EXTINCTION_VARIABLES,
-    RESIDUAL_VARIABLES,
-    clearest_cycle,
-    read_extinction,
-    read_residuals,
-)
-from lidarops.figures.series_data import (
-    QUANTITIES,
-    SECTION_VARIABLES,
-    Comparison,
-    compare,
-    join,
-    read_sections,
-)
-from lidarops.figures.wording import counted
+from lidarops.figures import any_kind_report, product_figures
+from lidarops.figures.kind_figures import ReportFigure, report_figures_of
+from lidarops.figures.reading import UNREADABLE, Readers, reason
+from lidarops.figures.report_sources import Compared, Group, Problem, Sources
 from lidarops.flags import Quality
-from lidarops.records import ProductRecord, Role, RunRecord, SceneOutcome
+from lidarops.kinds import rank_of
+from lidarops.records import ProductRecord, RunRecord, SceneOutcome
 from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
 _FLAG_ROWS: Final = 40
-_DARK_STEP: Final = "dark"
-"""Name of the step of a plan that subtracts dark files."""
-_KIND_ORDER: Final = (
-    "homogeneous",
-    "visibility",
-    "multiangle",
-    "elastic",
-    "signal",
-)
-Content = TypeVar("Content")
-Drawing = Callable[[], product_figures.Rendered]
-"""Returns a figure once it is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,23 +39,6 @@ class Figure:
     instrument: str
     caption: str
     alt: str
-
-
-@dataclass(frozen=True, slots=True)
-class Compared:
-    """A comparison with the truth, with its instrument and channel."""
-
-    instrument: str
-    channel: str
-    comparison: Comparison
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """A file that could not be used for the report."""
-
-    path: str
-    reason: str
 
 
 @dataclass(slots=True)
@@ -108,123 +54,35 @@ class Gallery:
 
 
 @dataclass(frozen=True, slots=True)
-class _Group:
-    """All products of one kind, instrument and channel."""
-
-    kind: str
-    instrument: str
-    channel: str
-    members: tuple[tuple[SceneOutcome, ProductRecord], ...]
-    root: Path
-    """Folder that product paths are relative to."""
-
-    @property
-    def label(self) -> str:
-        return f"{self.instrument} \N{MIDDLE DOT} {self.channel}"
-
-
-@dataclass(frozen=True, slots=True)
-class _Sources:
-    """Reads products for figures; unreadable products are noted as problems of the gallery."""
-
-    readers: Readers
-    truth: xr.Dataset | None
-    gallery: Gallery
-
-    def read_all(
-        self,
-        group: _Group,
-        names: tuple[str, ...],
-        reads: Iterable[Callable[..., Content]],
-        *,
-        with_truth: bool = False,
-    ) -> Iterator[Content]:
-        """Yield the content of every readable product of a group."""
-        paths = [product.path for _, product in group.members]
-        readings = [
-            ReadTask(group.root / path, names, read, with_truth)
-            for path, read in zip(paths, reads, strict=True)
-        ]
-        yield from self._read(paths, readings)
-
-    def rasters(
-        self, group: _Group, names: tuple[str, ...], read: Callable[..., Raster]
-    ) -> list[Raster]:
-        """Reduce all products of a group to the same resolution, given by their total length."""
-        sizes: dict[str, int] = {}
-        paths = [product.path for _, product in group.members]
-        lengths = self.readers.lengths([group.root / path for path in paths])
-        for path, length in zip(paths, lengths, strict=True):
-            if isinstance(length, ReadFailure):
-                self._note(path, length.reason)
-            else:
-                sizes[path] = length
-        profiles = -(-sum(sizes.values()) // COLUMNS)
-        reduced = functools.partial(read, profiles=profiles)
-        readings = [ReadTask(group.root / path, names, reduced) for path in sizes]
-        return list(self._read(list(sizes), readings))
-
-    def read_first(
-        self,
-        group: _Group,
-        names: tuple[str, ...],
-        read: Callable[..., Content | None],
-        *,
-        with_truth: bool = False,
-    ) -> Content | None:
-        """Return the content of the first product of a group that has any, or None."""
-        noted = {problem.path for problem in self.gallery.problems}
-        for _, product in group.members:
-            reading = ReadTask(group.root / product.path, names, read, with_truth)
-            content = self.readers.read(reading)
-            if isinstance(content, ReadFailure):
-                if product.path not in noted:
-                    self._note(product.path, content.reason)
-            elif content is not None:
-                return content
-        return None
-
-    def draw(self, draw: Callable[..., Any], content: object, title: str) -> Drawing:
-        """Start drawing a figure, in another process if there is one."""
-        return self.readers.later(
-            product_figures.draw_figure, product_figures.Sketch(draw, content, title)
-        )
-
-    def _read(self, paths: list[str], readings: list[ReadTask[Content]]) -> Iterator[Content]:
-        for path, content in zip(paths, self.readers.read_all(readings), strict=True):
-            if isinstance(content, ReadFailure):
-                self._note(path, content.reason)
-            else:
-                yield content
-
-    def _note(self, path: str, words: str) -> None:
-        self.gallery.problems.append(Problem(path, words))
-
-
-@dataclass(frozen=True, slots=True)
 class _PendingFigure:
+    """A figure that is being drawn."""
+
     name: str
+    """Start of its file name."""
+    instrument: str
     caption: str
-    draw: Drawing
+    rendered: Callable[[], product_figures.Rendered]
+    """Returns the figure once it is drawn."""
 
 
 class _Album:
     """Writes figures to files in their order; a bounded number is drawn at the same time."""
 
-    def __init__(self, folder: Path, ahead: int) -> None:
+    def __init__(self, folder: Path, readers: Readers) -> None:
         self.pictures: list[Figure] = []
         self._folder = folder
-        # Bounded, because the data of a figure stay in memory until it is drawn.
-        self._ahead = ahead
-        self._waiting: deque[tuple[str, _PendingFigure]] = deque()
+        self._readers = readers
+        self._waiting: deque[_PendingFigure] = deque()
         self._taken: Counter[str] = Counter()
 
     def __len__(self) -> int:
         return len(self.pictures) + len(self._waiting)
 
-    def add(self, instrument: str, figure: _PendingFigure) -> None:
-        self._waiting.append((instrument, figure))
-        self._keep(self._ahead)
+    def add(self, figure: ReportFigure, group: Group) -> None:
+        name = f"{figure.name}_{group.instrument}_{group.channel}"
+        self._waiting.append(_started(self._readers, figure, group.label, name, group.instrument))
+        # Bounded, because the data of a figure stay in memory until it is drawn.
+        self._keep(self._readers.processes)
 
     def finish(self) -> list[Figure]:
         self._keep(0)
@@ -232,11 +90,23 @@ class _Album:
 
     def _keep(self, ahead: int) -> None:
         while len(self._waiting) > ahead:
-            instrument, figure = self._waiting.popleft()
-            name = _unique(figure.name, self._taken)
-            rendered = figure.draw()
-            write_atomically(self._folder / name, rendered.png)
-            self.pictures.append(Figure(name, instrument, figure.caption, rendered.alt))
+            figure = self._waiting.popleft()
+            self.pictures.append(_written(self._folder, figure, _unique(figure.name, self._taken)))
+
+
+def _started(
+    readers: Readers, figure: ReportFigure, title: str, name: str, instrument: str
+) -> _PendingFigure:
+    """Start to draw a figure, in another process if there is one."""
+    sketch = product_figures.Sketch(figure.draw, figure.content, title)
+    rendered = readers.later(product_figures.draw_figure, sketch)
+    return _PendingFigure(name, instrument, figure.caption, rendered)
+
+
+def _written(folder: Path, figure: _PendingFigure, file: str) -> Figure:
+    rendered = figure.rendered()
+    write_atomically(folder / file, rendered.png)
+    return Figure(file, figure.instrument, figure.caption, rendered.alt)
 
 
 def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
@@ -259,20 +129,17 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
     """
     gallery = Gallery()
     with _sources(record, gallery, workers) as sources:
-        flags = _flags(record, sources)
-        album = _Album(folder, sources.readers.processes)
+        flags = _flags(record, sources.readers)
+        album = _Album(folder, sources.readers)
         for group in _groups(record):
             full = len(album) >= limit
             if full:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
             for figure in _draw(group, sources, full=full):
-                album.add(group.instrument, figure)
+                album.add(figure, group)
         gallery.pictures = album.finish()
         if flags is not None:
-            name = f"{flags.name}.png"
-            rendered = flags.draw()
-            write_atomically(folder / name, rendered.png)
-            gallery.flags = Figure(name, "", flags.caption, rendered.alt)
+            gallery.flags = _written(folder, flags, f"{flags.name}.png")
     return gallery
 
 
@@ -287,7 +154,7 @@ def missing_products(record: RunRecord) -> frozenset[str]:
     )
 
 
-def _groups(record: RunRecord) -> list[_Group]:
+def _groups(record: RunRecord) -> list[Group]:
     """Return the groups by kind; within a kind, the first channel of every instrument first."""
     members: dict[tuple[str, str, str], list[tuple[SceneOutcome, ProductRecord]]]
     members = defaultdict(list)
@@ -299,171 +166,29 @@ def _groups(record: RunRecord) -> list[_Group]:
     for (kind, instrument, channel), products in sorted(members.items()):
         turn = turns[kind, instrument]
         turns[kind, instrument] += 1
-        group = _Group(kind, instrument, channel, tuple(products), Path(record.products))
-        ordered.append((_KIND_ORDER.index(kind), turn, instrument, channel, group))
-    return [group for *_, group in sorted(ordered, key=lambda row: row[:4])]
+        group = Group(kind, instrument, channel, tuple(products), Path(record.products))
+        ordered.append((rank_of(kind), kind, turn, instrument, channel, group))
+    return [group for *_, group in sorted(ordered, key=lambda row: row[:5])]
 
 
-def _draw(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
-    if group.kind == "homogeneous":
-        if not full or sources.truth is not None:
-            yield from _homogeneous(group, sources, full=full)
-    elif group.kind == "visibility":
-        yield from _visibility(group, sources, full=full)
-    elif full:
-        return
-    elif group.kind == "multiangle":
-        yield from _multiangle(group, sources)
-    elif group.kind == "elastic":
-        yield from _elastic(group, sources)
-    else:
-        yield from _signal(group, sources)
+def _draw(group: Group, sources: Sources, *, full: bool) -> Iterator[ReportFigure]:
+    """Yield the figures of a group; none if the report is full, but compare with the truth."""
+    report = report_figures_of(group.kind) or any_kind_report.REPORT
+    figures = report.figures(group, sources)
+    if not full:
+        yield from figures
+    elif report.compares and sources.truth is not None:
+        # All comparisons are made before the first figure.
+        next(figures, None)
 
 
-def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
-    read = [
-        functools.partial(
-            read_sections,
-            instrument=group.instrument,
-            channel=group.channel,
-            paths=[item.path for item in scene.inputs if item.role is Role.SIGNAL],
-            dark_subtracted=_dark_subtracted(scene, group.channel),
-        )
-        for scene, _ in group.members
-    ]
-    by_scene = list(sources.read_all(group, SECTION_VARIABLES, read, with_truth=True))
-    scenes = len(by_scene)
-    unjoined = [section for sections in by_scene for section in sections]
-    sections = [section for section in join(unjoined) if section.time.size > 0]
-    compared = [
-        Compared(group.instrument, group.channel, comparison)
-        for section in sections
-        for quantity in QUANTITIES
-        if (comparison := compare(section, quantity)) is not None
-    ]
-    sources.gallery.compared += compared
-    for first in range(0, 0 if full else len(sections), panels.SECTIONS):
-        few = sections[first : first + panels.SECTIONS]
-        where = f"{group.label}, {', '.join(section.label for section in few)}"
-        yield _PendingFigure(
-            f"homogeneous_{group.instrument}_{group.channel}",
-            f"Extinction and background with their standard errors: {where};"
-            f" {counted(scenes, 'scene')}.",
-            sources.draw(product_figures.draw_retrieval, few, group.label),
-        )
-        if compared:
-            yield _PendingFigure(
-                f"truth_{group.instrument}_{group.channel}",
-                f"Unflagged values compared with the simulated truth: {where}.",
-                sources.draw(product_figures.draw_comparison, few, group.label),
-            )
-
-
-def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
-    read = [
-        functools.partial(read_crossings, instruments=instruments_of(scene))
-        for scene, _ in group.members
-    ]
-    by_scene = list(sources.read_all(group, CROSSING_VARIABLES, read, with_truth=True))
-    series = join_crossings([crossing for crossings in by_scene for crossing in crossings])
-    sources.gallery.compared += [
-        Compared(group.instrument, group.channel, comparison)
-        for crossing in series
-        if (comparison := compare(crossing, "extinction")) is not None
-    ]
-    if full or not series:
-        return
-    scene = group.members[0][0]
-    read_network = functools.partial(read_map, instruments=instruments_of(scene))
-    network = sources.read_first(group, MAP_VARIABLES, read_network)
-    if network is not None:
-        yield _PendingFigure(
-            f"network_{group.instrument}_{group.channel}",
-            f"Beams, crossings and median visibility at the crossings: {group.label}.",
-            sources.draw(network_figures.draw_map, network, group.label),
-        )
-    for first in range(0, len(series), network_figures.CROSSINGS):
-        few = series[first : first + network_figures.CROSSINGS]
-        yield _PendingFigure(
-            f"visibility_{group.instrument}_{group.channel}",
-            f"Visibility and extinction at the crossings, with standard errors:"
-            f" {group.label}, {', '.join(crossing.label for crossing in few)}.",
-            sources.draw(network_figures.draw_series, few, group.label),
-        )
-
-
-def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
-    steps = scene.plan.steps if scene.plan else ()
-    return any(step.name == _DARK_STEP and step.channel == channel for step in steps)
-
-
-def _signal(group: _Group, sources: _Sources) -> Iterator[_PendingFigure]:
-    rasters = sources.rasters(group, raster_variables(), read_raster)
-    if rasters:
-        yield _PendingFigure(
-            f"signal_{group.instrument}_{group.channel}",
-            f"Range-corrected signal and background: {group.label};"
-            f" {counted(len(rasters), 'scene')}.",
-            sources.draw(product_figures.draw_quicklook, rasters, group.label),
-        )
-
-
-def _elastic(group: _Group, sources: _Sources) -> Iterator[_PendingFigure]:
-    quantity = "attenuated_backscatter"
-    read = functools.partial(read_raster, quantity=quantity)
-    rasters = sources.rasters(group, raster_variables(quantity), read)
-    if rasters:
-        yield _PendingFigure(
-            f"elastic_{group.instrument}_{group.channel}",
-            f"Attenuated backscatter, clouds and background: {group.label};"
-            f" {counted(len(rasters), 'scene')}.",
-            sources.draw(product_figures.draw_backscatter, rasters, group.label),
-        )
-    profile = sources.read_first(group, PROFILE_VARIABLES, clearest_profile)
-    if profile is not None:
-        yield _PendingFigure(
-            f"profile_{group.instrument}_{group.channel}",
-            f"Profile with the most unflagged bins in a scene, and its error budget:"
-            f" {group.label}.",
-            sources.draw(product_figures.error_budget_figure, profile, group.label),
-        )
-
-
-def _multiangle(group: _Group, sources: _Sources) -> Iterator[_PendingFigure]:
-    rasters = sources.rasters(group, EXTINCTION_VARIABLES, read_extinction)
-    if rasters:
-        yield _PendingFigure(
-            f"multiangle_{group.instrument}_{group.channel}",
-            f"Extinction over time and altitude: {group.label}; {counted(len(rasters), 'scene')}.",
-            sources.draw(product_figures.draw_extinction, rasters, group.label),
-        )
-    clearest = functools.partial(clearest_cycle, instrument=group.instrument)
-    profile = sources.read_first(group, CYCLE_VARIABLES, clearest, with_truth=True)
-    if profile is not None:
-        yield _PendingFigure(
-            f"scan-profile_{group.instrument}_{group.channel}",
-            f"Scan cycle with the most unflagged values in a scene: {group.label}.",
-            sources.draw(product_figures.scan_profile, profile, group.label),
-        )
-    residuals = sources.read_first(group, RESIDUAL_VARIABLES, read_residuals)
-    if residuals is not None:
-        yield _PendingFigure(
-            f"scan-residuals_{group.instrument}_{group.channel}",
-            f"Residuals of the fit over zenith angle, mean over the cycles of a scene:"
-            f" {group.label}.",
-            sources.draw(product_figures.scan_residuals, residuals, group.label),
-        )
-
-
-def _flags(record: RunRecord, sources: _Sources) -> _PendingFigure | None:
+def _flags(record: RunRecord, readers: Readers) -> _PendingFigure | None:
     shares = _shares(record)
     if not shares:
         return None
-    return _PendingFigure(
-        "flags",
-        "Share of values with each quality bit, by channel and product kind, over all scenes.",
-        sources.draw(product_figures.flags_overview, shares, "Flagged values"),
-    )
+    caption = "Share of values with each quality bit, by channel and product kind, over all scenes."
+    figure = ReportFigure("flags", caption, product_figures.flags_overview, shares)
+    return _started(readers, figure, "Flagged values", figure.name, "")
 
 
 def _shares(record: RunRecord) -> Mapping[str, Mapping[Quality, float]]:
@@ -486,11 +211,11 @@ def _shares(record: RunRecord) -> Mapping[str, Mapping[Quality, float]]:
 
 
 @contextmanager
-def _sources(record: RunRecord, gallery: Gallery, workers: int) -> Iterator[_Sources]:
+def _sources(record: RunRecord, gallery: Gallery, workers: int) -> Iterator[Sources]:
     truth = _truth(record, gallery)
     products = sum(len(scene.products) for scene in record.scenes)
     with Readers(workers, products, truth) as readers:
-        yield _Sources(readers, truth, gallery)
+        yield Sources(readers, truth, gallery.compared, gallery.problems)
 
 
 def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:

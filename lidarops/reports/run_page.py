@@ -15,10 +15,11 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops.errors import CatalogError
+from lidarops.figures.report_sources import Compared
 from lidarops.figures.wording import duration, lacking, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
-from lidarops.reports.gallery import Compared, Figure, Gallery
+from lidarops.reports.gallery import Figure, Gallery
 from lidarops.reports.run_record import FILE_NAME
 from lidarops.system.files import write_atomically
 

@@ -10,6 +10,7 @@ from typing import Final
 
 from lidarops.figures.wording import counted, decided_on, duration, percent
 from lidarops.flags import Quality, Severity
+from lidarops.netcdf.variables import is_retrieved
 from lidarops.plan.signal_rules import idle_window
 from lidarops.records import LeftOut, RunRecord, SceneOutcome, Step
 
@@ -378,7 +379,7 @@ def _instrument_row(
     station: str, name: str, scenes: Sequence[SceneOutcome], refused_before: int
 ) -> InstrumentRow:
     retrieved = [
-        product for scene in scenes for product in scene.products if product.kind != "signal"
+        product for scene in scenes for product in scene.products if is_retrieved(product.kind)
     ]
     return InstrumentRow(
         station=station,

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -20,8 +21,11 @@ import xarray as xr
 
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError
+from lidarops.figures import any_kind
+from lidarops.figures.kind_figures import PageFigures, figures_of, no_figures
+from lidarops.kinds import kinds
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.site import pages, product_contents, product_gallery
+from lidarops.site import pages, product_contents
 from lidarops.site.paths import (
     SITE,
     day_page,
@@ -232,7 +236,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         )
         contents = (
             pages.product(entry, opened, quality, origin, gallery.figures),
-            gallery.thumbnail,
+            gallery.thumbnail.file(pages.style("thumb.css")),
             origin.text.encode(),
         )
     for name, content in zip(entry.files, contents, strict=True):
@@ -240,17 +244,19 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
-def _draw(opened: xr.Dataset, kind: str) -> tuple[product_gallery.Gallery, str]:
+def _draw(opened: xr.Dataset, kind: str) -> tuple[PageFigures, str]:
     """Draw a product; if it does not fit its kind, as a product of unknown kind."""
-    style = pages.style("thumb.css")
+    figures = figures_of(kind)
+    problem = ""
     try:
-        return product_gallery.draw_gallery(opened, kind, style), ""
+        if figures is not None:
+            return figures.page(opened), ""
     except _UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        return product_gallery.draw_gallery(opened, "", style), problem
-    except _UNREADABLE:
-        return product_gallery.nothing("it cannot be drawn", style), problem
+        return any_kind.draw_page(opened), problem
+    except _UNREADABLE as error:
+        return no_figures("it cannot be drawn"), problem or f"it cannot be drawn: {error}"
 
 
 def _missing_flags(opened: xr.Dataset) -> str:
@@ -317,6 +323,8 @@ def _version() -> str:
         *(package / "figures").glob("*.py"),
         package / "reports/run_record.py",
     ]
+    for kind in kinds().values():
+        sources += Path(str(import_module(kind.package).__file__)).parent.glob("*.py")
     sources += [path for path in (package / "site").rglob("*") if path.suffix in _SOURCES]
     digest = hashlib.sha256(__version__.encode())
     for source in sorted(sources):

@@ -15,11 +15,13 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops import __version__
+from lidarops.figures.kind_figures import Drawn
 from lidarops.figures.wording import counted, percent, size, visible
+from lidarops.kinds import kinds, rank_of
+from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.paths import day_page, href, slug, year_page
 from lidarops.site.product_contents import Origin, QualityCounts, variables
-from lidarops.site.product_entry import SIGNAL, UNKNOWN, Entry, Grade, Problem, mean_share
-from lidarops.site.product_gallery import Drawn
+from lidarops.site.product_entry import UNKNOWN, Entry, Grade, Problem, mean_share
 
 INDEX: Final = "index.html"
 ROWS: Final = 2000
@@ -28,15 +30,6 @@ _YEARS: Final = 48
 """Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
 _LATEST: Final = 6
-_KIND_ORDER: Final = ("visibility", "homogeneous", "multiangle", "elastic", "signal")
-_ABOUT: Final = {
-    "visibility": "Visibility",
-    "homogeneous": "Extinction of homogeneous sections",
-    "multiangle": "Optical depth and extinction of scans",
-    "elastic": "Backscatter of elastic profiles",
-    "signal": "Range-corrected signals",
-    UNKNOWN: "Products of unknown kind",
-}
 
 ByDay = Mapping[str, Sequence[Entry]]
 
@@ -77,7 +70,6 @@ def product(
     """Return the page of a product; it depends only on the product and its path."""
     page = entry.page
     file = entry.path.rsplit("/", 1)[-1]
-    about = _ABOUT.get(entry.kind, f"Product of kind {entry.kind}")
     summary = [
         ("Title", str(opened.attrs.get("title", "not stated"))),
         ("Station", _named(entry.place, entry.station)),
@@ -90,7 +82,7 @@ def product(
     return _render(
         "product.html",
         page,
-        heading=f"{about}, {entry.channel}",
+        heading=f"{_about(entry.kind, 'Product of kind')}, {entry.channel}",
         lead=f"{entry.place}, {entry.instrument}, {_clock(entry.start)} to"
         f" {_clock(entry.stop)} UTC",
         trail=[*_trail(entry, page), (entry.day, href(day_page(entry.station, entry.day), page))],
@@ -110,6 +102,14 @@ def product(
         attributes=[(str(name), str(value)) for name, value in opened.attrs.items()],
         most=ROWS,
     )
+
+
+def _about(kind: str, other: str) -> str:
+    """Return the heading of products of a kind; before the name of an unknown one, `other`."""
+    if kind == UNKNOWN:
+        return "Products of unknown kind"
+    known = kinds().get(kind)
+    return known.title if known else f"{other} {kind}"
 
 
 def _named(place: str, key: str) -> str:
@@ -153,8 +153,8 @@ def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
 
 
 def _order(entry: Entry) -> tuple[Any, ...]:
-    kinds = _KIND_ORDER.index(entry.kind) if entry.kind in _KIND_ORDER else -1
-    return entry.instrument, kinds, entry.kind, entry.channel, entry.start, entry.path
+    rank = rank_of(entry.kind)
+    return entry.instrument, rank, entry.kind, entry.channel, entry.start, entry.path
 
 
 def _short(share: float | None) -> str:
@@ -195,7 +195,7 @@ def index(entries: Sequence[Entry], problems: Sequence[Problem], campaigns: Sequ
     rows = sum(len(years(group)) for group in by_station.values())
     title = f"Lidar archive: {', '.join(campaigns[:3])}" if campaigns else "Lidar archive"
     newest = sorted(entries, key=lambda entry: (entry.start, entry.path), reverse=True)
-    retrieved = [entry for entry in newest if entry.kind != SIGNAL] or newest
+    retrieved = [entry for entry in newest if is_retrieved(entry.kind)] or newest
     return _render(
         "index.html",
         INDEX,
@@ -332,7 +332,7 @@ def day(
                 instrument,
                 [
                     (
-                        _ABOUT.get(kind, f"Kind {kind}"),
+                        _about(kind, "Kind"),
                         [_card(entry, page, place=False) for entry in rows],
                     )
                     for kind, rows in groupby(group, key=lambda entry: entry.kind)

@@ -8,7 +8,8 @@ from enum import StrEnum
 from statistics import fmean
 from typing import Final
 
-SIGNAL: Final = "signal"
+from lidarops.netcdf.variables import is_retrieved
+
 UNKNOWN: Final = "unknown"
 
 
@@ -124,7 +125,7 @@ def mean_share(entries: Iterable[Entry]) -> float | None:
     mean is over products, not values, so that a product of many bins does not dominate one of few
     sections. None without quality flags.
     """
-    known = [(entry.kind == SIGNAL, entry.share) for entry in entries if entry.share is not None]
-    retrieved = [share for is_signal, share in known if not is_signal]
+    known = [(entry.kind, entry.share) for entry in entries if entry.share is not None]
+    retrieved = [share for kind, share in known if is_retrieved(kind)]
     shares = retrieved or [share for _, share in known]
     return fmean(shares) if shares else None

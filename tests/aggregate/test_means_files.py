@@ -17,7 +17,6 @@ from support.products.made_products import MAKERS
 from lidarops.aggregate.facts import Refused, groups, read_facts
 from lidarops.aggregate.means import MeansResult, write_means
 from lidarops.aggregate.means_variables import (
-    BUDGETS,
     Period,
     Weights,
     averaged,
@@ -344,18 +343,10 @@ def test_means_are_no_products(tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", list(kinds()))
-def test_every_error_that_is_not_random_has_a_budget(kind: str):
+def test_every_systematic_error_is_averaged(kind: str):
     source = layout_of(kind)
-    for row in averaged(kind):
-        if row.error_kind not in (None, ErrorKind.RANDOM):
-            assert (kind, row.name) in BUDGETS
     covered = {systematic(kind, row.name) for row in averaged(kind)}
-    covered |= {
-        name
-        for (budget_kind, _), budget in BUDGETS.items()
-        if budget_kind is kind
-        for name in budget.shared
-    }
+    covered |= {name for row in averaged(kind) if row.budget for name in row.budget.shared}
     for row in source.data:
         if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:
             assert row.name in covered, row.name

@@ -8,6 +8,7 @@ from support.oracles.angle_scenes import clear, estimates
 
 from lidarops.aggregate._sums import Sample, Sums
 from lidarops.aggregate.means_variables import budget_of
+from lidarops.netcdf.variables import layout_of
 from lidarops.retrieve.multiangle.vertical import smooth_profile
 
 CYCLES = 48
@@ -30,7 +31,7 @@ def test_means_stay_within_their_errors(name: str):
             residuals=depths.residuals,
         )
         errors = getattr(smooth, f"{name}_standard_error")
-        budget = budget_of("multiangle", name)
+        budget = budget_of(layout_of("multiangle").row(name))
         random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = ~(smooth.extrapolated | smooth.prior_dominated)
         day = Sample(getattr(smooth, name), errors, random, shared, None, usable)

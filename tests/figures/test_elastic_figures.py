@@ -17,10 +17,11 @@ from support.products.made_products import context, elastic
 
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures
-from lidarops.figures.profile_data import CAUSES, clearest_profile
 from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
 from lidarops.netcdf.write import write_product
+from lidarops.products.elastic.figure_data import CAUSES, clearest_profile
+from lidarops.products.elastic.report_figures import error_budget_figure
 from lidarops.records import RunRecord
 from lidarops.reports import gallery
 
@@ -48,7 +49,7 @@ def product(made: xr.Dataset, tmp_path: Path) -> xr.Dataset:
 
 def backscatter_quicklook(product, *, title=""):
     raster = read_raster(product, quantity=QUANTITY)
-    return product_figures.draw_backscatter([raster], title=title)
+    return product_figures.draw_image([raster], title=title, what="attenuated backscatter")
 
 
 def lines(panel, label):
@@ -180,7 +181,7 @@ class TestClearestProfile:
 class TestErrorBudget:
     def test_curves_hold_the_profile_in_inverse_megametres(self, product):
         profile = clearest_profile(product)
-        figure = product_figures.error_budget_figure(profile, title="lidar")
+        figure = error_budget_figure(profile, title="lidar")
         left, right = figure.axes
         (value,) = lines(left, "particles, $\\pm$1 standard error")
         np.testing.assert_allclose(value.get_xdata(), MEGA * profile.backscatter)
@@ -201,7 +202,7 @@ class TestErrorBudget:
             assert "sr$^{-1}$" in panel.get_xlabel()
 
     def test_the_description_names_quantity_and_reference(self, product):
-        figure = product_figures.error_budget_figure(clearest_profile(product), title="lidar")
+        figure = error_budget_figure(clearest_profile(product), title="lidar")
         words = product_figures.alt_text(figure)
         assert words.startswith("lidar: particle backscatter")
         assert "0.2" in words
@@ -214,7 +215,7 @@ class TestErrorBudget:
     def test_equal_profiles_give_equal_bytes(self, product):
         first, second = (
             product_figures.render(
-                product_figures.error_budget_figure(clearest_profile(product), title=r"$\broken{")
+                error_budget_figure(clearest_profile(product), title=r"$\broken{")
             )
             for _ in range(2)
         )

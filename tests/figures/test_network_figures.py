@@ -11,15 +11,11 @@ from matplotlib.colors import to_rgba
 from support.products.made_network import EXTINCTION, product
 
 from lidarops.errors import ProductError
-from lidarops.figures import network_figures, product_figures
-from lidarops.figures.network_data import (
-    instruments_of,
-    join_crossings,
-    read_crossings,
-    read_map,
-)
-from lidarops.figures.series_data import compare
+from lidarops.figures import product_figures
+from lidarops.figures.series_data import compare, join
 from lidarops.flags import Quality
+from lidarops.products.visibility import report_figures
+from lidarops.products.visibility.figure_data import instruments_of, read_crossings, read_map
 from lidarops.records import LeftOut, Plan, SceneOutcome, Step
 
 NAMES = ("lidar-0", "lidar-1", "lidar-2")
@@ -58,7 +54,6 @@ def test_series_hold_values_errors_and_truth(made):
         np.testing.assert_allclose(
             crossing.estimates["visibility"].truth, -np.log(0.05) / EXTINCTION / 1e3, rtol=1e-6
         )
-        assert crossing.near < 1600.0
         comparison = compare(crossing, "extinction")
         assert comparison is not None
         assert comparison.within_3 == 1.0
@@ -89,9 +84,9 @@ def test_truth_is_the_mean_over_the_beams_at_the_crossing(made):
 
 def test_scenes_are_joined_in_time(made):
     halves = [made.isel(time=slice(6, 12)), made.isel(time=slice(6))]
-    joined = join_crossings([crossing for half in halves for crossing in read_crossings(half)])
+    joined = join(crossing for half in halves for crossing in read_crossings(half))
     whole = read_crossings(made)
-    assert [crossing.crossing for crossing in joined] == [0, 1, 2]
+    assert [crossing.number for crossing in joined] == [0, 1, 2]
     for crossing, expected in zip(joined, whole, strict=True):
         np.testing.assert_array_equal(crossing.time, expected.time)
         np.testing.assert_array_equal(
@@ -101,7 +96,7 @@ def test_scenes_are_joined_in_time(made):
 
 def test_the_map_shows_each_crossing_in_words_and_colour(made):
     network = read_map(made, NAMES)
-    figure = network_figures.draw_map(network, title="valley")
+    figure = report_figures.draw_map(network, title="valley")
     (panel, *_) = figure.axes
     texts = [text.get_text() for text in panel.texts]
     medians = np.median(made["visibility_in_air"].values, axis=0) / 1e3
@@ -122,7 +117,7 @@ def test_the_map_shows_each_crossing_in_words_and_colour(made):
 def test_a_crossing_without_a_value_is_labelled(made):
     lost = made.copy(deep=True)
     lost["quality_flag"][:, 1] = int(Quality.LOW_SIGNAL)
-    figure = network_figures.draw_map(read_map(lost))
+    figure = report_figures.draw_map(read_map(lost))
     assert "1: no value" in [text.get_text() for text in figure.axes[0].texts]
 
 
@@ -144,7 +139,7 @@ def test_beams_in_a_vertical_plane_are_drawn_upright(made):
 
 def test_series_are_drawn_with_errors_and_truth(made):
     series = read_crossings(made, truth(made), instruments=NAMES)
-    figure = network_figures.draw_series(series, title="valley")
+    figure = report_figures.draw_crossings(series, title="valley")
     upper, lower = figure.axes
     for panel, quantity, scale in ((upper, "visibility", 1.0), (lower, "extinction", 1e3)):
         gids = [line.get_gid() for line in panel.lines]
@@ -157,7 +152,7 @@ def test_series_are_drawn_with_errors_and_truth(made):
             )
         assert "km" in panel.get_ylabel()
     assert "0 of 12 rejected" in product_figures.alt_text(figure)
-    again = network_figures.draw_series(series, title="valley")
+    again = report_figures.draw_crossings(series, title="valley")
     assert product_figures.render(figure).png == product_figures.render(again).png
 
 

@@ -26,8 +26,10 @@ from support.products.fabricated import (
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures
 from lidarops.figures.raster import COLUMNS, read_raster
-from lidarops.figures.series_data import join, read_sections
+from lidarops.figures.series_data import join
 from lidarops.flags import Quality
+from lidarops.products.homogeneous import report_figures
+from lidarops.products.homogeneous.figure_data import read_sections
 
 INSTRUMENT = {"instrument": "horizontal", "channel": CHANNEL}
 
@@ -39,17 +41,17 @@ def sections_of(products, truth=None, **options):
 
 
 def retrieval(products, truth=None, *, title="", **options):
-    return product_figures.draw_retrieval(sections_of(products, truth, **options), title=title)
+    return report_figures.draw_retrieval(sections_of(products, truth, **options), title=title)
 
 
 def truth_comparison(products, truth, **options):
-    return product_figures.draw_comparison(sections_of(products, truth, **options))
+    return report_figures.draw_comparison(sections_of(products, truth, **options))
 
 
 def quicklook(products, *, title=""):
     profiles = -(-sum(product.sizes["time"] for product in products) // COLUMNS)
     rasters = [read_raster(product, profiles=profiles) for product in products]
-    return product_figures.draw_quicklook(rasters, title=title)
+    return product_figures.draw_image(rasters, title=title)
 
 
 def lines(panel, gid):
@@ -335,7 +337,7 @@ class TestOverview:
     def test_is_a_picture_of_1200_by_600(self):
         time = times(START, 96, 900.0)
         product = homogeneous(time, sections=SECTIONS[:1])
-        figure = product_figures.overview(
+        figure = report_figures.overview(
             product, truth_of(time), signal(time, bins=200), instrument="horizontal"
         )
         assert picture(figure).shape == (600, 1200, 3)
@@ -344,7 +346,7 @@ class TestOverview:
         assert figure.axes[1].collections
 
     def test_signal_and_truth_may_be_absent(self):
-        figure = product_figures.overview(homogeneous(times(START, 9, 900.0)), None, None)
+        figure = report_figures.overview(homogeneous(times(START, 9, 900.0)), None, None)
         assert len(figure.axes) == 1
         assert picture(figure).shape == (600, 1200, 3)
 
@@ -371,10 +373,11 @@ def test_no_global_state_of_matplotlib_is_touched():
         "from support.products import fabricated as fab\n"
         "from lidarops.figures import product_figures as figures\n"
         "from lidarops.figures.raster import read_raster\n"
-        "from lidarops.figures.series_data import read_sections\n"
+        "from lidarops.products.homogeneous.figure_data import read_sections\n"
+        "from lidarops.products.homogeneous.report_figures import draw_retrieval\n"
         "time = fab.times(fab.START, 5, 60.0)\n"
-        "figures.render(figures.draw_retrieval(read_sections(fab.homogeneous(time))))\n"
-        "figures.render(figures.draw_quicklook([read_raster(fab.signal(time, bins=40))]))\n"
+        "figures.render(draw_retrieval(read_sections(fab.homogeneous(time))))\n"
+        "figures.render(figures.draw_image([read_raster(fab.signal(time, bins=40))]))\n"
         "assert state() == before\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )

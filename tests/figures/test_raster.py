@@ -176,6 +176,6 @@ def test_other_rasters_are_not_joined():
 
 def test_joining_does_not_change_the_figure(monkeypatch):
     parts = rasters_of(0, 1, 2, 6, 6.5)
-    expected = product_figures.render(product_figures.draw_quicklook(parts, title="joined"))
+    expected = product_figures.render(product_figures.draw_image(parts, title="joined"))
     monkeypatch.setattr(panels, "joined", list)
-    assert product_figures.render(product_figures.draw_quicklook(parts, title="joined")) == expected
+    assert product_figures.render(product_figures.draw_image(parts, title="joined")) == expected

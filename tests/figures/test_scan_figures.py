@@ -12,9 +12,9 @@ from PIL import Image
 from support.products.fabricated import CHANNEL, START, Archive, outcome, run_record, times
 
 from lidarops.errors import ProductError
-from lidarops.figures import product_figures, scan_data
+from lidarops.figures import product_figures
 from lidarops.flags import Quality
-from lidarops.kinds import kinds
+from lidarops.products.multiangle import figure_data, report_figures
 from lidarops.reports import gallery
 
 STATION = 180.0
@@ -125,7 +125,8 @@ def truth_of(product, *, instrument="plain-scanner", zenith=(60.0, 30.0, 45.0)):
 
 
 def extinction_quicklook(product, *, title=""):
-    return product_figures.draw_extinction([scan_data.read_extinction(product)], title=title)
+    rasters = [figure_data.read_extinction(product)]
+    return product_figures.draw_image(rasters, title=title, what="extinction", along="altitude")
 
 
 def artist(panel, gid):
@@ -139,8 +140,8 @@ def picture(figure):
 
 
 def drawn(product, truth=None):
-    profile = scan_data.clearest_cycle(product, truth, instrument="plain-scanner")
-    return product_figures.scan_profile(profile, title="scanner").axes
+    profile = figure_data.clearest_cycle(product, truth, instrument="plain-scanner")
+    return report_figures.scan_profile(profile, title="scanner").axes
 
 
 def half_width(band, z):
@@ -154,7 +155,7 @@ class TestClearestCycle:
     def test_most_unflagged_values_win(self):
         product = multiangle()
         product["quality_flag"][7] = np.where(ALTITUDE > REACH, int(Quality.EXTRAPOLATED), 0)
-        profile = scan_data.clearest_cycle(product)
+        profile = figure_data.clearest_cycle(product)
         assert profile.time == product["time"].values[7]
         assert profile.altitude[-1] <= ALTITUDE[0] + 1.15 * (REACH - ALTITUDE[0])
         assert profile.altitude[-1] > REACH
@@ -165,16 +166,16 @@ class TestClearestCycle:
         flag[0, :5] |= int(Quality.POOR_STRATIFICATION)
         flag[:, ALTITUDE > REACH] |= int(Quality.EXTRAPOLATED)
         product["quality_flag"] = (BOTH, flag)
-        assert scan_data.clearest_cycle(product).time == product["time"].values[1]
+        assert figure_data.clearest_cycle(product).time == product["time"].values[1]
 
     def test_where_all_are_rejected_the_cycle_with_most_values_is_shown(self):
         product = multiangle()
         product["quality_flag"][:] = int(Quality.POOR_STRATIFICATION)
         product["optical_depth"][:9, :3] = np.nan
-        profile = scan_data.clearest_cycle(product)
+        profile = figure_data.clearest_cycle(product)
         assert profile.time == product["time"].values[9]
         assert np.isnan(profile.estimates["extinction"].value).all()
-        for panel, name in zip(drawn(product), scan_data.QUANTITIES, strict=True):
+        for panel, name in zip(drawn(product), figure_data.QUANTITIES, strict=True):
             low, high = panel.get_xlim()
             marks = artist(panel, f"flagged-{name}").get_xdata()
             assert ((marks >= low) & (marks <= high)).all()
@@ -185,12 +186,12 @@ class TestClearestCycle:
     def test_nothing_where_there_is_no_value(self):
         product = multiangle()
         product["optical_depth"][:] = np.nan
-        assert scan_data.clearest_cycle(product) is None
-        assert scan_data.clearest_cycle(multiangle().isel(time=slice(0))) is None
+        assert figure_data.clearest_cycle(product) is None
+        assert figure_data.clearest_cycle(multiangle().isel(time=slice(0))) is None
 
     def test_values_that_a_bit_rejects_are_kept_apart(self):
         product = multiangle()
-        profile = scan_data.clearest_cycle(product)
+        profile = figure_data.clearest_cycle(product)
         low = profile.altitude < 600
         for estimate in profile.estimates.values():
             assert np.isnan(estimate.value[low]).all()
@@ -201,13 +202,13 @@ class TestClearestCycle:
     def test_everything_is_shown_where_there_is_no_reach(self):
         product = multiangle()
         product["reach"][:] = np.nan
-        assert scan_data.clearest_cycle(product).altitude.size == ALTITUDE.size
+        assert figure_data.clearest_cycle(product).altitude.size == ALTITUDE.size
 
     def test_a_fill_value_in_the_flags_means_missing(self):
         product = multiangle()
         product["quality_flag"] = product["quality_flag"].astype(np.float64)
         product["quality_flag"][:, 20] = np.nan
-        profile = scan_data.clearest_cycle(product)
+        profile = figure_data.clearest_cycle(product)
         assert profile.flag[20] == int(Quality.INPUT_MISSING)
         assert np.isnan(profile.estimates["optical_depth"].value[20])
 
@@ -215,7 +216,7 @@ class TestClearestCycle:
 class TestTruth:
     def test_the_file_nearest_to_the_zenith_is_taken(self):
         product = multiangle()
-        profile = scan_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
+        profile = figure_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
         assert profile.truth.zenith_angle == 30.0
         assert profile.truth.time == profile.time + np.timedelta64(60, "s")
 
@@ -223,7 +224,7 @@ class TestTruth:
     def test_in_level_layers_any_beam_gives_the_vertical_profile(self, zenith):
         product = multiangle(cycles=3)
         truth = truth_of(product, zenith=(zenith,))
-        profile = scan_data.true_profile(product, 1, truth, instrument="plain-scanner")
+        profile = figure_data.true_profile(product, 1, truth, instrument="plain-scanner")
         assert profile.edges[0] == STATION
         np.testing.assert_allclose(
             profile.optical_depth, true_depth(profile.edges), rtol=1e-9, atol=1e-9
@@ -243,30 +244,30 @@ class TestTruth:
             truth_of(product).drop_vars("zenith_angle"),
             truth_of(product.assign_coords(time=product["time"] + np.timedelta64(3, "h"))),
         ):
-            assert scan_data.true_profile(product, 1, truth, instrument="plain-scanner") is None
+            assert figure_data.true_profile(product, 1, truth, instrument="plain-scanner") is None
         truth = truth_of(product)
         for other in (
             product.drop_vars("station_altitude"),
             product.assign_coords(wavelength=1064.0),
             product.drop_vars("wavelength"),
         ):
-            assert scan_data.true_profile(other, 1, truth, instrument="plain-scanner") is None
+            assert figure_data.true_profile(other, 1, truth, instrument="plain-scanner") is None
 
     def test_bounds_of_the_cycle_limit_the_time_of_the_truth(self):
         product = multiangle(cycles=1)
         truth = truth_of(product, zenith=(30.0,))
         truth["time"] = truth["time"] + np.timedelta64(10, "m")
-        assert scan_data.true_profile(product, 0, truth, instrument="plain-scanner") is None
+        assert figure_data.true_profile(product, 0, truth, instrument="plain-scanner") is None
         half = np.timedelta64(510, "s")
         middle = product["time"].values
         product["time_bnds"] = (("time", "nv"), np.stack([middle - half, middle + half], axis=1))
-        assert scan_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
+        assert figure_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
 
     def test_a_wavelength_in_metres_is_understood(self):
         product = multiangle(cycles=2)
         product = product.assign_coords(wavelength=((), 532e-9, {"units": "m"}))
         truth = truth_of(product)
-        assert scan_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
+        assert figure_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
 
 
 class TestProfileFigure:
@@ -291,7 +292,7 @@ class TestProfileFigure:
         )
 
     def test_flagged_values_and_missing_ones_are_marked_at_their_altitude(self):
-        for panel, name in zip(drawn(multiangle()), scan_data.QUANTITIES, strict=True):
+        for panel, name in zip(drawn(multiangle()), figure_data.QUANTITIES, strict=True):
             z = 1e3 * artist(panel, f"flagged-{name}").get_ydata()
             np.testing.assert_allclose(z, ALTITUDE[ALTITUDE < 600])
             z = 1e3 * artist(panel, f"care-{name}").get_ydata()
@@ -301,7 +302,7 @@ class TestProfileFigure:
     def test_without_flags_there_are_no_marks(self):
         product = multiangle().sel(altitude=slice(None, REACH))
         product["quality_flag"][:] = 0
-        for panel, name in zip(drawn(product), scan_data.QUANTITIES, strict=True):
+        for panel, name in zip(drawn(product), figure_data.QUANTITIES, strict=True):
             for kind in ("flagged", "care", "empty"):
                 assert artist(panel, f"{kind}-{name}") is None
 
@@ -362,14 +363,14 @@ class TestProfileFigure:
     def test_extinction_withheld_where_the_optical_depth_is_known(self):
         product = multiangle()
         product["extinction"][:] = np.nan
-        figure = product_figures.scan_profile(scan_data.clearest_cycle(product), title="scanner")
+        figure = report_figures.scan_profile(figure_data.clearest_cycle(product), title="scanner")
         assert "extinction no usable value" in product_figures.alt_text(figure)
         assert np.isfinite(figure.axes[1].get_xlim()).all()
 
     def test_the_description_lists_reach_truth_and_flags(self):
         product = multiangle()
-        profile = scan_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
-        words = product_figures.alt_text(product_figures.scan_profile(profile, title="scanner"))
+        profile = figure_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
+        words = product_figures.alt_text(report_figures.scan_profile(profile, title="scanner"))
         for part in ("scanner", "2024-03-01 00:08:30 UTC", "reach 3.5 km", "truth"):
             assert part in words
         flagged = int((profile.flag != 0).sum())
@@ -381,7 +382,7 @@ class TestProfileFigure:
 class TestResiduals:
     def test_means_and_rms_are_those_of_the_product_in_percent(self):
         product = multiangle()
-        read = scan_data.read_residuals(product)
+        read = figure_data.read_residuals(product)
         residual = 100 * product["residual"].values[..., ALTITUDE <= REACH]
         np.testing.assert_array_equal(read.zenith_angle, [-60, -45, -30, 0, 30, 45, 60])
         np.testing.assert_allclose(read.mean, residual.mean(axis=0).T)
@@ -394,7 +395,7 @@ class TestResiduals:
         np.testing.assert_allclose(read.edges[[0, -1]], [ALTITUDE[0] - 25, REACH + 5], atol=30)
 
     def test_noise_averages_out_and_a_gradient_does_not(self):
-        read = scan_data.read_residuals(multiangle(cycles=100, tilt=0.02))
+        read = figure_data.read_residuals(multiangle(cycles=100, tilt=0.02))
         upright = int(np.flatnonzero(read.zenith_angle == 0)[0])
         assert read.rms_of_mean[upright] == pytest.approx(0.1, rel=0.3)
         assert read.rms_of_mean[[0, -1]] == pytest.approx(2 * np.sin(np.radians(60)), rel=0.05)
@@ -406,11 +407,11 @@ class TestResiduals:
         high = ALTITUDE > 2000
         product["residual"][1:, :, high] = np.nan
         product["residual"][0, :, high] = 0.5
-        read = scan_data.read_residuals(product)
+        read = figure_data.read_residuals(product)
         assert (read.rms_of_mean <= read.rms).all()
         residual = 100 * product["residual"].values
         np.testing.assert_allclose(read.rms, np.sqrt(np.nanmean(residual**2, axis=(0, 2))))
-        clim = artist(product_figures.scan_residuals(read).axes[0], "residual").get_clim()
+        clim = artist(report_figures.scan_residuals(read).axes[0], "residual").get_clim()
         assert 1.5 < clim[1] < 5.0
 
     def test_rows_join_altitudes_where_there_are_many(self):
@@ -419,7 +420,7 @@ class TestResiduals:
         product = product.interp(altitude=fine, method="nearest").assign(
             quality_flag=(BOTH, np.zeros((2, 950), dtype=np.int32))
         )
-        read = scan_data.read_residuals(product)
+        read = figure_data.read_residuals(product)
         assert read.mean.shape == (95, ZENITH.size)
         assert read.edges.size == 96
         first = 100 * product["residual"].values[:, :, :10].mean(axis=(0, 2))
@@ -429,18 +430,18 @@ class TestResiduals:
         product = multiangle()
         product["residual"][:6] = 0.0
         product["quality_flag"][:6] |= int(Quality.NO_RESIDUAL)
-        read = scan_data.read_residuals(product)
+        read = figure_data.read_residuals(product)
         assert read.cycles == 6
         kept = 100 * product["residual"].values[6:][..., ALTITUDE <= REACH]
         np.testing.assert_allclose(read.rms, np.sqrt((kept**2).mean(axis=(0, 2))))
         product["quality_flag"][:] |= int(Quality.NO_RESIDUAL)
-        assert scan_data.read_residuals(product) is None
+        assert figure_data.read_residuals(product) is None
 
     def test_reading_in_parts_changes_nothing(self, monkeypatch):
         product = multiangle()
-        whole = scan_data.read_residuals(product)
-        monkeypatch.setattr(scan_data, "_READ_BYTES", 1)
-        parts = scan_data.read_residuals(product)
+        whole = figure_data.read_residuals(product)
+        monkeypatch.setattr(figure_data, "_READ_BYTES", 1)
+        parts = figure_data.read_residuals(product)
         np.testing.assert_allclose(parts.mean, whole.mean)
         np.testing.assert_allclose(parts.rms, whole.rms)
         assert parts.cycles == whole.cycles
@@ -467,23 +468,23 @@ class TestResiduals:
             beam_zenith_angle=("beam", np.array(zenith, dtype=float)),
             beam_azimuth=("beam", np.array(azimuth, dtype=float)),
         )
-        read = scan_data.read_residuals(product)
+        read = figure_data.read_residuals(product)
         np.testing.assert_array_equal(read.zenith_angle, signed)
         np.testing.assert_array_equal(read.plane, planes)
         np.testing.assert_array_equal(read.azimuths, azimuths)
-        upper, lower = product_figures.scan_residuals(read).axes[:2]
+        upper, lower = report_figures.scan_residuals(read).axes[:2]
         borders = [line for line in upper.get_lines() if line.get_gid() == "plane"]
         assert len(borders) == max(planes)
         assert ("not known" in lower.get_xlabel()) == bool(np.isnan(azimuths).any())
 
     def test_azimuths_may_be_missing(self):
-        read = scan_data.read_residuals(multiangle().drop_vars("beam_azimuth"))
+        read = figure_data.read_residuals(multiangle().drop_vars("beam_azimuth"))
         np.testing.assert_array_equal(read.zenith_angle, np.sort(ZENITH))
         assert np.isnan(read.azimuths).all()
 
     def test_the_map_holds_the_means_on_a_scale_around_zero(self):
-        read = scan_data.read_residuals(multiangle())
-        panel, below = product_figures.scan_residuals(read).axes[:2]
+        read = figure_data.read_residuals(multiangle())
+        panel, below = report_figures.scan_residuals(read).axes[:2]
         mesh = artist(panel, "residual")
         np.testing.assert_allclose(mesh.get_array(), read.mean)
         low, high = mesh.get_clim()
@@ -493,23 +494,23 @@ class TestResiduals:
         assert below.get_xticklabels()[0].get_text() == "\u221260"
 
     def test_negative_residuals_differ_from_positive_ones_in_grey(self):
-        read = scan_data.read_residuals(multiangle())
-        hatched = artist(product_figures.scan_residuals(read).axes[0], "negative").get_array()
+        read = figure_data.read_residuals(multiangle())
+        hatched = artist(report_figures.scan_residuals(read).axes[0], "negative").get_array()
         shown = ~np.ma.getmaskarray(hatched)
         assert (read.mean[shown] < 0).all()
         assert shown[:, 0].mean() > 0.95
         assert not shown[:, 4:].any()
 
     def test_one_cycle_has_no_mean_apart(self):
-        below = product_figures.scan_residuals(scan_data.read_residuals(multiangle(cycles=1))).axes[
-            1
-        ]
+        below = report_figures.scan_residuals(
+            figure_data.read_residuals(multiangle(cycles=1))
+        ).axes[1]
         assert artist(below, "rms-of-mean") is None
 
     def test_residuals_that_are_all_zero_can_be_drawn(self):
         product = multiangle()
         product["residual"][:] = 0.0
-        figure = product_figures.scan_residuals(scan_data.read_residuals(product))
+        figure = report_figures.scan_residuals(figure_data.read_residuals(product))
         assert artist(figure.axes[0], "negative") is None
         assert picture(figure).std() > 0
 
@@ -517,7 +518,7 @@ class TestResiduals:
         product = multiangle()
         product["residual"][:, 1] += 0.2
         words = product_figures.alt_text(
-            product_figures.scan_residuals(scan_data.read_residuals(product), title="s")
+            report_figures.scan_residuals(figure_data.read_residuals(product), title="s")
         )
         assert "mean of 12 cycles" in words
         assert "zenith angle of -45 degrees" in words
@@ -547,7 +548,7 @@ class TestQuicklook:
 
     def test_many_cycles_become_columns_of_means(self):
         product = multiangle(cycles=60)
-        raster = scan_data.read_extinction(product, profiles=20)
+        raster = figure_data.read_extinction(product, profiles=20)
         assert raster.mean.shape == (3, ALTITUDE.size)
         np.testing.assert_allclose(
             raster.mean[0, 10], 1e3 * product["extinction"].values[:20, 10].mean(), rtol=1e-6
@@ -559,15 +560,15 @@ class TestQuicklook:
 
 
 READERS = {
-    "profile": scan_data.clearest_cycle,
-    "residuals": scan_data.read_residuals,
+    "profile": figure_data.clearest_cycle,
+    "residuals": figure_data.read_residuals,
     "quicklook": extinction_quicklook,
 }
 NEEDED = {
     "profile": (
         *(
             f"{q}{e}"
-            for q in scan_data.QUANTITIES
+            for q in figure_data.QUANTITIES
             for e in ("", "_standard_error", "_gradient_error")
         ),
         "reach",
@@ -608,12 +609,12 @@ class TestRendering:
         product = multiangle()
 
         def files():
-            profile = scan_data.clearest_cycle(
+            profile = figure_data.clearest_cycle(
                 product, truth_of(product), instrument="plain-scanner"
             )
-            yield product_figures.render(product_figures.scan_profile(profile, title="s")).png
+            yield product_figures.render(report_figures.scan_profile(profile, title="s")).png
             yield product_figures.render(
-                product_figures.scan_residuals(scan_data.read_residuals(product))
+                report_figures.scan_residuals(figure_data.read_residuals(product))
             ).png
             yield product_figures.render(extinction_quicklook(product)).png
 
@@ -623,8 +624,8 @@ class TestRendering:
         title = "$\\frac{broken \x1b"
         product = multiangle(cycles=2)
         for figure in (
-            product_figures.scan_profile(scan_data.clearest_cycle(product), title=title),
-            product_figures.scan_residuals(scan_data.read_residuals(product), title=title),
+            report_figures.scan_profile(figure_data.clearest_cycle(product), title=title),
+            report_figures.scan_residuals(figure_data.read_residuals(product), title=title),
             extinction_quicklook(product, title=title),
         ):
             assert picture(figure).std() > 0
@@ -671,10 +672,3 @@ class TestGallery:
         made, _ = self.run(tmp_path, {"a.nc": product})
         assert not made.problems
         assert [figure.file.partition("_")[0] for figure in made.pictures] == ["multiangle"]
-
-    def test_multiangle_comes_after_homogeneous_and_before_the_others(self):
-        ranks = [
-            gallery._KIND_ORDER.index(kind) for kind in ("homogeneous", "multiangle", "elastic")
-        ]
-        assert ranks == sorted(ranks)
-        assert set(gallery._KIND_ORDER) == set(kinds())

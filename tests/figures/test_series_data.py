@@ -18,10 +18,10 @@ from lidarops.figures.series_data import (
     compare,
     join,
     normalised_error,
-    read_sections,
     thin,
 )
 from lidarops.flags import Quality
+from lidarops.products.homogeneous.figure_data import read_sections
 
 
 def sections_of(product, truth=None, **options):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final
 
 from lidarops.flags import Quality
@@ -13,6 +14,7 @@ from lidarops.netcdf.variables import (
     STANDARD_NAME_TABLE,
     SUBTRACTED_BACKGROUND,
     Coverage,
+    ErrorBudget,
     ErrorKind,
     Layout,
     Row,
@@ -87,6 +89,15 @@ def _error_budget() -> Iterator[Row]:
 
 
 _BUDGET_TERMS: Final = tuple(f"backscatter_error_{source}" for source in _BUDGET)
+_MEANS: Final = ErrorBudget(
+    random=("backscatter_error_noise", "backscatter_error_background"),
+    comment="Errors from noise and background are independent between profiles. Errors from"
+    " reference, lidar ratio and molecules are assumed to be shared by all profiles, so that they"
+    " are averaged and do not decrease with the number of profiles.",
+)
+_SHARED: Final = tuple(
+    f"backscatter_error_{source}" for source in ("reference", "lidar_ratio", "molecular")
+)
 
 LAYOUT: Final = Layout(
     title="Aerosol backscatter and extinction from elastic signals",
@@ -131,6 +142,7 @@ LAYOUT: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
+            budget=replace(_MEANS, shared=_SHARED),
         ),
         *_error_budget(),
         Row(
@@ -154,6 +166,7 @@ LAYOUT: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
+            budget=replace(_MEANS, times="lidar_ratio"),
             comment="backscatter times lidar_ratio.",
         ),
         Row(
@@ -168,6 +181,7 @@ LAYOUT: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
+            budget=replace(_MEANS, over="molecular_backscatter"),
             comment="Free of attenuation, unlike backscattering_ratio_in_air of the"
             f" {STANDARD_NAME_TABLE}. {NO_STANDARD_NAME}",
         ),
@@ -184,6 +198,7 @@ LAYOUT: Final = Layout(
             ancillaries=("quality_flag", "profiles", "shots"),
             significant_bits=_BITS,
             uncertain=True,
+            # Noise of the calibration and noise of the bins are not stated separately.
             error_kind=ErrorKind.BOTH,
             comment="Calibrated in the reference window.",
         ),

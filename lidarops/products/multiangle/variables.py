@@ -162,6 +162,7 @@ LAYOUT: Final = Layout(
             ),
             significant_bits=_BITS,
             uncertain=True,
+            # Noise, and smoothing error that profiles share, are not stated separately.
             error_kind=ErrorKind.BOTH,
             comment=f"Along the vertical, at the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
@@ -198,6 +199,7 @@ LAYOUT: Final = Layout(
             ),
             significant_bits=_BITS,
             uncertain=True,
+            # Noise, and smoothing error that profiles share, are not stated separately.
             error_kind=ErrorKind.BOTH,
             comment="Mean over the layer in altitude_bnds, at the wavelength of the channel."
             f" {NO_STANDARD_NAME}",
@@ -263,6 +265,7 @@ LAYOUT: Final = Layout(
             ancillaries=("layer_optical_depth_gradient_error",),
             significant_bits=_BITS,
             uncertain=True,
+            # Noise, and smoothing error that profiles share, are not stated separately.
             error_kind=ErrorKind.BOTH,
             optional=True,
             comment="Along the vertical, at the wavelength of the channel. Missing where"

@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.figures.series_data import Section, thin
-from lidarops.figures.time_axis import TimeAxis, Times, segments
+from lidarops.figures import svg
+from lidarops.figures.kind_figures import Drawn, PageFigures
+from lidarops.figures.series_data import Series, thin
+from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+from lidarops.figures.time_axis import TimeAxis, Times, segments, time_axis
 from lidarops.figures.wording import counted
-from lidarops.site import svg
-from lidarops.site.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,8 +43,8 @@ class Line:
     """Flagged values; NaN without a value."""
 
 
-def line_of(section: Section, quantity: str, factor: float) -> Line:
-    """Return a quantity of a section, multiplied by `factor`."""
+def line_of(section: Series, quantity: str, factor: float) -> Line:
+    """Return a quantity of a series, multiplied by `factor`."""
     few = thin(section, POINTS)
     estimate = few.estimates[quantity]
     off = section.flag != 0
@@ -164,8 +165,9 @@ def in_words(lines: Sequence[Line], units: str) -> str:
     return "; ".join(words)
 
 
-def sparkline(lines: Sequence[Line], width: float, height: float) -> Sheet:
+def sparkline(lines: Sequence[Line]) -> Sheet:
     """Return series without axes, for a thumbnail."""
+    width, height = svg.THUMB
     sheet = Sheet(height=height, width=width)
     times = np.unique(np.concatenate([line.time for line in lines]))
     low, high = limits(lines)
@@ -180,3 +182,58 @@ def sparkline(lines: Sequence[Line], width: float, height: float) -> Sheet:
         at = x(line.time[some].astype(np.int64).astype(np.float64))
         sheet.path(svg.marks(at, y(line.value[some]), svg.MARKS[index]), f"mark c{index}")
     return sheet
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A quantity of series in one of two panels."""
+
+    name: str
+    factor: float
+    """From the unit of the series to the displayed unit."""
+    units: str
+
+
+def stacked_page(
+    series: Sequence[Series], quantities: tuple[Quantity, Quantity], title: str
+) -> PageFigures:
+    """Draw two quantities of series against time, a few series per figure.
+
+    Parameters
+    ----------
+    series : sequence of Series
+        At least one.
+    quantities : pair of Quantity
+        The thumbnail shows the first.
+    title : str
+        Start of the captions.
+    """
+    drawn = []
+    for number, first in enumerate(range(0, len(series), SERIES), start=1):
+        sheet, words = _stack(series[first : first + SERIES], quantities, f"f{number}")
+        drawn.append(Drawn.of(sheet, f"{title} against time", words, f"f{number}"))
+    main = quantities[0]
+    lines = [line_of(part, main.name, main.factor) for part in series[:SERIES]]
+    alt = f"{main.name.capitalize()} against time. {in_words(lines, main.units)}"
+    return PageFigures(tuple(drawn), sparkline(lines), alt)
+
+
+def _stack(
+    series: Sequence[Series], quantities: tuple[Quantity, Quantity], key: str
+) -> tuple[Sheet, str]:
+    axis = time_axis(np.unique(np.concatenate([part.time for part in series])))
+    sheet = Sheet(height=516)
+    drawn: list[tuple[str, Panel, list[Line]]] = []
+    for quantity, (foot, top) in zip(quantities, ((268, 28), (466, 292)), strict=True):
+        lines = [line_of(part, quantity.name, quantity.factor) for part in series]
+        panel = Panel(time_scale(axis), Scale(*limits(lines), foot, top))
+        sheet.frame(panel, f"{quantity.name} ({quantity.units})")
+        drawn.append((quantity.name, panel, lines))
+    time_ticks(sheet, axis, [panel for _, panel, _ in drawn])
+    words = [in_words(drawn[0][2], quantities[0].units)]
+    for name, panel, lines in drawn:
+        beyond = values(sheet, panel, axis, lines, f"{key}-{name}")
+        if beyond:
+            words.append(f"{counted(beyond, 'value')} of {name} beyond the axis")
+    series_legend(sheet, 14, drawn[0][2])
+    return sheet, "; ".join(words)

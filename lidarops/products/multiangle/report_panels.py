@@ -13,9 +13,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import GREY, INK
-from lidarops.figures.scan_data import ProfileEstimate, ScanProfile, ScanResiduals
 from lidarops.figures.wording import bit_name, counted
 from lidarops.flags import Quality
+from lidarops.products.multiangle.figure_data import ProfileEstimate, ScanProfile, ScanResiduals
 
 Floats = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.figures.network_data import NetworkMap
+from lidarops.figures import svg
+from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
 from lidarops.figures.wording import counted
-from lidarops.site import svg
-from lidarops.site.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+from lidarops.products.visibility.figure_data import NetworkMap
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
     Parameters
     ----------
     network : NetworkMap
-        From `lidarops.figures.network_data.read_map`.
+        From `lidarops.products.visibility.figure_data.read_map`.
 
     Returns
     -------

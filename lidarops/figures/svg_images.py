@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarops.figures import svg
 from lidarops.figures.raster import Raster, colour_limits
+from lidarops.figures.svg import BAR, BLANK, COLOURS, LEFT, REJECTED, WIDTH, Panel, Scale, Sheet
+from lidarops.figures.svg_series import Line, limits, time_scale, time_ticks, values
 from lidarops.figures.time_axis import TimeAxis, time_axis
-from lidarops.site import svg
-from lidarops.site.series_panels import Line, limits, time_scale, time_ticks, values
-from lidarops.site.svg import BAR, BLANK, COLOURS, LEFT, REJECTED, WIDTH, Panel, Scale, Sheet
 
 Floats = NDArray[np.float64]
 
@@ -175,10 +175,11 @@ def _in_words(raster: Raster, blocks: Grid, ends: tuple[float, float] | None, al
     return "; ".join(words)
 
 
-def thumbnail(raster: Raster, width: float, height: float) -> Sheet:
+def thumbnail(raster: Raster) -> Sheet:
     """Return the image of a raster without axes."""
+    width, height = svg.THUMB
     axis = time_axis(raster.middle)
     sheet = Sheet(height=height, width=width, stretched=True)
     panel = Panel(Scale(0, 1, 0, width), Scale(0, 1, height, 0))
-    sheet.image(panel, svg.png(pixels(grid(raster, axis), axis, int(width), int(height))))
+    sheet.image(panel, svg.png(pixels(grid(raster, axis), axis, width, height)))
     return sheet

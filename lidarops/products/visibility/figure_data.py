@@ -11,10 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.series_data import (
-    Section,
+    NumberedSeries,
     SeriesEstimate,
     float_values,
-    join_estimates,
     require,
 )
 from lidarops.figures.time_axis import Times
@@ -46,18 +45,6 @@ _SAME_BEAM: Final = 0.2
 """degree; files of the truth within this zenith angle of a beam belong to it."""
 _FLAT: Final = 0.2
 """Smallest horizontal extent of a map that shows the ground, relative to the larger extent."""
-
-
-@dataclass(frozen=True, slots=True)
-class CrossingSeries(Section):
-    """Retrieved quantities at one crossing over time. `near` and `far` are its shortest range."""
-
-    crossing: int
-
-    @property
-    def label(self) -> str:
-        """Name of the crossing in legends."""
-        return f"crossing {self.crossing}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +81,7 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
 
 def read_crossings(
     product: xr.Dataset, truth: xr.Dataset | None = None, *, instruments: Sequence[str] = ()
-) -> list[CrossingSeries]:
+) -> list[NumberedSeries]:
     """Return the series at each crossing of a product.
 
     Parameters
@@ -108,7 +95,7 @@ def read_crossings(
 
     Returns
     -------
-    list of CrossingSeries
+    list of NumberedSeries
         Standard errors include the systematic error. The truth is the mean over the beams at the
         crossing.
 
@@ -127,15 +114,12 @@ def read_crossings(
     flags = product["quality_flag"].values.astype(np.int64)
     true_extinction = _truth(product, truth, instruments)
     time = product["time"].values.astype("datetime64[ns]")
-    nearest = np.nanmin(float_values(product, "beam_range"), axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         true_visibility = np.where(
             true_extinction > 0, _contrast_constant(value, visibility) / true_extinction, np.nan
         )
     return [
-        CrossingSeries(
-            near=float(nearest[v]),
-            far=float(nearest[v]),
+        NumberedSeries(
             time=time,
             flag=flags[:, v],
             estimates={
@@ -149,29 +133,11 @@ def read_crossings(
                     "km",
                 ),
             },
-            crossing=int(product["crossing_id"].values[v]),
+            noun="crossing",
+            number=int(product["crossing_id"].values[v]),
         )
         for v in range(product.sizes["crossing"])
     ]
-
-
-def join_crossings(series: Sequence[CrossingSeries]) -> list[CrossingSeries]:
-    """Join the series of several scenes by crossing, each over all times."""
-    joined = []
-    for number in sorted({part.crossing for part in series}):
-        parts = [part for part in series if part.crossing == number]
-        order = np.argsort(np.concatenate([part.time for part in parts]), kind="stable")
-        joined.append(
-            CrossingSeries(
-                near=parts[0].near,
-                far=parts[0].far,
-                time=np.concatenate([part.time for part in parts])[order],
-                flag=np.concatenate([part.flag for part in parts])[order],
-                estimates=join_estimates(parts, order),
-                crossing=number,
-            )
-        )
-    return joined
 
 
 def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap:

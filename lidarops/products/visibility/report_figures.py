@@ -1,8 +1,9 @@
-"""Figures of networks: a map of beams and crossings, and the series at each crossing."""
+"""The figures of the ``visibility`` product in reports: a map of beams, and series at crossings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -11,17 +12,58 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from lidarops.figures import panels
-from lidarops.figures.network_data import CrossingSeries, NetworkMap
-from lidarops.figures.time_axis import time_axis
-from lidarops.figures.wording import counted, visible
+from lidarops.figures import panels, product_figures
+from lidarops.figures.kind_figures import ReportFigure, ReportFigures
+from lidarops.figures.product_figures import described
+from lidarops.figures.report_sources import Group, Sources
+from lidarops.figures.series_data import NumberedSeries, compare, join
+from lidarops.figures.wording import counted
+from lidarops.products.visibility.figure_data import (
+    CROSSING_VARIABLES,
+    MAP_VARIABLES,
+    NetworkMap,
+    instruments_of,
+    read_crossings,
+    read_map,
+)
 
-_DPI: Final = 150
 _COLORS: Final = "cividis"
 """Perceptually uniform; readable with colour vision deficiency and in grey."""
 _LINES: Final = ("-", "--", "-.", ":")
 CROSSINGS: Final = panels.SECTIONS
 """Most crossings in one figure of series."""
+
+
+def _figures(group: Group, sources: Sources) -> Iterator[ReportFigure]:
+    read = [
+        partial(read_crossings, instruments=instruments_of(scene)) for scene, _ in group.members
+    ]
+    by_scene = list(sources.read_all(group, CROSSING_VARIABLES, read, with_truth=True))
+    series = join(crossing for crossings in by_scene for crossing in crossings)
+    sources.compare(group, (compare(crossing, "extinction") for crossing in series))
+    if not series:
+        return
+    read_network = partial(read_map, instruments=instruments_of(group.members[0][0]))
+    network = sources.read_first(group, MAP_VARIABLES, read_network)
+    if network is not None:
+        yield ReportFigure(
+            "network",
+            f"Beams, crossings and median visibility at the crossings: {group.label}.",
+            draw_map,
+            network,
+        )
+    for first in range(0, len(series), CROSSINGS):
+        few = series[first : first + CROSSINGS]
+        yield ReportFigure(
+            "visibility",
+            f"Visibility and extinction at the crossings, with standard errors:"
+            f" {group.label}, {', '.join(crossing.label for crossing in few)}.",
+            draw_crossings,
+            few,
+        )
+
+
+REPORT: Final = ReportFigures(_figures, compares=True)
 
 
 def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
@@ -30,7 +72,7 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
     Parameters
     ----------
     network : NetworkMap
-        From `lidarops.figures.network_data.read_map`.
+        From `lidarops.products.visibility.figure_data.read_map`.
     title : str, optional
 
     Returns
@@ -39,7 +81,7 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
         The colour of a crossing is its median visibility over time, also written beside it. A
         crossing without a value is hollow. Line styles distinguish instruments.
     """
-    figure = Figure(figsize=(7.4, 6.2), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(7.4, 6.2), dpi=product_figures.DPI, layout="constrained")
     panel = figure.subplots()
     panels.title(figure, title)
     panel.set_aspect("equal", adjustable="datalim")
@@ -81,14 +123,12 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
             network.numbers, network.visibility, network.used, strict=True
         )
     )
-    figure.set_label(
-        visible(
-            f"{title}: map of {counted(len(network.ends), 'beam')} of"
-            f" {counted(len(set(network.instruments)), 'instrument')}, with the median visibility"
-            f" at each crossing. {medians}."
-        )
+    return described(
+        figure,
+        f"{title}: map of {counted(len(network.ends), 'beam')} of"
+        f" {counted(len(set(network.instruments)), 'instrument')}, with the median visibility"
+        f" at each crossing. {medians}.",
     )
-    return figure
 
 
 def _beams(panel: Axes, network: NetworkMap) -> None:
@@ -114,12 +154,12 @@ def _beams(panel: Axes, network: NetworkMap) -> None:
         )
 
 
-def draw_series(series: Sequence[CrossingSeries], *, title: str = "") -> Figure:
+def draw_crossings(series: Sequence[NumberedSeries], *, title: str = "") -> Figure:
     """Draw visibility and extinction at crossings against time.
 
     Parameters
     ----------
-    series : sequence of CrossingSeries
+    series : sequence of NumberedSeries
         One to `CROSSINGS`.
     title : str, optional
 
@@ -129,18 +169,11 @@ def draw_series(series: Sequence[CrossingSeries], *, title: str = "") -> Figure:
         With 1-sigma errors (random and systematic), flagged values marked, and the truth as a
         black dashed line.
     """
-    axis = time_axis(np.unique(np.concatenate([crossing.time for crossing in series])))
-    figure = Figure(figsize=(10.0, 6.3), dpi=_DPI, layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    panels.title(figure, title)
-    panels.estimates(upper, axis, series, "visibility")
-    panels.estimates(lower, axis, series, "extinction")
-    for panel in (upper, lower):
+    quantities = ("visibility", "extinction")
+    figure, axes = product_figures.draw_series(series, quantities, title=title, heights=(2.6, 2.6))
+    for panel in axes:
         # Neither quantity is ever negative.
         panel.set_ylim(bottom=max(0.0, panel.get_ylim()[0]))
-    panels.time_ticks([upper, lower], axis)
-    panels.legend(upper)
-    panels.legend(lower, other=upper)
     words = []
     for crossing in series:
         good = ~crossing.rejected
@@ -148,9 +181,7 @@ def draw_series(series: Sequence[CrossingSeries], *, title: str = "") -> Figure:
         values = values[np.isfinite(values)]
         span = f"{values.min():.3g} to {values.max():.3g} km" if values.size else "no value"
         words.append(f"{crossing.label}: {span}, {int((~good).sum())} of {good.size} rejected")
-    figure.set_label(
-        visible(
-            f"{title}: visibility and extinction at the crossings against time. {'; '.join(words)}."
-        )
+    return described(
+        figure,
+        f"{title}: visibility and extinction at the crossings against time. {'; '.join(words)}.",
     )
-    return figure

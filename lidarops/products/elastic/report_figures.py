@@ -1,14 +1,22 @@
-"""Panels of a mean profile against range: backscatter and its error budget."""
+"""The figures of the ``elastic`` product in reports: backscatter, a profile, its error budget."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from lidarops.figures import panels
+from lidarops.figures.kind_figures import ReportFigure, ReportFigures
 from lidarops.figures.panels import GREY, INK
-from lidarops.figures.profile_data import Profile
+from lidarops.figures.product_figures import DPI, described, image_figures
+from lidarops.figures.report_sources import Group, Sources
+from lidarops.figures.wording import utc
+from lidarops.products.elastic.figure_data import PROFILE_VARIABLES, Profile, clearest_profile
+from lidarops.products.elastic.figures import IMAGE
 
 _BLUE: Final = "#0072B2"
 _STYLES: Final = {
@@ -22,7 +30,53 @@ _MEGA: Final = 1e6
 _UNITS: Final = "Mm$^{-1}$ sr$^{-1}$"
 
 
-def backscatter(panel: Axes, profile: Profile) -> None:
+def _figures(group: Group, sources: Sources) -> Iterator[ReportFigure]:
+    yield from image_figures(IMAGE, "Attenuated backscatter, clouds and background", group, sources)
+    profile = sources.read_first(group, PROFILE_VARIABLES, clearest_profile)
+    if profile is not None:
+        yield ReportFigure(
+            "profile",
+            f"Profile with the most unflagged bins in a scene, and its error budget:"
+            f" {group.label}.",
+            error_budget_figure,
+            profile,
+        )
+
+
+REPORT: Final = ReportFigures(_figures)
+
+
+def error_budget_figure(profile: Profile, *, title: str = "") -> Figure:
+    """Draw a mean backscatter profile and its error budget.
+
+    Parameters
+    ----------
+    profile : Profile
+        From `lidarops.products.elastic.figure_data.clearest_profile`.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = Figure(figsize=(10.0, 5.4), dpi=DPI, layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    moment = utc(profile.time)
+    panels.title(figure, f"{title}, {moment}, lidar ratio {profile.lidar_ratio:g} sr")
+    _backscatter(left, profile)
+    _error_budget(right, profile)
+    for panel in (left, right):
+        panels.legend(panel, columns=2)
+    bottom, top = (edge / 1e3 for edge in profile.reference)
+    return described(
+        figure,
+        f"{title}: particle backscatter against range at {moment} with its standard error,"
+        f" and the errors from noise, background, reference, lidar ratio and molecules. Reference"
+        f" window {bottom:.3g} to {top:.3g} km.",
+    )
+
+
+def _backscatter(panel: Axes, profile: Profile) -> None:
     """Draw particle backscatter with its standard error, and molecular backscatter."""
     _against_range(panel, profile)
     r = profile.range / 1e3
@@ -55,7 +109,7 @@ def backscatter(panel: Axes, profile: Profile) -> None:
     panel.set_ylabel("range (km)")
 
 
-def error_budget_panels(panel: Axes, profile: Profile) -> None:
+def _error_budget(panel: Axes, profile: Profile) -> None:
     """Draw the error from each cause, and the total standard error."""
     _against_range(panel, profile)
     r = profile.range / 1e3

@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 
 WIDTH: Final = 960
 """Width of a figure in its own units."""
+THUMB: Final = (240, 84)
+"""Width and height of a thumbnail."""
 LEFT: Final = 74
 RIGHT: Final = 18
 BAR: Final = 122

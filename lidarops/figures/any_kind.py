@@ -1,0 +1,148 @@
+"""The figure of a product of any kind: its main variable against time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.figures import svg, svg_series
+from lidarops.figures.kind_figures import Drawn, PageFigures, no_figures, preferred_variables
+from lidarops.figures.series_data import NumberedSeries, SeriesEstimate, quality_bits
+from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+from lidarops.figures.svg_series import Line
+from lidarops.figures.time_axis import time_axis
+from lidarops.netcdf.variables import QUALITY_FLAG
+
+Floats = NDArray[np.float64]
+
+_BULK: Final = 64_000_000
+"""Bytes of a variable above which only some profiles are read."""
+
+
+@dataclass(frozen=True, slots=True)
+class MainVariable:
+    """The main variable of a product over time."""
+
+    name: str
+    long_name: str
+    units: str
+    series: tuple[NumberedSeries, ...]
+    """Those with the most values."""
+    of: int
+    """Number of series of the variable."""
+
+    @property
+    def caption(self) -> str:
+        """What is drawn."""
+        few = f", {len(self.series)} of {self.of} series" if self.of > len(self.series) else ""
+        return f"{self.long_name[:1].upper()}{self.long_name[1:]} against time{few}"
+
+
+def read_main_variable(
+    product: xr.Dataset, *, most: int = svg_series.SERIES
+) -> MainVariable | None:
+    """Return the main variable of a product as series over time.
+
+    Parameters
+    ----------
+    product : Dataset
+        Of any kind; may be lazy. Of a large variable, only some profiles are read.
+    most : int, optional
+        Most series.
+
+    Returns
+    -------
+    MainVariable or None
+        The first that varies with time of: the preferred variables of all kinds, variables with a
+        standard error, floating-point variables. None without any.
+    """
+    name = _main_name(product)
+    if name is None:
+        return None
+    step = max(1, -(-product[name].nbytes // _BULK))
+    some = product.isel(time=slice(None, None, step))
+    some = some.isel(time=np.argsort(some["time"].values, kind="stable"))
+    variable = some[name]
+    table = _table(variable)
+    flags = np.zeros(table.shape, dtype=np.int64)
+    if QUALITY_FLAG in some and some[QUALITY_FLAG].dims == variable.dims:
+        flags = quality_bits(some[QUALITY_FLAG]).reshape(table.shape)
+    error = f"{name}_standard_error"
+    has_error = error in some and some[error].dims == variable.dims
+    errors = _table(some[error]) if has_error else np.full(table.shape, np.nan)
+    units = str(variable.attrs.get("units", ""))
+    columns = np.sort(np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:most])
+    unknown = np.full(table.shape[0], np.nan)
+    return MainVariable(
+        name=name,
+        long_name=str(variable.attrs.get("long_name", name)),
+        units=units,
+        series=tuple(
+            NumberedSeries(
+                time=some["time"].values.astype("datetime64[ns]"),
+                flag=flags[:, k],
+                estimates={name: SeriesEstimate(table[:, k], errors[:, k], unknown, units)},
+                noun=str(variable.dims[1]) if variable.ndim > 1 else "",
+                number=k,
+            )
+            for k in columns.tolist()
+        ),
+        of=table.shape[1],
+    )
+
+
+def _main_name(product: xr.Dataset) -> str | None:
+    if "time" not in product.variables or product["time"].dtype.kind != "M":
+        return None
+    over_time = [
+        str(name)
+        for name, variable in product.data_vars.items()
+        if variable.dims[:1] == ("time",) and variable.dtype.kind == "f" and variable.size
+    ]
+    preferred = [name for name in preferred_variables() if name in over_time]
+    uncertain = [name for name in over_time if f"{name}_standard_error" in product]
+    return next(iter([*preferred, *uncertain, *over_time]), None)
+
+
+def _table(variable: xr.DataArray) -> Floats:
+    return variable.values.reshape(variable.sizes["time"], -1).astype(np.float64)
+
+
+def draw_page(product: xr.Dataset) -> PageFigures:
+    """Draw the main variable of a product of any kind for a page."""
+    main = read_main_variable(product)
+    if main is None:
+        return no_figures("no variable to draw")
+    lines = _lines(main.series, main.name)
+    unit = svg.units(main.units)
+    label = f"{main.name.replace('_', ' ')} ({unit})" if unit not in ("", "1") else main.name
+    axis = time_axis(np.unique(main.series[0].time))
+    sheet = Sheet(height=390)
+    panel = Panel(
+        Scale(*axis.limits, LEFT, WIDTH - RIGHT), Scale(*svg_series.limits(lines), 330, 28)
+    )
+    sheet.frame(panel, label)
+    svg_series.time_ticks(sheet, axis, [panel])
+    svg_series.values(sheet, panel, axis, lines, "f1")
+    svg_series.series_legend(sheet, 14, lines)
+    drawn = Drawn.of(sheet, main.caption, svg_series.in_words(lines, unit), "f1")
+    return PageFigures((drawn,), svg_series.sparkline(lines), main.caption)
+
+
+def _lines(series: Sequence[NumberedSeries], name: str) -> list[Line]:
+    return [
+        Line(
+            label=part.label,
+            time=part.time[~part.rejected],
+            value=part.estimates[name].value[~part.rejected],
+            error=np.full(int((~part.rejected).sum()), np.nan),
+            off_time=part.time[part.rejected],
+            off_value=part.estimates[name].value[part.rejected],
+        )
+        for part in series
+    ]
