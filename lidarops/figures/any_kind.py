@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,11 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures import svg, svg_series
-from lidarops.figures.kind_figures import Drawn, PageFigures, no_figures, preferred_variables
+from lidarops.figures.kind_figures import PageFigures, no_figures, preferred_variables
 from lidarops.figures.series_data import NumberedSeries, SeriesEstimate, quality_bits
-from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
-from lidarops.figures.svg_series import Line
-from lidarops.figures.time_axis import time_axis
 from lidarops.netcdf.variables import QUALITY_FLAG
 
 Floats = NDArray[np.float64]
@@ -37,10 +33,10 @@ class MainVariable:
     """Number of series of the variable."""
 
     @property
-    def caption(self) -> str:
+    def title(self) -> str:
         """What is drawn."""
         few = f", {len(self.series)} of {self.of} series" if self.of > len(self.series) else ""
-        return f"{self.long_name[:1].upper()}{self.long_name[1:]} against time{few}"
+        return f"{self.long_name[:1].upper()}{self.long_name[1:]}{few}"
 
 
 def read_main_variable(
@@ -118,31 +114,5 @@ def draw_page(product: xr.Dataset) -> PageFigures:
     main = read_main_variable(product)
     if main is None:
         return no_figures("no variable to draw")
-    lines = _lines(main.series, main.name)
-    unit = svg.units(main.units)
-    label = f"{main.name.replace('_', ' ')} ({unit})" if unit not in ("", "1") else main.name
-    axis = time_axis(np.unique(main.series[0].time))
-    sheet = Sheet(height=390)
-    panel = Panel(
-        Scale(*axis.limits, LEFT, WIDTH - RIGHT), Scale(*svg_series.limits(lines), 330, 28)
-    )
-    sheet.frame(panel, label)
-    svg_series.time_ticks(sheet, axis, [panel])
-    svg_series.values(sheet, panel, axis, lines, "f1")
-    svg_series.series_legend(sheet, 14, lines)
-    drawn = Drawn.of(sheet, main.caption, svg_series.in_words(lines, unit), "f1")
-    return PageFigures((drawn,), svg_series.sparkline(lines), main.caption)
-
-
-def _lines(series: Sequence[NumberedSeries], name: str) -> list[Line]:
-    return [
-        Line(
-            label=part.label,
-            time=part.time[~part.rejected],
-            value=part.estimates[name].value[~part.rejected],
-            error=np.full(int((~part.rejected).sum()), np.nan),
-            off_time=part.time[part.rejected],
-            off_value=part.estimates[name].value[part.rejected],
-        )
-        for part in series
-    ]
+    quantity = svg_series.Quantity(main.name, 1.0, svg.units(main.units))
+    return svg_series.stacked_page(main.series, (quantity,), main.title)

@@ -28,7 +28,7 @@ def _figures(group: Group, sources: Sources) -> Iterator[ReportFigure]:
         joined = join(part for main in known if main.name == first.name for part in main.series)
         yield ReportFigure(
             group.kind,
-            f"{first.caption}: {group.label}; {counted(len(known), 'scene')}.",
+            f"{first.title} against time: {group.label}; {counted(len(known), 'scene')}.",
             _draw,
             joined[: panels.SECTIONS],
         )

@@ -24,6 +24,8 @@ POINTS: Final = 600
 _BARS: Final = 160
 """Most values with error bars; more values get a band."""
 _CROSSES: Final = 300
+_LABELS: Final = 50
+"""Height of the labels below the lowest panel."""
 SERIES: Final = 4
 """Most series in a panel, one per mark."""
 
@@ -195,15 +197,15 @@ class Quantity:
 
 
 def stacked_page(
-    series: Sequence[Series], quantities: tuple[Quantity, Quantity], title: str
+    series: Sequence[Series], quantities: Sequence[Quantity], title: str
 ) -> PageFigures:
-    """Draw two quantities of series against time, a few series per figure.
+    """Draw one or two quantities of series against time, a few series per figure.
 
     Parameters
     ----------
     series : sequence of Series
         At least one.
-    quantities : pair of Quantity
+    quantities : sequence of Quantity
         The thumbnail shows the first.
     title : str
         Start of the captions.
@@ -214,25 +216,26 @@ def stacked_page(
         drawn.append(Drawn.of(sheet, f"{title} against time", words, f"f{number}"))
     main = quantities[0]
     lines = [line_of(part, main.name, main.factor) for part in series[:SERIES]]
-    alt = f"{main.name.capitalize()} against time. {in_words(lines, main.units)}"
+    name = main.name.replace("_", " ").capitalize()
+    alt = f"{name} against time. {in_words(lines, main.units)}"
     return PageFigures(tuple(drawn), sparkline(lines), alt)
 
 
-def _stack(
-    series: Sequence[Series], quantities: tuple[Quantity, Quantity], key: str
-) -> tuple[Sheet, str]:
+def _stack(series: Sequence[Series], quantities: Sequence[Quantity], key: str) -> tuple[Sheet, str]:
     axis = time_axis(np.unique(np.concatenate([part.time for part in series])))
-    sheet = Sheet(height=516)
+    places = ((268, 28), (466, 292)) if len(quantities) > 1 else ((330, 28),)
+    sheet = Sheet(height=places[-1][0] + _LABELS)
     drawn: list[tuple[str, Panel, list[Line]]] = []
-    for quantity, (foot, top) in zip(quantities, ((268, 28), (466, 292)), strict=True):
+    for quantity, (foot, top) in zip(quantities, places, strict=True):
+        name, unit = quantity.name.replace("_", " "), quantity.units
         lines = [line_of(part, quantity.name, quantity.factor) for part in series]
         panel = Panel(time_scale(axis), Scale(*limits(lines), foot, top))
-        sheet.frame(panel, f"{quantity.name} ({quantity.units})")
-        drawn.append((quantity.name, panel, lines))
+        sheet.frame(panel, f"{name} ({unit})" if unit not in ("", "1") else name)
+        drawn.append((name, panel, lines))
     time_ticks(sheet, axis, [panel for _, panel, _ in drawn])
     words = [in_words(drawn[0][2], quantities[0].units)]
     for name, panel, lines in drawn:
-        beyond = values(sheet, panel, axis, lines, f"{key}-{name}")
+        beyond = values(sheet, panel, axis, lines, f"{key}-{name.replace(' ', '-')}")
         if beyond:
             words.append(f"{counted(beyond, 'value')} of {name} beyond the axis")
     series_legend(sheet, 14, drawn[0][2])

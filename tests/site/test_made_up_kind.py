@@ -1,0 +1,165 @@
+"""A kind of product that another package adds is shown by reports, pages and means."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.archives import site_archive
+from support.archives.aggregate_archive import facts_of
+from support.products import fabricated as fab
+from support.products.made_products import MAKERS
+
+from lidarops import kinds
+from lidarops.aggregate.facts import groups
+from lidarops.aggregate.means import write_means
+from lidarops.aggregate.means_variables import Period
+from lidarops.netcdf.variables import layout_of
+from lidarops.reports import run_page
+from lidarops.reports.gallery import Gallery, fill
+from lidarops.site.build import build_site
+
+KIND = """
+from lidarops.kinds import Kind
+from lidarops.settings import ChannelProduct
+
+KIND = Kind("smooth", "Smoothed extinction", __name__, ChannelProduct, rank=25)
+"""
+VARIABLES = """
+from dataclasses import replace
+
+from lidarops.netcdf.variables import ErrorBudget
+from lidarops.products.homogeneous.variables import LAYOUT as OTHER
+
+LAYOUT = replace(
+    OTHER,
+    data=tuple(
+        replace(row, budget=ErrorBudget(comment="All is shared."))
+        if row.name == "extinction"
+        else row
+        for row in OTHER.data
+    ),
+)
+"""
+FIGURES = """
+from lidarops.figures.kind_figures import KindFigures, no_figures
+
+FIGURES = KindFigures(page=lambda product: no_figures("a smooth page"), preferred="amplitude")
+"""
+REPORT = """
+from matplotlib.figure import Figure
+
+from lidarops.figures.kind_figures import ReportFigure, ReportFigures
+
+
+def draw(content, *, title):
+    return Figure(figsize=(2.0, 2.0), label=f"{title}: {content}")
+
+
+def figures(group, sources):
+    yield ReportFigure("even", f"A smooth figure of {group.label}", draw, "nothing but smoothness")
+
+
+REPORT = ReportFigures(figures)
+"""
+Register = Callable[..., None]
+
+
+@pytest.fixture
+def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
+    """Return a function that adds the kind, with some of its modules."""
+
+    def add(**modules: str) -> None:
+        package = tmp_path / "code" / "madeup_smooth"
+        package.mkdir(parents=True)
+        for name, text in {"__init__": KIND, "variables": VARIABLES, **modules}.items():
+            (package / f"{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(package.parent)
+        point = SimpleNamespace(
+            name="smooth", value="", load=lambda: import_module("madeup_smooth").KIND
+        )
+        points = [*entry_points(group=kinds.GROUP), point]
+        monkeypatch.setattr(kinds, "entry_points", lambda group: points)
+        monkeypatch.setitem(MAKERS, "smooth", MAKERS["homogeneous"])
+        forget()
+
+    def forget() -> None:
+        kinds.kinds.cache_clear()
+        layout_of.cache_clear()
+        for name in [name for name in sys.modules if name.startswith("madeup_smooth")]:
+            del sys.modules[name]
+
+    yield add
+    monkeypatch.undo()
+    forget()
+
+
+def _page(output: Path) -> str:
+    site_archive.add(output, "smooth")
+    site_archive.add(output, "elastic")
+    made = build_site(output)
+    assert (made.products, made.problems) == (2, ())
+    (day,) = (output / "site").rglob("2026-03-01.html")
+    text = day.read_text(encoding="utf-8")
+    assert text.index("Smoothed extinction") < text.index("Backscatter of elastic profiles")
+    (page,) = (page for page in (output / "site/product").rglob("*.html") if "smooth" in page.name)
+    return page.read_text(encoding="utf-8")
+
+
+def _report(folder: Path) -> Gallery:
+    time = fab.times(fab.START, 40, 600.0)
+    archive = fab.Archive(folder / "products")
+    records = [
+        archive.write(f"{kind}.nc", fab.homogeneous(time), kind)
+        for kind in ("smooth", "homogeneous", "wind")
+    ]
+    run = fab.run_record(archive.root, [fab.outcome("a_1", fab.START, products=tuple(records))])
+    assert run_page.build_report(run, folder / "report").page.is_file()
+    gallery = fill(run, folder / "report")
+    assert not gallery.problems
+    return gallery
+
+
+def test_without_figures_the_main_variable_is_shown(register: Register, tmp_path: Path) -> None:
+    register()
+    text = _page(tmp_path / "out")
+    assert text.count('<svg class="fig"') == 1
+    assert "Extinction coefficient of molecules and particles against time" in text
+    first, second, third = _report(tmp_path).pictures
+    assert first.file.startswith("homogeneous_")
+    assert second.file.startswith("smooth_")
+    assert "extinction against time" in second.alt
+    assert third.file.startswith("wind_"), "a kind that is not installed comes last"
+
+
+def test_figures_are_those_of_the_kind(register: Register, tmp_path: Path) -> None:
+    register(figures=FIGURES, report_figures=REPORT)
+    text = _page(tmp_path / "out")
+    assert '<svg class="fig"' not in text
+    assert "a smooth page" in text or any(
+        "a smooth page" in path.read_text() for path in (tmp_path / "out/site").rglob("*.svg")
+    )
+    _, figure, _ = _report(tmp_path).pictures
+    assert figure.file.startswith("even_")
+    assert figure.caption.startswith("A smooth figure of")
+    assert figure.alt.endswith("nothing but smoothness")
+
+
+def test_means_follow_its_budget(register: Register, tmp_path: Path) -> None:
+    register()
+    path = site_archive.add(tmp_path, "smooth")
+    (products,) = groups(facts_of(tmp_path)).values()
+    (file,) = write_means(tmp_path, products, Period.DAY).files
+    with xr.open_dataset(path) as data, xr.open_dataset(tmp_path / file.path) as means:
+        error = data.extinction_standard_error.where(data.usable < 2).astype(float)
+        np.testing.assert_allclose(
+            means.extinction_standard_error[0], error.mean("time"), rtol=1e-5
+        )
+        assert means.extinction.attrs["comment"].endswith("All is shared.")
