@@ -26,7 +26,6 @@ class MainVariable:
 
     name: str
     long_name: str
-    units: str
     series: tuple[NumberedSeries, ...]
     """Those with the most values."""
     of: int
@@ -64,32 +63,22 @@ def read_main_variable(
     some = product.isel(time=slice(None, None, step))
     some = some.isel(time=np.argsort(some["time"].values, kind="stable"))
     variable = some[name]
-    table = _table(variable)
-    flags = np.zeros(table.shape, dtype=np.int64)
-    if QUALITY_FLAG in some and some[QUALITY_FLAG].dims == variable.dims:
-        flags = quality_bits(some[QUALITY_FLAG]).reshape(table.shape)
-    error = f"{name}_standard_error"
-    has_error = error in some and some[error].dims == variable.dims
-    errors = _table(some[error]) if has_error else np.full(table.shape, np.nan)
+    table, unknown = _table(variable), np.full(variable.sizes["time"], np.nan)
+    flags = quality_bits(_beside(some, QUALITY_FLAG, name, 0.0)).reshape(table.shape)
+    errors = _table(_beside(some, f"{name}_standard_error", name, np.nan))
     units = str(variable.attrs.get("units", ""))
-    columns = np.sort(np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:most])
-    unknown = np.full(table.shape[0], np.nan)
-    return MainVariable(
-        name=name,
-        long_name=str(variable.attrs.get("long_name", name)),
-        units=units,
-        series=tuple(
-            NumberedSeries(
-                time=some["time"].values.astype("datetime64[ns]"),
-                flag=flags[:, k],
-                estimates={name: SeriesEstimate(table[:, k], errors[:, k], unknown, units)},
-                noun=str(variable.dims[1]) if variable.ndim > 1 else "",
-                number=k,
-            )
-            for k in columns.tolist()
-        ),
-        of=table.shape[1],
+    most_values = np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:most]
+    series = tuple(
+        NumberedSeries(
+            time=some["time"].values.astype("datetime64[ns]"),
+            flag=flags[:, k],
+            estimates={name: SeriesEstimate(table[:, k], errors[:, k], unknown, units)},
+            noun=str(variable.dims[1]) if variable.ndim > 1 else "",
+            number=k,
+        )
+        for k in np.sort(most_values).tolist()
     )
+    return MainVariable(name, str(variable.attrs.get("long_name", name)), series, table.shape[1])
 
 
 def _main_name(product: xr.Dataset) -> str | None:
@@ -105,6 +94,13 @@ def _main_name(product: xr.Dataset) -> str | None:
     return next(iter([*preferred, *uncertain, *over_time]), None)
 
 
+def _beside(product: xr.Dataset, other: str, name: str, default: float) -> xr.DataArray:
+    """Return another variable along the dimensions of one; the default if there is none."""
+    variable = product[name]
+    same = other in product and product[other].dims == variable.dims
+    return product[other] if same else xr.full_like(variable, default)
+
+
 def _table(variable: xr.DataArray) -> Floats:
     return variable.values.reshape(variable.sizes["time"], -1).astype(np.float64)
 
@@ -114,5 +110,6 @@ def draw_page(product: xr.Dataset) -> PageFigures:
     main = read_main_variable(product)
     if main is None:
         return no_figures("no variable to draw")
-    quantity = svg_series.Quantity(main.name, 1.0, svg.units(main.units))
+    units = svg.units(main.series[0].estimates[main.name].units)
+    quantity = svg_series.Quantity(main.name, 1.0, units)
     return svg_series.stacked_page(main.series, (quantity,), main.title)

@@ -31,7 +31,7 @@ class KindImage:
         profiles = max(1, -(-product.sizes.get("time", 0) // svg_images.COLUMNS))
         raster = self.read(product, profiles=profiles)
         label = f"{self.what} ({svg.units(raster.units)})"
-        sheet, words = svg_images.draw_image(raster, along=self.along, label=label, key="f1")
+        sheet, words = svg_images.image_sheet(raster, along=self.along, label=label, key="f1")
         below = ", with the background below" if np.isfinite(raster.background).any() else ""
         caption = f"{self.what.capitalize()} against time and {self.along}{below}"
         drawn = Drawn.of(sheet, caption, words, "f1")

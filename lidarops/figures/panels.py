@@ -24,7 +24,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from lidarops.figures.raster import Raster, colour_limits, joined, share_with_care
-from lidarops.figures.series_data import Series, compare, normalised_error, thin
+from lidarops.figures.series_data import TimeSeries, compare, normalised_error, thin
 from lidarops.figures.time_axis import TimeAxis, Times, segments
 from lidarops.figures.wording import bit_name, counted, percent, visible
 from lidarops.flags import Quality
@@ -124,7 +124,7 @@ def time_ticks(panels: Sequence[Axes], axis: TimeAxis) -> None:
 # Retrieved values ----------------------------------------------------------------------------
 
 
-def estimates(panel: Axes, axis: TimeAxis, sections: Sequence[Series], quantity: str) -> None:
+def estimates(panel: Axes, axis: TimeAxis, sections: Sequence[TimeSeries], quantity: str) -> None:
     """Draw a retrieved quantity of up to `SECTIONS` sections, with flags and truth."""
     _calm(panel)
     units, scale = _AXIS_UNITS.get(quantity, (sections[0].estimates[quantity].units, 1.0))
@@ -146,7 +146,7 @@ def _calm(panel: Axes) -> None:
 
 
 def _values(
-    panel: Axes, axis: TimeAxis, section: Series, quantity: str, scale: float, style: _Style
+    panel: Axes, axis: TimeAxis, section: TimeSeries, quantity: str, scale: float, style: _Style
 ) -> None:
     drawn = thin(section, _POINTS)
     if drawn.time.size == 0:
@@ -180,7 +180,7 @@ def _values(
 
 
 def _truth(
-    panel: Axes, axis: TimeAxis, sections: Sequence[Series], quantity: str, scale: float
+    panel: Axes, axis: TimeAxis, sections: Sequence[TimeSeries], quantity: str, scale: float
 ) -> None:
     label = "simulated truth"
     for section in sections:
@@ -204,7 +204,7 @@ def _truth(
 def _marks(
     panel: Axes,
     axis: TimeAxis,
-    sections: Sequence[Series],
+    sections: Sequence[TimeSeries],
     quantity: str,
     scale: float,
     *,
@@ -249,7 +249,7 @@ def _subset(index: NDArray[np.intp], at_most: int) -> NDArray[np.intp]:
     return index[:: max(1, -(-index.size // at_most))]
 
 
-def _limits(sections: Sequence[Series], quantity: str, scale: float) -> tuple[float, float]:
+def _limits(sections: Sequence[TimeSeries], quantity: str, scale: float) -> tuple[float, float]:
     """Return limits that contain every usable value with its error bar."""
     edges: list[Floats] = []
     for section in sections:
@@ -278,7 +278,7 @@ def _with_gaps(time: Times, axis: TimeAxis, *values: Floats) -> tuple[Floats, ..
     return np.insert(x, cuts, x[cuts]), *(np.insert(value, cuts, np.nan) for value in values)
 
 
-def scores(panel: Axes, axis: TimeAxis, sections: Sequence[Series], quantity: str) -> None:
+def scores(panel: Axes, axis: TimeAxis, sections: Sequence[TimeSeries], quantity: str) -> None:
     """Draw (retrieved - truth) / standard error of the unflagged values of sections."""
     _calm(panel)
     panel.set_ylabel(f"{quantity}\n(retrieved $-$ truth) / $\\sigma$", fontsize=9)

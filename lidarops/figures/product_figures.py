@@ -22,7 +22,7 @@ from lidarops.figures.kind_figures import ReportFigure
 from lidarops.figures.kind_images import KindImage
 from lidarops.figures.raster import Raster
 from lidarops.figures.report_sources import Group, Sources
-from lidarops.figures.series_data import Series
+from lidarops.figures.series_data import TimeSeries
 from lidarops.figures.time_axis import Times, time_axis
 from lidarops.figures.wording import bit_name, counted, percent, visible
 from lidarops.flags import Quality, Severity
@@ -81,7 +81,7 @@ def image_figures(
 
 
 def draw_series(
-    series: Sequence[Series],
+    series: Sequence[TimeSeries],
     quantities: Sequence[str],
     *,
     title: str = "",
@@ -91,7 +91,7 @@ def draw_series(
 
     Parameters
     ----------
-    series : sequence of Series
+    series : sequence of TimeSeries
         One to `panels.SECTIONS`, of one instrument and channel, joined in time.
     quantities : sequence of str
     title : str, optional
@@ -216,7 +216,7 @@ def described(figure: Figure, words: str) -> Figure:
     return figure
 
 
-def times(series: Sequence[Series]) -> Times:
+def times(series: Sequence[TimeSeries]) -> Times:
     """Return all times of series."""
     return np.unique(np.concatenate([part.time for part in series]))
 

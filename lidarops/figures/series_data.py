@@ -36,7 +36,7 @@ class SeriesEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class TimeSeries:
     """The quantities of one series over time."""
 
     time: Times
@@ -63,7 +63,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
-class Section(Series):
+class Section(TimeSeries):
     """The quantities retrieved from one range section, over time."""
 
     near: float
@@ -83,7 +83,7 @@ class Section(Series):
 
 
 @dataclass(frozen=True, slots=True)
-class NumberedSeries(Series):
+class NumberedSeries(TimeSeries):
     """The quantities at one index of another dimension than time."""
 
     noun: str
@@ -101,7 +101,7 @@ class NumberedSeries(Series):
         return f"{self.noun} {self.number}".strip()
 
 
-AnySeries = TypeVar("AnySeries", bound=Series)
+AnySeries = TypeVar("AnySeries", bound=TimeSeries)
 
 
 class Verdict(StrEnum):
@@ -166,12 +166,12 @@ def join(series: Iterable[AnySeries]) -> list[AnySeries]:
 
     Parameters
     ----------
-    series : iterable of Series
+    series : iterable of TimeSeries
         Of one instrument and channel, from any number of products.
 
     Returns
     -------
-    list of Series
+    list of TimeSeries
         One per key, sorted by key.
     """
     groups: dict[tuple[float, ...], list[AnySeries]] = {}
@@ -180,7 +180,7 @@ def join(series: Iterable[AnySeries]) -> list[AnySeries]:
     return [_joined(group) for _, group in sorted(groups.items())]
 
 
-def compare(section: Series, quantity: str) -> Comparison | None:
+def compare(section: TimeSeries, quantity: str) -> Comparison | None:
     """Compare the unflagged values of a section with the truth.
 
     Returns
@@ -208,7 +208,7 @@ def compare(section: Series, quantity: str) -> Comparison | None:
     )
 
 
-def normalised_error(section: Series, quantity: str) -> Floats:
+def normalised_error(section: TimeSeries, quantity: str) -> Floats:
     """Return (retrieved - truth) / standard error, shape (time,); NaN where undefined."""
     estimate = section.estimates[quantity]
     stated = np.isfinite(estimate.standard_error) & (estimate.standard_error > 0)
@@ -225,13 +225,13 @@ def thin(section: AnySeries, points: int) -> AnySeries:
 
     Parameters
     ----------
-    section : Series
+    section : TimeSeries
     points : int
         Each gap may add one block.
 
     Returns
     -------
-    Series
+    TimeSeries
         Unflagged profiles only; block means if there are more than `points`.
     """
     good = _where(section, section.flag == 0)

@@ -134,7 +134,7 @@ def units(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class SvgPanel:
     """A rectangle with two scales."""
 
     x: Scale
@@ -169,7 +169,7 @@ class Sheet:
         if data:
             self.parts.append(f'<path class="{css}" d="{data}"/>')
 
-    def clipped(self, panel: Panel, draw: Callable[[], None], key: str) -> None:
+    def clipped(self, panel: SvgPanel, draw: Callable[[], None], key: str) -> None:
         """Draw with clipping at the edges of a panel; `key` must be unique on a page."""
         self._clips += 1
         name = f"{key}-{self._clips}"
@@ -181,7 +181,7 @@ class Sheet:
         draw()
         self.parts.append("</g>")
 
-    def frame(self, panel: Panel, label: str, *, below: str = "", at_most: int = 5) -> None:
+    def frame(self, panel: SvgPanel, label: str, *, below: str = "", at_most: int = 5) -> None:
         """Draw the axes of a panel; the horizontal axis only if `below` labels it."""
         left, top, width, height = panel.box
         bottom = top + height
@@ -202,7 +202,7 @@ class Sheet:
         self.path(edge, "axis")
         self.text(left - 56, top + height / 2, label, css="t m s", turned=True)
 
-    def image(self, panel: Panel, png: bytes) -> None:
+    def image(self, panel: SvgPanel, png: bytes) -> None:
         """Fill a panel with an image."""
         left, top, width, height = panel.box
         data = base64.b64encode(png).decode("ascii")
@@ -280,7 +280,7 @@ def marks(x: Floats, y: Floats, mark: Callable[[float, float], str]) -> str:
     return "".join(mark(px, py) for px, py in zip(x[good].tolist(), y[good].tolist(), strict=True))
 
 
-def legend(sheet: Sheet, x: float, y: float, entries: Iterable[tuple[str, str, str]]) -> None:
+def draw_legend(sheet: Sheet, x: float, y: float, entries: Iterable[tuple[str, str, str]]) -> None:
     """Draw a legend in one line; entries are path data around the origin, style and text."""
     for data, css, words in entries:
         sheet.parts.append(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lidarops.figures import svg
 from lidarops.figures.raster import Raster, colour_limits
-from lidarops.figures.svg import BAR, BLANK, COLOURS, LEFT, REJECTED, WIDTH, Panel, Scale, Sheet
-from lidarops.figures.svg_series import Line, limits, time_scale, time_ticks, values
+from lidarops.figures.svg import BAR, BLANK, COLOURS, LEFT, REJECTED, WIDTH, Scale, Sheet, SvgPanel
+from lidarops.figures.svg_series import Line, draw_time_ticks, limits, time_scale, values
 from lidarops.figures.time_axis import TimeAxis, time_axis
 
 Floats = NDArray[np.float64]
@@ -90,7 +90,7 @@ def _colours(blocks: Grid) -> NDArray[np.int64]:
     return np.where(np.isfinite(blocks.mean), steps, BLANK)
 
 
-def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[Sheet, str]:
+def image_sheet(raster: Raster, *, along: str, label: str, key: str) -> tuple[Sheet, str]:
     """Draw a raster, with the background below it if known.
 
     Parameters
@@ -115,11 +115,11 @@ def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[She
     sheet = Sheet(height=520 if has_background else 390)
     right = WIDTH - BAR
     near, far = float(blocks.edges[0]) / 1e3, float(blocks.edges[-1]) / 1e3
-    upper = Panel(time_scale(axis, right), Scale(near, far, 330, 24))
+    upper = SvgPanel(time_scale(axis, right), Scale(near, far, 330, 24))
     sheet.parts.append(f'<rect class="gap" x="{LEFT}" y="24" width="{right - LEFT}" height="306"/>')
     lower = _background(raster, axis, right) if has_background else None
     panels = [upper, lower[0]] if lower else [upper]
-    time_ticks(sheet, axis, panels)
+    draw_time_ticks(sheet, axis, panels)
     sheet.frame(upper, f"{along} (km)")
     sheet.image(upper, svg.png(pixels(blocks, axis, right - LEFT, 306)))
     _clouds(sheet, upper, axis, raster)
@@ -134,13 +134,13 @@ def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[She
     return sheet, _in_words(raster, blocks, ends, along)
 
 
-def _background(raster: Raster, axis: TimeAxis, right: float) -> tuple[Panel, Line]:
+def _background(raster: Raster, axis: TimeAxis, right: float) -> tuple[SvgPanel, Line]:
     middle, empty = raster.middle, np.array([])
     line = Line("", middle, raster.background, raster.background_error, middle[:0], empty)
-    return Panel(time_scale(axis, right), Scale(*limits([line]), 470, 356)), line
+    return SvgPanel(time_scale(axis, right), Scale(*limits([line]), 470, 356)), line
 
 
-def _clouds(sheet: Sheet, panel: Panel, axis: TimeAxis, raster: Raster) -> None:
+def _clouds(sheet: Sheet, panel: SvgPanel, axis: TimeAxis, raster: Raster) -> None:
     x, y = panel.x(axis.x(raster.middle)), panel.y(raster.clouds / 1e3)
     low, high = panel.y.ends
     shown = (raster.clouds / 1e3 >= low) & (raster.clouds / 1e3 <= high)
@@ -152,7 +152,7 @@ def _clouds(sheet: Sheet, panel: Panel, axis: TimeAxis, raster: Raster) -> None:
 def _bar(sheet: Sheet, ends: tuple[float, float], label: str, right: float) -> None:
     left = right + 14
     ramp = np.repeat(np.arange(COLOURS + 2, 2, -1, dtype=np.uint8)[:, None], 4, axis=1)
-    panel = Panel(Scale(0, 1, left, left + 14), Scale(*ends, 330, 24, log=True))
+    panel = SvgPanel(Scale(0, 1, left, left + 14), Scale(*ends, 330, 24, log=True))
     sheet.image(panel, svg.png(ramp))
     for value in panel.y.ticks():
         y = float(panel.y(value))
@@ -180,6 +180,6 @@ def thumbnail(raster: Raster) -> Sheet:
     width, height = svg.THUMB
     axis = time_axis(raster.middle)
     sheet = Sheet(height=height, width=width, stretched=True)
-    panel = Panel(Scale(0, 1, 0, width), Scale(0, 1, height, 0))
+    panel = SvgPanel(Scale(0, 1, 0, width), Scale(0, 1, height, 0))
     sheet.image(panel, svg.png(pixels(grid(raster, axis), axis, width, height)))
     return sheet

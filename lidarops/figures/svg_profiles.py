@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale
+from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Scale, SvgPanel
 
 Floats = NDArray[np.float64]
 
@@ -18,13 +18,13 @@ HEIGHT: Final = 456
 _MIDDLE: Final = (WIDTH + LEFT - RIGHT) / 2
 
 
-def panels(height: Floats, spans: Sequence[tuple[float, float]], *, log: bool) -> list[Panel]:
+def panels(height: Floats, spans: Sequence[tuple[float, float]], *, log: bool) -> list[SvgPanel]:
     """Return two panels over the same heights, km; the second is logarithmic if `log`."""
     low, high = float(height.min()), float(height.max())
     y = (low, high if high > low else low + 1.0, _FOOT, _TOP)
     ends = ((LEFT, _MIDDLE - 36), (_MIDDLE + 36, WIDTH - RIGHT))
     return [
-        Panel(Scale(*span, *end, log=log and number == 1), Scale(*y))
+        SvgPanel(Scale(*span, *end, log=log and number == 1), Scale(*y))
         for number, (span, end) in enumerate(zip(spans, ends, strict=True))
     ]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lidarops.figures import svg
 from lidarops.figures.kind_figures import Drawn, PageFigures
-from lidarops.figures.series_data import Series, thin
-from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+from lidarops.figures.series_data import TimeSeries, thin
+from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Scale, Sheet, SvgPanel
 from lidarops.figures.time_axis import TimeAxis, Times, segments, time_axis
 from lidarops.figures.wording import counted
 
@@ -45,7 +45,7 @@ class Line:
     """Flagged values; NaN without a value."""
 
 
-def line_of(section: Series, quantity: str, factor: float) -> Line:
+def line_of(section: TimeSeries, quantity: str, factor: float) -> Line:
     """Return a quantity of a series, multiplied by `factor`."""
     few = thin(section, POINTS)
     estimate = few.estimates[quantity]
@@ -84,7 +84,7 @@ def time_scale(axis: TimeAxis, right: float = WIDTH - RIGHT) -> Scale:
     return Scale(first, last, LEFT, right)
 
 
-def time_ticks(sheet: Sheet, axis: TimeAxis, panels: Sequence[Panel]) -> None:
+def draw_time_ticks(sheet: Sheet, axis: TimeAxis, panels: Sequence[SvgPanel]) -> None:
     """Draw UTC ticks through panels, labels below the last panel, and marks at cut gaps."""
     scale = panels[-1].x
     _, top, _, height = panels[-1].box
@@ -101,7 +101,7 @@ def time_ticks(sheet: Sheet, axis: TimeAxis, panels: Sequence[Panel]) -> None:
     sheet.text(panels[0].box[0], 14, "time in UTC", css="t s")
 
 
-def values(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line], key: str) -> int:
+def values(sheet: Sheet, panel: SvgPanel, axis: TimeAxis, lines: Sequence[Line], key: str) -> int:
     """Draw series into a panel; return the number of values beyond its limits."""
     sheet.clipped(panel, lambda: _draw(sheet, panel, axis, lines), key)
     low, high = panel.y.ends
@@ -109,7 +109,7 @@ def values(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line], ke
     return int(np.count_nonzero((finite < low) | (finite > high)))
 
 
-def _draw(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line]) -> None:
+def _draw(sheet: Sheet, panel: SvgPanel, axis: TimeAxis, lines: Sequence[Line]) -> None:
     for line in lines:
         _rejected(sheet, panel, axis, line)
     for index, line in enumerate(lines):
@@ -131,7 +131,7 @@ def _draw(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line]) -> 
             sheet.path(svg.marks(x, y, svg.MARKS[index]), f"mark c{index}")
 
 
-def _rejected(sheet: Sheet, panel: Panel, axis: TimeAxis, line: Line) -> None:
+def _rejected(sheet: Sheet, panel: SvgPanel, axis: TimeAxis, line: Line) -> None:
     some = slice(None, None, max(1, -(-line.off_time.size // _CROSSES)))
     x, y = panel.x(axis.x(line.off_time[some])), panel.y(line.off_value[some])
     sheet.path(svg.marks(x, y, svg.cross), "off")
@@ -149,7 +149,7 @@ def series_legend(sheet: Sheet, y: float, lines: Sequence[Line], x: float = LEFT
     ]
     if any(line.off_time.size for line in lines):
         rows.append((svg.cross(0.0, 0.0), "off", "flagged"))
-    svg.legend(sheet, x, y, rows)
+    svg.draw_legend(sheet, x, y, rows)
 
 
 def in_words(lines: Sequence[Line], units: str) -> str:
@@ -197,13 +197,13 @@ class Quantity:
 
 
 def stacked_page(
-    series: Sequence[Series], quantities: Sequence[Quantity], title: str
+    series: Sequence[TimeSeries], quantities: Sequence[Quantity], title: str
 ) -> PageFigures:
     """Draw one or two quantities of series against time, a few series per figure.
 
     Parameters
     ----------
-    series : sequence of Series
+    series : sequence of TimeSeries
         At least one.
     quantities : sequence of Quantity
         The thumbnail shows the first.
@@ -221,18 +221,20 @@ def stacked_page(
     return PageFigures(tuple(drawn), sparkline(lines), alt)
 
 
-def _stack(series: Sequence[Series], quantities: Sequence[Quantity], key: str) -> tuple[Sheet, str]:
+def _stack(
+    series: Sequence[TimeSeries], quantities: Sequence[Quantity], key: str
+) -> tuple[Sheet, str]:
     axis = time_axis(np.unique(np.concatenate([part.time for part in series])))
     places = ((268, 28), (466, 292)) if len(quantities) > 1 else ((330, 28),)
     sheet = Sheet(height=places[-1][0] + _LABELS)
-    drawn: list[tuple[str, Panel, list[Line]]] = []
+    drawn: list[tuple[str, SvgPanel, list[Line]]] = []
     for quantity, (foot, top) in zip(quantities, places, strict=True):
         name, unit = quantity.name.replace("_", " "), quantity.units
         lines = [line_of(part, quantity.name, quantity.factor) for part in series]
-        panel = Panel(time_scale(axis), Scale(*limits(lines), foot, top))
+        panel = SvgPanel(time_scale(axis), Scale(*limits(lines), foot, top))
         sheet.frame(panel, f"{name} ({unit})" if unit not in ("", "1") else name)
         drawn.append((name, panel, lines))
-    time_ticks(sheet, axis, [panel for _, panel, _ in drawn])
+    draw_time_ticks(sheet, axis, [panel for _, panel, _ in drawn])
     words = [in_words(drawn[0][2], quantities[0].units)]
     for name, panel, lines in drawn:
         beyond = values(sheet, panel, axis, lines, f"{key}-{name.replace(' ', '-')}")

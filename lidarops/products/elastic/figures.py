@@ -79,9 +79,9 @@ def _error_budget(profile: Profile, key: str) -> tuple[Sheet, str]:
     sheet.clipped(left, draw_values, f"{key}-p")
     sheet.clipped(right, draw_causes, f"{key}-p")
     named = [("M-9 0H9", "line c0", "particles"), ("M-9 0H9", "line d2 c1", "molecules")]
-    svg.legend(sheet, LEFT + 14, 20, named)
+    svg.draw_legend(sheet, LEFT + 14, 20, named)
     rows = [("M-9 0H9", f"line d{n} c{n}", _CAUSES[name]) for n, name in enumerate(causes)]
-    svg.legend(sheet, LEFT + 330, 20, [*rows, ("M-9 0H9", "line ink", "total")])
+    svg.draw_legend(sheet, LEFT + 330, 20, [*rows, ("M-9 0H9", "line ink", "total")])
     bottom, top = (f"{edge / 1e3:.3g}" for edge in profile.reference)
     good = value[np.isfinite(value)]
     reach = f"{svg.number(float(good.min()))} to {svg.number(float(good.max()))} {unit}"

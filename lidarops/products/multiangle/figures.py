@@ -14,7 +14,7 @@ from lidarops.figures import svg
 from lidarops.figures import svg_profiles as profiles
 from lidarops.figures.kind_figures import Drawn, KindFigures, PageFigures
 from lidarops.figures.kind_images import KindImage
-from lidarops.figures.svg import LEFT, Panel, Sheet
+from lidarops.figures.svg import LEFT, Sheet, SvgPanel
 from lidarops.figures.wording import utc
 from lidarops.products.multiangle.figure_data import (
     EXTINCTION_VARIABLES,
@@ -71,7 +71,7 @@ def _cycle(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
         _estimate(sheet, panel, panel.y(y), parts, f"{key}-s{number}")
     named = [("M-9 0H9", "line c0", "retrieved, with standard error")]
     wide = ("M-9-4H9V4H-9z", "band wide c0", "plus largest error from a horizontal gradient")
-    svg.legend(sheet, LEFT + 14, 20, [*named, wide, (svg.cross(0, 0), "off", "rejected")])
+    svg.draw_legend(sheet, LEFT + 14, 20, [*named, wide, (svg.cross(0, 0), "off", "rejected")])
     value = shown["extinction"][0]
     good = value[np.isfinite(value)]
     reach = (
@@ -83,7 +83,7 @@ def _cycle(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
     return sheet, f"Extinction {reach}; {flagged} of {profile.flag.size} altitudes flagged"
 
 
-def _estimate(sheet: Sheet, panel: Panel, up: Floats, parts: Sequence[Floats], key: str) -> None:
+def _estimate(sheet: Sheet, panel: SvgPanel, up: Floats, parts: Sequence[Floats], key: str) -> None:
     value, error, wide, rejected = parts
 
     def draw() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.figures import svg
-from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+from lidarops.figures.svg import LEFT, RIGHT, WIDTH, Scale, Sheet, SvgPanel
 from lidarops.figures.wording import counted
 from lidarops.products.visibility.figure_data import NetworkMap
 
@@ -56,7 +56,7 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
         sheet.text(
             place[0] + 9, place[1] - 7, f"{number}: {_km(visibility)}" if known else f"{number}"
         )
-    svg.legend(
+    svg.draw_legend(
         sheet,
         LEFT + 14,
         14,
@@ -70,7 +70,7 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
     return sheet, _words(network)
 
 
-def _panel(points: Floats) -> Panel:
+def _panel(points: Floats) -> SvgPanel:
     """Return a panel with equal scales on both axes that contains all points."""
     across, up = WIDTH - RIGHT - LEFT, _FOOT - _TOP
     low, high = points.min(axis=0), points.max(axis=0)
@@ -79,13 +79,13 @@ def _panel(points: Floats) -> Panel:
     middle = (low + high) / 2.0
     half = 0.5 * length * np.array([across, up])
     (left, bottom), (right, top) = middle - half, middle + half
-    return Panel(
+    return SvgPanel(
         Scale(float(left), float(right), LEFT, WIDTH - RIGHT),
         Scale(float(bottom), float(top), _FOOT, _TOP),
     )
 
 
-def _placed(panel: Panel, points: Floats) -> list[tuple[float, float]]:
+def _placed(panel: SvgPanel, points: Floats) -> list[tuple[float, float]]:
     return list(zip(panel.x(points[:, 0]).tolist(), panel.y(points[:, 1]).tolist(), strict=True))
 
 
