@@ -35,10 +35,10 @@ PURPOSES: Final = {
     "retrieve": "numerics: arrays in, arrays out",
     "raw": "raw formats, xarray engine",
     "system": "stores and processes",
-    "vocabulary": "errors, flags, constants, records",
+    "vocabulary": "errors, flags, settings, kinds",
 }
 """Package -> what it is for, in the words of the picture."""
-VOCABULARY: Final = {"errors", "flags", "constants", "records"}
+VOCABULARY: Final = {"errors", "flags", "constants", "settings", "kinds", "records"}
 
 WIDTH: Final = 1180
 ROW: Final = 92
