@@ -127,7 +127,7 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class PlannedStep:
     """One step of a plan, with its settings and the reason why it runs."""
 
     name: str
@@ -137,9 +137,14 @@ class Step:
     instrument: str = ""
     """Member of a network to which the step applies; empty where the scene has no members."""
     rule: str = ""
-    """Name of the rule that decided, in `lidarops.plan.rule_table`."""
+    """Name of the rule that decided."""
     number: float | None = None
     """Number on which the rule decided, where there is one."""
+    product: str = ""
+    """Kind of product to which the step belongs; empty where all kinds share it."""
+    needs: tuple[str, ...] = ()
+    """Steps whose outputs it takes, run or left out: ``name``, or ``channel/name`` of another
+    channel."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as plain JSON types."""
@@ -148,8 +153,8 @@ class Step:
             "channel": self.channel,
             "settings": dict(self.settings),
             "reason": self.reason,
-            **_member_field(self.instrument),
-            **_rule_fields(self.rule, self.number),
+            **_origin_fields(self),
+            **({"needs": list(self.needs)} if self.needs else {}),
         }
 
 
@@ -163,9 +168,11 @@ class LeftOut:
     instrument: str = ""
     """Member of a network; empty where the scene has no members."""
     rule: str = ""
-    """Name of the rule that decided, in `lidarops.plan.rule_table`."""
+    """Name of the rule that decided."""
     number: float | None = None
     """Number on which the rule decided, where there is one."""
+    product: str = ""
+    """Kind of product to which the step belongs; empty where all kinds share it."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the omission as plain JSON types."""
@@ -173,21 +180,19 @@ class LeftOut:
             "name": self.name,
             "channel": self.channel,
             "reason": self.reason,
-            **_member_field(self.instrument),
-            **_rule_fields(self.rule, self.number),
+            **_origin_fields(self),
         }
 
 
-def _member_field(instrument: str) -> dict[str, Any]:
-    """Return the instrument in plans of networks; plans of single instruments lack the key."""
-    return {"instrument": instrument} if instrument else {}
-
-
-def _rule_fields(rule: str, number: float | None) -> dict[str, Any]:
-    return {
-        **({"rule": rule} if rule else {}),
-        **({"number": number} if number is not None else {}),
+def _origin_fields(entry: PlannedStep | LeftOut) -> dict[str, Any]:
+    """Return what a plan states of the origin of an entry; empty fields are left out."""
+    fields = {
+        "instrument": entry.instrument,
+        "product": entry.product,
+        "rule": entry.rule,
+        "number": entry.number,
     }
+    return {name: value for name, value in fields.items() if value not in ("", None)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +200,7 @@ class Plan:
     """The steps that run for one scene, and those that are left out, with the reasons."""
 
     scene: str
-    steps: tuple[Step, ...]
+    steps: tuple[PlannedStep, ...]
     left_out: tuple[LeftOut, ...]
 
     def as_dict(self) -> dict[str, Any]:

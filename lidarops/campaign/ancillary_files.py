@@ -19,7 +19,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import AncillaryError, RetrievalInputError
-from lidarops.records import InputRecord, Plan, Role
+from lidarops.records import InputRecord, Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 
 Array = npt.NDArray[np.float64]
@@ -67,31 +67,29 @@ class Ancillaries:
     """In order of file names."""
 
     @classmethod
-    def read(cls, folder: Path, plan: Plan) -> Self:
-        """Read the files that the steps of a plan name.
+    def read(cls, folder: Path, files: Mapping[str, Role]) -> Self:
+        """Read ancillary files.
 
         Parameters
         ----------
         folder : Path
             Folder of the campaign file.
-        plan : Plan
+        files : mapping of str to Role
+            Paths below `folder`, with their roles.
 
         Raises
         ------
         AncillaryError
             If a file cannot be used.
         """
-        profiles, overlaps, inputs = {}, {}, {}
-        for step in plan.steps:
-            source = step.settings.get("molecular_profile")
-            if source and source not in profiles:
-                profiles[source], digest = molecular_profile(folder, source)
-                inputs[source] = InputRecord(source, Role.MOLECULAR, digest)
-            source = step.settings.get("overlap_profile")
-            if source and source not in overlaps:
-                overlaps[source], digest = overlap_profile(folder, source)
-                inputs[source] = InputRecord(source, Role.OVERLAP, digest)
-        return cls(profiles, overlaps, tuple(inputs[name] for name in sorted(inputs)))
+        profiles, overlaps, inputs = {}, {}, []
+        for name, role in sorted(files.items()):
+            if role is Role.MOLECULAR:
+                profiles[name], digest = molecular_profile(folder, name)
+            else:
+                overlaps[name], digest = overlap_profile(folder, name)
+            inputs.append(InputRecord(name, role, digest))
+        return cls(profiles, overlaps, tuple(inputs))
 
 
 def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:

@@ -388,7 +388,7 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 def _plan_table(title: str, plan: Plan) -> Table:
     from lidarops.figures.wording import decided_on
-    from lidarops.plan.signal_rules import idle_window
+    from lidarops.steps.reading import idle_window
 
     table = make_table(title, "channel", "step", "does", "reason", "rule", "number")
     for step in plan.steps:
@@ -423,7 +423,7 @@ def _stale_table(title: str, judged: Judgement) -> Table:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
-    from lidarops.plan.signal_rules import idle_window
+    from lidarops.steps.reading import idle_window
 
     stale = [
         {"kind": product.kind, "channel": product.channel, "reason": product.reason}

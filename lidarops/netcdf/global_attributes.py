@@ -13,7 +13,7 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_date, product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import DetectionMode, LeftOut, Step
+from lidarops.records import DetectionMode, LeftOut, PlannedStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def _history(context: Context, layout: Layout, date: datetime) -> str:
     program = f"lidarops {__version__} ({context.provenance.code_version})"
     plan = context.provenance.plan
 
-    def concerns(item: Step | LeftOut) -> bool:
+    def concerns(item: PlannedStep | LeftOut) -> bool:
         return item.channel in ("", context.channel) and item.name not in layout.unused_steps
 
     done = [f"{step.name}: {step.reason}" for step in plan.steps if concerns(step)]

@@ -1,130 +1,74 @@
 """Find channels that a campaign requests or gives facts of, and that the files do not hold.
 
-The rules compare one layout of channels with the campaign. `lidarops.plan.scene_plan` applies them
-to a scene, `unavailable_channels` to all files of an archive: a channel that no file holds is a
-typing error, one that some files lack is a lidar that was changed.
+`missing_channels` compares one layout of channels with the campaign, for the plan of a scene;
+`unavailable_channels` all files of an archive: a channel that no file holds is a typing error, one
+that some files lack is a lidar that was changed.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.plan.rules import Decisions, Rule, StepName, applied
-from lidarops.plan.signal_rules import GLUED, glued_parts, joined_layout
 from lidarops.records import ChannelLayout, Holding, LeftOut, Unmet
+from lidarops.steps.channels import glued_parts, is_glued, joined_layout
 
 FACTS: Final = "facts"
+_ABSENT: Final = "channel_present"
+_UNMATCHED: Final = "facts_fit"
 
 _FIRST: Final = datetime.min.replace(tzinfo=UTC)
 _LAST: Final = datetime.max.replace(tzinfo=UTC)
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
-    """The channels of some files, with their instrument and its facts at that time."""
-
-    layout: tuple[ChannelLayout, ...]
-    instrument: Instrument
-    facts: InstrumentFacts
+def named_channels(instrument: Instrument) -> list[str]:
+    """Return the channels that the products of an instrument request by name."""
+    requested = instrument.products.requested().values()
+    return list(dict.fromkeys(name for settings in requested for name in settings.named))
 
 
-def glued_channels(
-    layout: Sequence[ChannelLayout], instrument: Instrument
-) -> tuple[ChannelLayout, ...]:
-    """Return the requested glued channels that can be made from files.
+def missing_channels(
+    layout: tuple[ChannelLayout, ...], instrument: Instrument, facts: InstrumentFacts
+) -> Iterator[LeftOut]:
+    """Yield the channels that a campaign requests or gives facts of, and that files lack.
 
     Parameters
     ----------
-    layout : sequence of ChannelLayout
+    layout : tuple of ChannelLayout
         Channels of the files.
     instrument : Instrument
-        Its products request glued channels by names such as ``glued_532o``.
-
-    Returns
-    -------
-    tuple of ChannelLayout
-        Channels whose analog and photon-counting parts have one bin width; in photon-counting
-        units.
+    facts : InstrumentFacts
+        The facts about it at the time of the files.
     """
-    return joined_layout(layout, sorted(_requested_glued(instrument)))
-
-
-def _requested_glued(instrument: Instrument) -> set[str]:
-    products = instrument.products
-    channels = [
-        name
-        for settings in (products.elastic, products.multiangle)
-        if settings is not None
-        for name in settings.channels
-    ]
-    if products.signal is not None and products.signal.channels != "all":
-        channels += products.signal.channels
-    return {name for name in channels if name.startswith(GLUED)}
-
-
-def _requested_channels(instrument: Instrument) -> dict[StepName, Sequence[str]]:
-    """Return the channels that each kind of product names."""
-    products = instrument.products
-    return {
-        kind: settings.channels
-        for kind, settings in (
-            (StepName.SIGNAL, products.signal),
-            (StepName.HOMOGENEOUS, products.homogeneous),
-            (StepName.ELASTIC, products.elastic),
-            (StepName.MULTIANGLE, products.multiangle),
-        )
-        if settings is not None and settings.channels != "all"
-    }
-
-
-def _absent(held: Held) -> Decisions:
-    """Yield the channels that the campaign requests and the files lack."""
-    channels = {channel.name: channel for channel in held.layout}
-    glued = [channel.name for channel in glued_channels(held.layout, held.instrument)]
-    for kind, names in _requested_channels(held.instrument).items():
-        for name in names:
-            if kind is StepName.HOMOGENEOUS and name.startswith(GLUED):
-                reason = "not made of glued channels: each record is fitted with its own background"
-                yield LeftOut(kind, name, reason)
-            elif name not in channels and name not in glued:
-                yield LeftOut(kind, name, _why_absent(name, channels))
-
-
-def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
-    if name.startswith(GLUED):
-        parts = glued_parts(name)
-        if set(parts) <= set(channels):
-            widths = [f"{channels[part].bin_width:g} m" for part in parts]
-            return f"its analog and photon-counting channels have bins of {' and '.join(widths)}"
-        missing = [part for part in parts if part not in channels]
-        return f"the files hold no {' and no '.join(missing)} to glue"
-    return f"the files hold no such channel, only {', '.join(channels)}"
-
-
-def _unmatched_facts(held: Held) -> Decisions:
-    """Yield the channels of the campaign's facts that the files lack."""
-    present = [channel.name for channel in held.layout]
-    for name, facts in held.facts.channels.items():
+    present = {channel.name: channel for channel in layout}
+    glued = [channel.name for channel in joined_layout(layout, named_channels(instrument))]
+    for kind, settings in instrument.products.requested().items():
+        for name in settings.named:
+            if name not in present and name not in glued:
+                reason = _why_absent(name, present)
+                yield LeftOut(kind, name, reason, rule=_ABSENT, product=kind)
+    for name, facts_of_channel in facts.channels.items():
         if name not in present:
-            reason = f"the facts name a channel that the files lack; they hold {', '.join(present)}"
-            yield LeftOut(StepName.READ.value, name, reason)
-        elif facts.lag is not None and not name.startswith("analog_"):
+            held = ", ".join(present)
+            reason = f"the facts name a channel that the files lack; they hold {held}"
+            yield LeftOut("read", name, reason, rule=_UNMATCHED)
+        elif facts_of_channel.lag is not None and not name.startswith("analog_"):
             reason = "a lag belongs to the facts of the analog channel"
-            yield LeftOut(StepName.LAG.value, name, reason)
+            yield LeftOut("lag", name, reason, rule=_UNMATCHED)
 
 
-ABSENT: Final = Rule(
-    "channel_present", StepName.READ, "Do the files hold the requested channels?", _absent
-)
-UNMATCHED: Final = Rule(
-    "facts_fit", StepName.READ, "Do the campaign's facts fit the files?", _unmatched_facts
-)
-RULES: Final = (ABSENT, UNMATCHED)
+def _why_absent(name: str, present: Mapping[str, ChannelLayout]) -> str:
+    if is_glued(name):
+        parts = glued_parts(name)
+        if set(parts) <= set(present):
+            widths = [f"{present[part].bin_width:g} m" for part in parts]
+            return f"its analog and photon-counting channels have bins of {' and '.join(widths)}"
+        missing = [part for part in parts if part not in present]
+        return f"the files hold no {' and no '.join(missing)} to glue"
+    return f"the files hold no such channel, only {', '.join(present)}"
 
 
 def validity_edges(campaign: Campaign) -> list[datetime]:
@@ -150,7 +94,7 @@ def lacks_channels(
         Instruments, and the channels of their files.
     """
     return any(
-        _lacking(Held(layout, owner, facts))
+        _lacking(layout, owner, facts)
         for name, layout in layouts
         if (owner := campaign.instruments.get(name)) is not None
         for facts in owner.facts or (InstrumentFacts(),)
@@ -160,16 +104,17 @@ def lacks_channels(
 def names_channels(campaign: Campaign) -> bool:
     """Return whether a campaign names channels, so that files may lack them."""
     return any(
-        any(_requested_channels(instrument).values())
-        or any(facts.channels for facts in instrument.facts)
+        any(named_channels(instrument)) or any(facts.channels for facts in instrument.facts)
         for instrument in campaign.instruments.values()
     )
 
 
-def _lacking(held: Held) -> list[LeftOut]:
+def _lacking(
+    layout: tuple[ChannelLayout, ...], instrument: Instrument, facts: InstrumentFacts
+) -> list[LeftOut]:
     """Return the channels that files lack, without misplaced facts about a lag."""
-    omissions = (omission for omission in applied(RULES, held) if isinstance(omission, LeftOut))
-    return [omission for omission in omissions if omission.name != StepName.LAG]
+    missing = missing_channels(layout, instrument, facts)
+    return [omission for omission in missing if omission.name != "lag"]
 
 
 def unavailable_channels(
@@ -203,7 +148,6 @@ def unavailable_channels(
     tuple of Unmet
         Channels that no file holds come first.
     """
-    requested = {StepName(kind) for kind in kinds} or set(StepName)
     all_files: dict[tuple[str, str], int] = defaultdict(int)
     lacking: dict[tuple[str, str, str], list[tuple[int, str]]] = defaultdict(list)
     held: dict[tuple[str, str], int] = defaultdict(int)
@@ -222,10 +166,10 @@ def unavailable_channels(
             until is None or facts.valid_from < until
         )
         reasons = {}
-        for omission in _lacking(Held(holding.layout, instrument, facts)):
-            if omission.rule == ABSENT.name and StepName(omission.name) in requested:
+        for omission in _lacking(holding.layout, instrument, facts):
+            if omission.rule == _ABSENT and (not kinds or omission.name in kinds):
                 reasons[omission.name, omission.channel] = omission.reason
-            elif omission.rule == UNMATCHED.name and touched:
+            elif omission.rule == _UNMATCHED and touched:
                 reasons[period, omission.channel] = omission.reason
         for (requester, channel), reason in reasons.items():
             lacking[name, requester, channel].append((holding.files, reason))

@@ -12,7 +12,7 @@ import os
 import platform
 import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
@@ -21,10 +21,13 @@ from typing import Any, Final
 
 from lidarops.errors import CatalogError
 from lidarops.kinds import kinds
-from lidarops.plan.rules import StepName
-from lidarops.plan.signal_rules import GLUED, glued_parts, read_windows
 from lidarops.raw.model import count_bins
-from lidarops.records import Granule, Plan, Scene, Step
+from lidarops.records import Plan, PlannedStep, Scene
+from lidarops.steps.channels import file_channels, is_glued
+from lidarops.steps.dependence import is_product, plan_closure
+from lidarops.steps.reading import read_windows
+from lidarops.steps.registry import product_step, typed_settings
+from lidarops.steps.step import UnitCosts
 
 _FORMAT: Final = "lidarops costs"
 _CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
@@ -33,17 +36,12 @@ MOST_FIGURES: Final = 40
 
 
 class Term(StrEnum):
-    """A term of the CPU time."""
+    """A term of the CPU time that all kinds of product share; see `kind_terms` for the others."""
 
     RUN = "run"
     """A run: process, imports, ledger."""
     LOAD = "load"
     """Compiled code that the first scene of a process loads, for any product."""
-    HOMOGENEOUS_LOAD = "homogeneous_load"
-    """Compiled code that the first scene with such a product loads."""
-    ELASTIC_LOAD = "elastic_load"
-    MULTIANGLE_LOAD = "multiangle_load"
-    VISIBILITY_LOAD = "visibility_load"
     SCENE = "scene"
     FILE = "file"
     """A raw file of a scene, dark files included."""
@@ -56,46 +54,41 @@ class Term(StrEnum):
     DARK = "dark"
     """A channel from which dark files are subtracted."""
     LOOK = "look"
-    SIGNAL = "signal"
-    SIGNAL_VALUE = "signal_value"
-    """One bin of one profile, written."""
-    HOMOGENEOUS = "homogeneous"
-    HOMOGENEOUS_VALUE = "homogeneous_value"
-    """One bin of a section of one profile."""
-    ELASTIC = "elastic"
-    ELASTIC_VALUE = "elastic_value"
-    """One bin of one average."""
-    MULTIANGLE = "multiangle"
-    MULTIANGLE_VALUE = "multiangle_value"
-    """One altitude of one profile."""
-    VISIBILITY = "visibility"
-    VISIBILITY_VALUE = "visibility_value"
-    """One average of one beam."""
+    """Sampled profiles of a channel, for decisions that need data."""
     PAGE = "page"
     """The page of a report."""
-    SIGNAL_FIGURE = "signal_figure"
-    """The figures of one channel of an instrument, for all scenes together."""
-    HOMOGENEOUS_FIGURE = "homogeneous_figure"
-    ELASTIC_FIGURE = "elastic_figure"
-    MULTIANGLE_FIGURE = "multiangle_figure"
-    VISIBILITY_FIGURE = "visibility_figure"
     FIGURE_VALUE = "figure_value"
     """One bin of one profile in a figure."""
+
+
+def value_term(kind: str) -> str:
+    """Return the term of one value of a product, as its step counts them."""
+    return f"{kind}_value"
+
+
+def load_term(kind: str) -> str:
+    """Return the term of the compiled code that the first product of a kind loads."""
+    return f"{kind}_load"
+
+
+def figure_term(kind: str) -> str:
+    """Return the term of the figures of one channel of an instrument, for all scenes together."""
+    return f"{kind}_figure"
 
 
 @dataclass(frozen=True, slots=True)
 class Costs:
     """Unit costs of all terms on a machine."""
 
-    seconds: Mapping[Term, float]
+    seconds: Mapping[str, float]
     """Term -> CPU time in s for one unit."""
     processor: str = ""
     date: str = ""
-    """Date of the calibration; empty for `DEFAULTS`."""
+    """Date of the calibration; empty for `default_costs`."""
     note: str = ""
     """Why these costs are not those of this machine; empty where they are."""
 
-    def of(self, amounts: Mapping[Term, float]) -> float:
+    def of(self, amounts: Mapping[str, float]) -> float:
         """Return the CPU time of amounts, s."""
         return math.fsum(self.seconds[term] * amount for term, amount in amounts.items())
 
@@ -108,13 +101,9 @@ class Costs:
 UNCALIBRATED: Final = (
     "not calibrated on this machine: run lidarops bench throughput --case costs, once"
 )
-DEFAULTS: Final[Mapping[Term, float]] = {
+_SHARED_COSTS: Final[Mapping[Term, float]] = {
     Term.RUN: 7.0,
     Term.LOAD: 1.5,
-    Term.HOMOGENEOUS_LOAD: 0.1,
-    Term.ELASTIC_LOAD: 0.1,
-    Term.MULTIANGLE_LOAD: 0.1,
-    Term.VISIBILITY_LOAD: 0.1,
     Term.SCENE: 0.005,
     Term.FILE: 2e-5,
     Term.DIGEST: 2e-9,
@@ -122,25 +111,24 @@ DEFAULTS: Final[Mapping[Term, float]] = {
     Term.VALUE: 1.2e-7,
     Term.DARK: 0.035,
     Term.LOOK: 0.04,
-    Term.SIGNAL: 0.05,
-    Term.SIGNAL_VALUE: 2e-8,
-    Term.HOMOGENEOUS: 0.08,
-    Term.HOMOGENEOUS_VALUE: 1.2e-7,
-    Term.ELASTIC: 0.1,
-    Term.ELASTIC_VALUE: 5e-7,
-    Term.MULTIANGLE: 0.1,
-    Term.MULTIANGLE_VALUE: 6e-6,
-    Term.VISIBILITY: 0.2,
-    Term.VISIBILITY_VALUE: 2.5e-3,
     Term.PAGE: 0.2,
-    Term.SIGNAL_FIGURE: 0.8,
-    Term.HOMOGENEOUS_FIGURE: 0.4,
-    Term.ELASTIC_FIGURE: 1.5,
-    Term.MULTIANGLE_FIGURE: 1.9,
-    Term.VISIBILITY_FIGURE: 1.2,
     Term.FIGURE_VALUE: 3e-7,
 }
-"""Costs on a common server core, used without a calibration."""
+
+
+@cache
+def default_costs() -> Mapping[str, float]:
+    """Return the costs on a common server core, used without a calibration, by term in s."""
+    costs: dict[str, float] = {term.value: seconds for term, seconds in _SHARED_COSTS.items()}
+    for kind in kinds():
+        of_kind: UnitCosts = product_step(kind).costs
+        costs |= {
+            kind: of_kind.product,
+            value_term(kind): of_kind.value,
+            load_term(kind): of_kind.load,
+            figure_term(kind): of_kind.figure,
+        }
+    return costs
 
 
 @dataclass(slots=True)
@@ -161,7 +149,9 @@ class Tally:
         made = {(step.name, scene.instrument, step.channel) for step in _products(plan)}
         self.count += bool(made)
         self._figures |= made
-        self._values += terms.get(Term.SIGNAL_VALUE, 0.0) + terms.get(Term.ELASTIC_VALUE, 0.0)
+        self._values += sum(
+            terms.get(value_term(kind), 0.0) for kind in kinds() if product_step(kind).drawn_whole
+        )
         seconds = self.costs.of(terms)
         self.scenes += seconds
         return seconds
@@ -205,18 +195,7 @@ class Tally:
         }
 
 
-def load_term(kind: str) -> Term:
-    """Return the term of the code that the first product of a kind loads."""
-    # The signal product loads nothing beyond what all products load.
-    return Term.LOAD if kind == "signal" else Term(f"{kind}_load")
-
-
-def figure_term(kind: str) -> Term:
-    """Return the term of the figures of a kind of product."""
-    return Term(f"{kind}_figure")
-
-
-def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[Term, float]:
+def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[str, float]:
     """Return the amount of each term in a scene.
 
     Parameters
@@ -229,44 +208,44 @@ def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[Term, floa
 
     Returns
     -------
-    dict of Term to float
+    dict of str to float
         Terms with an amount above 0; empty where the plan makes no product.
     """
     products = _products(plan)
     if not products:
         return {}
     members = scene.members or (scene,)
-    channels = [step.channel for step in plan.steps if step.name == StepName.READ]
+    channels = [step.channel for step in plan.steps if step.name == "read"]
     files = (*scene.granules, *scene.dark)
-    terms: dict[Term, float] = defaultdict(float)
+    terms: dict[str, float] = defaultdict(float)
     terms[Term.SCENE] = 1
     terms[Term.FILE] = sum(
         len(member.granules) + len(member.dark) * _subtracts_dark(plan, member.instrument)
         for member in members
     )
     terms[Term.DIGEST] = sum(file.size for file in files if whole or file.sha256 is None)
-    terms[Term.CHANNEL] = sum(not name.startswith(GLUED) for name in channels)
+    terms[Term.CHANNEL] = sum(not is_glued(name) for name in channels)
     terms[Term.VALUE] = sum(_conditioned(member, plan) for member in members)
-    terms[Term.DARK] = sum(step.name == StepName.DARK for step in plan.steps)
-    terms[Term.LOOK] = sum(step.name == StepName.LOOK for step in plan.steps)
+    terms[Term.DARK] = sum(step.name == "dark" for step in plan.steps)
+    terms[Term.LOOK] = sum(step.name == "look" for step in plan.steps)
     for step in products:
-        terms[Term(step.name)] += 1
-        terms[Term(f"{step.name}_value")] += _values(step, scene, plan)
+        closure = plan_closure(plan, [(step.name, step.channel)])
+        terms[step.name] += 1
+        terms[value_term(step.name)] += product_step(step.name).values(
+            typed_settings(step), scene, closure
+        )
     return {term: float(amount) for term, amount in terms.items() if amount}
 
 
-def _products(plan: Plan) -> list[Step]:
-    names = tuple(kinds())
-    return [step for step in plan.steps if step.name in names]
+def _products(plan: Plan) -> list[PlannedStep]:
+    return [step for step in plan.steps if is_product(step)]
 
 
 def _subtracts_dark(plan: Plan, instrument: str) -> bool:
-    return any(
-        step.name == StepName.DARK and step.instrument in ("", instrument) for step in plan.steps
-    )
+    return any(step.name == "dark" and step.instrument in ("", instrument) for step in plan.steps)
 
 
-def _steps_of(plan: Plan, member: Scene) -> Iterator[Step]:
+def _steps_of(plan: Plan, member: Scene) -> Iterator[PlannedStep]:
     """Yield the steps of a scene, or of a member of one."""
     return (step for step in plan.steps if step.instrument in ("", member.instrument))
 
@@ -281,8 +260,8 @@ def _conditioned(member: Scene, plan: Plan) -> float:
     windows = read_windows(tuple(_steps_of(plan, member)))
     total = 0
     for step in _steps_of(plan, member):
-        if step.name == StepName.READ and not _only_glued(step.channel, plan):
-            names = glued_parts(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
+        if step.name == "read" and not _only_glued(step.channel, plan):
+            names = file_channels(step.channel)
             total += sum(
                 count_bins(windows[name]) if name in windows else bins.get(name, 0)
                 for name in names
@@ -292,46 +271,9 @@ def _conditioned(member: Scene, plan: Plan) -> float:
 
 def _only_glued(channel: str, plan: Plan) -> bool:
     """Return whether a channel is read for glued channels only."""
-    glued = {value for step in plan.steps if step.name == StepName.GLUE
-             for value in step.settings.values()}  # fmt: skip
-    return channel in glued and channel not in {step.channel for step in _products(plan)}
-
-
-def _values(step: Step, scene: Scene, plan: Plan) -> float:
-    settings = step.settings
-    if step.name == "visibility":
-        seconds = _average(step, plan)
-        members = {member.instrument: member for member in scene.members}
-        return float(
-            sum(_intervals(members[beam["instrument"]].granules, seconds)
-                for beam in settings["beams"])
-        )  # fmt: skip
-    profiles = len(scene.granules)
-    if step.name == "homogeneous":
-        width = min(channel.bin_width for channel in scene.layout)
-        return float(profiles * sum((far - near) / width for near, far in settings["sections"]))
-    if step.name == "multiangle":
-        return float(profiles * settings["highest"] / settings["step"])
-    by_channel = _bins(scene)
-    names = glued_parts(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
-    bins = min(by_channel[name] for name in names)
-    if step.name == "elastic":
-        return float(_intervals(scene.granules, _average(step, plan)) * bins)
-    return float(profiles * bins)
-
-
-def _average(product: Step, plan: Plan) -> float:
-    return next(
-        float(step.settings["seconds"])
-        for step in plan.steps
-        if step.name == StepName.AVERAGE and step.channel == product.channel
+    return channel not in {step.channel for step in _products(plan)} and any(
+        channel in file_channels(step.channel) for step in plan.steps if is_glued(step.channel)
     )
-
-
-def _intervals(granules: Iterable[Granule], seconds: float) -> int:
-    """Return the number of clock intervals that hold profiles."""
-    starts = (granule.start for granule in granules)
-    return len({math.floor(start.timestamp() / seconds) for start in starts if start})
 
 
 # The calibration of a machine -----------------------------------------------------------------
@@ -379,7 +321,7 @@ def save_calibration(costs: Costs, path: Path | None = None) -> Path:
         "format": _FORMAT,
         "processor": costs.processor,
         "date": costs.date,
-        "seconds": {term.value: costs.seconds[term] for term in Term},
+        "seconds": {term: costs.seconds[term] for term in default_costs()},
     }
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -397,7 +339,7 @@ def save_calibration(costs: Costs, path: Path | None = None) -> Path:
 
 
 def load_calibration(path: Path | None = None) -> Costs:
-    """Return the costs of this machine: calibrated ones, or `DEFAULTS` with a note.
+    """Return the costs of this machine: calibrated ones, or `default_costs` with a note.
 
     A calibration of another processor is not used, because home directories are shared between
     machines. Never raises, because a missing estimate must not stop a command.
@@ -413,7 +355,7 @@ def load_calibration(path: Path | None = None) -> Costs:
         note = f"{UNCALIBRATED} ({error})"
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         note = f"{UNCALIBRATED} ({source} cannot be used: {error})"
-    return Costs(DEFAULTS, note=note)
+    return Costs(default_costs(), note=note)
 
 
 def _read(document: Any) -> Costs:
@@ -421,7 +363,7 @@ def _read(document: Any) -> Costs:
         raise ValueError("it is not a calibration")
     if document["processor"] != processor():
         raise ValueError(f"it is for another processor, {document['processor']}")
-    seconds = {term: float(document["seconds"][term.value]) for term in Term}
+    seconds = {term: float(document["seconds"][term]) for term in default_costs()}
     if not all(math.isfinite(cost) and cost >= 0 for cost in seconds.values()):
         raise ValueError("a cost is not a finite, non-negative time")
     return Costs(seconds, processor=processor(), date=str(document["date"]))

@@ -11,8 +11,8 @@ from typing import Final
 from lidarops.figures.wording import counted, decided_on, duration, percent
 from lidarops.flags import Quality, Severity
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.plan.signal_rules import idle_window
-from lidarops.records import LeftOut, RunRecord, SceneOutcome, Step
+from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome
+from lidarops.steps.reading import idle_window
 
 _MOST_NAMES: Final = 8
 """Most names listed in one cell."""
@@ -209,7 +209,7 @@ def carried_out(record: RunRecord) -> list[DecisionRow]:
     return _decisions(record, _carried_out)
 
 
-def _carried_out(scene: SceneOutcome) -> Iterator[Step]:
+def _carried_out(scene: SceneOutcome) -> Iterator[PlannedStep]:
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
         idle = idle_window(step, steps)
@@ -222,7 +222,7 @@ def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:
 
 
 def _decisions(
-    record: RunRecord, items_of: Callable[[SceneOutcome], Iterable[Step | LeftOut]]
+    record: RunRecord, items_of: Callable[[SceneOutcome], Iterable[PlannedStep | LeftOut]]
 ) -> list[DecisionRow]:
     scenes: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     channels: dict[tuple[str, str, str], set[str]] = defaultdict(set)

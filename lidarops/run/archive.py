@@ -20,7 +20,8 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.process.scene import Job, failed_outcome
+from lidarops.process.job import Job
+from lidarops.process.scene import failed_outcome
 from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import run_page, run_record
 from lidarops.run.executor import (

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
 from lidarops.netcdf.code_version import joint_code_version
-from lidarops.process.scene import Job, attempt, failed_outcome, internal_error
+from lidarops.process.job import Job
+from lidarops.process.scene import attempt, failed_outcome, internal_error
 from lidarops.records import SceneOutcome
 from lidarops.run import worker
 from lidarops.system.processes import keep_memory, start_method

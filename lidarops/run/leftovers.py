@@ -10,12 +10,11 @@ from functools import cached_property
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RecordedProduct
-from lidarops.plan import product_dependence
-from lidarops.plan.rules import StepName
 from lidarops.plan.scenes import Cut, parse_scene_id
-from lidarops.plan.signal_rules import GLUED
 from lidarops.process.scene import nothing_to_do
 from lidarops.records import Granule, InputRecord, Plan, Scene
+from lidarops.steps import dependence
+from lidarops.steps.channels import GLUED
 
 Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""
@@ -93,9 +92,7 @@ def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> di
     campaign : Campaign
     """
     scenes = list(planned)
-    without = [
-        (scene, plan) for scene, plan in scenes if not product_dependence.planned_products(plan)
-    ]
+    without = [(scene, plan) for scene, plan in scenes if not dependence.planned_products(plan)]
     in_networks = {
         granule.path for scene, _ in scenes if scene.members for granule in scene.granules
     }
@@ -153,7 +150,7 @@ def orphaned_products(
     requested = {
         (scene.id, kind, channel)
         for scene, plan in planned
-        for kind, channel in product_dependence.planned_products(plan)
+        for kind, channel in dependence.planned_products(plan)
     }
     orphans = []
     for product in made:
@@ -192,7 +189,7 @@ def _why_left_out(plan: Plan, product: RecordedProduct) -> str:
     reasons = dict.fromkeys(
         omission.reason
         for omission in plan.left_out
-        if omission.channel == product.channel and omission.name in (product.kind, StepName.READ)
+        if omission.channel == product.channel and omission.name in (product.kind, "read")
     )
     return "; ".join(reasons) or "its plan leaves it out"
 

@@ -28,9 +28,10 @@ from lidarops.netcdf.provenance import (
     package_versions,
     read_provenance,
 )
-from lidarops.process.scene import Job, process_scene
+from lidarops.process.job import Job
+from lidarops.process.scene import process_scene
 from lidarops.raw import licel
-from lidarops.records import Granule, InputRecord, LeftOut, Plan, Role, Scene, Status, Step
+from lidarops.records import Granule, InputRecord, LeftOut, Plan, PlannedStep, Role, Scene, Status
 from lidarops.system.stores import RemoteStore, is_url
 
 _LOG = logging.getLogger(__name__)
@@ -130,7 +131,7 @@ def _insufficient(file: Path, problem: str) -> ProductError:
 def _plan(fields: Mapping[str, Any]) -> Plan:
     return Plan(
         fields["scene"],
-        tuple(Step(**step) for step in fields["steps"]),
+        tuple(PlannedStep(**step) for step in fields["steps"]),
         tuple(LeftOut(**left) for left in fields["left_out"]),
     )
 

@@ -19,9 +19,9 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.netcdf.code_version import joint_code_version
 from lidarops.plan import cost_estimate
-from lidarops.plan.product_dependence import ProductKey
 from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
 from lidarops.run.staleness import Judge, Judgement
+from lidarops.steps.dependence import ProductKey
 
 MOST_INPUTS: Final = 100_000
 """Granules that the record of a run names; the ledger names all."""

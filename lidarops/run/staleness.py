@@ -24,14 +24,14 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.netcdf.code_version import code_version, joint_code_version, source_version
 from lidarops.netcdf.provenance import package_versions
-from lidarops.plan import product_dependence
-from lidarops.plan.product_dependence import ProductKey
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.records import Granule, InputRecord, Plan, Role, Scene
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection
+from lidarops.steps import dependence
+from lidarops.steps.dependence import ProductKey
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
@@ -82,7 +82,7 @@ class Judgement:
 
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
-        return product_dependence.plan_closure(
+        return dependence.plan_closure(
             self.plan, [(product.kind, product.channel) for product in self.stale]
         )
 
@@ -139,7 +139,7 @@ class Judge:
         self._store = store
         self._selection = selection or Selection()
         self._force = force
-        self._settings = product_dependence.Settings(campaign)
+        self._settings = dependence.Settings(campaign)
         self._profiles: dict[str, str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
@@ -195,7 +195,7 @@ class Judge:
                 if name
             }
         )
-        return product_dependence.digest(
+        return dependence.digest(
             [
                 {key: value for key, value in settings.items() if key not in _OPERATION},
                 joint_code_version(_requested_kinds(self._campaign), *_PLANNING),
@@ -304,8 +304,8 @@ class Judge:
         judged = self.judgement(scene, whole)
         last = tried.get(scene.id)
         stale = []
-        requested = product_dependence.plan_of_kinds(whole, self._selection.kinds)
-        for kind, channel in product_dependence.planned_products(requested):
+        requested = dependence.plan_of_kinds(whole, self._selection.kinds)
+        for kind, channel in dependence.planned_products(requested):
             known = made.get((scene.id, kind, channel))
             reason = self._reason(scene, whole, (kind, channel), known, touched)
             if reason:
@@ -315,7 +315,7 @@ class Judge:
             requested=requested,
             key=self.key(judged),
             stale=tuple(stale),
-            fresh=len(product_dependence.planned_products(requested)) - len(stale),
+            fresh=len(dependence.planned_products(requested)) - len(stale),
             suspect=last is not None and last.crashes > 0,
         )
         if last is None or self._force or not stale:
@@ -329,7 +329,7 @@ class Judge:
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement by which every product of a scene is stale."""
-        products = product_dependence.planned_products(whole)
+        products = dependence.planned_products(whole)
         stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
         return Judgement(scene, whole, whole, day_of(scene.start), "", stale, 0)
 
@@ -348,7 +348,7 @@ class Judge:
         """
         scene, whole = judged.scene, judged.plan
         software = [source_version(), package_versions()] if internal else []
-        return product_dependence.digest(
+        return dependence.digest(
             [
                 *software,
                 whole.hash,
@@ -366,16 +366,16 @@ class Judge:
         self, scene: Scene, whole: Plan, product: ProductKey, files: Sequence[InputRecord]
     ) -> tuple[Dependence, tuple[InputRecord, ...]]:
         """Return what a product depends on, and the files that it was made from."""
-        closure = product_dependence.plan_closure(whole, [product])
-        used = product_dependence.product_inputs(closure, files)
+        closure = dependence.plan_closure(whole, [product])
+        used = dependence.product_inputs(closure, files)
         settings = self._settings.of(scene, closure, product[1])
-        dependence = Dependence(
+        depends_on = Dependence(
             plan_hash=closure.hash,
-            settings_hash=product_dependence.digest(settings),
-            inputs_hash=product_dependence.inputs_digest(used),
+            settings_hash=dependence.digest(settings),
+            inputs_hash=dependence.inputs_digest(used),
             code_version=code_version(product[0]),
         )
-        return dependence, used
+        return depends_on, used
 
     def settles(
         self, judged: Judgement, files: Sequence[InputRecord], made: Mapping[ProductKey, Dependence]
@@ -401,12 +401,10 @@ class Judge:
         )
         for stale in judged.stale:
             product = (stale.kind, stale.channel)
-            used = product_dependence.product_inputs(
-                product_dependence.plan_closure(whole, [product]), now
-            )
+            used = dependence.product_inputs(dependence.plan_closure(whole, [product]), now)
             if product not in made:
                 return False
-            if made[product].inputs_hash != product_dependence.inputs_digest(used):
+            if made[product].inputs_hash != dependence.inputs_digest(used):
                 return False
         return True
 
@@ -422,8 +420,8 @@ class Judge:
         if self._force or known is None:
             return "forced" if self._force else "not made yet"
         recorded = known.depends_on
-        closure = product_dependence.plan_closure(whole, [product])
-        settings = product_dependence.digest(self._settings.of(scene, closure, product[1]))
+        closure = dependence.plan_closure(whole, [product])
+        settings = dependence.digest(self._settings.of(scene, closure, product[1]))
         code = code_version(product[0])
         if (recorded.code_version, recorded.plan_hash, recorded.settings_hash) != (
             code,
@@ -432,8 +430,8 @@ class Judge:
         ):
             return _changed(recorded, closure.hash, code)
         # Last, because files may have to be read for it.
-        used = product_dependence.product_inputs(closure, self._files(scene, whole, self._content))
-        if recorded.inputs_hash != product_dependence.inputs_digest(used):
+        used = dependence.product_inputs(closure, self._files(scene, whole, self._content))
+        if recorded.inputs_hash != dependence.inputs_digest(used):
             return _difference(self._store.inputs_of(known.path), used)
         return self._file_reason(known, touched)
 
@@ -525,11 +523,11 @@ def _requested_kinds(campaign: Campaign) -> set[str]:
 
 
 def _kinds(whole: Plan) -> set[str]:
-    return {kind for kind, _ in product_dependence.planned_products(whole)}
+    return {kind for kind, _ in dependence.planned_products(whole)}
 
 
 def _channels(whole: Plan) -> list[str]:
-    return sorted({channel for _, channel in product_dependence.planned_products(whole)})
+    return sorted({channel for _, channel in dependence.planned_products(whole)})
 
 
 def _counts(

@@ -17,17 +17,17 @@ from support.archives.scene_jobs import catalogued_scenes
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.flags import Quality
-from lidarops.plan import product_dependence
+from lidarops.steps import dependence
 from lidarops.plan.preview import GAP, OMITTED, refine_plan
 from lidarops.plan.rule_table import RULES
 from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW, plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.plan.signal_rules import idle_window, read_windows
+from lidarops.steps.reading import idle_window, read_windows
 from lidarops.process import channel_steps
 from lidarops.process import scene as processing
 from lidarops.process.scene import Job, process_scene
 from lidarops.raw.licel import RawFile
-from lidarops.records import Plan, Role, RunRecord, Step
+from lidarops.records import Plan, Role, RunRecord, PlannedStep
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
@@ -329,14 +329,14 @@ def test_a_window_without_effect_states_why(products, why):
     assert ("photon_532o" in read_windows(plan.steps)) == (not why)
     assert not any(idle_window(step, plan.steps) for step in plan.steps if step is not window)
     # The product of sections states the same, whatever other products there are.
-    alone = product_dependence.plan_closure(plan, [("homogeneous", "photon_532o")])
+    alone = dependence.plan_closure(plan, [("homogeneous", "photon_532o")])
     assert window in alone.steps
     assert not idle_window(window, alone.steps)
 
 
 def test_a_window_does_not_depend_on_other_lidars():
-    window = Step("range_window", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
-    signal = Step("signal", "photon_532o", {}, "requested", "west")
+    window = PlannedStep("range_window", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
+    signal = PlannedStep("signal", "photon_532o", {}, "requested", "west")
     assert not idle_window(window, [window, signal])
     assert read_windows([window, signal]) == {"photon_532o": ((0, 9),)}
 

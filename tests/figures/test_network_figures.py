@@ -16,7 +16,7 @@ from lidarops.figures.series_data import compare, join
 from lidarops.flags import Quality
 from lidarops.products.visibility import report_figures
 from lidarops.products.visibility.figure_data import instruments_of, read_crossings, read_map
-from lidarops.records import LeftOut, Plan, SceneOutcome, Step
+from lidarops.records import LeftOut, Plan, PlannedStep, SceneOutcome
 
 NAMES = ("lidar-0", "lidar-1", "lidar-2")
 
@@ -163,7 +163,7 @@ def test_a_foreign_product_is_refused(made):
 
 def test_instruments_are_those_of_the_plan(made):
     beams = [{"instrument": name} for name in NAMES]
-    plan = Plan("s", (Step("visibility", "photon_532o", {"beams": beams}, "why"),), ())
+    plan = Plan("s", (PlannedStep("visibility", "photon_532o", {"beams": beams}, "why"),), ())
     start = made["time"].values[0].astype("datetime64[us]").item()
     outcome = SceneOutcome("s", "valley", "valley", start, 3, plan)
     assert instruments_of(outcome) == NAMES

@@ -27,7 +27,7 @@ from support.products.fabricated import (
 from lidarops.errors import CatalogError
 from lidarops.figures.wording import counted, duration, percent, size
 from lidarops.flags import Quality
-from lidarops.records import LeftOut, Plan, ProductRecord, Step, Unmet
+from lidarops.records import LeftOut, Plan, ProductRecord, PlannedStep, Unmet
 from lidarops.reports import run_page, run_tables
 from lidarops.reports import run_record as record
 
@@ -168,7 +168,7 @@ class TestSimulatedRun:
         words = "too many beyond 3"
         assert words in built(simulated, tmp_path / "without", figures=0).text
         plan = simulated.scenes[0].plan
-        plan = replace(plan, steps=(*plan.steps, Step("dark", CHANNEL, {"files": 2}, "2 files")))
+        plan = replace(plan, steps=(*plan.steps, PlannedStep("dark", CHANNEL, {"files": 2}, "2 files")))
         scene = replace(simulated.scenes[0], plan=plan)
         assert (
             words
@@ -312,7 +312,7 @@ class TestDegenerateRuns:
 
 class TestDecisions:
     def test_rule_and_number_of_a_step_are_shown(self, archive, tmp_path):
-        step = Step("look", CHANNEL, {}, "sections may be dark", rule="look", number=16.0)
+        step = PlannedStep("look", CHANNEL, {}, "sections may be dark", rule="look", number=16.0)
         plan = replace(fab.plan("one"), steps=(step,))
         scene = outcome("one", START, plan=plan, cpu_seconds=3.0, estimated_seconds=2.0)
         run = replace(run_record(archive.root, [scene]), costs="calibrated yesterday")
@@ -410,8 +410,8 @@ class TestManyScenes:
         assert hashes[0] == hashes[1]
 
     def test_a_range_window_without_effect_is_marked(self, tmp_path):
-        window = Step("range_window", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
-        signal = Step("signal", CHANNEL, {}, "requested")
+        window = PlannedStep("range_window", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
+        signal = PlannedStep("signal", CHANNEL, {}, "requested")
         scenes = [
             outcome(name, plan=Plan(name, steps, ()))
             for name, steps in (("alone", (window,)), ("both", (window, signal)))

@@ -27,7 +27,7 @@ from lidarops.records import (
     RunRecord,
     SceneOutcome,
     Status,
-    Step,
+    PlannedStep,
     Unmet,
 )
 from lidarops.reports.run_record import FILE_NAME, load_run_record, save_run_record
@@ -82,7 +82,7 @@ left_out = st.builds(LeftOut, text, text, text, rule=text, number=st.none() | nu
 plans = st.builds(
     Plan,
     text,
-    some(st.builds(Step, text, text, mapping, text)),
+    some(st.builds(PlannedStep, text, text, mapping, text)),
     some(left_out),
 )
 products = st.builds(
@@ -171,7 +171,7 @@ def test_types_survive(tmp_path):
 
 
 def test_tuples_within_settings_keep_the_hash(tmp_path):
-    plan = Plan("s", (Step("homogeneous", "c", {"sections": ((1, 2), (3, 4))}, "why"),), ())
+    plan = Plan("s", (PlannedStep("homogeneous", "c", {"sections": ((1, 2), (3, 4))}, "why"),), ())
     back = load_run_record(
         save_run_record(fab.run_record(tmp_path, [fab.outcome("s", plan=plan)]), tmp_path)
     )
@@ -181,7 +181,7 @@ def test_tuples_within_settings_keep_the_hash(tmp_path):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, {1, 2}, object(), b"x"])
 def test_settings_outside_json_are_refused(tmp_path, value):
-    plan = Plan("s", (Step("a", "c", {"x": [value]}, "why"),), ())
+    plan = Plan("s", (PlannedStep("a", "c", {"x": [value]}, "why"),), ())
     record = fab.run_record(tmp_path, [fab.outcome("s", plan=plan)])
     with pytest.raises(CatalogError, match="settings"):
         save_run_record(record, tmp_path / "run")

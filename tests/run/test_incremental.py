@@ -24,7 +24,7 @@ from lidarops.catalog.rows import day_of
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
-from lidarops.process.scene import Job
+from lidarops.process.job import Job
 from lidarops.records import SceneOutcome
 from lidarops.run import executor
 from lidarops.run.archive import (

@@ -19,7 +19,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.plan.product_dependence import plan_closure, planned_products
+from lidarops.steps.dependence import plan_closure, planned_products
 from lidarops.reports import gallery, run_record
 from lidarops.run import archive as pipeline
 from lidarops.run import session

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
-from lidarops.plan import product_dependence
+from lidarops.steps import dependence
 from lidarops.process.scene import Job, _digest, failed_outcome
 from lidarops.records import ProductRecord, SceneOutcome
 
@@ -21,12 +21,12 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         inputs += Ancillaries.read(job.campaign.folder, job.plan).inputs
     except LidarOpsError as error:
         return failed_outcome(job, str(error)), True
-    settings = product_dependence.Settings(job.campaign)
+    settings = dependence.Settings(job.campaign)
     products = []
-    for kind, channel in product_dependence.planned_products(job.plan):
-        closure = product_dependence.plan_closure(job.plan, [(kind, channel)])
+    for kind, channel in dependence.planned_products(job.plan):
+        closure = dependence.plan_closure(job.plan, [(kind, channel)])
         used = sorted(
-            record.sha256 for record in product_dependence.product_inputs(closure, inputs)
+            record.sha256 for record in dependence.product_inputs(closure, inputs)
         )
         fields = [closure.as_dict(), settings.of(job.scene, closure, channel), used]
         content = json.dumps(fields, sort_keys=True).encode()

@@ -37,13 +37,15 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
 from lidarops.netcdf.write import write_plain
-from lidarops.plan import cost_estimate, product_dependence
+from lidarops.plan import cost_estimate
 from lidarops.plan.cost_estimate import Costs, Term
-from lidarops.process.scene import Job, process_scene
+from lidarops.process.job import Job
+from lidarops.process.scene import process_scene
 from lidarops.records import RunRecord
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
 from lidarops.simulate.campaign import plan_simulation, write_simulation
+from lidarops.steps import dependence
 
 _LOG = logging.getLogger(__name__)
 
@@ -68,7 +70,7 @@ class Observation:
 
     scene: str
     products: tuple[str, ...]
-    amounts: Mapping[Term, float]
+    amounts: Mapping[str, float]
     seconds: float
     """CPU time."""
     estimated: float
@@ -164,7 +166,7 @@ def calibrate(
     return Calibration(
         date=date,
         machine=this_machine,
-        seconds={term.value: seconds[term] for term in Term},
+        seconds={term: seconds[term] for term in cost_estimate.default_costs()},
         observations=tuple(
             replace(observation, estimated=model.of(observation.amounts))
             for observation in observations
@@ -173,7 +175,7 @@ def calibrate(
     )
 
 
-def fit_costs(observations: Sequence[Observation]) -> dict[Term, float]:
+def fit_costs(observations: Sequence[Observation]) -> dict[str, float]:
     """Return the costs by least squares of relative errors, s per unit.
 
     Minimises sum_i (1 - a_i x / t_i)^2 + sum_k (w (x_k / d_k - 1))^2 over x >= 0, with the
@@ -184,18 +186,19 @@ def fit_costs(observations: Sequence[Observation]) -> dict[Term, float]:
     observations : sequence of Observation
         With times above zero.
     """
-    defaults = np.array([cost_estimate.DEFAULTS[term] for term in Term])
+    defaults_by_term = cost_estimate.default_costs()
+    terms, defaults = list(defaults_by_term), np.array(list(defaults_by_term.values()))
     amounts = np.array(
-        [[observation.amounts.get(term, 0.0) for term in Term] for observation in observations]
+        [[observation.amounts.get(term, 0.0) for term in terms] for observation in observations]
     )
     seconds = np.array([observation.seconds for observation in observations])
     matrix = amounts * defaults / seconds[:, np.newaxis]
-    prior = _PRIOR_WEIGHT * np.eye(len(Term))
+    prior = _PRIOR_WEIGHT * np.eye(len(terms))
     relative, _ = nnls(
         np.vstack([matrix, prior]),
-        np.concatenate([np.ones(len(seconds)), np.full(len(Term), _PRIOR_WEIGHT)]),
+        np.concatenate([np.ones(len(seconds)), np.full(len(terms), _PRIOR_WEIGHT)]),
     )
-    return {term: float(value) for term, value in zip(Term, relative * defaults, strict=True)}
+    return {term: float(value) for term, value in zip(terms, relative * defaults, strict=True)}
 
 
 def _scenes(
@@ -220,8 +223,7 @@ def _scenes(
         Observation(
             scene=job.scene.instrument,
             products=tuple(
-                f"{kind} {channel}"
-                for kind, channel in product_dependence.planned_products(job.plan)
+                f"{kind} {channel}" for kind, channel in dependence.planned_products(job.plan)
             ),
             amounts=cost_estimate.amounts(job.scene, job.plan),
             seconds=median(seconds),
@@ -235,20 +237,20 @@ def _job_variants(job: Job) -> Iterator[Job]:
     yield job
     granules = tuple(replace(granule, sha256=None) for granule in job.scene.granules)
     yield replace(job, scene=replace(job.scene, granules=granules))
-    products = product_dependence.planned_products(job.plan)
+    products = dependence.planned_products(job.plan)
     for product in products if len(products) > 1 else ():
-        yield replace(job, plan=product_dependence.plan_closure(job.plan, [product]))
+        yield replace(job, plan=dependence.plan_closure(job.plan, [product]))
 
 
-def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
+def _report(campaign: Campaign, record: RunRecord) -> dict[str, float]:
     """Return the costs of a report page, and of the figures of each kind of product."""
     page = _page(campaign, replace(record, scenes=()))
-    costs = {Term.PAGE: page}
+    costs: dict[str, float] = {Term.PAGE: page}
     for kind in kinds():
         scenes = sorted(
             (replace(scene, products=first_product)
              for scene in record.scenes
-             if (first_product := tuple(p for p in scene.products if p.kind is kind)[:1])),
+             if (first_product := tuple(p for p in scene.products if p.kind == kind)[:1])),
             key=lambda scene: scene.products[0].values,
         )  # fmt: skip
         smallest_cost = max(_page(campaign, replace(record, scenes=(scenes[0],))) - page, 0.0)
@@ -262,7 +264,7 @@ def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
     return costs
 
 
-def _load_times(campaign: Campaign) -> dict[Term, float]:
+def _load_times(campaign: Campaign) -> dict[str, float]:
     """Return the time to load code for the first product of each kind, in a new process, s."""
     output = _child(
         "from lidarops.bench.throughput.cost_calibration import first_times;"
@@ -281,8 +283,8 @@ def first_times(path: str) -> None:
     campaign = load_campaign(path)
     jobs: dict[str, Job] = {}
     for assessment in archive.assess(campaign, force=True):
-        for kind, channel in product_dependence.planned_products(assessment.plan):
-            plan = product_dependence.plan_closure(assessment.plan, [(kind, channel)])
+        for kind, channel in dependence.planned_products(assessment.plan):
+            plan = dependence.plan_closure(assessment.plan, [(kind, channel)])
             jobs.setdefault(kind, Job(campaign, assessment.scene, plan))
     times = {}
     # Code that all kinds load counts for the first of them, signals.
@@ -510,8 +512,8 @@ def calibration_report(calibration: Calibration, data: str = "") -> BenchmarkRep
         title="Costs by term",
         columns=("term", "CPU s per unit", "default"),
         rows=tuple(
-            (term.value, f"{calibration.seconds[term]:.3g}", f"{cost_estimate.DEFAULTS[term]:.3g}")
-            for term in Term
+            (term, f"{calibration.seconds[term]:.3g}", f"{default:.3g}")
+            for term, default in cost_estimate.default_costs().items()
         ),
         note=f"Saved in {calibration.path}; lidarops plan estimates run times with them.",
     )

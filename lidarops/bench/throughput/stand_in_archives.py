@@ -17,7 +17,6 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.scan import scan_keys
 from lidarops.catalog.store import Store
-from lidarops.plan import product_dependence
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import (
@@ -32,6 +31,7 @@ from lidarops.records import (
     Status,
 )
 from lidarops.run.staleness import Judge
+from lidarops.steps import dependence
 
 FILES_PER_DAY: Final = 288
 """Files per instrument and day: one every 5 minutes."""
@@ -149,8 +149,7 @@ def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> SceneEntry:
         InputRecord(granule.path, Role.SIGNAL, str(granule.sha256)) for granule in scene.granules
     ]
     products = tuple(
-        _product(judge, campaign, scene, key, files)
-        for key in product_dependence.planned_products(plan)
+        _product(judge, campaign, scene, key, files) for key in dependence.planned_products(plan)
     )
     outcome = SceneOutcome(
         scene.id,
@@ -169,7 +168,7 @@ def _product(
     judge: Judge,
     campaign: Campaign,
     scene: Scene,
-    key: product_dependence.ProductKey,
+    key: dependence.ProductKey,
     files: Sequence[InputRecord],
 ) -> NewProduct:
     kind, channel = key

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from lidarops.settings import ChannelProduct, Metres, quantity
 
@@ -15,6 +15,11 @@ class SignalSettings(ChannelProduct):
     channels: list[str] | Literal["all"] = "all"
     background_range: tuple[Metres, Metres] | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
+    )
+
+    background: Literal["tail_mean", "cubic"] = Field(
+        default="tail_mean",
+        description="mean of background_range, or the cubic of a homogeneous section there",
     )
 
     @model_validator(mode="after")

@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-import dask.array as da
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from dask.delayed import delayed
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -35,8 +33,8 @@ WITHHELD: Final = (
 """A bin with one of these bits is not used."""
 CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
-_BATCH: Final = 256
-"""Profiles interpolated by one task, unless one cycle has more."""
+_BATCH: Final = 64
+"""Profiles interpolated together, unless one cycle has more."""
 _AT_ONCE: Final = 32
 """Profiles whose background is estimated together: their arrays fit into the processor cache."""
 _BESIDE: Final = 4
@@ -56,30 +54,18 @@ class Background:
     """m, for the scattering of the molecules."""
 
 
-def on_altitudes(
-    conditioned: xr.Dataset,
-    *,
-    zenith_angle: npt.ArrayLike,
-    azimuth: npt.ArrayLike | None,
-    time_bnds: npt.ArrayLike,
-    shots: npt.ArrayLike,
-    altitude_grid: npt.ArrayLike,
-    station_altitude: float,
-    background: Background,
-    overlap: Array | None = None,
-) -> xr.Dataset:
-    """Interpolate the profiles of a scan to common altitudes, sorted by cycle and beam.
+class AltitudeCycles:
+    """Profiles of a scan on common altitudes, sorted by cycle and beam, from chunks of profiles.
 
     The variance of the background is added to that of the noise. Profiles of one cycle and
     direction are averaged, weighted by their shots. Beams that do not rise, are longer than 10
     vertical paths or have no known direction are left out, as are cycles without other beams.
+    Only the cycles are held; chunks do not change a bit of the result.
 
     Parameters
     ----------
-    conditioned : xr.Dataset
-        ``power``, ``variance`` and ``quality`` over (time, range), from
-        `lidarops.retrieve.signal.labeled.condition` or
-        `lidarops.retrieve.signal.labeled_gluing.glue`; may be dask-backed, with any chunks.
+    distance : (range,) float
+        m along the beam.
     zenith_angle, azimuth : (time,) float
         degree, as for `lidarops.retrieve.multiangle.scan_cycles.directions`.
     time_bnds : (time, 2) datetime64
@@ -94,60 +80,169 @@ def on_altitudes(
     overlap : (range,) float, optional
         The signal is divided by it; NaN where it is not known.
 
+    Raises
+    ------
+    RetrievalInputError
+        For invalid arguments, or if no beam points above the horizon.
+    """
+
+    def __init__(
+        self,
+        distance: Array,
+        *,
+        zenith_angle: npt.ArrayLike,
+        azimuth: npt.ArrayLike | None,
+        time_bnds: npt.ArrayLike,
+        shots: npt.ArrayLike,
+        altitude_grid: npt.ArrayLike,
+        station_altitude: float,
+        background: Background,
+        overlap: Array | None = None,
+    ) -> None:
+        directions = scan_cycles.directions(zenith_angle, azimuth)
+        numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
+        levels = np.asarray(altitude_grid, dtype=np.float64)
+        self._order = order = _order(
+            directions, numbers, slant_paths.altitude_grid(levels, station_altitude)
+        )
+        self._settings = _Settings(
+            distance=distance,
+            overlap=overlap,
+            background=background,
+            shapes=_shapes(background, order.zenith_angle, distance, station_altitude),
+            zenith_angle=order.zenith_angle,
+            altitude=levels,
+            station_altitude=station_altitude,
+        )
+        self._weights = np.asarray(shots, dtype=np.float64)
+        self._bounds = np.asarray(time_bnds)
+        self._sides_known = (
+            azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any()
+        )
+        self._batches = list(_batches(order))
+        self._pieces: list[tuple[Array, Array, Flags, Array]] = []
+
+    def ends(self) -> Integers:
+        """Return the profiles before which a chunk may end: those that begin a cycle."""
+        profiles = self._order.profile
+        return np.array([profiles[batch].min() for batch in self._batches[1:]], dtype=np.int64)
+
+    def add(self, conditioned: xr.Dataset, first: int) -> None:
+        """Add consecutive profiles, which end where a cycle does.
+
+        Parameters
+        ----------
+        conditioned : xr.Dataset
+            ``power``, ``variance`` and ``quality`` over (time, range), from
+            `lidarops.retrieve.signal.labeled.condition` or
+            `lidarops.retrieve.signal.labeled_gluing.glue`.
+        first : int
+            Number of the first of the profiles in the scene.
+        """
+        past = first + conditioned.sizes["time"]
+        power, variance, quality = (
+            conditioned[name].to_numpy() for name in ("power", "variance", "quality")
+        )
+        while len(self._pieces) < len(self._batches):
+            batch = self._batches[len(self._pieces)]
+            members = self._order.profile[batch]
+            if members.max() >= past:
+                break
+            cycle = self._order.cycle[batch] - self._order.cycle[batch.start]
+            self._pieces.append(
+                _batch_on_altitudes(
+                    power,
+                    variance,
+                    quality,
+                    members - first,
+                    self._weights[members],
+                    cycle,
+                    self._order.beam[batch],
+                    self._settings,
+                )
+            )
+
+    def result(self) -> xr.Dataset:
+        """Return the cycles of all profiles.
+
+        Returns
+        -------
+        xr.Dataset
+            ``signal`` (range-corrected) and ``variance`` over (time, beam, altitude), NaN where
+            missing; ``quality`` (the bits of all bins at an altitude) over (time, altitude);
+            ``left`` (the most signal that may have been subtracted with the background) over
+            (time, beam); and ``shots`` over time. ``time`` is the middle of ``time_bnds``, which
+            span the profiles of a cycle.
+        """
+        order = self._order
+        arrays = [np.concatenate(pieces) for pieces in zip(*self._pieces, strict=True)]
+        cube = ("time", "beam", "altitude")
+        dims = (cube, cube, ("time", "altitude"), ("time", "beam"))
+        names = ("signal", "variance", "quality", "left")
+        bounds = _cycle_bounds(self._bounds, order)
+        coordinates = {
+            "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
+            "time_bnds": (("time", "nv"), bounds),
+            "beam": np.arange(order.zenith_angle.size, dtype=np.int32),
+            "beam_zenith_angle": ("beam", order.zenith_angle),
+            "altitude": self._settings.altitude,
+        }
+        if self._sides_known:
+            coordinates["beam_azimuth"] = ("beam", order.azimuth)
+        total = np.bincount(order.cycle, weights=self._weights[order.profile])
+        return xr.Dataset(
+            {
+                **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=True)},
+                "shots": ("time", np.rint(total).astype(np.int32)),
+            },
+            coords=coordinates,
+        )
+
+
+def on_altitudes(
+    conditioned: xr.Dataset,
+    *,
+    zenith_angle: npt.ArrayLike,
+    azimuth: npt.ArrayLike | None,
+    time_bnds: npt.ArrayLike,
+    shots: npt.ArrayLike,
+    altitude_grid: npt.ArrayLike,
+    station_altitude: float,
+    background: Background,
+    overlap: Array | None = None,
+) -> xr.Dataset:
+    """Return all profiles of a scan on common altitudes, sorted by cycle and beam.
+
+    Parameters
+    ----------
+    conditioned : xr.Dataset
+        As for `AltitudeCycles.add`, of the whole scan.
+    zenith_angle, azimuth, time_bnds, shots, altitude_grid, station_altitude, background, overlap
+        As for `AltitudeCycles`.
+
     Returns
     -------
     xr.Dataset
-        Dask-backed: ``signal`` (range-corrected) and ``variance`` over (time, beam, altitude), NaN
-        where missing; ``quality`` (the bits of all bins at an altitude) over (time, altitude);
-        ``left`` (the most signal that may have been subtracted with the background) over
-        (time, beam); and ``shots`` over time. ``time`` is the middle of ``time_bnds``, which span
-        the profiles of a cycle. Bit for bit the same for any chunking.
+        As from `AltitudeCycles.result`.
 
     Raises
     ------
     RetrievalInputError
         For invalid arguments, or if no beam points above the horizon.
     """
-    directions = scan_cycles.directions(zenith_angle, azimuth)
-    numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
-    levels = np.asarray(altitude_grid, dtype=np.float64)
-    order = _order(directions, numbers, slant_paths.altitude_grid(levels, station_altitude))
-    distance = conditioned["range"].to_numpy().astype(np.float64)
-    settings = _Settings(
-        distance=distance,
-        overlap=overlap,
-        background=background,
-        shapes=_shapes(background, order.zenith_angle, distance, station_altitude),
-        zenith_angle=order.zenith_angle,
-        altitude=levels,
+    cycles = AltitudeCycles(
+        conditioned["range"].to_numpy().astype(np.float64),
+        zenith_angle=zenith_angle,
+        azimuth=azimuth,
+        time_bnds=time_bnds,
+        shots=shots,
+        altitude_grid=altitude_grid,
         station_altitude=station_altitude,
+        background=background,
+        overlap=overlap,
     )
-    weights = np.asarray(shots, dtype=np.float64)
-    batches = [
-        _lazy_batch(conditioned, weights, order, batch, settings) for batch in _batches(order)
-    ]
-    arrays = [da.concatenate(pieces) for pieces in zip(*batches, strict=True)]  # type: ignore[no-untyped-call]
-    cube = ("time", "beam", "altitude")
-    dims = (cube, cube, ("time", "altitude"), ("time", "beam"))
-    names = ("signal", "variance", "quality", "left")
-    bounds = _cycle_bounds(np.asarray(time_bnds), order)
-    coordinates = {
-        "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
-        "time_bnds": (("time", "nv"), bounds),
-        "beam": np.arange(order.zenith_angle.size, dtype=np.int32),
-        "beam_zenith_angle": ("beam", order.zenith_angle),
-        "altitude": levels,
-    }
-    if azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any():
-        coordinates["beam_azimuth"] = ("beam", order.azimuth)
-    total = np.bincount(order.cycle, weights=weights[order.profile])
-    return xr.Dataset(
-        {
-            **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=True)},
-            "shots": ("time", np.rint(total).astype(np.int32)),
-        },
-        coords=coordinates,
-    )
+    cycles.add(conditioned, 0)
+    return cycles.result()
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,57 +340,10 @@ def _batches(order: _Order) -> Iterator[slice]:
             low = high
 
 
-def _lazy_batch(
-    conditioned: xr.Dataset, shots: Array, order: _Order, batch: slice, settings: _Settings
-) -> tuple[da.Array, ...]:
-    """Return the lazy arrays of `_batch_on_altitudes` for one batch of cycles."""
-    members = order.profile[batch]
-    start, stop = int(members.min()), int(members.max()) + 1
-    blocks = [_blocks(conditioned[name], start, stop) for name in ("power", "variance", "quality")]
-    cycle = order.cycle[batch] - order.cycle[batch.start]
-    arrays = delayed(_batch_on_altitudes, nout=4, pure=True)(
-        *blocks, members, shots[members], cycle, order.beam[batch], settings
-    )
-    shape = (int(cycle[-1]) + 1, settings.zenith_angle.size, settings.altitude.size)
-    return tuple(
-        da.from_delayed(array, shape=size, dtype=dtype)  # type: ignore[no-untyped-call]
-        for array, size, dtype in zip(
-            arrays,
-            (shape, shape, (shape[0], shape[2]), shape[:2]),
-            (np.float64, np.float64, np.int32, np.float64),
-            strict=True,
-        )
-    )
-
-
-def _blocks(array: xr.DataArray, start: int, stop: int) -> tuple[int, list[Any]]:
-    """Return the blocks that contain some profiles, and the number of the first profile in them."""
-    data = array.data
-    if not isinstance(data, da.Array):
-        return start, [data[start:stop]]
-    ends = np.cumsum(data.chunks[0])
-    first, last = np.searchsorted(ends, (start, stop - 1), side="right")
-    # With separate optimisation, each array of each batch would read the files again.
-    blocks = data.rechunk({1: -1}).to_delayed(optimize_graph=False)  # type: ignore[no-untyped-call]
-    return int(ends[first] - data.chunks[0][first]), list(blocks[first : last + 1, 0])
-
-
-def _rows(source: tuple[int, list[_Block]], members: Integers) -> _Block:
-    """Return some profiles from blocks."""
-    first, blocks = source
-    stops = first + np.cumsum([len(block) for block in blocks])
-    place = np.searchsorted(stops, members, side="right")
-    out = np.empty((members.size, *blocks[0].shape[1:]), blocks[0].dtype)
-    for number in np.unique(place):
-        selected, block = place == number, blocks[number]
-        out[selected] = block[members[selected] - (stops[number] - len(block))]
-    return out
-
-
 def _batch_on_altitudes(
-    power: tuple[int, list[_Block]],
-    variance: tuple[int, list[_Block]],
-    quality: tuple[int, list[_Block]],
+    power: _Block,
+    variance: _Block,
+    quality: _Block,
     members: Integers,
     shots: Array,
     cycle: Integers,
@@ -309,12 +357,15 @@ def _batch_on_altitudes(
     """
     pieces = [
         _net_bins(
-            _rows(power, profiles), _rows(variance, profiles), _rows(quality, profiles),
-            beam[first : first + _AT_ONCE], settings,
+            power[profiles],
+            variance[profiles],
+            quality[profiles],
+            beam[first : first + _AT_ONCE],
+            settings,
         )
         for first in range(0, members.size, _AT_ONCE)
         for profiles in [members[first : first + _AT_ONCE]]
-    ]  # fmt: skip
+    ]
     values, noise, bits, left = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     distance = settings.distance[settings.interpolated]
     unexplained = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)

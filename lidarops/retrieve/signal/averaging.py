@@ -137,6 +137,19 @@ def _grouped_mean(
         sums,
         count,
     )
+    value, noise, systematic = _means(sums, count, grouping.least_count)
+    shape_of_means = (*before, grouping.number, *after)
+    return Averages(
+        value.reshape(shape_of_means),
+        noise.reshape(shape_of_means),
+        systematic.reshape(shape_of_means),
+        count.reshape(shape_of_means),
+        sums[0].reshape(shape_of_means),
+    )
+
+
+def _means(sums: Array, count: Counts, least_count: int) -> tuple[Array, Array, Array]:
+    """Turn sums into means, in place: values, their variance, and their shared variance."""
     total, value, noise, systematic = sums
     with np.errstate(invalid="ignore", divide="ignore"):
         value /= total
@@ -144,15 +157,64 @@ def _grouped_mean(
         systematic /= total
         systematic **= 2
     for means in (value, noise, systematic):
-        means[count < grouping.least_count] = np.nan
-    shape_of_means = (*before, grouping.number, *after)
-    return Averages(
-        value.reshape(shape_of_means),
-        noise.reshape(shape_of_means),
-        systematic.reshape(shape_of_means),
-        count.reshape(shape_of_means),
-        total.reshape(shape_of_means),
-    )
+        means[count < least_count] = np.nan
+    return value, noise, systematic
+
+
+class RunningMean:
+    """Weighted means of groups of profiles that come one after another.
+
+    Equal to the last bit to `time_mean` of all profiles together, because profiles are added one
+    by one in both.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Number of groups, and of bins.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._sums = np.zeros((4, 1, *shape))
+        self._count = np.zeros((1, *shape), dtype=np.int64)
+
+    def add(
+        self,
+        profiles: Array,
+        variance: Array,
+        *,
+        groups: npt.NDArray[np.intp],
+        weights: Array,
+        shared_variance: Array | None = None,
+    ) -> None:
+        """Add profiles, (time, range), to their groups.
+
+        Parameters
+        ----------
+        profiles, variance, shared_variance : (time, range) float
+            As for `time_mean`.
+        groups : (time,) int
+            Number of the mean to which each profile belongs.
+        weights : (time,) float
+            Number of shots of each profile.
+        """
+        shape = (1, *profiles.shape)
+        _weighted_sums.add_profiles(
+            frozen(profiles[np.newaxis]),
+            _flat_term(variance, "variance", profiles.shape, shape, 0),
+            _flat_term(
+                0.0 if shared_variance is None else shared_variance,
+                "shared_variance", profiles.shape, shape, 0,
+            ),
+            _flat_term(weights, "weights", profiles.shape[:1], shape[:2], 0),
+            frozen(np.ascontiguousarray(groups, dtype=np.intp)),
+            self._sums,
+            self._count,
+        )  # fmt: skip
+
+    def averages(self) -> Averages:
+        """Return the means of what was added; no more can be added."""
+        value, noise, systematic = _means(self._sums, self._count, least_count=1)
+        return Averages(value[0], noise[0], systematic[0], self._count[0], self._sums[0, 0])
 
 
 def _flat_term(

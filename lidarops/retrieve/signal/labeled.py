@@ -217,9 +217,14 @@ def _named(
 ) -> xr.Dataset:
     names = ("signal", "signal_standard_error", "quality_flag")
     along_time = ("background", "background_standard_error")
-    start, stop = background_range
-    words = f"background: {_BACKGROUNDS[method][1]} from {start:g} to {stop:g} m"
+    words = background_words(method, background_range)
     return xr.Dataset(dict(zip((*names, *along_time), arrays, strict=True)), attrs={"steps": words})
+
+
+def background_words(method: str, background_range: tuple[float, float]) -> str:
+    """Return in words how the background is estimated, from a range in m."""
+    start, stop = background_range
+    return f"background: {_BACKGROUNDS[BackgroundMethod(method)][1]} from {start:g} to {stop:g} m"
 
 
 class _Source:

@@ -1,27 +1,25 @@
-"""Averages of profiles in xarray over intervals of the clock, for any chunks of dask."""
+"""Averages of profiles in xarray over intervals of the clock, for profiles that come in chunks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final
 
-import dask.array as da
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.signal import averaging
+from lidarops.retrieve.signal.averaging import RunningMean
 
-_BATCH: Final = 256
-"""Profiles per task, unless one mean needs more."""
 _PROFILES_IN_CACHE: Final = 32
-"""Profiles averaged together, unless one mean needs more; they fit the processor cache."""
+"""Profiles averaged together; they fit the processor cache."""
+_MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
 Shared = Callable[[npt.NDArray[np.datetime64]], npt.NDArray[np.float64]]
-
-_Block = npt.NDArray[Any]
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.intp]
 
 
 def clock_average(
@@ -38,158 +36,140 @@ def clock_average(
     conditioned : xr.Dataset
         ``power``, ``variance`` and ``quality`` over (time, range), from
         `lidarops.retrieve.signal.labeled.condition`, with the coordinates ``time`` and
-        ``time_bnds``; ascending in time. May be dask-backed, with any chunks.
-    seconds : float
-        Length of an interval; it must divide a day.
-    shots : xr.DataArray, (time,)
-    shared_variance : callable, optional
-        Returns the part of ``variance`` that neighbouring profiles have in common at given
-        times, (time, range), such as that of a dark signal. It does not average down.
+        ``time_bnds``; ascending in time.
+    seconds, shots, shared_variance
+        As for `ClockAverage`.
 
     Returns
     -------
     xr.Dataset
-        ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
-        range), ``shots`` (sum), ``profiles`` (number) over time. ``time`` is the middle of
-        ``time_bnds``, which span the profiles of the interval. Chunks do not change a bit of the
-        result. Intervals without a profile are omitted. A mean has all quality bits of its
-        profiles, but INPUT_MISSING only if no profile has data.
+        As from `ClockAverage.result`.
 
     Raises
     ------
     RetrievalInputError
         Where `seconds` does not divide a day.
     """
-    if not 0 < seconds <= 86400 or 86400 % seconds:
-        raise RetrievalInputError(
-            f"is {seconds:g} s",
-            field="average",
-            remedy="give seconds that divide a day: 600, 1800, 3600",
-        )
-    bounds = conditioned["time_bnds"].to_numpy()
-    times = conditioned["time"].to_numpy()
-    interval = (times - np.datetime64("1970-01-01")) // np.timedelta64(round(seconds * 1e9), "ns")
-    first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
-    past = np.append(first[1:], interval.size)
-    starts, stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
-    middles = starts + (stops - starts) // 2
-    shared = None if shared_variance is None else shared_variance(middles)
-    packed = _packed(conditioned, shots.to_numpy().astype(np.float64), shared, first, past)
-    result = xr.Dataset(
-        {
-            "power": (("time", "range"), packed[:, 0]),
-            "variance": (("time", "range"), packed[:, 1]),
-            "quality": (("time", "range"), packed[:, 2].astype(np.int32)),
-            "profiles": ("time", np.diff(first, append=interval.size).astype(np.int32)),
-            "shots": ("time", np.add.reduceat(shots.to_numpy(), first).astype(np.int32)),
-        },
-        coords={
-            "time": middles,
-            "time_bnds": (("time", "nv"), np.stack([starts, stops], axis=-1)),
-            "range": conditioned["range"],
-        },
+    average = ClockAverage(
+        conditioned[["time", "time_bnds"]],
+        conditioned["range"].to_numpy(),
+        seconds=seconds,
+        shots=shots,
+        shared_variance=shared_variance,
     )
-    for name in ("power", "variance"):
-        result[name].attrs = dict(conditioned[name].attrs)
-    return result
+    average.add(conditioned)
+    return average.result()
 
 
-def _batches(first: npt.NDArray[np.intp], past: npt.NDArray[np.intp]) -> Iterator[tuple[int, int]]:
-    """Yield runs of whole intervals of about `_BATCH` profiles, as (first, past)."""
-    low = 0
-    for high in range(1, first.size + 1):
-        if high == first.size or past[high] - first[low] > _BATCH:
-            yield low, high
-            low = high
+class ClockAverage:
+    """Means of profiles over intervals of the clock (UTC), weighted by their shots.
 
+    Profiles come in chunks, which do not change a bit of the result. Only the means are held.
 
-def _packed(
-    conditioned: xr.Dataset,
-    weights: npt.NDArray[np.float64],
-    shared: npt.NDArray[np.float64] | None,
-    first: npt.NDArray[np.intp],
-    past: npt.NDArray[np.intp],
-) -> da.Array:
-    """Return power, variance and quality bits of the means in one array, (interval, 3, range).
+    Parameters
+    ----------
+    geometry : xr.Dataset
+        ``time`` and ``time_bnds`` of all profiles, ascending.
+    distance : (range,) float
+        m.
+    seconds : float
+        Length of an interval; it must divide a day.
+    shots : xr.DataArray, (time,)
+        Of all profiles.
+    shared_variance : callable, optional
+        Returns the part of ``variance`` that neighbouring profiles have in common at given
+        times, (time, range), such as that of a dark signal. It does not average down.
 
-    A common array from inputs with equal chunks lets dask compute the inputs only once.
+    Raises
+    ------
+    RetrievalInputError
+        Where `seconds` does not divide a day.
     """
-    batches = list(_batches(first, past))
-    profiles = tuple(int(past[high - 1] - first[low]) for low, high in batches)
-    intervals = tuple(high - low for low, high in batches)
-    bins = conditioned.sizes["range"]
-    group = np.repeat(np.arange(first.size), past - first)
-    if shared is None:
-        shared = np.zeros((first.size, bins))
-    arrays = [
-        da.asarray(conditioned[name].data).rechunk((profiles, (bins,)))  # type: ignore[no-untyped-call]
-        for name in ("power", "variance", "quality")
-    ]
-    columns = [da.from_array(column, chunks=(profiles,)) for column in (weights, group)]  # type: ignore[no-untyped-call]
-    rows = da.from_array(shared, chunks=(intervals, (bins,)))  # type: ignore[no-untyped-call]
-    packed: da.Array = da.blockwise(  # type: ignore[no-untyped-call]
-        _averaged,
-        "tpr",
-        *(argument for array in arrays for argument in (array, "tr")),
-        *(argument for column in columns for argument in (column, "t")),
-        rows,
-        "tr",
-        new_axes={"p": 3},
-        adjust_chunks={"t": intervals},
-        align_arrays=False,
-        dtype=np.float64,
-    )
-    return packed
 
-
-def _averaged(
-    power: _Block,
-    variance: _Block,
-    quality: _Block,
-    weights: npt.NDArray[np.float64],
-    group: npt.NDArray[np.intp],
-    shared: npt.NDArray[np.float64],
-) -> _Block:
-    ends = np.flatnonzero(np.diff(group, append=group[-1] + 1)) + 1
-    pieces = []
-    first, low = 0, 0
-    for high, end in enumerate(map(int, ends), start=1):
-        # Average in pieces of whole intervals that fit the cache.
-        if high == ends.size or ends[high] - first > _PROFILES_IN_CACHE:
-            rows = slice(first, end)
-            pieces.append(
-                _averaged_piece(
-                    power[rows],
-                    variance[rows],
-                    quality[rows],
-                    weights[rows],
-                    group[rows] - group[first],
-                    shared[low:high],
-                )
+    def __init__(
+        self,
+        geometry: xr.Dataset,
+        distance: Array,
+        *,
+        seconds: float,
+        shots: xr.DataArray,
+        shared_variance: Shared | None = None,
+    ) -> None:
+        if not 0 < seconds <= 86400 or 86400 % seconds:
+            raise RetrievalInputError(
+                f"is {seconds:g} s",
+                field="average",
+                remedy="give seconds that divide a day: 600, 1800, 3600",
             )
-            first, low = end, high
-    return np.concatenate(pieces)
+        bounds, times = geometry["time_bnds"].to_numpy(), geometry["time"].to_numpy()
+        length = np.timedelta64(round(seconds * 1e9), "ns")
+        interval = (times - np.datetime64("1970-01-01")) // length
+        first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
+        self._starts, self._stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
+        self._middles = self._starts + (self._stops - self._starts) // 2
+        self._counts = np.diff(first, append=interval.size)
+        self._group = np.repeat(np.arange(first.size), self._counts)
+        self._weights = shots.to_numpy().astype(np.float64)
+        self._shots = np.add.reduceat(shots.to_numpy(), first).astype(np.int32)
+        self._shared = None if shared_variance is None else shared_variance(self._middles)
+        self._means = RunningMean((first.size, distance.size))
+        self._bits = np.zeros((first.size, distance.size), dtype=np.int32)
+        self._distance = distance
+        self._units: dict[str, dict[str, Any]] = {}
+        self._added = 0
 
+    def add(self, conditioned: xr.Dataset) -> None:
+        """Add the next profiles: ``power``, ``variance`` and ``quality`` over (time, range)."""
+        arrays = [conditioned[name].to_numpy() for name in ("power", "variance", "quality")]
+        for first in range(0, len(arrays[0]), _PROFILES_IN_CACHE):
+            rows = slice(first, first + _PROFILES_IN_CACHE)
+            self._add(*(array[rows] for array in arrays))
+        self._units = {
+            name: dict(conditioned[name].attrs) for name in ("power", "variance", "range")
+        }
 
-def _averaged_piece(
-    power: _Block,
-    variance: _Block,
-    quality: _Block,
-    weights: npt.NDArray[np.float64],
-    interval: npt.NDArray[np.intp],
-    shared: npt.NDArray[np.float64],
-) -> _Block:
-    common = shared[interval]
-    means = averaging.time_mean(
-        power,
-        np.maximum(variance - common, 0.0),
-        groups=interval,
-        weights=weights,
-        shared_variance=common,
-        axis=0,
-    )
-    first = np.flatnonzero(np.diff(interval, prepend=-1))
-    missing = np.int32(Quality.INPUT_MISSING)
-    bits = np.bitwise_or.reduceat(quality & ~missing, first, axis=0)
-    bits[~np.isfinite(means.values)] |= missing
-    return np.stack([means.values, means.variance + means.shared_variance, bits], axis=1)
+    def _add(self, power: Array, variance: Array, quality: npt.NDArray[np.int32]) -> None:
+        profiles = slice(self._added, self._added + len(power))
+        group = self._group[profiles]
+        common = None if self._shared is None else self._shared[group]
+        self._means.add(
+            power,
+            variance if common is None else np.maximum(variance - common, 0.0),
+            groups=group,
+            weights=self._weights[profiles],
+            shared_variance=common,
+        )
+        first = np.flatnonzero(np.diff(group, prepend=-1))
+        self._bits[group[first]] |= np.bitwise_or.reduceat(quality & ~_MISSING, first, axis=0)
+        self._added += len(power)
+
+    def result(self) -> xr.Dataset:
+        """Return the means of all profiles.
+
+        Returns
+        -------
+        xr.Dataset
+            ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
+            range), ``shots`` (sum), ``profiles`` (number) over time. ``time`` is the middle of
+            ``time_bnds``, which span the profiles of the interval. Intervals without a profile are
+            omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
+            profile has data.
+        """
+        means = self._means.averages()
+        self._bits[~np.isfinite(means.values)] |= _MISSING
+        plane = ("time", "range")
+        units = self._units
+        return xr.Dataset(
+            {
+                "power": (plane, means.values, units["power"]),
+                "variance": (plane, means.variance + means.shared_variance, units["variance"]),
+                "quality": (plane, self._bits),
+                "profiles": ("time", self._counts.astype(np.int32)),
+                "shots": ("time", self._shots),
+            },
+            coords={
+                "time": self._middles,
+                "time_bnds": (("time", "nv"), np.stack([self._starts, self._stops], axis=-1)),
+                "range": ("range", self._distance, units["range"]),
+            },
+        )

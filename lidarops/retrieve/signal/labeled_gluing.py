@@ -13,6 +13,7 @@ from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
 
+Array = npt.NDArray[np.float64]
 _Block = npt.NDArray[Any]
 
 LAG_PROFILES: Final = 256
@@ -24,32 +25,29 @@ _WINDOW: Final = {"glue_bottom": "m", "glue_top": "m"}
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
 
-def range_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
-    """Return the lag of analog behind photon counting in bins, as given by their ranges."""
-    photon_range, analog_range = photon["range"].to_numpy(), analog["range"].to_numpy()
+def range_lag(analog_range: Array, photon_range: Array) -> float:
+    """Return the lag of analog behind photon counting in bins, as given by their ranges in m."""
     return float((photon_range[0] - analog_range[0]) / (photon_range[1] - photon_range[0]))
 
 
-def estimate_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
+def estimate_lag(analog: Array, photon: Array, *, known: float) -> float:
     """Return the lag of analog behind photon counting in bins, estimated from their noise.
 
     Parameters
     ----------
-    analog, photon : xr.Dataset
-        From `lidarops.retrieve.signal.labeled.condition`; the first 256 profiles are computed.
+    analog, photon : (time, range) float
+        Power of the first `LAG_PROFILES` profiles of a scene.
+    known : float
+        Bins, where the correlation is not significant
+        (`lidarops.retrieve.signal.lag.estimate_lag`).
 
     Returns
     -------
     float
-        Bins; where the correlation is not significant
-        (`lidarops.retrieve.signal.lag.estimate_lag`), `range_lag`.
     """
-    bins = min(analog.sizes["range"], photon.sizes["range"])
-    selection = {"time": slice(LAG_PROFILES), "range": slice(bins)}
-    estimate = _lag.estimate_lag(
-        analog["power"].isel(selection).to_numpy(), photon["power"].isel(selection).to_numpy()
-    )
-    return float(estimate.lag) if estimate.significant else range_lag(analog, photon)
+    bins = min(analog.shape[-1], photon.shape[-1])
+    estimate = _lag.estimate_lag(analog[:, :bins], photon[:, :bins])
+    return float(estimate.lag) if estimate.significant else known
 
 
 def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Dataset:

@@ -6,7 +6,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.process.scene import Job
+from lidarops.process.job import Job
 from lidarops.records import Scene
 from lidarops.run.archive import update_catalog
 

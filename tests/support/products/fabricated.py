@@ -19,7 +19,7 @@ from lidarops.records import (
     RunRecord,
     SceneOutcome,
     Status,
-    Step,
+    PlannedStep,
 )
 
 CHANNEL = "photon_532o"
@@ -209,7 +209,7 @@ def granule(path: str, reason: str = "", *, instrument: str = "horizontal") -> G
 
 def plan(scene: str, *left_out: LeftOut) -> Plan:
     """Return a plan of one step."""
-    step = Step("homogeneous", CHANNEL, {"method": "auto", "sections": [[2500, 5000]]}, "requested")
+    step = PlannedStep("homogeneous", CHANNEL, {"method": "auto", "sections": [[2500, 5000]]}, "requested")
     return Plan(scene, (step,), left_out)
 
 

@@ -18,7 +18,7 @@ from lidarops.records import (
     Plan,
     Provenance,
     Role,
-    Step,
+    PlannedStep,
 )
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
@@ -37,13 +37,13 @@ def provenance(kind: str = "homogeneous", **changes: Any) -> Provenance:
     plan = Plan(
         scene=SCENE,
         steps=(
-            Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
-            Step("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
-            Step("homogeneous", "photon_532o", {"method": "auto"}, "requested"),
-            Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "requested"),
-            Step("multiangle", "photon_532o", {"method": "auto"}, "requested"),
-            Step("visibility", "photon_532o", {"contrast": 0.05}, "requested"),
-            Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
+            PlannedStep("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
+            PlannedStep("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
+            PlannedStep("homogeneous", "photon_532o", {"method": "auto"}, "requested"),
+            PlannedStep("elastic", "photon_532o", {"lidar_ratio": 50.0}, "requested"),
+            PlannedStep("multiangle", "photon_532o", {"method": "auto"}, "requested"),
+            PlannedStep("visibility", "photon_532o", {"contrast": 0.05}, "requested"),
+            PlannedStep("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
     )

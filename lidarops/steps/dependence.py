@@ -8,38 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
-from lidarops.kinds import kinds
-from lidarops.plan.rules import StepName
-from lidarops.plan.signal_rules import GLUED, glued_parts, required_by
-from lidarops.records import InputRecord, Plan, Role, Scene, Step
+from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
+from lidarops.steps.reading import required_by
+from lidarops.steps.registry import definition, typed_settings
+from lidarops.steps.step import Step
 
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
-
-_KINDS: Final = frozenset(kind for kind in kinds())
-_ONLY_FOR: Final[Mapping[str, frozenset[str]]] = {
-    StepName.BACKGROUND: frozenset({"signal", "visibility"}),
-    StepName.RANGE_WINDOW: frozenset({"homogeneous", "visibility"}),
-    StepName.LOOK: frozenset({"homogeneous"}),
-    StepName.ALONG_PATH: frozenset({"homogeneous"}),
-    StepName.GRADIENT: frozenset({"multiangle"}),
-    StepName.GRADIENT_REGRESSOR: frozenset({"multiangle"}),
-    StepName.ROBUST: frozenset({"multiangle"}),
-    StepName.VERTICAL: frozenset({"multiangle"}),
-    StepName.CORRELATION: frozenset({"multiangle"}),
-    StepName.LAYERS: frozenset({"multiangle"}),
-    StepName.PRIOR: frozenset({"visibility"}),
-    StepName.AVERAGE: frozenset({"elastic", "visibility"}),
-    StepName.MOLECULAR: frozenset({"elastic", "multiangle"}),
-    StepName.KNOWN_SHAPE: frozenset({"elastic"}),
-    StepName.REFERENCE: frozenset({"elastic"}),
-}
-"""Steps that serve only some kinds of product. All other steps serve every kind."""
 
 _OF_CAMPAIGN: Final = frozenset(
     {"all_steps", "archive", "output", "catalog", "superseded", "scenes", "simulation", "stations",
@@ -51,9 +32,14 @@ _EDGES: Final = frozenset({"valid_from", "valid_to"})
 _PROFILES: Final = ("molecular_profile", "overlap_profile")
 
 
+def is_product(entry: PlannedStep | LeftOut) -> bool:
+    """Return whether an entry of a plan is about the step that makes a product."""
+    return bool(entry.product) and entry.name == entry.product
+
+
 def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
     """Return kind and channel of the products that a plan makes, in its order."""
-    keys = ((step.name, step.channel) for step in plan.steps if step.name in _KINDS)
+    keys = ((step.name, step.channel) for step in plan.steps if is_product(step))
     return tuple(dict.fromkeys(keys))
 
 
@@ -71,75 +57,72 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     Plan
         The same for a product, whatever else the whole plan holds.
     """
-    if any(step.instrument for step in plan.steps):
-        return _network_closure(plan, {kind for kind, _ in products})
-    kinds: dict[str, set[str]] = {}
-    for kind, channel in products:
-        kinds.setdefault(channel, set()).add(kind)
-        for parent in glued_parts(channel) if channel.startswith(GLUED) else ():
-            kinds.setdefault(parent, set())
-    steps = tuple(
-        _with_requesters(step, kinds)
-        for step in plan.steps
-        if step.channel in kinds and _serves(step.name, kinds[step.channel])
+    entries: Sequence[PlannedStep | LeftOut] = (*plan.steps, *plan.left_out)
+    places: dict[tuple[str, str], list[PlannedStep | LeftOut]] = defaultdict(list)
+    for entry in entries:
+        places[entry.channel, entry.name].append(entry)
+    waiting = [
+        entry for entry in entries if is_product(entry) and (entry.name, entry.channel) in products
+    ]
+    reached: set[int] = set()
+    while waiting:
+        entry = waiting.pop()
+        if id(entry) not in reached:
+            reached.add(id(entry))
+            waiting += _needed(entry, places)
+    kept = [entry for entry in entries if id(entry) in reached]
+    steps = [entry for entry in kept if isinstance(entry, PlannedStep)]
+    return replace(
+        plan,
+        steps=tuple(_with_requesters(step, steps) for step in steps),
+        left_out=tuple(entry for entry in kept if isinstance(entry, LeftOut)),
     )
-    left_out = tuple(
-        omission
-        for omission in plan.left_out
-        if omission.channel in kinds and _serves(omission.name, kinds[omission.channel])
-    )
-    return replace(plan, steps=steps, left_out=left_out)
 
 
-def plan_of_kinds(plan: Plan, kinds: Collection[str]) -> Plan:
+def _needed(
+    entry: PlannedStep | LeftOut,
+    places: Mapping[tuple[str, str], Sequence[PlannedStep | LeftOut]],
+) -> Iterator[PlannedStep | LeftOut]:
+    """Yield the entries of a plan that a step names as needed."""
+    if isinstance(entry, LeftOut):
+        return
+    for need in entry.needs:
+        channel, _, name = need.rpartition("/")
+        for other in places.get((channel or entry.channel, name), ()):
+            of_member = not entry.instrument or other.instrument == entry.instrument
+            if of_member and other.product in ("", entry.product):
+                yield other
+
+
+def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> PlannedStep:
+    """Return a step whose reason, if it reads a channel, names only what it is read for."""
+    if step.name != "read" or step.instrument:
+        return step
+    products = sorted(s.name for s in steps if is_product(s) and s.channel == step.channel)
+    glued = sorted(s.channel for s in steps if f"{step.channel}/noise" in s.needs)
+    return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
+
+
+def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
     """Return the part of a plan that concerns some kinds of product: their steps and omissions.
 
     Parameters
     ----------
     plan : Plan
-    kinds : collection of str
-        All kinds where empty.
+    selected : collection of str
+        Kinds of product; all where empty.
     """
-    if not kinds:
+    if not selected:
         return plan
-    products = [product for product in planned_products(plan) if product[0] in kinds]
-    # Without a product, steps that the members of a network share would remain.
-    closure = plan_closure(plan, products) if products else replace(plan, steps=(), left_out=())
-    names = {*kinds, StepName.READ}
+    products = [product for product in planned_products(plan) if product[0] in selected]
+    closure = plan_closure(plan, products)
+    names = {*selected, "read"}
     left_out = tuple(
         omission
         for omission in plan.left_out
         if omission.name in names or omission in closure.left_out
     )
     return replace(closure, left_out=left_out)
-
-
-def _network_closure(plan: Plan, kinds: set[str]) -> Plan:
-    """Return the part of a network's plan for some kinds; they need all members and channels."""
-    return replace(
-        plan,
-        steps=tuple(step for step in plan.steps if _serves(step.name, kinds)),
-        left_out=tuple(omission for omission in plan.left_out if _serves(omission.name, kinds)),
-    )
-
-
-def _serves(step: str, kinds: set[str]) -> bool:
-    if step in _KINDS:
-        return step in kinds
-    return step not in _ONLY_FOR or not kinds.isdisjoint(_ONLY_FOR[step])
-
-
-def _with_requesters(step: Step, kinds: Mapping[str, set[str]]) -> Step:
-    """Return a step whose reason, if it reads a channel, names only the requesters in `kinds`."""
-    if step.name != StepName.READ:
-        return step
-    requesters = sorted(kinds[step.channel])
-    requesters += [
-        name
-        for name in sorted(kinds)
-        if name.startswith(GLUED) and step.channel in glued_parts(name)
-    ]
-    return replace(step, reason=required_by(requesters))
 
 
 class Settings:
@@ -208,9 +191,9 @@ def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str
     """
     settings = as_settings(known)
     channels = {step.channel for step in plan.steps} | {channel}
-    named = {value for step in plan.steps for value in step.settings.values() if _is_text(value)}
+    read = ancillary_files(plan.steps)
     for name in _PROFILES:
-        if settings.get(name) not in named:
+        if settings.get(name) not in read:
             settings = {**settings, name: None}
     return {
         **{key: value for key, value in settings.items() if key not in _EDGES},
@@ -225,8 +208,14 @@ def single_channel_settings(
     return None if products is None else {**products, "channels": [channel]}
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
+def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
+    """Return the ancillary files that steps read, by path, with their roles."""
+    return {
+        path: role
+        for step in steps
+        if type(definition(step)).files is not Step.files
+        for path, role in definition(step).files(typed_settings(step)).items()
+    }
 
 
 def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecord, ...]:
@@ -239,8 +228,8 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     files : iterable of InputRecord
         Files of the scene.
     """
-    dark = any(step.name == StepName.DARK for step in plan.steps)
-    named = {step.settings.get(key) for step in plan.steps for key in _PROFILES}
+    dark = any(step.name == "dark" for step in plan.steps)
+    named = ancillary_files(plan.steps)
     return tuple(
         file
         for file in files

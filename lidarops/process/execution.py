@@ -1,0 +1,179 @@
+"""Carry out the steps of a plan, and stream the profiles of a scene through them in chunks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.records import LeftOut, Plan, PlannedStep, Scene
+from lidarops.steps.channels import file_channels
+from lidarops.steps.conditioning import PROFILES
+from lidarops.steps.data import GEOMETRY, Chunk, Data, ProductStream, Source, WholeProduct
+from lidarops.steps.dependence import is_product
+from lidarops.steps.registry import definition, product_step, typed_settings
+from lidarops.steps.step import Look
+
+CHUNK_BYTES: Final = 4_000_000
+"""Bytes of raw counts that are processed together."""
+IN_MEMORY: Final = 2_000_000
+"""Bytes of counts up to which a scene is one chunk: below, chunks cost more than they save."""
+READ_TOGETHER: Final = 8
+"""Chunks of dask in a chunk, so that few profiles are read twice where it ends within one."""
+
+
+def chunk_profiles(bins: int, requested: int | None) -> int:
+    """Return the number of profiles that are processed together, of channels with `bins` bins."""
+    return max(1, requested or CHUNK_BYTES // (4 * max(bins, 1)))
+
+
+def channel_data(
+    source: Source, steps: Sequence[PlannedStep], channel: str
+) -> tuple[Data, dict[str, ProductStream]]:
+    """Carry out the steps of a channel, up to the products in the making.
+
+    Parameters
+    ----------
+    source : Source
+    steps : sequence of PlannedStep
+        Of the plan, in its order.
+    channel : str
+
+    Returns
+    -------
+    Data
+        What the shared steps gave.
+    dict of str to ProductStream
+        By kind of product.
+    """
+    shared: dict[str, Data] = {}
+    for name in dict.fromkeys((*file_channels(channel), channel)):
+        data = shared[name] = Data(source, name, shared)
+        for step in steps:
+            if step.channel == name and not step.product:
+                definition(step).carry_out(typed_settings(step), data)
+    products: dict[str, Data] = {}
+    streams: dict[str, ProductStream] = {}
+    for step in steps:
+        if step.channel == channel and step.product:
+            data = products.setdefault(step.product, shared[channel].of_product())
+            definition(step).carry_out(typed_settings(step), data)
+            if data.stream is not None:
+                streams[step.product] = data.stream
+    return shared[channel], streams
+
+
+def profiles_of(source: Source, steps: Sequence[PlannedStep], channel: str) -> xr.Dataset:
+    """Return power, variance and quality of all profiles of a source."""
+    data, _ = channel_data(source, [step for step in steps if not step.product], channel)
+    counts = loaded(source.archive, file_channels(channel), slice(None))
+    return data[PROFILES].of(counts)
+
+
+def refined_plan(plan: Plan, scene: Scene, profiles: Any) -> Plan:
+    """Return a plan without the parts of products in which sampled profiles show nothing.
+
+    Parameters
+    ----------
+    plan : Plan
+    scene : Scene
+        With usable granules only.
+    profiles : callable
+        Returns power, variance and quality of a channel in some granules.
+    """
+    look = Look(plan, scene, profiles)
+    steps: list[PlannedStep] = []
+    left_out: list[LeftOut] = list(plan.left_out)
+    for step in plan.steps:
+        if is_product(step):
+            refined, omissions = product_step(step.product).refined(step, look)
+            steps.append(refined)
+            left_out += omissions
+        else:
+            steps.append(step)
+    return replace(plan, steps=tuple(steps), left_out=tuple(left_out))
+
+
+def loaded(archive: xr.Dataset, channels: Iterable[str], rows: slice) -> xr.Dataset:
+    """Return some profiles of channels, with their counts in memory."""
+    of_channels = tuple(f"{channel}_" for channel in channels)
+    names = [
+        name for name in archive.variables if name in GEOMETRY or f"{name}_".startswith(of_channels)
+    ]
+    return archive[names].isel(time=rows).load()
+
+
+def chunks(
+    source: Source, channel: str, streams: Iterable[ProductStream], profiles: int
+) -> Iterator[Chunk]:
+    """Yield the profiles of a channel in chunks that end where its products allow it.
+
+    Parameters
+    ----------
+    source : Source
+    channel : str
+    streams : iterable of ProductStream
+    profiles : int
+        Number of profiles of a chunk, unless a product needs more together.
+    """
+    archive, parts = source.archive, file_channels(channel)
+    streams = list(streams)
+    reads = not streams or any(
+        not isinstance(stream, WholeProduct) or stream.reads for stream in streams
+    )
+    for rows in _rows(archive.sizes["time"], _ends(streams), profiles if reads else None):
+        counts = loaded(archive, parts, rows) if reads else archive.isel(time=rows)
+        yield Chunk(counts, rows.start)
+
+
+def _ends(streams: Iterable[ProductStream]) -> np.ndarray[Any, Any] | None:
+    """Return the rows before which a chunk may end; None for any."""
+    ends = [stream.ends() for stream in streams if isinstance(stream, WholeProduct)]
+    limiting = [rows for rows in ends if rows is not None]
+    if not limiting:
+        return None
+    common = limiting[0]
+    for rows in limiting[1:]:
+        common = np.intersect1d(common, rows)
+    return common
+
+
+def _rows(count: int, ends: np.ndarray[Any, Any] | None, profiles: int | None) -> Iterator[slice]:
+    """Yield consecutive rows, about `profiles` together, cut before some of `ends` only."""
+    size = profiles or count
+    allowed = np.arange(count + 1) if ends is None else np.append(ends, count)
+    first = 0
+    while first < count:
+        place = int(np.searchsorted(allowed, first + size, side="right")) - 1
+        # More than the size where no cut is allowed within it.
+        past = int(allowed[place]) if place >= 0 else 0
+        if past <= first:
+            past = int(allowed[np.searchsorted(allowed, first, side="right")])
+        yield slice(first, past)
+        first = past
+
+
+def member_data(source: Source, steps: Sequence[PlannedStep], product: PlannedStep) -> Data:
+    """Return what the steps of one member of a network give, for a product of the network."""
+    data = channel_data(source, [s for s in steps if not s.product], product.channel)[0]
+    data = data.of_product()
+    for step in steps:
+        if step.product == product.product:
+            definition(step).carry_out(typed_settings(step), data)
+    return data
+
+
+def joint_data(plan: Plan) -> dict[str, Data]:
+    """Return what the steps of a whole network give, by kind of product."""
+    nothing = Source(xr.Dataset(), None, Ancillaries({}, {}, ()), math.nan)
+    products: dict[str, Data] = {}
+    for step in plan.steps:
+        if not step.instrument:
+            data = products.setdefault(step.product, Data(nothing, step.channel, {}))
+            definition(step).carry_out(typed_settings(step), data)
+    return products

@@ -1,0 +1,224 @@
+"""Steps of the product ``elastic``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import xarray as xr
+
+from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.records import Plan, Scene
+from lidarops.retrieve.elastic import labeled
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.channels import range_channel, range_offset
+from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.data import Chunk, Data, WholeProduct
+from lidarops.steps.pointing import fixed_zenith
+from lidarops.steps.products import AVERAGE, MOLECULES, Average
+from lidarops.steps.profiles import gluing
+from lidarops.steps.reading import WAVELENGTH
+from lidarops.steps.registry import bins_of, intervals, setting_of
+from lidarops.steps.step import (
+    REQUESTED,
+    Datum,
+    Decisions,
+    Leave,
+    NoSettings,
+    ProductStep,
+    Run,
+    Step,
+    UnitCosts,
+)
+
+KNOWN_SHAPE: Final = Datum[bool]("known_shape")
+"""That the background is fitted with the shape of the signal of clean air."""
+REFERENCE: Final = Datum[labeled.Reference]("reference")
+
+
+@dataclass(frozen=True, slots=True)
+class _ReferenceLimits:
+    """Limits within which the reference window may lie, m along the beam."""
+
+    bottom: float
+    top: float
+    width: float
+    reason: str
+    """Why there can be no reference window; empty where there can."""
+
+
+def _reference_limits(case: ChannelCase) -> _ReferenceLimits:
+    settings: ElasticSettings = case.request
+    zenith, reason = fixed_zenith(case)
+    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
+    window = settings.reference
+    # A window is a set of bin centres.
+    ranged = replace(case.channel, name=range_channel(case.channel.name))
+    reach = case.last - 0.5 * case.channel.bin_width + range_offset(ranged, case.facts)
+    bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
+    if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
+        reason = (
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    return _ReferenceLimits(bottom, top, window.width * stretch, reason)
+
+
+class KnownShape(Step[NoSettings]):
+    """Fit the background with the shape of the signal of aerosol-free air."""
+
+    name = "known_shape"
+    outputs = (KNOWN_SHAPE,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the campaign requests this background."""
+        if case.request.background == "known_shape":
+            yield Run("the far range is assumed to be aerosol-free, and tested")
+        else:
+            yield Leave("the campaign requests tail_mean; signal in the far range biases it")
+
+    def carry_out(self, settings: NoSettings, data: Data) -> None:  # noqa: ARG002
+        """Give that the shape is used."""
+        data[KNOWN_SHAPE] = True
+
+
+class WindowSettings(SettingsModel):
+    """Settings of the step ``reference``."""
+
+    lowest: float
+    """m along the beam."""
+    highest: float
+    """m along the beam."""
+    width: float
+    """m along the beam."""
+    scattering_ratio: float
+    relative_error: float
+
+
+class ReferenceWindow(Step[WindowSettings]):
+    """State where the reference window may lie."""
+
+    name = "reference"
+    settings = WindowSettings
+    outputs = (REFERENCE,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run always."""
+        limits, window = _reference_limits(case), case.request.reference
+        settings = WindowSettings(
+            lowest=limits.bottom,
+            highest=limits.top,
+            width=limits.width,
+            scattering_ratio=window.scattering_ratio,
+            relative_error=window.relative_error,
+        )
+        reason = "windows within the campaign's limits are tested against the molecular profile"
+        yield Run(reason, settings, number=limits.top - limits.bottom)
+
+    def carry_out(self, settings: WindowSettings, data: Data) -> None:
+        """Give the limits."""
+        data[REFERENCE] = labeled.Reference(**dict(settings))
+
+
+class InversionSettings(SettingsModel):
+    """Settings of the step ``elastic``."""
+
+    lidar_ratio: float
+    """sr."""
+    lidar_ratio_standard_error: float
+    """sr."""
+    molecular_relative_error: float
+
+
+class Elastic(ProductStep[InversionSettings]):
+    """Invert the averaged elastic signals."""
+
+    name = "elastic"
+    settings = InversionSettings
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, AVERAGE, MOLECULES, KNOWN_SHAPE, REFERENCE)
+    costs = UnitCosts(product=0.1, value=5e-7, figure=1.5, load=0.1)
+    drawn_whole = True
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where a fixed beam reaches aerosol-free air."""
+        settings: ElasticSettings = case.request
+        limits = _reference_limits(case)
+        if limits.reason:
+            yield Leave(limits.reason)
+            return
+        yield Run(
+            REQUESTED,
+            InversionSettings(
+                lidar_ratio=settings.lidar_ratio,
+                lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
+                molecular_relative_error=settings.molecular_relative_error,
+            ),
+        )
+
+    def stream(self, settings: InversionSettings, data: Data) -> WholeProduct:
+        """Return the product, which holds averages only."""
+        return _Inversion(settings, data)
+
+    def values(self, settings: InversionSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+        """Return the number of bins of all averages."""
+        seconds = setting_of(plan, self.name, Average.name, "seconds")
+        return float(intervals(scene.granules, seconds) * bins_of(scene, self.name, plan))
+
+    def held(self, settings: InversionSettings, scene: Scene, plan: Plan) -> float:
+        """Return the bytes of the averages and of what is retrieved from them."""
+        return _BYTES_OF_A_BIN * self.values(settings, scene, plan)
+
+
+_BYTES_OF_A_BIN: Final = 400.0
+"""Bytes per bin of an average at the peak of the inversion (measured)."""
+
+
+class _Inversion(WholeProduct):
+    """Averages of the profiles of a scene, and their inversion."""
+
+    def __init__(self, settings: InversionSettings, data: Data) -> None:
+        self._settings, self._data = settings, data
+        source, profiles = data.source, data[PROFILES]
+        self._averages = profiles.averages(
+            source.geometry, profiles.shots(source.archive), data[AVERAGE]
+        )
+
+    def add(self, chunk: Chunk) -> None:
+        """Add the next profiles to their averages."""
+        self._averages.add(chunk)
+
+    def result(self) -> xr.Dataset:
+        """Return the inverted averages."""
+        data, settings = self._data, self._settings
+        geometry = data.source.geometry
+        averages = self._averages.result().assign_coords(
+            {
+                name: float(geometry[name][0])
+                for name in ("zenith_angle", "azimuth")
+                if name in geometry
+            }
+        )
+        overlap = data.get(OVERLAP)
+        inverted = labeled.invert_elastic(
+            averages,
+            molecules=data[MOLECULES],
+            wavelength=data[WAVELENGTH],
+            station_altitude=data.source.station_altitude,
+            lidar_ratio=settings.lidar_ratio,
+            lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
+            molecular_relative_error=settings.molecular_relative_error,
+            reference=data[REFERENCE],
+            known_shape=data.get(KNOWN_SHAPE) is True,
+            overlap=None if overlap is None else overlap(averages["range"].to_numpy()),
+        )
+        return inverted.assign(gluing(averages))
+
+
+STEPS: Final = (
+    Average("the noise of a single profile is too large for the inversion"),
+    KnownShape(),
+    ReferenceWindow(),
+    Elastic(),
+)

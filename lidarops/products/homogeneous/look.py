@@ -1,0 +1,173 @@
+"""Look at some profiles of a scene, to leave out the sections in which they show no signal.
+
+Sections that are left out are missing in the product, with the quality bit that the retrieval
+would set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.flags import Quality
+from lidarops.records import Granule, LeftOut, PlannedStep
+from lidarops.retrieve.background.detectable_light import (
+    LightDetection,
+    detect_light,
+    spaced_indices,
+)
+from lidarops.retrieve.homogeneous import labeled
+from lidarops.steps.step import Look
+
+if TYPE_CHECKING:
+    from lidarops.products.homogeneous.steps import PathSettings
+
+LOOKED_AT: Final = 16
+"""Number of profiles of a scene that are sampled first."""
+GAP: Final = timedelta(minutes=10)
+"""Longest time between sampled profiles where the first sample shows no signal."""
+DARK: Final = 3.0
+"""Significance below which no profile of the first sample shows a signal; a retrieval is accepted
+above 5. Noise alone lifts the largest of 16 above 3 in 2 % of scenes, above 1.7 in half."""
+STILL_DARK: Final = 3.5
+"""The same for the second sample, which has more profiles and so larger noise maxima."""
+REFINEMENTS: Final[Mapping[str, Quality]] = {
+    "section_saturated": Quality.SATURATED,
+    "section_dark": Quality.LOW_SIGNAL,
+}
+"""Rule that leaves a section out -> its quality bit."""
+
+Section = tuple[float, float]
+
+
+def omitted_sections(
+    planned: PlannedStep, settings: PathSettings, look: Look, most: int
+) -> dict[Section, LeftOut]:
+    """Return the sections in which there is nothing to retrieve, and why.
+
+    Parameters
+    ----------
+    planned : PlannedStep
+        The step ``homogeneous``.
+    settings : PathSettings
+        Its settings. Sections that they leave out already are not looked at again.
+    look : Look
+    most : int
+        Number of profiles that are sampled first.
+
+    Returns
+    -------
+    dict
+        Independent of chunks and workers.
+    """
+    granules = look.scene.granules
+    sections = [section for section in settings.sections if section not in settings.omitted]
+    places = spaced_indices(len(granules), most)
+    first = _looks(look.profiles(planned.channel, [granules[k] for k in places]), sections)
+    doubtful = [
+        section
+        for section, seen in first.items()
+        if seen.profiles and (seen.significance < DARK or not seen.unsaturated)
+    ]
+    if not doubtful:
+        return {}
+    rest = [granules[k] for k in _second_places(granules, places)]
+    second = _looks(look.profiles(planned.channel, rest), doubtful) if rest else {}
+    omitted = {}
+    for section in doubtful:
+        both = _merged_looks(first[section], second.get(section))
+        omission = _SectionLook(planned, section, first[section], both).omission()
+        if omission is not None:
+            omitted[section] = omission
+    return omitted
+
+
+def empty_sections(
+    shots: xr.DataArray, unit: str, omitted: Mapping[Section, Quality]
+) -> xr.Dataset:
+    """Return sections without values but with their quality bits, for profiles with `shots`."""
+    empty = labeled.empty_fit(shots, unit=unit, sections=list(omitted))
+    bits = np.array([int(bit) for bit in omitted.values()], dtype=np.int32)
+    missing = np.where(shots.to_numpy() > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
+    flags = bits | missing[:, np.newaxis]
+    return empty.assign(quality_flag=empty["quality_flag"].copy(data=flags))
+
+
+@dataclass(frozen=True, slots=True)
+class _SectionLook:
+    """What sampled profiles show in one section."""
+
+    planned: PlannedStep
+    section: Section
+    first: LightDetection
+    all: LightDetection
+    """Of both samples together, where there was a second one; else `first`."""
+
+    def omission(self) -> LeftOut | None:
+        """Return the section as left out, or None where it is retrieved."""
+        minutes = f"{GAP.total_seconds() / 60:g} min"
+        if self.first.unsaturated == self.all.unsaturated == 0:
+            reason = f"all {self.all.profiles} profiles, at most {minutes} apart, are saturated"
+            return self._without("section_saturated", reason, 0.0)
+        if self.first.significance < DARK and self.all.significance < STILL_DARK:
+            most = max(self.first.significance, self.all.significance)
+            reason = (
+                f"no signal in {self.all.profiles} profiles at most {minutes} apart: at most"
+                f" {most:.1f} standard errors (limit {STILL_DARK:g})"
+            )
+            return self._without("section_dark", reason, most)
+        return None
+
+    def _without(self, rule: str, reason: str, number: float) -> LeftOut:
+        near, far = self.section
+        return LeftOut(
+            self.planned.name,
+            self.planned.channel,
+            f"section {near:g}-{far:g} m: {reason}",
+            rule=rule,
+            number=number,
+            product=self.planned.product,
+        )
+
+
+def _second_places(granules: Sequence[Granule], places: npt.NDArray[np.int64]) -> list[int]:
+    """Return the indices of further granules, so that samples are at most `GAP` apart."""
+    sampled = {int(place) for place in places}
+    more = []
+    last: datetime | None = None
+    for place, granule in enumerate(granules):
+        following = granules[place + 1].start if place + 1 < len(granules) else None
+        if place in sampled:
+            last = granule.start
+        elif last is None or following is None or following - last > GAP:
+            more.append(place)
+            last = granule.start
+    return more
+
+
+def _merged_looks(first: LightDetection, second: LightDetection | None) -> LightDetection:
+    if second is None:
+        return first
+    return LightDetection(
+        first.profiles + second.profiles,
+        max(first.significance, second.significance),
+        first.unsaturated + second.unsaturated,
+    )
+
+
+def _looks(
+    profiles: xr.Dataset, sections: Sequence[tuple[float, float]]
+) -> dict[tuple[float, float], LightDetection]:
+    power, variance, quality, distance = (
+        profiles[name].to_numpy() for name in ("power", "variance", "quality", "range")
+    )
+    return {
+        (near, far): detect_light(power, variance, quality, distance, near, far)
+        for near, far in sections
+    }

@@ -1,0 +1,373 @@
+"""Steps of the product ``homogeneous``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.flags import Quality
+from lidarops.products.homogeneous.look import (
+    LOOKED_AT,
+    REFINEMENTS,
+    empty_sections,
+    omitted_sections,
+)
+from lidarops.products.homogeneous.settings import HomogeneousSettings
+from lidarops.records import DetectionMode, LeftOut, Plan, PlannedStep, Scene
+from lidarops.retrieve.air import labeled as labeled_visibility
+from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.homogeneous import labeled
+from lidarops.retrieve.homogeneous.labeled import LEVEL
+from lidarops.retrieve.signal.labeled import channel_unit
+from lidarops.settings import SettingsModel, VisibilitySettings
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.channels import is_glued
+from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
+from lidarops.steps.data import Chunk, Data, WholeProduct
+from lidarops.steps.products import FEWEST_BINS
+from lidarops.steps.reading import ANALOG_NOISE, BINS, WAVELENGTH, RangeWindow, WindowSettings
+from lidarops.steps.reading import bins_with_noise as bins_with_their_noise
+from lidarops.steps.registry import settings_of
+from lidarops.steps.step import (
+    ALL_STEPS,
+    REQUESTED,
+    Datum,
+    Decisions,
+    Leave,
+    Look,
+    NoSettings,
+    ProductStep,
+    Run,
+    Step,
+    UnitCosts,
+)
+
+VISIBILITY: Final = Datum[bool]("along_path")
+"""That visibility along the sections is requested."""
+LOOKED: Final = Datum[bool]("look")
+"""That sampled profiles show which sections contain a signal."""
+
+FULL_OVERLAP: Final = 0.99
+"""Smallest overlap at which a homogeneous section may begin."""
+_ROUNDING: Final = 1e-6
+"""Relative tolerance: headers and campaign files round angles differently."""
+
+Section = tuple[float, float]
+
+
+def _inside(case: ChannelCase) -> list[Section]:
+    """Return the requested sections that lie within the bins."""
+    width = case.channel.bin_width
+    return [
+        (near, far)
+        for near, far in case.request.sections
+        if far <= case.last and (far - near) / width >= FEWEST_BINS
+    ]
+
+
+def _climb(case: ChannelCase, near: float, far: float) -> float:
+    """Return the climb of the most level beam of a scene along a section, m.
+
+    Infinite where the zenith angle is unknown, so that the beam does not count as level.
+    """
+    fixed = case.facts.zenith_angle
+    angles = [granule.zenith_angle if fixed is None else fixed for granule in case.scene.granules]
+    return min(
+        math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
+        for angle in angles
+    )
+
+
+def _level(case: ChannelCase) -> list[Section]:
+    """Return the sections that are retrieved: within the bins, along a nearly level path."""
+    return [
+        (near, far)
+        for near, far in _inside(case)
+        if case.all_steps or _climb(case, near, far) <= LEVEL * (1.0 + _ROUNDING)
+    ]
+
+
+class SectionWindow(RangeWindow):
+    """Read only the bins that the sections of a photon-counting channel need."""
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for photon counting where the sections end before the last bin."""
+        if case.channel.mode is not DetectionMode.PHOTON:
+            yield Leave(ANALOG_NOISE)
+            return
+        if case.all_steps:
+            yield Leave(ALL_STEPS)
+            return
+        farthest = max(far for _, far in _level(case))
+        bins = bins_with_their_noise(0.0, farthest, case)[1]
+        if not 0 < bins < case.channel.bins:
+            yield Leave("a section extends to the last bin", number=float(case.channel.bins))
+            return
+        reason = "neither homogeneous sections nor the noise of their counts need farther bins"
+        yield Run(reason, WindowSettings(bins=((0, bins),)), number=float(bins))
+
+
+class LookSettings(SettingsModel):
+    """Settings of the step ``look``."""
+
+    profiles: int
+    """Number of profiles that are sampled first."""
+
+
+class LookForSignal(Step[LookSettings]):
+    """Leave out the sections in which no sampled profile shows a signal."""
+
+    name = "look"
+    settings = LookSettings
+    outputs = (LOOKED,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run unless all steps are requested."""
+        if case.all_steps:
+            yield Leave(ALL_STEPS)
+        else:
+            reason = "sections in which no sampled profile shows a signal are not retrieved"
+            yield Run(reason, LookSettings(profiles=LOOKED_AT), number=float(LOOKED_AT))
+
+    def carry_out(self, settings: LookSettings, data: Data) -> None:
+        """Give nothing: `Homogeneous.refined` looks before the steps are carried out."""
+
+
+class AlongPath(Step[NoSettings]):
+    """Add visibility along the sections."""
+
+    name = "along_path"
+    outputs = (VISIBILITY,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the campaign requests it."""
+        definition = case.request.visibility
+        if definition is None:
+            yield Leave("the campaign requests no visibility along the sections")
+        else:
+            reason = "the campaign requests visibility along the sections"
+            yield Run(reason, number=definition.threshold)
+
+    def carry_out(self, settings: NoSettings, data: Data) -> None:
+        """Give nothing: the definition is a setting of the retrieval."""
+
+
+class VisibilityDefinition(SettingsModel):
+    """Definition of visibility in a plan."""
+
+    contrast: float
+    law: str
+    angstrom_exponent: float | None = None
+    exponent_standard_error: float
+
+    @classmethod
+    def of(cls, settings: VisibilitySettings) -> VisibilityDefinition:
+        """Return the definition that a campaign requests."""
+        return cls(
+            contrast=settings.threshold,
+            law=settings.law,
+            angstrom_exponent=settings.angstrom_exponent,
+            exponent_standard_error=settings.exponent_standard_error,
+        )
+
+
+class PathSettings(SettingsModel):
+    """Settings of the step ``homogeneous``."""
+
+    method: Literal["auto", "direct", "cubic"]
+    sections: tuple[Section, ...]
+    """m."""
+    visibility: VisibilityDefinition | None = None
+    left_out: tuple[tuple[float, float, str], ...] = ()
+    """Sections that are not retrieved, with the quality bit that says why."""
+
+    @property
+    def omitted(self) -> dict[Section, Quality]:
+        """Sections that are not retrieved, with their quality bit."""
+        return {(near, far): Quality[bit] for near, far, bit in self.left_out}
+
+
+class Homogeneous(ProductStep[PathSettings]):
+    """Retrieve background, amplitude and extinction of range sections."""
+
+    name = "homogeneous"
+    settings = PathSettings
+    inputs = (PROFILES, RELATIVE_VARIANCE, OVERLAP, WAVELENGTH, BINS, LOOKED, VISIBILITY)
+    costs = UnitCosts(product=0.08, value=1.2e-7, figure=0.4, load=0.1)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for the sections that lie within the bins, along a nearly level path."""
+        if is_glued(case.channel.name):
+            reason = "not made of glued channels: each record is fitted with its own background"
+            yield Leave(reason, rule="channel_present")
+            return
+        inside, level = _inside(case), _level(case)
+        for near, far in case.request.sections:
+            if (near, far) not in inside:
+                yield _outside(case, near, far)
+        for near, far in inside:
+            if (near, far) not in level:
+                yield _slanted(case, near, far)
+        if level:
+            settings: HomogeneousSettings = case.request
+            definition = settings.visibility
+            yield Run(
+                f"{REQUESTED}; background is retrieved together with extinction",
+                PathSettings(
+                    method=settings.method,
+                    sections=tuple(level),
+                    visibility=None if definition is None else VisibilityDefinition.of(definition),
+                ),
+                number=float(len(level)),
+            )
+
+    def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:
+        """Return the planned step without the sections in which sampled profiles show no signal."""
+        sample = settings_of(look.plan, self.name, LookForSignal.name, planned.channel)
+        if sample is None or not look.scene.granules:
+            return planned, []
+        settings = PathSettings.model_validate(planned.settings)
+        omitted = omitted_sections(planned, settings, look, LookSettings(**sample).profiles)
+        if not omitted:
+            return planned, []
+        entries = [(*section, REFINEMENTS[why.rule].name) for section, why in omitted.items()]
+        refined = settings.model_copy(update={"left_out": (*settings.left_out, *entries)})
+        return _with_settings(planned, refined), list(omitted.values())
+
+    def stream(self, settings: PathSettings, data: Data) -> WholeProduct:
+        """Return the product, which holds the values of sections only."""
+        return _Sections(settings, data)
+
+    def values(self, settings: PathSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+        """Return the number of bins in the sections of all profiles."""
+        width = min(channel.bin_width for channel in scene.layout)
+        return float(
+            len(scene.granules) * sum((far - near) / width for near, far in settings.sections)
+        )
+
+    def held(self, settings: PathSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+        """Return the bytes of the values of all sections."""
+        return _BYTES_OF_A_SECTION * len(scene.granules) * len(settings.sections)
+
+
+_BYTES_OF_A_SECTION: Final = 400.0
+"""Bytes per section of a profile: about 25 variables, and copies while they are written."""
+
+
+def _outside(case: ChannelCase, near: float, far: float) -> Leave:
+    bins = (min(far, case.last) - near) / case.channel.bin_width
+    reason = (
+        f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
+        f" holds fewer than {FEWEST_BINS} bins"
+    )
+    return Leave(reason, number=bins, rule="section_inside")
+
+
+def _slanted(case: ChannelCase, near: float, far: float) -> Leave:
+    climb = _climb(case, near, far)
+    slope = (
+        "neither headers nor campaign give the zenith angle"
+        if math.isinf(climb)
+        else f"the beam climbs {climb:.0f} m (limit {LEVEL:g} m)"
+    )
+    reason = f"section {near:g}-{far:g} m: {slope}; a vertical gradient would mimic extinction"
+    return Leave(reason, number=None if math.isinf(climb) else climb, rule="section_level")
+
+
+def _with_settings(planned: PlannedStep, settings: SettingsModel) -> PlannedStep:
+    return replace(planned, settings=settings.model_dump(mode="json", exclude_none=True))
+
+
+class _Sections(WholeProduct):
+    """Values of the sections of each profile."""
+
+    def __init__(self, settings: PathSettings, data: Data) -> None:
+        self._settings, self._data = settings, data
+        self._omitted = settings.omitted
+        self._kept = [section for section in settings.sections if section not in self._omitted]
+        self._parts: list[xr.Dataset] = []
+
+    @property
+    def reads(self) -> bool:
+        """Whether a section is retrieved."""
+        return bool(self._kept)
+
+    def add(self, chunk: Chunk) -> None:
+        """Retrieve the sections of the next profiles."""
+        profiles = self._data[PROFILES]
+        shots = profiles.shots(chunk.counts)
+        parts = []
+        if self._kept:
+            parts.append(self._retrieved(chunk.profiles(profiles)))
+        if self._omitted:
+            unit = channel_unit(self._data.source.archive, self._data.channel)
+            parts.append(empty_sections(shots, unit, self._omitted))
+        sections = _in_order(parts, [*self._kept, *self._omitted], self._settings.sections)
+        slanted = labeled.not_level(sections, chunk.geometry["zenith_angle"])
+        sections = sections.assign(quality_flag=sections["quality_flag"] | slanted, shots=shots)
+        self._parts.append(sections.assign_coords(chunk.geometry.variables))
+
+    def _retrieved(self, conditioned: xr.Dataset) -> xr.Dataset:
+        quality = conditioned["quality"]
+        overlap = self._data.get(OVERLAP)
+        if overlap is not None:
+            # The signal still holds its background, so it cannot be divided by the overlap: bins
+            # with partial overlap are excluded.
+            quality = quality | _partial(overlap(conditioned["range"].to_numpy()))
+        return labeled.fit_homogeneous_path(
+            conditioned["power"],
+            sections=self._kept,
+            variance=conditioned["variance"],
+            quality=quality,
+            method=self._settings.method,
+            # An estimated variance scatters, which must not count as misfit.
+            relative_variance=self._data[RELATIVE_VARIANCE],
+        )
+
+    def result(self) -> xr.Dataset:
+        """Return all profiles, with visibility along the sections where it is requested."""
+        joined: xr.Dataset = xr.concat(
+            self._parts, dim="time", data_vars="minimal", coords="minimal"
+        )
+        definition = self._settings.visibility
+        if definition is None:
+            return joined
+        return _with_visibility(
+            joined, Definition(wavelength=self._data[WAVELENGTH], **dict(definition))
+        )
+
+
+def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:
+    """Return the quality bit of bins with partial overlap."""
+    bits = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
+    return xr.DataArray(bits.astype(np.int32), dims="range")
+
+
+def _in_order(
+    parts: list[xr.Dataset], sections: list[Section], order: tuple[Section, ...]
+) -> xr.Dataset:
+    """Return the retrieved and the empty sections together, in the order of the request."""
+    if len(parts) == 1:
+        return parts[0]
+    joined: xr.Dataset = xr.concat(parts, dim="section")
+    number = np.arange(len(order), dtype=np.int32)
+    places = [sections.index(section) for section in order]
+    return joined.isel(section=places).assign_coords(section=("section", number))
+
+
+def _with_visibility(sections: xr.Dataset, definition: Definition) -> xr.Dataset:
+    visibility = labeled_visibility.visibility_of_extinction(
+        sections["extinction"],
+        sections["extinction_standard_error"],
+        sections["extinction_model_error"],
+        definition,
+    )
+    return sections.assign(visibility.data_vars).assign_attrs(steps=definition.words)
+
+
+STEPS: Final = (SectionWindow(), LookForSignal(), AlongPath(), Homogeneous())

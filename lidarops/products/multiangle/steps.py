@@ -1,0 +1,337 @@
+"""Steps of the product ``multiangle``, which follow from the pointing of the beams.
+
+A step that the retrieval decides from the data is planned where the beams permit it. The attribute
+``lidarops_steps`` of the product states what was decided.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.errors import RetrievalInputError
+from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.records import Plan, Scene
+from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
+from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles
+from lidarops.retrieve.multiangle.labeled_altitudes import Background as TailBackground
+from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.data import Chunk, Data, Indices, WholeProduct
+from lidarops.steps.pointing import no_scan
+from lidarops.steps.products import MOLECULES
+from lidarops.steps.reading import WAVELENGTH
+from lidarops.steps.step import (
+    REQUESTED,
+    Datum,
+    Decisions,
+    Leave,
+    NoSettings,
+    ProductStep,
+    Run,
+    Step,
+    UnitCosts,
+)
+
+Array = npt.NDArray[np.float64]
+
+DECIDED: Final = Datum[None]("decided_by_the_retrieval")
+"""Steps that the retrieval carries out within itself."""
+
+_HALF_TURN: Final = 180.0
+_SIMPLE: Final = frozenset({"kano_hamilton", "two_angle"})
+"""Methods that treat each altitude independently."""
+_BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
+"""Methods that cannot fit a horizontal gradient."""
+_JOINT: Final = frozenset({"auto", "joint"})
+
+
+def altitude_steps(step: float, highest: float) -> Array:
+    """Return the altitudes of a multi-angle product, m above the station."""
+    return np.arange(step, highest + 1e-6, step)
+
+
+@dataclass(frozen=True, slots=True)
+class Beams:
+    """The beam directions of a scan that the retrieval uses."""
+
+    count: int
+    sides_known: bool
+    """Whether any azimuth is known."""
+    free: float
+    """degree, the largest azimuth sector without beams."""
+    surround: bool
+    """Whether no half turn is free of beams, so that a horizontal gradient can be estimated."""
+
+
+def beams(case: ChannelCase) -> Beams:
+    """Return the beam directions that the retrieval will use from the files of a scan."""
+    settings: MultiAngleSettings = case.request
+    side = case.facts.azimuth
+    pointings = tuple(
+        (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
+        for granule in case.scene.granules
+    )
+    return _beams(pointings, settings.step, settings.highest)
+
+
+def _number(angle: float | None) -> float:
+    return math.nan if angle is None else angle
+
+
+# All rules of a scene need the same beams.
+@lru_cache(maxsize=1)
+def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: float) -> Beams:
+    zenith_angle, azimuth = np.array(pointings).T
+    sides_known = bool(np.isfinite(azimuth).any())
+    try:
+        directions = scan_cycles.directions(zenith_angle, azimuth)
+    except RetrievalInputError:
+        # The retrieval raises the same error with its message.
+        return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
+    altitude = altitude_steps(step, highest)
+    up = slant_paths.rising_beams(directions.zenith_angle, altitude)
+    if up.size == 0:
+        return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
+    scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
+    tilted = scan.tilted_azimuths
+    free = math.degrees(slant_paths.widest_azimuth_gap(tilted))
+    return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(tilted))
+
+
+class _PartOfRetrieval(Step[NoSettings]):
+    """A step that the retrieval carries out within itself."""
+
+    outputs: ClassVar = (DECIDED,)
+
+    def carry_out(self, settings: NoSettings, data: Data) -> None:
+        """Give nothing."""
+
+
+class Gradient(_PartOfRetrieval):
+    """Include a horizontal gradient of backscatter in the error."""
+
+    name = "gradient"
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run unless the campaign excludes gradients."""
+        largest = case.request.largest_gradient
+        if largest > 0:
+            reason = "backscatter may vary horizontally: retrieved, or part of the error"
+            yield Run(reason, number=largest)
+        else:
+            yield Leave("largest_gradient of the campaign is 0", number=0.0)
+
+
+class GradientRegressor(_PartOfRetrieval):
+    """Fit a horizontal gradient."""
+
+    name = "gradient_regressor"
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where beams point to all sides."""
+        directions, method = beams(case), case.request.method
+        if method in _BLIND:
+            yield Leave(f"method {method} fits no horizontal gradient")
+        elif not directions.sides_known:
+            yield Leave("headers give no azimuths: all beams are assumed to point to one side")
+        elif not directions.surround:
+            sector = f"an azimuth sector of {directions.free:g} degree"
+            yield Leave(f"{sector}, more than a half turn, has no beams", number=directions.free)
+        else:
+            reason = (
+                "beams point to all sides, so a horizontal gradient can be estimated; decided from"
+                " the data, at altitudes with signal"
+            )
+            yield Run(reason, number=directions.free)
+
+
+class Robust(_PartOfRetrieval):
+    """Give outlying beams less weight."""
+
+    name = "robust"
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where there are enough beams to identify an outlier."""
+        count = float(beams(case).count)
+        if count < FEWEST_BEAMS:
+            reason = f"fewer than {FEWEST_BEAMS} beam directions cannot identify an outlier"
+            yield Leave(reason, number=count)
+        else:
+            reason = "decided from the data: used where a residual is too large to be chance"
+            yield Run(reason, number=count)
+
+
+class Vertical(_PartOfRetrieval):
+    """Regularise the profile along altitude."""
+
+    name = "vertical"
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the method treats altitudes together."""
+        settings: MultiAngleSettings = case.request
+        count = beams(case).count
+        if settings.method in _SIMPLE:
+            yield Leave(f"method {settings.method} treats each altitude independently")
+        elif settings.method == "auto" and count <= 2:
+            reason = (
+                "two beam directions give one difference at each altitude, used without smoothing"
+            )
+            yield Leave(reason, number=float(count))
+        else:
+            reason = (
+                "decided from the data: the smoothing increases with the noise of single altitudes"
+            )
+            yield Run(reason, number=float(round(settings.highest / settings.step)))
+
+
+class Correlation(_PartOfRetrieval):
+    """Include the correlation of errors along altitude."""
+
+    name = "correlation"
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where redundant beams can show a correlation."""
+        spare, method = float(beams(case).count - 2), case.request.method
+        if method not in _JOINT:
+            yield Leave(f"method {method} assumes independent errors at different altitudes")
+        elif spare <= 0:
+            reason = "no beam direction is redundant: residuals show no correlation along altitude"
+            yield Leave(reason, number=spare)
+        else:
+            reason = (
+                "decided from the data: AR(1) along altitude, from residuals of redundant beams"
+            )
+            yield Run(reason, number=spare)
+
+
+class Layers(_PartOfRetrieval):
+    """Give the optical depth of layers."""
+
+    name = "layers"
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the campaign requests layers."""
+        number = float(len(case.request.layers))
+        if number:
+            yield Run("the campaign requests the optical depth of layers", number=number)
+        else:
+            yield Leave("the campaign requests no layers", number=number)
+
+
+class ScanSettings(SettingsModel):
+    """Settings of the step ``multiangle``."""
+
+    highest: float
+    """m above the station."""
+    step: float
+    """m."""
+    method: str
+    largest_gradient: float
+    """m-1."""
+    layers: tuple[tuple[float, float], ...]
+    """m above the station."""
+    background_range: tuple[float, float]
+    """m along the beam."""
+
+
+class MultiAngle(ProductStep[ScanSettings]):
+    """Retrieve optical depth and extinction from the beams of each scan cycle."""
+
+    name = "multiangle"
+    settings = ScanSettings
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, DECIDED)
+    costs = UnitCosts(product=0.1, value=6e-6, figure=1.9, load=0.1)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the beam scans."""
+        reason = no_scan(case)
+        if reason:
+            yield Leave(reason)
+            return
+        settings: MultiAngleSettings = case.request
+        yield Run(
+            f"{REQUESTED}, and the beam scans",
+            ScanSettings(
+                highest=settings.highest,
+                step=settings.step,
+                method=settings.method,
+                largest_gradient=settings.largest_gradient,
+                layers=tuple(settings.layers),
+                background_range=(0.9 * case.last, case.last),
+            ),
+        )
+
+    def stream(self, settings: ScanSettings, data: Data) -> WholeProduct:
+        """Return the product, which holds cycles on common altitudes."""
+        return _Scans(settings, data)
+
+    def values(self, settings: ScanSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+        """Return the number of altitudes of all profiles."""
+        return float(len(scene.granules) * settings.highest / settings.step)
+
+    def held(self, settings: ScanSettings, scene: Scene, plan: Plan) -> float:
+        """Return the bytes of the cycles and of what is retrieved from them."""
+        return _BYTES_OF_AN_ALTITUDE * self.values(settings, scene, plan)
+
+
+_BYTES_OF_AN_ALTITUDE: Final = 400.0
+"""Bytes per altitude of a beam of a cycle at the peak of the retrieval."""
+
+
+class _Scans(WholeProduct):
+    """Scan cycles on common altitudes, and their optical depth."""
+
+    def __init__(self, settings: ScanSettings, data: Data) -> None:
+        self._settings, self._station = settings, data.source.station_altitude
+        self._profiles = profiles = data[PROFILES]
+        geometry, overlap = data.source.geometry, data.get(OVERLAP)
+        self._cycles = AltitudeCycles(
+            profiles.range,
+            zenith_angle=geometry["zenith_angle"].to_numpy(),
+            azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
+            time_bnds=geometry["time_bnds"].to_numpy(),
+            shots=profiles.shots(data.source.archive).to_numpy(),
+            altitude_grid=self._station + altitude_steps(settings.step, settings.highest),
+            station_altitude=self._station,
+            background=TailBackground(settings.background_range, data[MOLECULES], data[WAVELENGTH]),
+            overlap=None if overlap is None else overlap(profiles.range),
+        )
+
+    def ends(self) -> Indices:
+        """Return the rows before which a chunk may end: those that begin a cycle."""
+        return self._cycles.ends()
+
+    def add(self, chunk: Chunk) -> None:
+        """Interpolate the cycles of the next profiles to common altitudes."""
+        self._cycles.add(chunk.profiles(self._profiles), chunk.rows.start)
+
+    def result(self) -> xr.Dataset:
+        """Return the optical depth of all cycles."""
+        settings = self._settings
+        return labeled.retrieve_optical_depth(
+            self._cycles.result(),
+            station_altitude=self._station,
+            method=settings.method,
+            largest_gradient=settings.largest_gradient,
+            layers=[(low + self._station, high + self._station) for low, high in settings.layers],
+        )
+
+
+STEPS: Final = (
+    Gradient(),
+    GradientRegressor(),
+    Robust(),
+    Vertical(),
+    Correlation(),
+    Layers(),
+    MultiAngle(),
+)

@@ -1,0 +1,105 @@
+"""Steps of the product ``signal``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.flags import Quality
+from lidarops.records import Plan, Scene
+from lidarops.retrieve.signal.labeled import background_words
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.data import Chunk, Data, RowProduct
+from lidarops.steps.products import (
+    BACKGROUND_METHOD,
+    BACKGROUND_RANGE,
+    FEWEST_BINS,
+    Background,
+    tail,
+)
+from lidarops.steps.registry import bins_of
+from lidarops.steps.step import (
+    REQUESTED,
+    Decisions,
+    Leave,
+    NoSettings,
+    ProductStep,
+    Run,
+    UnitCosts,
+)
+
+
+class Signal(ProductStep[NoSettings]):
+    """Subtract the background and correct for range."""
+
+    name = "signal"
+    inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
+    costs = UnitCosts(product=0.05, value=2e-8, figure=0.8)
+    drawn_whole = True
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the range of the background holds enough bins."""
+        limits = case.request.background_range
+        start, stop = tail(case, limits)
+        bins = (stop - start) / case.channel.bin_width
+        if bins >= FEWEST_BINS:
+            yield Run(REQUESTED)
+            return
+        stop = limits[1] if limits else case.last
+        reason = (
+            f"background_range {start:g}-{stop:g} m holds fewer than {FEWEST_BINS} bins;"
+            f" the last bin ends at {case.last:g} m"
+        )
+        yield Leave(reason, number=bins)
+
+    def stream(self, settings: NoSettings, data: Data) -> RowProduct:  # noqa: ARG002
+        """Return the product, which is written as profiles come."""
+        return _Signals(data)
+
+    def values(self, settings: NoSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+        """Return the number of bins of all profiles."""
+        return float(len(scene.granules) * bins_of(scene, self.name, plan))
+
+
+class _Signals(RowProduct):
+    """Range-corrected signals of each profile."""
+
+    def __init__(self, data: Data) -> None:
+        self._profiles = data[PROFILES]
+        self._background = data[BACKGROUND_RANGE], data[BACKGROUND_METHOD]
+        overlap: Callable[..., npt.NDArray[np.float64]] | None = data.get(OVERLAP)
+        self._overlap = None if overlap is None else overlap(self._profiles.range)
+        self._geometry = data.source.geometry
+
+    def frame(self) -> xr.Dataset:
+        """Return times, pointing and ranges of all profiles."""
+        background_range, method = self._background
+        frame = self._geometry.assign_coords(range=self._profiles.range)
+        return frame.assign_attrs(steps=background_words(method, background_range))
+
+    def rows(self, chunk: Chunk) -> xr.Dataset:
+        """Return the signals of profiles."""
+        signals = self._profiles.signals(chunk.counts, *self._background)
+        if self._overlap is not None:
+            signals = _without_overlap(signals, self._overlap)
+        shots = self._profiles.shots(chunk.counts)
+        return signals.assign(shots=shots).assign_coords(chunk.geometry.variables)
+
+
+def _without_overlap(signals: xr.Dataset, overlap: npt.NDArray[np.float64]) -> xr.Dataset:
+    """Return signals divided by the overlap, and flagged where it is not known."""
+    along = xr.DataArray(overlap.astype(np.float32), dims="range")
+    lost = along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
+    return signals.assign(
+        signal=signals["signal"] / along,
+        signal_standard_error=signals["signal_standard_error"] / along,
+        quality_flag=signals["quality_flag"] | lost,
+    )
+
+
+STEPS: Final = (Background(), Signal())

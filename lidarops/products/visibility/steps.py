@@ -1,0 +1,506 @@
+"""Steps of the product ``visibility`` of a network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.campaign.model import Campaign, ChannelFacts, InstrumentFacts
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.products.visibility.network import (
+    KIND,
+    SAME_POINTING,
+    BeamPlan,
+    MemberCase,
+    angle_between,
+    crossings,
+)
+from lidarops.products.visibility.settings import VisibilityProductSettings
+from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, PlannedStep, Scene
+from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.background.left_signal import window_before
+from lidarops.retrieve.network import geometry, labeled
+from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.channels import glued_parts, is_glued
+from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.data import Averages, Chunk, Data, Indices
+from lidarops.steps.network import Decided, Member, NetworkProductStep, NetworkStream
+from lidarops.steps.products import AVERAGE, BACKGROUND_RANGE, Average, Background
+from lidarops.steps.reading import (
+    ANALOG_NOISE,
+    BINS,
+    WAVELENGTH,
+    RangeWindow,
+    WindowSettings,
+    bins_with_noise,
+    bins_within,
+    merged,
+)
+from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, intervals, setting_of
+from lidarops.steps.step import (
+    ALL_STEPS,
+    Datum,
+    Decisions,
+    Leave,
+    NoSettings,
+    Run,
+    Step,
+    UnitCosts,
+)
+
+PRIOR: Final = Datum[None]("prior")
+
+_SAME_WAVELENGTH: Final = 1e-9
+"""m; largest difference between equal wavelengths of instruments."""
+_EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+
+
+class MemberBackground(Background):
+    """State the far range of the channel of an instrument."""
+
+
+class MemberWindow(RangeWindow):
+    """Read only the bins that the crossings of an instrument and its background need."""
+
+    def __init__(self, farthest: float = 0.0, tail: tuple[float, float] = (0.0, 0.0)) -> None:
+        self._farthest, self._tail = farthest, tail
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for photon counting where some bins are not needed."""
+        channel = case.channel
+        if is_glued(channel.name) or channel.mode is not DetectionMode.PHOTON:
+            yield Leave(ANALOG_NOISE, rule="member_window")
+            return
+        if case.all_steps:
+            yield Leave(ALL_STEPS, rule="member_window")
+            return
+        width, (start, stop) = channel.bin_width, self._tail
+        low, high = window_before(start + width)
+        near = bins_with_noise(0.0, self._farthest + BINS_BEYOND * width, case)
+        far = (bins_within(low - width, high, case), bins_within(start, stop, case))
+        kept = merged((first, min(past, channel.bins)) for first, past in (near, *far))
+        number = float(sum(past - first for first, past in kept))
+        if len(kept) == 1 and number == channel.bins:
+            reason = "crossings and background need all bins"
+            yield Leave(reason, number=number, rule="member_window")
+            return
+        reason = "bins between the farthest crossing and the background range are not needed"
+        yield Run(reason, WindowSettings(bins=tuple(kept)), number=number, rule="member_window")
+
+
+class Prior(Step[NoSettings]):
+    """Use a prior about the mean field of a block."""
+
+    name = "prior"
+    outputs = (PRIOR,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for the method ``network`` unless the campaign requests no prior."""
+        settings: VisibilityProductSettings = case.request
+        if settings.method != "network":
+            yield Leave(f"method {settings.method} uses no prior")
+        elif settings.prior == "none":
+            yield Leave("the campaign requests no prior: gradients along beams mimic attenuation")
+        else:
+            reason = (
+                "decided from the data: the strongest prior about the mean field of a block that"
+                " agrees with its beams"
+            )
+            yield Run(reason, number=settings.block / settings.average)
+
+    def carry_out(self, settings: NoSettings, data: Data) -> None:
+        """Give nothing: the retrieval has its own setting."""
+
+
+class NetworkSettings(SettingsModel):
+    """Settings of the step ``visibility``."""
+
+    beams: tuple[BeamPlan, ...]
+    wavelength: float
+    """m."""
+    block_seconds: float
+    method: str
+    prior: str
+    tolerance: float
+    """m."""
+    smallest_angle: float
+    """degree."""
+    exponent_relative_error: float
+    lidar_ratio_relative_error: float
+    overlap_relative_error: float
+    contrast: float
+    law: str
+    angstrom_exponent: float | None = None
+    exponent_standard_error: float
+
+    @property
+    def definition(self) -> Definition:
+        """Definition of visibility."""
+        return Definition(
+            wavelength=self.wavelength,
+            contrast=self.contrast,
+            law=self.law,
+            angstrom_exponent=self.angstrom_exponent,
+            exponent_standard_error=self.exponent_standard_error,
+        )
+
+
+class Visibility(NetworkProductStep):
+    """Retrieve extinction and visibility where the beams of a network cross."""
+
+    name = KIND
+    settings = NetworkSettings
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, BINS, BACKGROUND_RANGE, AVERAGE, PRIOR)
+    costs = UnitCosts(product=0.2, value=2.5e-3, figure=1.2, load=0.1)
+
+    def plan(self, scene: Scene, campaign: Campaign) -> Decided:
+        """Return the entries of the plan of a scene of a network.
+
+        Without steps where the beams do not cross; the omissions then state why.
+        """
+        settings: Any = campaign.networks[scene.instrument].requested()[self.name]
+        return list(_NetworkPlan(scene, campaign, settings).entries())
+
+    def network_stream(
+        self, settings: SettingsModel, members: Sequence[Member], data: Data
+    ) -> NetworkStream:
+        """Return the product, which holds averages of the beams."""
+        assert isinstance(settings, NetworkSettings)  # noqa: S101
+        return _NetworkStream(settings, members, data[AVERAGE])
+
+    def values(self, settings: NetworkSettings, scene: Scene, plan: Plan) -> float:
+        """Return the number of averages of all beams."""
+        seconds = setting_of(plan, self.name, Average.name, "seconds")
+        members = {member.instrument: member for member in scene.members}
+        return float(
+            sum(intervals(members[beam.instrument].granules, seconds) for beam in settings.beams)
+        )
+
+    def held(self, settings: NetworkSettings, scene: Scene, plan: Plan) -> float:
+        """Return the bytes of the averages of all beams."""
+        bins = max(channel.bins for member in scene.members for channel in member.layout)
+        return _BYTES_OF_A_BIN * bins * self.values(settings, scene, plan)
+
+
+_BYTES_OF_A_BIN: Final = 60.0
+"""Bytes per bin of an average of a beam: power, variance and quality, and copies."""
+
+_AVERAGE: Final = Average(
+    "signals are averaged before the retrieval: noise biases means of retrieved values"
+)
+
+
+class _NetworkPlan:
+    """The plan of a scene of a network."""
+
+    def __init__(
+        self, scene: Scene, campaign: Campaign, settings: VisibilityProductSettings
+    ) -> None:
+        self._scene, self._campaign, self._settings = scene, campaign, settings
+        self._members = [MemberCase(member, campaign, settings) for member in scene.members]
+
+    def entries(self) -> Iterator[PlannedStep | LeftOut]:
+        """Yield the entries of the members that take part, then those of the whole network."""
+        yield from self._absent()
+        able = []
+        for member in self._members:
+            why, number = member.why_not()
+            if why:
+                yield self._left(member.scene.instrument, why, number, "member")
+            else:
+                able.append(member)
+        prepared = [entry for member in able for entry in self._prepared(member)]
+        yield from (entry for entry in prepared if isinstance(entry, LeftOut))
+        wavelengths = [
+            step.settings["wavelength"]
+            for step in prepared
+            if isinstance(step, PlannedStep) and "wavelength" in step.settings
+        ]
+        beams = [beam for member in able for beam in member.pointings()]
+        reason = self._why_none(beams, wavelengths)
+        kept: list[BeamPlan] = []
+        if reason is None:
+            kept = beams
+            yield from self._without_lonely_beams(kept)
+            reason = self._why_no_crossing(kept)
+        if reason is not None:
+            yield self._joint_case.entry(KIND, reason)
+            return
+        used = {beam.instrument for beam in kept}
+        yield from (
+            step for step in prepared if isinstance(step, PlannedStep) and step.instrument in used
+        )
+        yield from self._joint(kept, min(wavelengths))
+
+    def _absent(self) -> Iterator[LeftOut]:
+        present = {member.instrument for member in self._scene.members}
+        for name in self._campaign.networks[self._scene.instrument].instruments:
+            if name not in present:
+                yield self._left(name, "no granule in the window", 0.0, "member_present")
+
+    def _left(self, member: str, reason: str, number: float | None, rule: str) -> LeftOut:
+        return LeftOut(
+            KIND,
+            self._settings.channel,
+            f"{member}: {reason}",
+            member,
+            rule=rule,
+            number=number,
+            product=KIND,
+        )
+
+    def _prepared(self, member: MemberCase) -> Iterator[PlannedStep | LeftOut]:
+        """Yield the steps from the counts of an instrument to its signal."""
+        name = self._settings.channel
+        present = {channel.name: channel for channel in member.scene.layout}
+        for channel in glued_parts(name) if is_glued(name) else (name,):
+            case = member.channel_case(present[channel])
+            for step in FILE_STEPS:
+                yield from case.decisions(step)
+        case = member.channel_case(member.channel)
+        if is_glued(name):
+            for step in GLUE_STEPS:
+                yield from case.decisions(step)
+        yield from self._of_product(case).decisions(MemberBackground())
+
+    def _of_product(self, case: ChannelCase) -> ChannelCase:
+        return case.of_product(KIND, self._settings)
+
+    @property
+    def _joint_case(self) -> ChannelCase:
+        """The case of the steps of the whole network."""
+        channel = ChannelLayout(
+            self._settings.channel, DetectionMode.PHOTON, math.nan, 0, math.nan, 0
+        )
+        return self._of_product(
+            ChannelCase(self._scene, channel, InstrumentFacts(), ChannelFacts())
+        )
+
+    def _why_none(self, beams: Sequence[BeamPlan], wavelengths: Sequence[float]) -> Leave | None:
+        """Return why there can be no network, whatever the crossings."""
+        if wavelengths and max(wavelengths) - min(wavelengths) > _SAME_WAVELENGTH:
+            listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
+            reason = f"the instruments have different wavelengths: {listed} nm"
+            return Leave(reason, max(wavelengths) - min(wavelengths), rule="one_wavelength")
+        if len(beams) > geometry.MOST_BEAMS:
+            reason = f"{len(beams)} beams exceed the limit of {geometry.MOST_BEAMS}"
+            return Leave(reason, float(len(beams)), rule="few_beams")
+        return None
+
+    def _crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
+        return crossings(beams, self._scene, self._campaign, self._settings)
+
+    def _without_lonely_beams(self, beams: list[BeamPlan]) -> Iterator[LeftOut]:
+        """Take out beams with fewer than two crossings, until all remaining beams have two."""
+        while beams:
+            network = self._crossings(beams)
+            counts = {beam: int(network.on_beam(n)[0].size) for n, beam in enumerate(beams)}
+            lonely = [beam for beam in beams if counts[beam] < 2]
+            for beam in lonely:
+                pointing = f"zenith angle {beam.zenith_angle:g} and azimuth {beam.azimuth:g} degree"
+                reason = f"the beam at {pointing} has fewer than two crossings with other beams"
+                yield self._left(beam.instrument, reason, float(counts[beam]), "beams_meet")
+                beams.remove(beam)
+            if not lonely:
+                return
+
+    def _why_no_crossing(self, beams: Sequence[BeamPlan]) -> Leave | None:
+        """Return why the beams with crossings form no network of the requested method."""
+        if not beams:
+            reason = "no beam has two crossings with other beams, between which it is attenuated"
+            return Leave(reason, 0.0, rule="some_meet")
+        method = self._settings.method
+        if method in {"cycle", "multiplier", "unbiased"}:
+            try:
+                geometry.build_cycle(self._crossings(beams))
+            except RetrievalInputError as error:
+                return Leave(f"method {method}: {error}", float(len(beams)), rule="cycle")
+        return None
+
+    def _joint(
+        self, beams: Sequence[BeamPlan], wavelength: float
+    ) -> Iterator[PlannedStep | LeftOut]:
+        """Yield the read windows of the instruments, and the steps of the whole network."""
+        network = self._crossings(beams)
+        for member in self._members:
+            name = member.scene.instrument
+            numbers = [n for n, beam in enumerate(beams) if beam.instrument == name]
+            if numbers:
+                farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
+                case = self._of_product(member.channel_case(member.channel))
+                yield from case.decisions(MemberWindow(farthest, member.tail))
+        for step in (_AVERAGE, Prior()):
+            yield from self._joint_case.decisions(step)
+        yield self._joint_case.entry(KIND, self._visibility(beams, network, wavelength))
+
+    def _visibility(
+        self, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
+    ) -> Run:
+        settings = self._settings
+        definition = settings.visibility
+        return Run(
+            f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
+            f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones",
+            NetworkSettings(
+                beams=tuple(beams),
+                wavelength=wavelength,
+                block_seconds=settings.block.total_seconds(),
+                method=settings.method,
+                prior=settings.prior,
+                tolerance=settings.tolerance,
+                smallest_angle=settings.smallest_angle,
+                exponent_relative_error=settings.exponent_relative_error,
+                lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
+                overlap_relative_error=settings.overlap_relative_error,
+                contrast=definition.threshold,
+                law=definition.law,
+                angstrom_exponent=definition.angstrom_exponent,
+                exponent_standard_error=definition.exponent_standard_error,
+            ),
+            number=float(network.crossings),
+        )
+
+
+class _NetworkStream(NetworkStream):
+    """Averages of all beams of a network, and what is retrieved from them."""
+
+    def __init__(
+        self, settings: NetworkSettings, members: Sequence[Member], seconds: float
+    ) -> None:
+        self._settings, self._seconds = settings, seconds
+        by_name = {member.instrument: member for member in members}
+        self._beams = [_Beam(by_name[beam.instrument], beam, seconds) for beam in settings.beams]
+
+    def add(self, member: Member, chunk: Chunk) -> None:
+        """Add profiles of an instrument to the averages of its beams."""
+        for beam in self._beams:
+            if beam.member is member:
+                beam.add(chunk)
+
+    def result(self) -> xr.Dataset:
+        """Return the variables of the product."""
+        settings = self._settings
+        signals = [beam.signals() for beam in self._beams]
+        return labeled.retrieve_network(
+            signals,
+            self._network(signals),
+            labeled.NetworkSettings(
+                block_intervals=round(settings.block_seconds / self._seconds),
+                visibility=settings.definition,
+                method=settings.method,
+                prior=settings.prior,
+                exponent_relative_error=settings.exponent_relative_error,
+                lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
+                overlap_relative_error=settings.overlap_relative_error,
+            ),
+        )
+
+    def _network(self, signals: Sequence[BeamAverages]) -> geometry.Network:
+        settings = self._settings
+        return geometry.build_network(
+            [
+                geometry.Beam(
+                    *beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle
+                )
+                for beam in signals
+            ],
+            tolerance=settings.tolerance,
+            nearest=[beam.nearest for beam in settings.beams],
+            farthest=[beam.farthest for beam in settings.beams],
+            smallest_angle=settings.smallest_angle,
+        )
+
+
+class _Beam:
+    """One beam of a member: the averaged profiles of its pointing."""
+
+    def __init__(self, member: Member, planned: BeamPlan, seconds: float) -> None:
+        self.member, self._planned = member, planned
+        self._averages: Averages | None = None
+        self._interval: Indices = np.zeros(0, dtype=np.int64)
+        self._profiles: Indices = np.zeros(0, dtype=np.int64)
+        data = member.data
+        if data is None:
+            return
+        geometry_of_all = data.source.geometry
+        self._profiles = _profiles_of(geometry_of_all, planned)
+        if self._profiles.size:
+            of_beam = geometry_of_all.isel(time=self._profiles)
+            profiles = data[PROFILES]
+            shots = profiles.shots(data.source.archive).isel(time=self._profiles)
+            self._averages = profiles.averages(of_beam, shots, seconds)
+            self._interval = _intervals(of_beam["time"].to_numpy(), seconds)
+
+    def add(self, chunk: Chunk) -> None:
+        """Add the profiles of a chunk that have the pointing of the beam."""
+        inside = (self._profiles >= chunk.rows.start) & (self._profiles < chunk.rows.stop)
+        if self._averages is not None and inside.any():
+            self._averages.add(chunk, self._profiles[inside] - chunk.rows.start)
+
+    def signals(self) -> BeamAverages:
+        """Return the averages with the geometry and settings of the beam."""
+        member, planned, data = self.member, self._planned, self.member.data
+        averages = _no_averages(member.range) if self._averages is None else self._averages.result()
+        distance = averages["range"].to_numpy().astype(np.float64)
+        overlap = None if data is None else data.get(OVERLAP)
+        return BeamAverages(
+            averages=averages,
+            interval=self._interval,
+            instrument=member.instrument,
+            station=(member.station.latitude, member.station.longitude, member.station.altitude),
+            background_range=(distance[0], np.inf) if data is None else data[BACKGROUND_RANGE],
+            nearest=planned.nearest,
+            overlap=None if overlap is None else overlap(distance),
+            exponent=planned.exponent,
+            zenith_angle=planned.zenith_angle,
+            azimuth=planned.azimuth,
+        )
+
+
+def _profiles_of(geometry_of_all: xr.Dataset, beam: BeamPlan) -> Indices:
+    """Return the numbers of the profiles of a beam."""
+    planned = (beam.zenith_angle, beam.azimuth)
+    angles = (geometry_of_all[name].to_numpy() for name in ("zenith_angle", "azimuth"))
+    return np.array(
+        [
+            number
+            for number, pointing in enumerate(zip(*angles, strict=True))
+            if angle_between(pointing, planned) <= SAME_POINTING
+        ],
+        dtype=np.int64,
+    )
+
+
+def _intervals(moments: npt.NDArray[np.datetime64], seconds: float) -> Indices:
+    """Return the numbers of the clock intervals that hold profiles, each once."""
+    length = np.timedelta64(round(seconds * 1e9), "ns")
+    return np.unique((moments.astype("datetime64[ns]") - _EPOCH) // length).astype(np.int64)
+
+
+def _no_averages(distance: npt.NDArray[np.float64]) -> xr.Dataset:
+    """Return averages of a beam without profiles."""
+    empty = np.zeros((0, distance.size))
+    pair = ("time", "range")
+    return xr.Dataset(
+        {
+            "power": (pair, empty),
+            "variance": (pair, empty),
+            "quality": (pair, np.full(empty.shape, int(Quality.INPUT_MISSING), dtype=np.int32)),
+            "shots": ("time", np.zeros(0, dtype=np.int32)),
+        },
+        coords={
+            "range": distance,
+            "time_bnds": (("time", "nv"), np.zeros((0, 2), dtype="datetime64[ns]")),
+        },
+    )
+
+
+STEPS: Final = (MemberBackground(), MemberWindow(), _AVERAGE, Prior(), Visibility())

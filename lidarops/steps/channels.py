@@ -1,0 +1,79 @@
+"""Names of channels: those of files, and those that are glued from two of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
+from lidarops.records import ChannelLayout
+
+GLUED: Final = "glued_"
+"""Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
+
+
+def is_glued(channel: str) -> bool:
+    """Return whether a channel is glued from two of the files."""
+    return channel.startswith(GLUED)
+
+
+def glued_parts(glued: str) -> tuple[str, str]:
+    """Return the names of the analog and the photon-counting channel of a glued channel."""
+    label = glued.removeprefix(GLUED)
+    return f"analog_{label}", f"photon_{label}"
+
+
+def file_channels(channel: str) -> tuple[str, ...]:
+    """Return the channels of the files that a channel is made from."""
+    return glued_parts(channel) if is_glued(channel) else (channel,)
+
+
+def range_channel(channel: str) -> str:
+    """Return the channel that defines the ranges: for a glued one, the photon-counting one."""
+    return file_channels(channel)[-1]
+
+
+def joined_layout(
+    layout: Iterable[ChannelLayout], names: Iterable[str]
+) -> tuple[ChannelLayout, ...]:
+    """Return the glued channels whose two parts are in the files with one bin width.
+
+    They are in photon-counting units. Names of other channels are skipped.
+    """
+    present = {channel.name: channel for channel in layout}
+    glued = []
+    for name in sorted({name for name in names if is_glued(name)}):
+        analog, photon = (present.get(part) for part in glued_parts(name))
+        if analog and photon and analog.bin_width == photon.bin_width:
+            glued.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
+    return tuple(glued)
+
+
+def wavelength(channel: ChannelLayout, facts: ChannelFacts) -> float:
+    """Return the wavelength in m from the campaign or else the header; may be NaN."""
+    return channel.wavelength if facts.wavelength is None else facts.wavelength
+
+
+def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
+    """Return the shift of the ranges of a channel, m: the given offset minus the given lag."""
+    of_channel = channel_facts(facts, channel.name)
+    late = of_channel.lag * channel.bin_width if isinstance(of_channel.lag, float) else 0.0
+    return (of_channel.range_offset or 0.0) - late
+
+
+def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
+    """Return a channel of the files, or one glued from two of them."""
+    layout = tuple(layout)
+    known = (*layout, *joined_layout(layout, [name]))
+    return next(channel for channel in known if channel.name == name)
+
+
+def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:
+    """Return the ranges of the bin centres of a channel, m."""
+    ranged = replace(channel, name=range_channel(channel.name))
+    middles = (np.arange(channel.bins) + 0.5) * channel.bin_width
+    return np.asarray(middles + range_offset(ranged, facts))

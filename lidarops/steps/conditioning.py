@@ -1,0 +1,256 @@
+"""From the counts of a channel of the files to the power, variance and quality of its profiles."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import datetime
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.records import DetectionMode, Granule, Role
+from lidarops.retrieve.signal import labeled
+from lidarops.retrieve.signal.dark import SESSION_GAP
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.channels import range_offset
+from lidarops.steps.data import Data, Profiles
+from lidarops.steps.profiles import FileProfiles
+from lidarops.steps.reading import ARCHIVE
+from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
+
+Array = npt.NDArray[np.float64]
+
+FULL_OVERLAP_RANGE: Final = Datum[float]("full_overlap_range")
+"""m, nearer bins are flagged."""
+OVERLAP: Final = Datum[Callable[[Array], Array]]("overlap")
+"""Returns the overlap at ranges in m."""
+RANGE_OFFSET: Final = Datum[float]("range_offset")
+"""m, added to the range of every bin."""
+DARK: Final = Datum[labeled.DarkSignals]("dark")
+DEAD_TIME: Final = Datum[float]("dead_time")
+"""s."""
+RELATIVE_VARIANCE: Final = Datum[bool]("relative_variance")
+"""Whether the variance is estimated from the profile, and so scatters."""
+PROFILES: Final = Datum[Profiles]("profiles")
+"""Power, variance and quality of the profiles of the channel."""
+
+
+class OverlapSettings(SettingsModel):
+    """Settings of the step ``overlap``."""
+
+    full_overlap_range: float
+    """m."""
+    overlap_profile: str | None = None
+    """Ancillary file of the overlap function."""
+
+
+class Overlap(Step[OverlapSettings]):
+    """Flag bins before full overlap, and give the overlap function."""
+
+    name = "overlap"
+    settings = OverlapSettings
+    outputs = (FULL_OVERLAP_RANGE, OVERLAP)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the campaign states the overlap."""
+        full, profile = case.facts.full_overlap_range, case.facts.overlap_profile
+        if not profile and full <= 0:
+            yield Leave("the campaign gives no full_overlap_range")
+            return
+        reason = "bins nearer than full overlap are flagged and excluded"
+        if profile:
+            reason = f"overlap_profile given by the campaign; {reason}"
+        settings = OverlapSettings(full_overlap_range=full, overlap_profile=profile)
+        yield Run(reason, settings, number=full)
+
+    def carry_out(self, settings: OverlapSettings, data: Data) -> None:
+        """Give the range of full overlap, and the overlap function where it is known."""
+        data[FULL_OVERLAP_RANGE] = settings.full_overlap_range
+        if settings.overlap_profile is not None:
+            data[OVERLAP] = data.source.ancillaries.overlaps[settings.overlap_profile].at
+
+    def files(self, settings: OverlapSettings) -> Mapping[str, Role]:
+        """Return the file of the overlap function."""
+        return {settings.overlap_profile: Role.OVERLAP} if settings.overlap_profile else {}
+
+
+class RangeOffsetSettings(SettingsModel):
+    """Settings of the step ``range_offset``."""
+
+    range_offset: float
+    """m."""
+
+
+class RangeOffset(Step[RangeOffsetSettings]):
+    """Shift the ranges of the bins."""
+
+    name = "range_offset"
+    settings = RangeOffsetSettings
+    outputs = (RANGE_OFFSET,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run where the campaign gives an offset or a lag."""
+        offset, lag = range_offset(case.channel, case.facts), case.facts_of_channel.lag
+        if offset:
+            reason = "given by the campaign"
+            if isinstance(lag, float):
+                reason += f", including a lag of {lag:g} bins"
+            yield Run(reason, RangeOffsetSettings(range_offset=offset), number=offset)
+        elif lag == "estimate":
+            yield Leave("an estimated lag shifts glued channels only")
+        else:
+            yield Leave("the campaign gives no range_offset")
+
+    def carry_out(self, settings: RangeOffsetSettings, data: Data) -> None:
+        """Give the offset."""
+        data[RANGE_OFFSET] = settings.range_offset
+
+
+class DarkSettings(SettingsModel):
+    """Settings of the step ``dark``."""
+
+    files: int
+    method: Literal["interpolated", "nearest"]
+
+
+class Dark(Step[DarkSettings]):
+    """Subtract the signal of dark files from an analog channel."""
+
+    name = "dark"
+    settings = DarkSettings
+    inputs = (ARCHIVE,)
+    outputs = (DARK,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for analog channels with dark files near the scene."""
+        if case.channel.mode is DetectionMode.PHOTON:
+            yield Leave("dark counts are part of the photon-counting background")
+            return
+        count = len(case.scene.dark)
+        if not count:
+            yield Leave("no dark files within 24 h of the scene", number=0.0)
+            return
+        times = sorted(granule.start for granule in case.scene.dark if granule.start)
+        profiles = [granule.start for granule in case.scene.granules if granule.start]
+        around = times[0] < max(profiles) and min(profiles) < times[-1]
+        sessions = _sessions(case.scene.dark)
+        method: Literal["interpolated", "nearest"]
+        # Interpolation needs two sessions.
+        if around and sessions > 1:
+            use, method = "interpolated in time", "interpolated"
+        elif sessions > 1:
+            use, method = "the nearest in time is used", "nearest"
+        else:
+            use, method = "one session, used for all profiles", "nearest"
+        order = _times_around(times, min(profiles), max(profiles))
+        files = "1 dark file" if count == 1 else f"{count} dark files"
+        reason = f"{files} within 24 h of the scene, {order}: {use}"
+        yield Run(reason, DarkSettings(files=count, method=method), number=float(count))
+
+    def carry_out(self, settings: DarkSettings, data: Data) -> None:
+        """Give the dark signals."""
+        if data.source.dark is not None:
+            data[DARK] = labeled.read_dark(data.source.dark, data.channel, method=settings.method)
+
+
+def _sessions(dark: Iterable[Granule]) -> int:
+    """Return the number of dark sessions, separated by `SESSION_GAP` as in the retrieval."""
+    middles = sorted(
+        granule.start + ((granule.stop or granule.start) - granule.start) / 2
+        for granule in dark
+        if granule.start
+    )
+    gaps = ((later - time).total_seconds() for time, later in itertools.pairwise(middles))
+    return 1 + sum(gap > SESSION_GAP for gap in gaps)
+
+
+def _times_around(times: Sequence[datetime], first: datetime, last: datetime) -> str:
+    """Return in words how many times lie before, among and after the profiles of a scene."""
+    counts = {
+        "before": sum(time < first for time in times),
+        "among": sum(first <= time <= last for time in times),
+        "after": sum(time > last for time in times),
+    }
+    *firsts, last_count = [f"{number} {place}" for place, number in counts.items() if number]
+    words = f"{', '.join(firsts)} and {last_count}" if firsts else last_count
+    return f"{words} its profiles"
+
+
+class DeadTimeSettings(SettingsModel):
+    """Settings of the step ``dead_time``."""
+
+    dead_time: float
+    """s."""
+
+
+class DeadTime(Step[DeadTimeSettings]):
+    """Correct photon counts for the dead time."""
+
+    name = "dead_time"
+    settings = DeadTimeSettings
+    outputs = (DEAD_TIME,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for photon counting with a known dead time."""
+        dead_time = case.facts_of_channel.dead_time
+        if case.channel.mode is not DetectionMode.PHOTON:
+            yield Leave("analog detection has no dead time")
+        elif dead_time is None:
+            yield Leave("the campaign gives no dead_time; pile-up is flagged for an assumed 4 ns")
+        else:
+            settings = DeadTimeSettings(dead_time=dead_time)
+            yield Run("given by the campaign", settings, number=dead_time)
+
+    def carry_out(self, settings: DeadTimeSettings, data: Data) -> None:
+        """Give the dead time."""
+        data[DEAD_TIME] = settings.dead_time
+
+
+class NoiseSettings(SettingsModel):
+    """Settings of the step ``noise``."""
+
+    method: Literal["poisson", "given", "differences"]
+    noise_variance: float | None = None
+    """mV2, with the method ``given``."""
+
+
+class Noise(Step[NoiseSettings]):
+    """Turn counts into power, with variance and quality."""
+
+    name = "noise"
+    settings = NoiseSettings
+    inputs = (ARCHIVE, FULL_OVERLAP_RANGE, RANGE_OFFSET, DARK, DEAD_TIME)
+    outputs = (PROFILES, RELATIVE_VARIANCE)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run always: the noise is Poisson, given, or estimated."""
+        variance = case.facts_of_channel.noise_variance
+        if case.channel.mode is DetectionMode.PHOTON:
+            reason = "photon counts are Poisson distributed"
+            yield Run(reason, NoiseSettings(method="poisson"))
+        elif variance is not None:
+            settings = NoiseSettings(method="given", noise_variance=variance)
+            yield Run("given by the campaign", settings, number=variance)
+        else:
+            reason = (
+                "the campaign gives no noise_variance; estimated from third differences over range"
+            )
+            yield Run(reason, NoiseSettings(method="differences"))
+
+    def carry_out(self, settings: NoiseSettings, data: Data) -> None:
+        """Give the profiles of the channel."""
+        data[RELATIVE_VARIANCE] = settings.method == "differences"
+        data[PROFILES] = FileProfiles(
+            data[ARCHIVE],
+            data.channel,
+            {
+                "dead_time": data.get(DEAD_TIME),
+                "noise_variance": settings.noise_variance,
+                "dark": data.get(DARK),
+                "range_offset": data.get(RANGE_OFFSET) or 0.0,
+                "full_overlap_range": data.get(FULL_OVERLAP_RANGE) or 0.0,
+            },
+        )

@@ -1,0 +1,166 @@
+"""What steps work on: the data of a channel by name, and its profiles in chunks along time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.steps.step import Datum
+
+T = TypeVar("T")
+Indices = npt.NDArray[np.int64]
+
+GEOMETRY = ("time", "time_bnds", "zenith_angle", "azimuth")
+"""Coordinates that every product over the time of the profiles has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The opened files of a scene, on which the steps of all its channels work."""
+
+    archive: xr.Dataset
+    """Raw counts of the scene, lazy or in memory."""
+    dark: xr.Dataset | None
+    """Raw counts of its dark files, lazy."""
+    ancillaries: Ancillaries
+    station_altitude: float
+    """m above mean sea level."""
+
+    @property
+    def geometry(self) -> xr.Dataset:
+        """Times and pointing of all profiles."""
+        return self.archive[[name for name in GEOMETRY if name in self.archive]]
+
+
+class Chunk:
+    """Consecutive profiles of a scene, with their counts in memory."""
+
+    def __init__(self, counts: xr.Dataset, first: int) -> None:
+        self.counts = counts
+        self.rows = slice(first, first + counts.sizes["time"])
+        """Place of the profiles in the scene."""
+        self._profiles: dict[int, xr.Dataset] = {}
+
+    @property
+    def geometry(self) -> xr.Dataset:
+        """Times and pointing of the profiles."""
+        return self.counts[[name for name in GEOMETRY if name in self.counts]]
+
+    def profiles(self, profiles: Profiles) -> xr.Dataset:
+        """Return power, variance and quality of the profiles, computed once for all products."""
+        key = id(profiles)
+        if key not in self._profiles:
+            self._profiles[key] = profiles.of(self.counts)
+        return self._profiles[key]
+
+
+class Profiles(ABC):
+    """How the profiles of a channel follow from raw counts."""
+
+    @property
+    @abstractmethod
+    def range(self) -> npt.NDArray[np.float64]:
+        """Ranges of the bin centres, m."""
+
+    @abstractmethod
+    def shots(self, counts: xr.Dataset) -> xr.DataArray:
+        """Return the number of laser shots of each profile."""
+
+    @abstractmethod
+    def of(self, counts: xr.Dataset) -> xr.Dataset:
+        """Return power, variance and quality of profiles, (time, range)."""
+
+    @abstractmethod
+    def signals(
+        self, counts: xr.Dataset, background_range: tuple[float, float], background_method: str
+    ) -> xr.Dataset:
+        """Return background-subtracted, range-corrected signals of profiles."""
+
+    @abstractmethod
+    def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
+        """Return an empty average of profiles over clock intervals."""
+
+
+class Averages(ABC):
+    """Means of profiles over clock intervals, in the making."""
+
+    @abstractmethod
+    def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
+        """Add the next profiles: all of a chunk, or some of its rows."""
+
+    @abstractmethod
+    def result(self) -> xr.Dataset:
+        """Return the means, with power, variance and quality over (time, range)."""
+
+
+class WholeProduct(ABC):
+    """A product that is retrieved when all profiles are known, in reduced form."""
+
+    @property
+    def reads(self) -> bool:
+        """Whether the product needs the counts of the profiles."""
+        return True
+
+    def ends(self) -> Indices | None:
+        """Return the rows before which a chunk may end; None for any."""
+        return None
+
+    @abstractmethod
+    def add(self, chunk: Chunk) -> None:
+        """Take the next profiles."""
+
+    @abstractmethod
+    def result(self) -> xr.Dataset:
+        """Return the variables of the product, in memory."""
+
+
+class RowProduct(ABC):
+    """A product of which each profile gives its own rows, written as they come."""
+
+    @abstractmethod
+    def frame(self) -> xr.Dataset:
+        """Return the coordinates of all profiles, and what does not depend on time."""
+
+    @abstractmethod
+    def rows(self, chunk: Chunk) -> xr.Dataset:
+        """Return the variables of the product for the next profiles."""
+
+
+ProductStream = WholeProduct | RowProduct
+
+
+@dataclass(slots=True)
+class Data:
+    """What the steps of one channel have given so far, by name."""
+
+    source: Source
+    channel: str
+    channels: Mapping[str, Data]
+    """Data of the channels that were prepared before."""
+    stream: ProductStream | None = None
+    """The product in the making, once its step has been carried out."""
+    _values: dict[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, datum: Datum[T]) -> T:
+        """Return what a step has given."""
+        value: T = self._values[datum.name]
+        return value
+
+    def __setitem__(self, datum: Datum[T], value: T) -> None:
+        """Keep what a step gives."""
+        self._values[datum.name] = value
+
+    def get(self, datum: Datum[T]) -> T | None:
+        """Return what a step has given; None where the step is left out."""
+        return self._values.get(datum.name)
+
+    def of_product(self) -> Data:
+        """Return a copy for the steps of one product, which other products do not see."""
+        return Data(self.source, self.channel, self.channels, None, dict(self._values))

@@ -1,0 +1,48 @@
+"""Where the beams of a scene point, from the headers of its files or the facts of the campaign."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from lidarops.steps.case import ChannelCase
+
+STEEPEST: Final = 80.0
+"""degree; largest zenith angle at which a beam reaches aerosol-free air."""
+FIXED: Final = 0.05
+"""degree; largest difference between the zenith angles of the files of a fixed beam."""
+LEAST_SPREAD: Final = 5.0
+"""degree; smallest span of zenith angles of a scan."""
+
+
+def no_scan(case: ChannelCase) -> str:
+    """Return why the files of a scene are not a scan; empty where they are."""
+    if case.facts.zenith_angle is not None:
+        angle = case.facts.zenith_angle
+        return f"the campaign states a fixed beam at a zenith angle of {angle:g} degree"
+    header_angles = [granule.zenith_angle for granule in case.scene.granules]
+    angles = [angle for angle in header_angles if angle is not None]
+    if len(angles) < len(header_angles):
+        return "headers lack zenith angles"
+    spread = max(angles) - min(angles)
+    if spread < LEAST_SPREAD:
+        return f"zenith angles span only {spread:g} degree: the beam does not scan"
+    return ""
+
+
+def fixed_zenith(case: ChannelCase) -> tuple[float, str]:
+    """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
+    if case.facts.zenith_angle is not None:
+        angles = [case.facts.zenith_angle]
+    else:
+        header_angles = [granule.zenith_angle for granule in case.scene.granules]
+        if any(angle is None for angle in header_angles):
+            return math.nan, "neither headers nor campaign give the zenith angle"
+        angles = [angle for angle in header_angles if angle is not None]
+    if max(angles) - min(angles) > FIXED:
+        reason = f"the zenith angle of the beam changes from {min(angles):g} to {max(angles):g}"
+        return math.nan, f"{reason} degree"
+    if max(angles) > STEEPEST:
+        reason = f"at a zenith angle of {max(angles):g} degree the beam does not reach"
+        return math.nan, f"{reason} aerosol-free air"
+    return max(angles), ""

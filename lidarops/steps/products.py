@@ -1,0 +1,129 @@
+"""Steps of several kinds of product, each with its own settings: background, average, air."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, Literal
+
+from lidarops.records import Role
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.data import Data
+from lidarops.steps.step import Datum, Decisions, Run, Step
+
+BACKGROUND_RANGE: Final = Datum[tuple[float, float]]("background_range")
+"""m, the range from which the background is estimated."""
+BACKGROUND_METHOD: Final = Datum[str]("background_method")
+AVERAGE: Final = Datum[float]("average")
+"""s, length of the clock intervals over which profiles are averaged."""
+MOLECULES: Final = Datum[MolecularProfile]("molecules")
+
+FEWEST_BINS: Final = 8
+"""Fewest bins of a section, and of the range of a background."""
+
+
+def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the limits in m of the far range whose mean is the background.
+
+    By default the last tenth of the bins.
+    """
+    start, stop = limits or (0.9 * case.last, case.last)
+    return start, min(stop, case.last)
+
+
+class BackgroundSettings(SettingsModel):
+    """Settings of the step ``background``."""
+
+    method: Literal["tail_mean", "cubic"]
+    range: tuple[float, float]
+    """m."""
+
+
+class Background(Step[BackgroundSettings]):
+    """State how the background is estimated, from `background_range` of the request."""
+
+    name = "background"
+    settings = BackgroundSettings
+    outputs = (BACKGROUND_RANGE, BACKGROUND_METHOD)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run always; the product is left out where the range holds too few bins."""
+        limits = case.request.background_range
+        start, stop = tail(case, limits)
+        method = getattr(case.request, "background", "tail_mean")
+        where = (
+            "the last tenth of the bins" if limits is None else "background_range of the campaign"
+        )
+        reason = f"mean of {where}; signal there biases it"
+        if method == "cubic":
+            reason = f"cubic of the homogeneous section {where}; another course of signal biases it"
+        yield Run(
+            reason,
+            BackgroundSettings(method=method, range=(start, stop)),
+            number=(stop - start) / case.channel.bin_width,
+        )
+
+    def carry_out(self, settings: BackgroundSettings, data: Data) -> None:
+        """Give the range."""
+        data[BACKGROUND_RANGE] = settings.range
+        data[BACKGROUND_METHOD] = settings.method
+
+
+class AverageSettings(SettingsModel):
+    """Settings of the step ``average``."""
+
+    seconds: float
+
+
+class Average(Step[AverageSettings]):
+    """Average profiles over clock intervals, by `average` of the request."""
+
+    name = "average"
+    settings = AverageSettings
+    outputs = (AVERAGE,)
+
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run always."""
+        seconds = case.request.average.total_seconds()
+        yield Run(self._reason, AverageSettings(seconds=seconds), number=seconds)
+
+    def carry_out(self, settings: AverageSettings, data: Data) -> None:
+        """Give the length of the intervals."""
+        data[AVERAGE] = settings.seconds
+
+
+class MolecularSettings(SettingsModel):
+    """Settings of the step ``molecular``."""
+
+    molecular_profile: str | None = None
+    """Ancillary file of pressure and temperature; None for the US Standard Atmosphere 1976."""
+
+
+class Molecular(Step[MolecularSettings]):
+    """Give the density of the air."""
+
+    name = "molecular"
+    settings = MolecularSettings
+    outputs = (MOLECULES,)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run always."""
+        source = case.facts.molecular_profile
+        reason = "given by the campaign"
+        if not source:
+            reason = "the campaign gives no molecular_profile; US Standard Atmosphere 1976 is used"
+        yield Run(reason, MolecularSettings(molecular_profile=source or None))
+
+    def carry_out(self, settings: MolecularSettings, data: Data) -> None:
+        """Give the profile of the file, or of the standard atmosphere."""
+        source = settings.molecular_profile
+        profiles = data.source.ancillaries.profiles
+        data[MOLECULES] = MolecularProfile.us_standard() if source is None else profiles[source]
+
+    def files(self, settings: MolecularSettings) -> Mapping[str, Role]:
+        """Return the file of pressure and temperature."""
+        return {settings.molecular_profile: Role.MOLECULAR} if settings.molecular_profile else {}

@@ -1,0 +1,160 @@
+"""Profiles of a channel that the files hold, and of one that is glued from two of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.retrieve.signal import labeled, labeled_gluing
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+from lidarops.steps.data import Averages, Chunk, Indices, Profiles
+
+_PARTS: Final = ("power", "variance", "quality")
+
+
+class FileProfiles(Profiles):
+    """Profiles of a channel that the files hold.
+
+    Parameters
+    ----------
+    archive : xr.Dataset
+        The raw counts of the scene, whose ranges are used.
+    channel : str
+    settings : mapping
+        Arguments of `lidarops.retrieve.signal.labeled.condition`.
+    """
+
+    def __init__(self, archive: xr.Dataset, channel: str, settings: Mapping[str, Any]) -> None:
+        self._channel, self._settings = channel, settings
+        grid = str(archive[channel].dims[-1])
+        # As `condition` adds it, in the type of the coordinate.
+        distance = archive[grid].to_numpy()
+        offset = settings["range_offset"]
+        self._range = (distance + offset if offset else distance).astype(np.float64)
+
+    @property
+    def range(self) -> npt.NDArray[np.float64]:
+        """Ranges of the bin centres, m."""
+        return self._range
+
+    def shots(self, counts: xr.Dataset) -> xr.DataArray:
+        """Return the number of laser shots of each profile."""
+        return counts[f"{self._channel}_shots"]
+
+    def of(self, counts: xr.Dataset) -> xr.Dataset:
+        """Return power, variance and quality of profiles."""
+        return labeled.condition(counts, self._channel, **self._settings)
+
+    def signals(
+        self, counts: xr.Dataset, background_range: tuple[float, float], background_method: str
+    ) -> xr.Dataset:
+        """Return background-subtracted, range-corrected signals of profiles."""
+        return labeled.range_corrected_signals(
+            counts,
+            self._channel,
+            background_range=background_range,
+            background_method=background_method,
+            **self._settings,
+        )
+
+    def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
+        """Return an empty average of profiles over clock intervals."""
+        dark = self._settings["dark"]
+        return _FileAverages(
+            self,
+            ClockAverage(
+                geometry,
+                self._range,
+                seconds=seconds,
+                shots=shots,
+                shared_variance=None if dark is None else dark.variance,
+            ),
+        )
+
+
+class _FileAverages(Averages):
+    """Means of profiles of a channel of the files."""
+
+    def __init__(self, profiles: FileProfiles, means: ClockAverage) -> None:
+        self._profiles, self._means = profiles, means
+
+    def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
+        """Add the next profiles: all of a chunk, or some of its rows."""
+        conditioned = chunk.profiles(self._profiles)
+        self._means.add(conditioned if rows is None else conditioned.isel(time=rows))
+
+    def result(self) -> xr.Dataset:
+        """Return the means."""
+        return self._means.result()
+
+
+class GluedProfiles(Profiles):
+    """Profiles that are glued from those of an analog and a photon-counting channel.
+
+    Parameters
+    ----------
+    analog, photon : Profiles
+    lag : float
+        Bins by which the analog record lags the photon-counting one.
+    """
+
+    def __init__(self, analog: Profiles, photon: Profiles, lag: float) -> None:
+        self._analog, self._photon, self._lag = analog, photon, lag
+
+    @property
+    def range(self) -> npt.NDArray[np.float64]:
+        """Ranges of the bin centres, m."""
+        return self._photon.range[: self._analog.range.size]
+
+    def shots(self, counts: xr.Dataset) -> xr.DataArray:
+        """Return the number of laser shots of each profile."""
+        return self._photon.shots(counts)
+
+    def of(self, counts: xr.Dataset) -> xr.Dataset:
+        """Return power, variance and quality of profiles, and the variables of the gluing."""
+        return labeled_gluing.glue(self._analog.of(counts), self._photon.of(counts), lag=self._lag)
+
+    def signals(
+        self, counts: xr.Dataset, background_range: tuple[float, float], background_method: str
+    ) -> xr.Dataset:
+        """Return background-subtracted, range-corrected signals of profiles."""
+        joined = self.of(counts)
+        return labeled.correct_for_range(joined, background_range, background_method).assign(
+            gluing(joined)
+        )
+
+    def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
+        """Return an empty average of profiles over clock intervals."""
+        return _GluedAverages(
+            self._analog.averages(geometry, shots, seconds),
+            self._photon.averages(geometry, shots, seconds),
+            self._lag,
+        )
+
+
+class _GluedAverages(Averages):
+    """Means of both parts of a glued channel, which are glued at the end."""
+
+    def __init__(self, analog: Averages, photon: Averages, lag: float) -> None:
+        self._analog, self._photon, self._lag = analog, photon, lag
+
+    def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
+        """Add the next profiles: all of a chunk, or some of its rows."""
+        self._analog.add(chunk, rows)
+        self._photon.add(chunk, rows)
+
+    def result(self) -> xr.Dataset:
+        """Return the glued means."""
+        analog, photon = self._analog.result(), self._photon.result()
+        glued = labeled_gluing.glue(analog[[*_PARTS]], photon[[*_PARTS]], lag=self._lag)
+        bins = slice(glued.sizes["range"])
+        return photon.isel(range=bins).drop_vars(_PARTS).assign(glued.variables)
+
+
+def gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the variables that describe the gluing; none where profiles are not glued."""
+    return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}

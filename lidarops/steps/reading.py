@@ -1,0 +1,179 @@
+"""Read a channel, at its wavelength, and only the bins that its products need."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from typing import Final
+
+import xarray as xr
+
+from lidarops.campaign.model import channel_facts
+from lidarops.raw.model import Stretches
+from lidarops.records import PlannedStep
+from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS, NOISE_WINDOW
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.channels import file_channels, range_channel, range_offset, wavelength
+from lidarops.steps.data import Data
+from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
+
+ARCHIVE: Final = Datum[xr.Dataset]("archive")
+"""Raw counts of all profiles of the scene, lazy or in memory."""
+WAVELENGTH: Final = Datum[float]("wavelength")
+"""m."""
+BINS: Final = Datum[None]("bins")
+"""That only some bins are read."""
+
+NO_PRODUCT: Final = "no product of the campaign uses this channel"
+NO_WAVELENGTH: Final = "the wavelength in the header is implausible, and no facts give one"
+ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its bins"
+RANGE_WINDOW: Final = "range_window"
+"""Name of the step by which a kind of product states the bins that it needs."""
+
+
+class ReadSettings(SettingsModel):
+    """Settings of the step ``read``."""
+
+    wavelength: float
+    """m."""
+
+
+class Read(Step[ReadSettings]):
+    """Read the counts of a channel."""
+
+    name = "read"
+    settings = ReadSettings
+    outputs = (ARCHIVE, WAVELENGTH)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Read a channel that a product needs, at a known wavelength."""
+        requesters = [*case.requests, *case.requesters]
+        if not requesters:
+            reason = NO_PRODUCT
+            if case.networks:
+                word = "networks" if len(case.networks) > 1 else "network"
+                reason = f"used only by {word} {' and '.join(case.networks)}"
+            yield Leave(reason, rule="channel")
+            return
+        facts = channel_facts(case.facts, range_channel(case.channel.name))
+        metres = wavelength(case.channel, facts)
+        if math.isnan(metres):
+            yield Leave(NO_WAVELENGTH, rule="channel")
+        else:
+            yield Run(required_by(requesters), ReadSettings(wavelength=metres), rule="channel")
+
+    def carry_out(self, settings: ReadSettings, data: Data) -> None:
+        """Give the archive and the wavelength."""
+        data[ARCHIVE] = data.source.archive
+        data[WAVELENGTH] = settings.wavelength
+
+
+def required_by(requesters: Iterable[str]) -> str:
+    """Return the reason why a channel is read: the products and glued channels that need it."""
+    return f"required by {' and '.join(requesters)}"
+
+
+class WindowSettings(SettingsModel):
+    """Settings of the step ``range_window``."""
+
+    bins: tuple[tuple[int, int], ...]
+    """First bin and the one past the last, of each stretch that is read."""
+
+
+class RangeWindow(Step[WindowSettings]):
+    """Base of the steps by which a kind of product states the bins that it needs."""
+
+    name = RANGE_WINDOW
+    settings = WindowSettings
+    inputs = (ARCHIVE,)
+    outputs = (BINS,)
+
+    def carry_out(self, settings: WindowSettings, data: Data) -> None:
+        """Give nothing: the bins are left out when the files are opened."""
+
+
+def read_windows(steps: Collection[PlannedStep]) -> dict[str, Stretches]:
+    """Return the channels of which only some bins are needed, with these bins."""
+    windows: dict[str, list[tuple[int, int]]] = {}
+    for step in steps:
+        if step.name == RANGE_WINDOW and not idle_window(step, steps):
+            stretches = WindowSettings.model_validate(step.settings).bins
+            windows.setdefault(step.channel, []).extend(stretches)
+    return {channel: tuple(merged(stretches)) for channel, stretches in windows.items()}
+
+
+def merged(stretches: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return stretches of bins, ascending, with touching ones merged and empty ones left out."""
+    kept: list[tuple[int, int]] = []
+    for first, past in sorted(stretches):
+        if kept and first <= kept[-1][1]:
+            kept[-1] = (kept[-1][0], max(kept[-1][1], past))
+        elif first < past:
+            kept.append((first, past))
+    return kept
+
+
+def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
+    """Return why a range window has no effect; empty where it has one, or for other steps.
+
+    Such a window stays in the plan, because the plan stated in a product must not depend on the
+    other products of the scene.
+
+    Parameters
+    ----------
+    step : PlannedStep
+    steps : collection of PlannedStep
+        All steps of the scene.
+    """
+    if step.name != RANGE_WINDOW:
+        return ""
+    windowed = {
+        (other.channel, other.product)
+        for other in steps
+        if other.name == RANGE_WINDOW and other.instrument == step.instrument
+    }
+    needing = list(
+        dict.fromkeys(
+            other.product if other.channel == step.channel else other.channel
+            for other in steps
+            if other.instrument in ("", step.instrument)
+            and other.product
+            and step.channel in (other.channel, *file_channels(other.channel))
+            and (other.channel, other.product) not in windowed
+        )
+    )
+    if not needing:
+        return ""
+    return f"{' and '.join(needing)} need{'s' if len(needing) == 1 else ''} all bins"
+
+
+def bins_with_noise(nearest: float, farthest: float, case: ChannelCase) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, with those that their noise needs.
+
+    The variance of a count is that of the mean over a share of the range on either side.
+
+    Returns
+    -------
+    (int, int)
+        The first bin, and the one past the last, which may lie beyond the channel.
+    """
+    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+
+    def margin(distance: float) -> int:
+        # Two for rounding.
+        return max(math.ceil(NOISE_WINDOW * distance / width), MIN_NOISE_BINS) + 2
+
+    first = math.floor((nearest - offset) / width) - margin(nearest)
+    return max(first, 0), math.ceil((farthest - offset) / width) + margin(farthest)
+
+
+def bins_within(nearest: float, farthest: float, case: ChannelCase) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, without a margin for their noise.
+
+    For bins that are averaged: the noise at the ends then comes from fewer bins.
+    """
+    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+    # Two for rounding.
+    first = math.floor((nearest - offset) / width) - 2
+    return max(first, 0), max(math.ceil((farthest - offset) / width) + 2, 0)
