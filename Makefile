@@ -40,8 +40,9 @@ bench: .venv/.runtime
 	$(INSTALL) --no-build-isolation -e .
 	touch $@
 
-.venv/.dev: .venv/.runtime requirements-dev.lock
+.venv/.dev: .venv/.runtime requirements-dev.lock tests/plugin/pyproject.toml
 	$(INSTALL) --require-hashes -r requirements-dev.lock
+	$(INSTALL) --no-build-isolation -e tests/plugin
 	touch $@
 
 COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \

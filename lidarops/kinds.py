@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from math import inf
 from types import MappingProxyType
 from typing import Any, Final
 
 from lidarops.errors import LidarOpsError
+from lidarops.registry import registered
 from lidarops.settings import ChannelProduct, NetworkProduct
 
 GROUP: Final = "lidarops.product_kinds"
@@ -93,23 +93,8 @@ def kinds() -> Mapping[str, Kind]:
     LidarOpsError
         If an entry point cannot be loaded, or two have one name.
     """
-    registered: dict[str, Kind] = {}
-    for point in entry_points(group=GROUP):
-        try:
-            kind = point.load()
-        except (ImportError, AttributeError) as error:
-            raise LidarOpsError(
-                f"kind of product {point.name!r} cannot be loaded from {point.value}: {error}",
-                remedy="repair or remove the package that registers it",
-            ) from error
-        if not isinstance(kind, Kind) or kind.name != point.name or kind.name in registered:
-            raise LidarOpsError(
-                f"kind of product {point.name!r} of {point.value} is no Kind of that name, or the"
-                " name is taken",
-                remedy="repair or remove the package that registers it",
-            )
-        registered[kind.name] = kind
-    order = sorted(registered.values(), key=lambda kind: (kind.rank, kind.name))
+    unordered = registered(GROUP, Kind, "kind of product")
+    order = sorted(unordered.values(), key=lambda kind: (kind.rank, kind.name))
     return MappingProxyType({kind.name: kind for kind in order})
 
 

@@ -85,6 +85,8 @@ class Granule:
     layout: tuple[ChannelLayout, ...] = ()
     sha256: str | None = None
     """Digest of the file; None until the whole file has been read."""
+    format: str = ""
+    """Name of its raw format; empty where the file is refused."""
     header_digest: str | None = None
     """Equal for files whose headers differ only in the fields above and in the lasers; None where
     unknown, or where the file may have changed."""

@@ -246,7 +246,7 @@ _GRANULE_COLUMNS: Final = tuple(
     for name in (
         "path", "size", "mtime_ns", "instrument", "role", "status", "reason", "notes", "start",
         "stop", "zenith_angle", "azimuth", "latitude", "longitude", "altitude", "layout", "sha256",
-        "header_digest",
+        "format", "header_digest",
     )
 )  # fmt: skip
 _ROLES: Final = {role.value: role for role in Role}
@@ -263,7 +263,8 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
     (
         path, size, mtime_ns, instrument, role, status, reason, notes, start, stop,
-        zenith_angle, azimuth, latitude, longitude, altitude, layout, sha256, header_digest,
+        zenith_angle, azimuth, latitude, longitude, altitude, layout, sha256, format_name,
+        header_digest,
     ) = row  # fmt: skip
     return Granule(
         path=path,
@@ -284,5 +285,6 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
         altitude=altitude,
         layout=layouts[layout],
         sha256=sha256,
+        format=format_name,
         header_digest=header_digest,
     )

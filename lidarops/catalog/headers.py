@@ -13,14 +13,16 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
-from lidarops.raw import licel
+from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
+from lidarops.raw.header import HeaderOrder, RawHeader
 from lidarops.records import Granule, Role, Status
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
 
 _UNREADABLE: Final = "cannot be read"
-"""Start of the reason if a refused file may be readable another time."""
+_TRY_AGAIN: Final = (_UNREADABLE, UNKNOWN_FORMAT)
+"""Starts of the reason if a refused file may be readable another time, or its format be added."""
 
 _HEADER_BYTES = 16384
 _FAR_FROM_STATION = 0.5
@@ -52,7 +54,7 @@ class _Place:
 
     latitude: float
     longitude: float
-    header_position: licel.HeaderOrder | Literal["ignore"]
+    header_position: HeaderOrder | Literal["ignore"]
     pointings: tuple[_Pointing, ...]
 
     def pointing(self, moment: datetime) -> tuple[float | None, float | None]:
@@ -96,7 +98,7 @@ class Headers:
 
     def row(self, due: UnreadFile, granule: Granule) -> GranuleRow:
         """Return the row of a granule."""
-        retry = granule.reason.startswith(_UNREADABLE)
+        retry = granule.reason.startswith(_TRY_AGAIN)
         return row_of(granule, self._campaign, RETRY if retry else due.scan_key)
 
 
@@ -114,9 +116,8 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
         claimants = f"{due.instrument} and {', '.join(due.rivals)}"
         return _refused(due, f"claimed by instruments {claimants} (make their patterns disjoint)")
     try:
-        header = licel.parse_header(
-            headers.source.head(file.path, _HEADER_BYTES), file=file.path, size=file.size
-        )
+        head = headers.source.head(file.path, _HEADER_BYTES)
+        header = parse_raw_header(head, file=file.path, size=file.size)
         return _accepted(due, header, headers.place(due.instrument))
     except RawFormatError as error:
         return _refused(due, str(error).removeprefix(f"{file.path}: "))
@@ -136,12 +137,14 @@ def _refused(due: UnreadFile, reason: str) -> Granule:
     )
 
 
-def _accepted(due: UnreadFile, header: licel.Header, place: _Place) -> Granule:
+def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
     zenith_angle, azimuth = place.pointing(header.start)
     notes = header.notes
     latitude, longitude = place.latitude, place.longitude
-    if place.header_position != "ignore":
-        latitude, longitude = header.position(place.header_position)
+    order = place.header_position
+    position = None if order == "ignore" else header.position(order)
+    if position is not None:
+        latitude, longitude = position
         distance = max(abs(latitude - place.latitude), abs(longitude - place.longitude))
         if distance > _FAR_FROM_STATION:
             note = _position_note(latitude, longitude, place.latitude, place.longitude)
@@ -161,8 +164,9 @@ def _accepted(due: UnreadFile, header: licel.Header, place: _Place) -> Granule:
         latitude=latitude,
         longitude=longitude,
         altitude=header.altitude,
-        layout=licel.layout(header),
-        header_digest=licel.header_digest(header),
+        layout=header.layout,
+        format=header.format,
+        header_digest=header.digest,
     )
 
 

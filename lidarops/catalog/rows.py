@@ -70,10 +70,12 @@ def _stamp(granule: Granule, scan_key: str, layout: str) -> tuple[int, int]:
         granule.role.value,
         granule.status.value,
         granule.reason,
-        granule.start,
-        granule.stop,
+        # As numbers: the repr of a time takes twice as long.
+        None if granule.start is None else granule.start.timestamp(),
+        None if granule.stop is None else granule.stop.timestamp(),
         granule.zenith_angle,
         granule.azimuth,
+        granule.format,
         layout,
     )
     digest = hashlib.sha256(repr(facts).encode("utf-8", "backslashreplace")).digest()
@@ -109,6 +111,7 @@ def _values(granule: Granule, campaign: str, scan_key: str, layout: str) -> dict
         "altitude": granule.altitude,
         "layout": layout,
         "sha256": granule.sha256,
+        "format": granule.format,
         "header_digest": granule.header_digest,
         "day": None if granule.start is None else day_of(granule.start),
         "stamp_low": low,

@@ -48,6 +48,8 @@ GRANULE = sa.Table(
     sa.Column("altitude", sa.Float),
     sa.Column("layout", sa.ForeignKey("layout.hash")),
     sa.Column("sha256", _DIGEST),
+    # Name of the raw format; empty where the file is refused.
+    sa.Column("format", _NAME, nullable=False),
     sa.Column("header_digest", sa.String(16)),
     # Day of the start, in days since 1970-01-01; null if the start is unknown.
     sa.Column("day", sa.Integer),

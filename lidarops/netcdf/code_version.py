@@ -17,6 +17,8 @@ _EVERY_PRODUCT: Final = (
     "lidarops.process.scene",
     "lidarops.netcdf.build",
     "lidarops.netcdf.write",
+    # Found by entry point, so that no import leads to it.
+    "lidarops.raw.licel_format",
 )
 """Modules that every product passes through."""
 _OF_KIND: Final = ("settings", "steps", "variables", "flags")

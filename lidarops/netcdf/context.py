@@ -35,7 +35,8 @@ class Context:
     """Start of the scene's window, not of its first profile."""
     stop: datetime
     provenance: Provenance
-    raw_format: str = "Licel"
+    raw_format: str
+    """Raw format of its files, in words."""
 
 
 def product_path(context: Context) -> str:

@@ -9,6 +9,7 @@ from lidarops.netcdf import provenance
 from lidarops.netcdf.code_version import code_version
 from lidarops.netcdf.context import Context
 from lidarops.process.job import Job
+from lidarops.raw.formats import raw_format
 from lidarops.records import ChannelLayout, DetectionMode, InputRecord, Plan, Provenance, Scene
 from lidarops.steps import dependence
 
@@ -72,6 +73,9 @@ def product_context(
             },
             versions=provenance.package_versions(),
             code_version=code_version(kind),
+        ),
+        raw_format=" and ".join(
+            sorted({raw_format(granule.format).title for granule in (*scene.granules, *scene.dark)})
         ),
     )
 

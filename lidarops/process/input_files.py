@@ -15,9 +15,9 @@ import xarray as xr
 
 from lidarops.campaign.model import Campaign
 from lidarops.errors import CatalogError, LidarOpsError, SceneError
-from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
-from lidarops.raw.model import Stretches
+from lidarops.raw.formats import parse_raw_header
+from lidarops.raw.header import Stretches
 from lidarops.records import Granule, InputRecord, Scene, Status
 from lidarops.steps.dependence import scene_facts
 from lidarops.system.stores import RemoteStore
@@ -111,7 +111,7 @@ def _read_digest(granule: Granule, root: Path) -> str:
             f"holds {len(data)} bytes, {granule.size} according to the catalog",
             remedy="run lidarops catalog again",
         )
-    licel.parse_header(data, file=granule.path, size=len(data))
+    parse_raw_header(data, file=granule.path, size=len(data), known=granule.format)
     return hashlib.sha256(data).hexdigest()
 
 

@@ -1,12 +1,19 @@
 """Raw formats: from the bytes of a file to an xarray Dataset.
 
-The modules in reading order, for Licel files:
+The modules in reading order. For every format:
 
-1. `licel_header`: bytes to `Header` and `Dataset` records.
-2. `licel`: header to counts, counts to physical arrays (mV and MHz). The public functions of the
-   format.
-3. `licel_write`: numbers to header text, counts to bytes.
+1. `header`: header and channels of a file of any format.
+2. `file`: the one place where raw files are opened.
+3. `formats`: what a raw format is, and the registry that finds it by entry point.
 4. `model`: names, attributes and coordinates of raw data in xarray.
-5. `backend`: one file as a lazy Dataset, the xarray engine ``licel``.
-6. `archive`: many files as one dask-backed Dataset, `open_archive`.
+5. `archive`: many files as one dask-backed Dataset, `open_archive`.
+
+For Licel files:
+
+6. `licel_header`: bytes to `Header` and `Dataset` records.
+7. `licel`: header to counts, counts to physical arrays (mV and MHz). The public functions of the
+   format.
+8. `licel_write`: numbers to header text, counts to bytes.
+9. `licel_format`: the format ``licel`` of the registry.
+10. `backend`: one file as a lazy Dataset, the xarray engine ``licel``.
 """

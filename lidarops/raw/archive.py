@@ -1,4 +1,4 @@
-"""Many raw files of one layout as one dask-backed Dataset.
+"""Many raw files of one format and layout as one dask-backed Dataset.
 
 The data model is that of `lidarops.raw.model`. Headers are read when the archive is opened; of
 files whose headers the catalog knows to be equal, one header is read. A task of the graph reads
@@ -25,8 +25,10 @@ from dask.base import tokenize
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.licel import Dataset, RawFile, channel_names, header_digest, to_physical
-from lidarops.raw.model import Columns, Position, Stretches, build_raw_dataset
+from lidarops.raw.file import RawFile
+from lidarops.raw.formats import raw_format, read_raw_header
+from lidarops.raw.header import RawChannel, Stretches, channel_names, to_physical
+from lidarops.raw.model import Columns, Position, build_raw_dataset
 from lidarops.records import Granule
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
@@ -65,7 +67,7 @@ def open_archive(
     root: str | os.PathLike[str] | None = None,
     stretches: Mapping[str, Stretches] | None = None,
 ) -> xr.Dataset:
-    """Open raw files of one layout as one Dataset.
+    """Open raw files of one format and layout as one Dataset.
 
     Parameters
     ----------
@@ -97,7 +99,7 @@ def open_archive(
     Raises
     ------
     RawFormatError
-        If a file cannot be read or is of another layout; the error names the file.
+        If a file cannot be read or is of another format or layout; the error names the file.
     """
     columns = Columns(channel_names(channels), header_position)
     stamps = _read_headers(columns, _files(source, root))
@@ -107,17 +109,17 @@ def open_archive(
     # Hashing one text is faster than dask's walk over a list of numbers.
     token = tokenize(repr(stamps), columns.kept)
 
-    def signal(channel: int, dataset: Dataset) -> da.Array:
-        offsets = columns.channel_values(channel, "offset").astype(np.int64)
-        scales = columns.channel_values(channel, "scale") if mask_and_scale else None
+    def signal(index: int, channel: RawChannel) -> da.Array:
+        places = columns.channel_values(index, "place").astype(np.int64)
+        scales = columns.channel_values(index, "scale") if mask_and_scale else None
         lengths = tuple(len(files.paths) for _, files in chunks)
-        kept = columns.kept.get(dataset.name)
-        name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, lengths)}"
+        kept = columns.kept.get(channel.name)
+        name = f"{columns.format}-{channel.name}-{tokenize(token, places, scales, lengths)}"
         graph = {}
-        for index, (rows, files) in enumerate(chunks):
+        for chunk, (rows, files) in enumerate(chunks):
             scale = None if scales is None else scales[rows]
-            graph[name, index, 0] = (_Chunk(files, offsets[rows], dataset.bins, kept, scale),)
-        shape = (lengths, (dataset.bins,))
+            graph[name, chunk, 0] = (_Chunk(files, places[rows], channel.bins, kept, scale),)
+        shape = (lengths, (channel.bins,))
         dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
 
@@ -143,10 +145,10 @@ def _read_headers(
                 stamps.append((path, granule.size, granule.mtime_ns))
                 continue
         with RawFile(path) as file:
-            header = file.read_header()
+            header = read_raw_header(file, "" if granule is None else granule.format)
             columns.append(header)
             stamps.append((path, file.size, file.mtime_ns))
-        if digest_and_size == (header_digest(header), header.size):
+        if digest_and_size == (header.digest, header.size):
             variants[digest_and_size] = columns.variant[-1]
     return stamps
 
@@ -155,6 +157,8 @@ def _read_headers(
 class _Files:
     """The files of one chunk, shared by the tasks of all channels."""
 
+    format: str
+    """Name of their raw format."""
     paths: tuple[str, ...]
     sizes: tuple[int, ...]
 
@@ -164,7 +168,7 @@ class _Chunk:
     """Task that reads one channel of the files of one chunk; small, and can be pickled."""
 
     files: _Files
-    offsets: NDArray[np.int64]
+    places: NDArray[np.int64]
     bins: int
     kept: Stretches | None
     """Stretches of bins to read; None for all bins."""
@@ -173,40 +177,27 @@ class _Chunk:
 
     def __call__(self) -> NDArray[Any]:
         values = np.empty(
-            (len(self.offsets), self.bins), np.int32 if self.scales is None else np.float32
+            (len(self.places), self.bins), np.int32 if self.scales is None else np.float32
         )
         row = np.empty(self.bins, np.dtype("<i4"))
+        read_counts = raw_format(self.files.format).read_counts
         for index, (path, size) in enumerate(zip(self.files.paths, self.files.sizes, strict=True)):
             with RawFile(path) as file:
                 file.expect(size)
-                offset = int(self.offsets[index])
-                if self.kept is None:
-                    file.read_counts(offset, [row])
-                else:
-                    _read_stretches(file, offset, self.kept, row)
+                read_counts(file, int(self.places[index]), self.kept, row)
             if self.scales is None:
                 values[index] = row
             else:
                 to_physical(row, self.scales[index], values[index])
         count = _COUNT.get()
         if count is not None:
-            count.bytes += len(self.offsets) * self.bins * row.itemsize
+            count.bytes += len(self.places) * self.bins * row.itemsize
         return values
-
-
-def _read_stretches(
-    file: RawFile, offset: int, stretches: Stretches, row: NDArray[np.int32]
-) -> None:
-    start = 0
-    for first, past in stretches:
-        bins = past - first
-        row[start : start + bins] = file.read_part(offset + row.itemsize * first, bins)
-        start += bins
 
 
 def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]]:
     if profiles is None:
-        largest = max(dataset.bins for dataset in columns.datasets)
+        largest = max(channel.bins for channel in columns.selected)
         profiles = max(1, _CHUNK_BYTES // (4 * largest))
     if profiles < 1:
         raise RawFormatError(
@@ -216,7 +207,8 @@ def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]
         )
     slices = [slice(i, i + profiles) for i in range(0, len(columns.paths), profiles)]
     return [
-        (rows, _Files(tuple(columns.paths[rows]), tuple(columns.sizes[rows]))) for rows in slices
+        (rows, _Files(columns.format, tuple(columns.paths[rows]), tuple(columns.sizes[rows])))
+        for rows in slices
     ]
 
 

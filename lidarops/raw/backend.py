@@ -7,7 +7,6 @@ bins only. It can be pickled, because it holds the path and no open file.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -19,10 +18,11 @@ from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.licel import Dataset, RawFile, channel_names, read_header, to_physical
+from lidarops.raw import licel
+from lidarops.raw.file import RawFile
+from lidarops.raw.header import RawChannel, channel_names, to_physical
+from lidarops.raw.licel_format import FORMAT, raw_header
 from lidarops.raw.model import Columns, Position, build_raw_dataset
-
-_FIRST_LINES = re.compile(rb"[^\r\n]{1,1022}\r\n[^\r\n]{0,1022}\d/\d{4} +\d{1,2}:\d\d:\d\d")
 
 
 class LicelBackendEntrypoint(BackendEntrypoint):
@@ -68,16 +68,16 @@ class LicelBackendEntrypoint(BackendEntrypoint):
                 f"cannot open a {type(filename_or_obj).__name__}", remedy="give a local path"
             )
         columns = Columns(channel_names(channels), header_position)
-        header = read_header(filename_or_obj)
+        header = raw_header(licel.read_header(filename_or_obj))
         columns.append(header)
 
-        def signal(_: int, dataset: Dataset) -> Any:
+        def signal(_: int, channel: RawChannel) -> Any:
             array = _Counts(
                 path=header.path,
                 size=header.size,
-                offset=dataset.offset or 0,
-                bins=dataset.bins,
-                scale=dataset.scale if mask_and_scale else None,
+                offset=channel.place,
+                bins=channel.bins,
+                scale=channel.scale if mask_and_scale else None,
             )
             return indexing.LazilyIndexedArray(_LazyCounts(array))
 
@@ -93,7 +93,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
             return False
         try:
             with RawFile(filename_or_obj) as file:
-                return _FIRST_LINES.match(file.read(0, 2048)) is not None
+                return FORMAT.recognises(file.read(0, 2048))
         except RawFormatError:
             return False
 
@@ -122,9 +122,9 @@ class _Counts:
             file.expect(self.size)
             if high - low == self.bins:
                 counts = np.empty(self.bins, np.dtype("<i4"))
-                file.read_counts(self.offset, [counts])
+                licel.read_datasets(file, self.offset, [counts])
             else:
-                counts = file.read_part(self.offset + 4 * low, high - low)
+                counts = licel.read_part(file, self.offset + 4 * low, high - low)
         selected = counts[:: abs(selection.step)][:: int(np.sign(selection.step))]
         if self.scale is None:
             out[...] = selected

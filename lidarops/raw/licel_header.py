@@ -21,10 +21,11 @@ from datetime import UTC, datetime
 from enum import IntEnum
 from functools import lru_cache
 from sys import intern
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
+from lidarops.raw.header import HeaderOrder, IncompleteHeaderError, place_on_earth
 from lidarops.records import DetectionMode
 
 CONVENTION: Final = (
@@ -32,8 +33,6 @@ CONVENTION: Final = (
     " photon counting: MHz = counts / shots * (150 m / bin_width)"
 )
 """Conversion of counts to physical values. Later Licel readers divide by 2^adc_bits - 1."""
-
-HeaderOrder = Literal["longitude_first", "latitude_first"]
 
 _LINE_LIMIT = 1024
 _CACHED_BLOCK = 4 * 1024
@@ -49,9 +48,8 @@ _ICE_POINT = 273.15
 _NUMBER = re.compile(r"[+-]?(?:\d{1,9}(?:[.,]\d{0,9})?|[.,]\d{1,9})", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
-_DATE = r"\d{1,2}/\d{1,2}/\d{4} {1,8}\d{1,2}:\d{2}:\d{2}"
-_DATES = re.compile(rf"(?<!\S)({_DATE}) {{1,8}}({_DATE})(?!\S)", re.ASCII)
-_NOT_DIGITS = re.compile(r"[/: ]+")
+_DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
+_DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
 
 
 class DatasetKind(IntEnum):
@@ -218,18 +216,7 @@ class Header:
         RawFormatError
             If the pair is impossible in this order.
         """
-        latitude, longitude = self.latitude, self.longitude
-        if order == "latitude_first":
-            latitude, longitude = longitude, latitude
-        if abs(latitude) > 90 or abs(longitude) > 180:
-            raise RawFormatError(
-                f"latitude {latitude:g}, longitude {longitude:g} is not a place on Earth",
-                file=self.path or self.name,
-                field="position",
-                remedy=f"header_position is {order}: choose the other order, or 'ignore',"
-                " in the campaign",
-            )
-        return latitude, longitude
+        return place_on_earth(self.longitude, self.latitude, order, self.path or self.name)
 
 
 class _Place(NamedTuple):
@@ -242,10 +229,6 @@ class _Place(NamedTuple):
     pressure: float | None
     custom: str | None
     notes: tuple[str, ...]
-
-
-class IncompleteHeaderError(RawFormatError):
-    """Bytes that end inside the header."""
 
 
 def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> Header:
@@ -368,14 +351,15 @@ def _bounded(value: float, low: float, high: float, name: str) -> None:
 
 
 def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
-    start, stop = _moment(dates[1], "start"), _moment(dates[2], "stop")
+    numbers = list(map(int, dates.groups()))
+    start, stop = _moment(numbers[:6], "start"), _moment(numbers[6:], "stop")
     if stop < start:
         raise RawFormatError(f"{stop:%Y-%m-%d %H:%M:%S} lies before the start", field="stop")
     return start, stop
 
 
-def _moment(text: str, name: str) -> datetime:
-    day, month, year, hour, minute, second = map(int, _NOT_DIGITS.split(text))
+def _moment(numbers: list[int], name: str) -> datetime:
+    day, month, year, hour, minute, second = numbers
     _bounded(year, *_YEARS, name)
     try:
         return datetime(year, month, day, hour, minute, second, tzinfo=UTC)

@@ -1,4 +1,4 @@
-"""Data model of raw files in xarray: names of variables, coordinates and attributes.
+"""Data model of raw files of any format in xarray: names of variables, coordinates and attributes.
 
 Every channel is a variable ``<channel>(time, range)`` in mV (analog) or MHz (photon counting), or
 in raw counts, with ``<channel>_shots(time)`` and, for analog channels,
@@ -27,13 +27,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.licel import CONVENTION, Dataset, Header, check_layout, select_signals
+from lidarops.raw.formats import raw_format
+from lidarops.raw.header import RawChannel, RawHeader, Stretches, check_layout, select_channels
 from lidarops.records import Granule
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
-
-Stretches = tuple[tuple[int, int], ...]
-"""Stretches of bins of a channel, ascending: first bin, and the one past the last."""
 
 POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
 
@@ -70,11 +68,13 @@ _PROPERTIES: Mapping[str, _Property] = {
 
 @dataclass(slots=True)
 class Columns:
-    """Header values of many files of one layout, one column per property."""
+    """Header values of many files of one format and layout, one column per property."""
 
     channels: tuple[str, ...] | None
     """Names to open; None for all."""
     position_order: Position
+    format: str = ""
+    """Name of the raw format; empty without files."""
     paths: list[str] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     times: list[tuple[int, int]] = field(default_factory=list)
@@ -83,10 +83,10 @@ class Columns:
     """Latitude, longitude, altitude, zenith angle, azimuth; NaN if unknown."""
     sites: set[str] = field(default_factory=set)
     notes: set[str] = field(default_factory=set)
-    variants: dict[tuple[Dataset, ...], tuple[int, tuple[Dataset, ...]]] = field(
+    variants: dict[tuple[RawChannel, ...], tuple[int, tuple[RawChannel, ...]]] = field(
         default_factory=dict
     )
-    """All datasets of a header -> number of the variant, selected datasets."""
+    """All channels of a header -> number of the variant, selected channels."""
     variant: list[int] = field(default_factory=list)
     kept: dict[str, Stretches] = field(default_factory=dict)
     """Stretches of the channels of which some bins are left out."""
@@ -99,38 +99,47 @@ class Columns:
                 remedy=f"choose one of {', '.join(POSITIONS)}",
             )
 
-    def append(self, header: Header) -> None:
+    def append(self, header: RawHeader) -> None:
         """Add a file.
 
         Raises
         ------
         RawFormatError
-            If the file lacks a channel, has it on another range grid than the first file, or has
-            an impossible position.
+            If the file is of another format than the first file, lacks a channel, has it on
+            another range grid than the first file, or has an impossible position.
         """
-        if header.datasets not in self.variants:
-            selected = select_signals(header, self.channels)
-            check_layout(header, selected, self.datasets if self.variants else selected)
-            ordered = sorted(selected, key=lambda d: self._rank(d.name))
-            self.variants[header.datasets] = (len(self.variants), tuple(ordered))
+        if header.format != self.format:
+            self._start_format(header)
+        if header.channels not in self.variants:
+            selected = select_channels(header, self.channels)
+            check_layout(header.path, selected, self.selected if self.variants else selected)
+            ordered = sorted(selected, key=lambda channel: self._rank(channel.name))
+            self.variants[header.channels] = (len(self.variants), tuple(ordered))
         position = (
-            (math.nan, math.nan)
-            if self.position_order == "ignore"
-            else header.position(self.position_order)
-        )
-        pointing = (header.zenith_angle, _nan_if_none(header.azimuth))
+            None if self.position_order == "ignore" else header.position(self.position_order)
+        ) or (math.nan, math.nan)
+        pointing = (_nan_if_none(header.zenith_angle), _nan_if_none(header.azimuth))
         self.sites.add(header.site)
         self.notes.update(header.notes)
         self._add_row(
             header.path,
             header.size,
             (header.start, header.stop),
-            (*position, header.altitude, *pointing),
-            self.variants[header.datasets][0],
+            (*position, _nan_if_none(header.altitude), *pointing),
+            self.variants[header.channels][0],
         )
 
+    def _start_format(self, header: RawHeader) -> None:
+        if self.format:
+            raise RawFormatError(
+                f"is of raw format {header.format}, the files before it of {self.format}",
+                file=header.path,
+                remedy="open files of one format",
+            )
+        self.format = header.format
+
     def append_alike(self, granule: Granule, path: str, variant: int) -> None:
-        """Add a file whose header has the site and datasets of another file.
+        """Add a file whose header has the site and channels of another file.
 
         Parameters
         ----------
@@ -169,12 +178,12 @@ class Columns:
         self.variant.append(variant)
 
     @property
-    def datasets(self) -> tuple[Dataset, ...]:
-        """Selected datasets of the first file."""
+    def selected(self) -> tuple[RawChannel, ...]:
+        """Selected channels of the first file."""
         return next(iter(self.variants.values()))[1]
 
     def channel_values(self, channel: int, name: str) -> NDArray[Any]:
-        """Return a property of dataset number `channel`, one value per file."""
+        """Return a property of selected channel number `channel`, one value per file."""
         by_variant = [getattr(selected[channel], name) for _, selected in self.variants.values()]
         return np.array(by_variant)[self.variant]
 
@@ -187,8 +196,8 @@ class Columns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the selected datasets."""
-        return tuple(dataset.name for dataset in self.datasets)
+        """Names of the selected channels."""
+        return tuple(channel.name for channel in self.selected)
 
     def keep(self, stretches: Mapping[str, Stretches]) -> None:
         """Keep only some bins of these channels.
@@ -198,7 +207,7 @@ class Columns:
         RawFormatError
             If a channel is not opened, or its stretches do not ascend.
         """
-        stored = {dataset.name: dataset.bins for dataset in self.datasets}
+        stored = {channel.name: channel.bins for channel in self.selected}
         for name, requested in stretches.items():
             edges = [edge for stretch in requested for edge in stretch]
             ascending = all(low < high for low, high in pairwise(edges))
@@ -213,21 +222,21 @@ class Columns:
             if self.kept[name] == ((0, stored[name]),):
                 del self.kept[name]
         self.variants = {
-            datasets: (
+            channels: (
                 number,
-                tuple(replace(d, bins=count_bins(self.stretches(d))) for d in selected),
+                tuple(replace(c, bins=count_bins(self.stretches(c))) for c in selected),
             )
-            for datasets, (number, selected) in self.variants.items()
+            for channels, (number, selected) in self.variants.items()
         }
 
-    def stretches(self, dataset: Dataset) -> Stretches:
-        """Return the kept stretches of bins of a selected dataset."""
-        return self.kept.get(dataset.name, ((0, dataset.bins),))
+    def stretches(self, channel: RawChannel) -> Stretches:
+        """Return the kept stretches of bins of a selected channel."""
+        return self.kept.get(channel.name, ((0, channel.bins),))
 
     def _rank(self, name: str) -> int:
         if not self.variants:
             return 0
-        return next(i for i, dataset in enumerate(self.datasets) if dataset.name == name)
+        return next(i for i, channel in enumerate(self.selected) if channel.name == name)
 
 
 def _nan_if_none(value: float | None) -> float:
@@ -239,8 +248,8 @@ def count_bins(stretches: Stretches) -> int:
     return sum(past - first for first, past in stretches)
 
 
-Signal = Callable[[int, Dataset], Any]
-"""Channel number, its dataset in the first file -> array (time, range), lazy or not."""
+Signal = Callable[[int, RawChannel], Any]
+"""Number of a channel, the channel in the first file -> array (time, range), lazy or not."""
 
 
 def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
@@ -256,16 +265,16 @@ def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.D
     """
     grids = _grids(columns)
     variables: dict[str, xr.Variable] = {}
-    for channel, dataset in enumerate(columns.datasets):
-        dims = ("time", grids[columns.stretches(dataset), dataset.bin_width])
-        extra, attributes = _channel_properties(columns, channel, scaled=scaled)
-        variables[dataset.name] = xr.Variable(dims, signal(channel, dataset), attributes)
+    for index, channel in enumerate(columns.selected):
+        dims = ("time", grids[columns.stretches(channel), channel.bin_width])
+        extra, attributes = _channel_properties(columns, index, scaled=scaled)
+        variables[channel.name] = xr.Variable(dims, signal(index, channel), attributes)
         variables.update(extra)
     return xr.Dataset(
         variables,
         {**_time(columns), **_ranges(grids), **_place(columns)},
         {
-            "source_format": "Licel",
+            "source_format": raw_format(columns.format).title,
             "site": ", ".join(sorted(columns.sites)),
             **({"notes": "; ".join(sorted(columns.notes))} if columns.notes else {}),
         },
@@ -274,50 +283,52 @@ def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.D
 
 def _grids(columns: Columns) -> dict[tuple[Stretches, float], str]:
     # The most common grid is "range"; the others follow in file order.
-    uses = Counter((columns.stretches(d), d.bin_width) for d in columns.datasets)
+    uses = Counter((columns.stretches(c), c.bin_width) for c in columns.selected)
     ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
     return {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
 
 
 def _channel_properties(
-    columns: Columns, channel: int, *, scaled: bool
+    columns: Columns, index: int, *, scaled: bool
 ) -> tuple[dict[str, xr.Variable], dict[str, Any]]:
-    dataset = columns.datasets[channel]
-    devices = sorted(set(columns.channel_values(channel, "device").tolist()))
+    channel = columns.selected[index]
+    devices = sorted(set(columns.channel_values(index, "device").tolist()))
     attributes = {
-        **_attributes(dataset, scaled=scaled),
+        **_attributes(channel, scaled=scaled),
+        "conversion": raw_format(columns.format).conversion,
         "device": ", ".join(devices),
-        **_full_scale(columns, channel, scaled=scaled),
+        **_full_scale(columns, index, scaled=scaled),
     }
     variables = {}
     for name, prop in _PROPERTIES.items():
-        values = columns.channel_values(channel, name)
-        if values[0] is None or (name == "scale" and scaled):
+        values = columns.channel_values(index, name)
+        # Of type object where a file lacks the property.
+        if values.dtype == object or (name == "scale" and scaled):
             continue
         if prop.may_be_attribute and _is_constant(values):
             attributes[name] = values[0].item()
             continue
-        variables[f"{dataset.name}_{name}"] = xr.Variable(
+        variables[f"{channel.name}_{name}"] = xr.Variable(
             ("time",),
             values.astype(prop.dtype),
             {
-                "units": prop.units or dataset.units,
-                "long_name": f"{prop.description} of {dataset.name}",
+                "units": prop.units or channel.units,
+                "long_name": f"{prop.description} of {channel.name}",
             },
         )
     return variables, attributes
 
 
-def _full_scale(columns: Columns, channel: int, *, scaled: bool) -> dict[str, float]:
-    dataset = columns.datasets[channel]
-    if dataset.input_range is None:
+def _full_scale(columns: Columns, index: int, *, scaled: bool) -> dict[str, float]:
+    channel = columns.selected[index]
+    if channel.input_range is None:
         return {}
     if scaled:
         # In the precision of the signal, so saturated values compare equal.
-        nominal = columns.channel_values(channel, "input_range") * 1e3 * (1 - 0.5**dataset.adc_bits)
+        nominal = columns.channel_values(index, "input_range") * 1e3 * (1 - 0.5**channel.adc_bits)
         values = nominal.astype(np.float32)
     else:
-        values = columns.channel_values(channel, "full_scale")
+        values = columns.channel_values(index, "full_scale")
     return {"full_scale": values[0].item()} if _is_constant(values) else {}
 
 
@@ -325,21 +336,20 @@ def _is_constant(values: NDArray[Any]) -> bool:
     return bool((values == values[0]).all())
 
 
-def _attributes(dataset: Dataset, *, scaled: bool) -> dict[str, Any]:
-    polarisation = _POLARISATIONS.get(dataset.polarisation, dataset.polarisation)
-    kind = dataset.kind.name.lower().replace("_", " ")
-    label = int(dataset.wavelength_label.partition(".")[0])
-    wavelength = {} if math.isnan(dataset.wavelength) else {"wavelength": dataset.wavelength}
+def _attributes(channel: RawChannel, *, scaled: bool) -> dict[str, Any]:
+    polarisation = _POLARISATIONS.get(channel.polarisation, channel.polarisation)
+    mode = channel.mode.value
+    label = int(channel.wavelength_label.partition(".")[0])
+    wavelength = {} if math.isnan(channel.wavelength) else {"wavelength": channel.wavelength}
     return {
-        "units": dataset.units if scaled else "count",
-        "long_name": f"{kind} signal at {label} nm, {polarisation} polarisation",
-        "detection_mode": kind,
-        "wavelength_label": dataset.wavelength_label,
+        "units": channel.units if scaled else "count",
+        "long_name": f"{mode} signal at {label} nm, {polarisation} polarisation",
+        "detection_mode": mode,
+        "wavelength_label": channel.wavelength_label,
         **wavelength,
         "polarisation": polarisation,
-        "bin_width": dataset.bin_width,
-        "adc_bits": dataset.adc_bits,
-        "conversion": CONVENTION,
+        "bin_width": channel.bin_width,
+        "adc_bits": channel.adc_bits,
     }
 
 

@@ -21,7 +21,8 @@ from rich.text import Text
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
 from lidarops.flags import Quality
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
-from lidarops.raw import licel
+from lidarops.raw.file import RawFile
+from lidarops.raw.formats import read_raw_header
 
 _LONG: Final = {"comment", "history", "references"}
 """Attributes too long for a table; the JSON output has them."""
@@ -31,7 +32,7 @@ _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
 def describe(file: Path) -> dict[str, Any]:
-    """Describe a raw Licel file or a NetCDF product.
+    """Describe a raw file or a NetCDF product.
 
     Parameters
     ----------
@@ -90,20 +91,14 @@ def provenance(file: Path) -> str:
 
 def _raw(file: Path) -> dict[str, Any]:
     try:
-        header = licel.read_header(file)
+        with RawFile(file) as opened:
+            header = read_raw_header(opened)
     except RawFormatError as error:
-        error.remedy = error.remedy or "lidarops inspect reads Licel files and NetCDF products"
+        error.remedy = error.remedy or "lidarops inspect reads raw files and NetCDF products"
         raise
-    description: dict[str, Any] = _plain(header)
-    channels = description.pop("datasets")
-    for channel, dataset in zip(channels, header.datasets, strict=True):
-        channel |= {
-            "name": dataset.name,
-            "bin_width": dataset.bin_width,
-            "wavelength": _plain(dataset.wavelength),
-        }
-    description |= {"zenith_angle": header.zenith_angle}
-    return {"type": "raw", "file": str(file), **description, "channels": channels}
+    description: dict[str, Any] = _plain(header._asdict())
+    # What only its format holds comes besides.
+    return {"type": "raw", "file": str(file), **(description.pop("record") or {}), **description}
 
 
 def _product(file: Path) -> dict[str, Any]:

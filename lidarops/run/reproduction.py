@@ -30,7 +30,8 @@ from lidarops.netcdf.provenance import (
 )
 from lidarops.process.job import Job
 from lidarops.process.scene import process_scene
-from lidarops.raw import licel
+from lidarops.raw.file import RawFile
+from lidarops.raw.formats import read_raw_header
 from lidarops.records import Granule, InputRecord, LeftOut, Plan, PlannedStep, Role, Scene, Status
 from lidarops.system.stores import RemoteStore, is_url
 
@@ -521,18 +522,19 @@ def _order(granule: Granule) -> tuple[bool, datetime | None, str]:
 
 
 def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:
-    path = root / record.path
-    header = licel.read_header(path)
+    with RawFile(root / record.path) as file:
+        header = read_raw_header(file)
     return Granule(
         path=record.path,
-        size=path.stat().st_size,
+        size=header.size,
         mtime_ns=0,
         instrument=instrument,
         role=record.role,
         status=Status.GOOD,
         start=header.start,
         stop=header.stop,
-        layout=licel.layout(header),
+        layout=header.layout,
+        format=header.format,
     )
 
 

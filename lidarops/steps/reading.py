@@ -9,7 +9,7 @@ from typing import Final
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
-from lidarops.raw.model import Stretches
+from lidarops.raw.header import Stretches
 from lidarops.records import PlannedStep
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS, NOISE_WINDOW
 from lidarops.settings import SettingsModel

@@ -48,13 +48,13 @@ def store(campaign: Campaign) -> Iterator[Store]:
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List that collects the names of files whose headers are parsed."""
     names: list[str] = []
-    parse = headers.licel.parse_header
+    parse = headers.parse_raw_header
 
     def counting(buffer: bytes, *, file: str, size: int) -> object:
         names.append(file)
         return parse(buffer, file=file, size=size)
 
-    monkeypatch.setattr(headers.licel, "parse_header", counting)
+    monkeypatch.setattr(headers, "parse_raw_header", counting)
     return names
 
 

@@ -26,7 +26,7 @@ from lidarops.steps.reading import idle_window, read_windows
 from lidarops.process import channel_steps
 from lidarops.process import scene as processing
 from lidarops.process.scene import Job, process_scene
-from lidarops.raw.licel import RawFile
+from lidarops.raw.file import RawFile
 from lidarops.records import Plan, Role, RunRecord, PlannedStep
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
@@ -518,7 +518,9 @@ def test_a_file_with_a_changed_time_is_read_again(tmp_path, monkeypatch):
     seen: list[str] = []
     read = RawFile.read_header
     monkeypatch.setattr(
-        RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
+        RawFile,
+        "read_header",
+        lambda file, parse: seen.append(Path(file.path).name) or read(file, parse),
     )
     process_scene(Job(campaign, stale, plan_scene(stale, campaign)))
     assert set(seen) == {"h0", "h1", "h2", "h3"}
@@ -530,7 +532,9 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
     seen: list[str] = []
     read = RawFile.read_header
     monkeypatch.setattr(
-        RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
+        RawFile,
+        "read_header",
+        lambda file, parse: seen.append(Path(file.path).name) or read(file, parse),
     )
 
     def again(**changes: Any) -> list[str]:

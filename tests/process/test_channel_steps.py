@@ -220,6 +220,7 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "start": datetime(2026, 3, 1, tzinfo=UTC),
         "stop": datetime(2026, 3, 1, tzinfo=UTC) + timedelta(days=1),
         "provenance": Provenance("test", plan.scene, "elastic", channel, (), plan, {}, {}, "0"),
+        "raw_format": "Licel",
     }
     product = build_product(retrieved, Context(**settings))
     assert product["backscatter"].dims == ("time", "range")

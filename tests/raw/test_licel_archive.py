@@ -18,7 +18,8 @@ import lidarops
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
-from lidarops.raw.licel import RawFile
+from lidarops.raw.file import RawFile
+from lidarops.raw.licel_format import raw_header
 from lidarops.records import Granule, Role, Status
 
 SYNCHRONOUS = {"scheduler": "synchronous"}
@@ -129,13 +130,11 @@ def test_only_the_nearest_bins_are_read(pilar, stacked, monkeypatch):
     whole = near.analog_532p
     assert near.photon_532s.shape == (len(pilar), 100)
     read = []
-    monkeypatch.setattr(RawFile, "read_counts", lambda *_: pytest.fail("the whole channel"))
-    part = RawFile.read_part
-    monkeypatch.setattr(
-        RawFile, "read_part", lambda file, at, n: read.append(n) or part(file, at, n)
-    )
+    pread = os.pread
+    monkeypatch.setattr(os, "preadv", lambda *_: pytest.fail("the whole channel"))
+    monkeypatch.setattr(os, "pread", lambda d, n, at: read.append(n) or pread(d, n, at))
     values = near.photon_532s.values
-    assert read == [100] * len(pilar)
+    assert read == [400] * len(pilar)
     monkeypatch.undo()
     assert np.array_equal(values, stacked.photon_532s.values[:, :100])
     assert np.array_equal(near[near.photon_532s.dims[1]], stacked.range[:100])
@@ -209,7 +208,7 @@ def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
     """Return the granules of files, as in a catalog."""
     granules = []
     for path in paths:
-        header = licel.read_header(path)
+        header = raw_header(licel.read_header(path))
         granules.append(
             Granule(
                 path=str(path.relative_to(folder)),
@@ -224,7 +223,7 @@ def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
                 zenith_angle=header.zenith_angle,
                 azimuth=header.azimuth,
                 altitude=header.altitude,
-                header_digest=licel.header_digest(header),
+                header_digest=header.digest,
             )
         )
     return granules
@@ -236,7 +235,9 @@ def headers_read(monkeypatch) -> list[str]:
     headers_seen: list[str] = []
     read = RawFile.read_header
     monkeypatch.setattr(
-        RawFile, "read_header", lambda file: headers_seen.append(file.path) or read(file)
+        RawFile,
+        "read_header",
+        lambda file, parse: headers_seen.append(file.path) or read(file, parse),
     )
     return headers_seen
 

@@ -322,7 +322,7 @@ def test_datasets_that_are_no_signal_are_not_opened(tmp_path):
     overflow = " 1 5 0 00004 0 0000 7.50 00000.o 0 0 00 000 00 000101 0.0000 OF0"
     path = write(tmp_path, datasets=(overflow, ANALOG))
     assert "overflow_0o" not in xr.open_dataset(path, engine="licel")
-    with pytest.raises(RawFormatError, match="overflow_0o is not a signal"):
+    with pytest.raises(RawFormatError, match="has no channel overflow_0o"):
         xr.open_dataset(path, engine="licel", channels=["overflow_0o"])
 
 

@@ -11,6 +11,7 @@ import pytest
 from support.licel_strategies import naive_physical, naive_read
 
 from lidarops.raw import licel
+from lidarops.raw.licel_format import raw_header
 
 
 @pytest.fixture(scope="session")
@@ -179,7 +180,7 @@ def test_pilar(data_root):
 
 
 def test_layout(data_root):
-    channels = licel.layout(licel.read_header(data_root / "pilar/20241002/h24A0217.301035"))
+    channels = raw_header(licel.read_header(data_root / "pilar/20241002/h24A0217.301035")).layout
     assert len(channels) == 12
     assert channels[3].name == "photon_408o"
     assert (channels[3].bins, channels[3].bin_width, channels[3].adc_bits) == (4096, 7.5, 0)

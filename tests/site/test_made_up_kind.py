@@ -8,6 +8,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from support.archives.aggregate_archive import facts_of
 from support.products import fabricated as fab
 from support.products.made_products import MAKERS
 
-from lidarops import kinds
+from lidarops import kinds, registry
 from lidarops.aggregate.facts import groups
 from lidarops.aggregate.means import write_means
 from lidarops.aggregate.means_variables import Period
@@ -85,8 +86,11 @@ def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Regist
         point = SimpleNamespace(
             name="smooth", value="", load=lambda: import_module("madeup_smooth").KIND
         )
-        points = [*entry_points(group=kinds.GROUP), point]
-        monkeypatch.setattr(kinds, "entry_points", lambda group: points)
+
+        def points(group: str) -> list[Any]:
+            return [*entry_points(group=group), *([point] if group == kinds.GROUP else [])]
+
+        monkeypatch.setattr(registry, "entry_points", points)
         monkeypatch.setitem(MAKERS, "smooth", MAKERS["homogeneous"])
         forget()
 

@@ -83,6 +83,7 @@ def context(kind: str = "homogeneous", **changes: Any) -> Context:
         "start": START,
         "stop": START + timedelta(days=1),
         "provenance": provenance(kind),
+        "raw_format": "Licel",
     }
     return Context(**(fields | changes))
 

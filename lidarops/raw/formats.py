@@ -1,0 +1,130 @@
+"""Registry of the raw formats, which are found by entry point.
+
+A raw format is one `RawFormat`. A package outside lidarops adds one by an entry point of the group
+``lidarops.raw_formats``, and lidarops then catalogues and processes its files like any others::
+
+    [project.entry-points."lidarops.raw_formats"]
+    myformat = "mypackage.myformat:FORMAT"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.errors import RawFormatError
+from lidarops.raw.file import RawFile
+from lidarops.raw.header import RawHeader, Stretches
+from lidarops.registry import registered
+
+GROUP: Final = "lidarops.raw_formats"
+"""Group of entry points."""
+
+UNKNOWN_FORMAT: Final = "is of no known raw format"
+"""What is wrong with a file that no format recognises."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawFormat:
+    """One raw format. Its functions raise `RawFormatError` for what is damaged."""
+
+    name: str
+    """Its name in the catalog."""
+    title: str
+    """Its name in attributes of products."""
+    conversion: str
+    """How counts become physical values, in words."""
+    recognises: Callable[[bytes], bool]
+    """First bytes of a file, 8192 or more if there are so many -> whether it is of this format."""
+    parse_header: Callable[[bytes, str, int], RawHeader]
+    """First bytes or a whole file, its path for messages, its size in bytes -> header.
+
+    `header.IncompleteHeaderError` requests more bytes. Given a whole file, it may check more."""
+    read_counts: Callable[[RawFile, int, Stretches | None, NDArray[np.int32]], None]
+    """Fill a row with the counts of one channel: open file, `place` of the channel, stretches of
+    bins (None for all), row."""
+
+
+@cache
+def raw_formats() -> Mapping[str, RawFormat]:
+    """Return all raw formats by name, in alphabetical order.
+
+    Raises
+    ------
+    LidarOpsError
+        If an entry point cannot be loaded, or two have one name.
+    """
+    formats = registered(GROUP, RawFormat, "raw format")
+    return MappingProxyType(dict(sorted(formats.items())))
+
+
+def raw_format(name: str) -> RawFormat:
+    """Return a raw format by its name.
+
+    Raises
+    ------
+    RawFormatError
+        If there is none of that name.
+    """
+    known = raw_formats()
+    if name not in known:
+        raise RawFormatError(
+            f"there is no raw format {name!r}",
+            remedy=f"formats are {', '.join(known)}; install the package of any other format",
+        )
+    return known[name]
+
+
+def parse_raw_header(head: bytes, *, file: str, size: int, known: str = "") -> RawHeader:
+    """Return the header at the start of `head`.
+
+    Parameters
+    ----------
+    head : bytes
+        A whole file or its beginning.
+    file : str
+        Name for messages.
+    size : int
+        Bytes of the whole file.
+    known : str, optional
+        Name of its format; by default the one that recognises the first bytes.
+
+    Raises
+    ------
+    RawFormatError
+        If no format or more than one recognises the file, or if it is damaged; the error names
+        file and field.
+    """
+    raw = raw_format(known) if known else _recognised(head, file)
+    return raw.parse_header(head, file, size)
+
+
+def _recognised(head: bytes, file: str) -> RawFormat:
+    formats = [raw for raw in raw_formats().values() if raw.recognises(head)]
+    if len(formats) == 1:
+        return formats[0]
+    if formats:
+        raise RawFormatError(
+            f"is recognised by several raw formats: {', '.join(raw.name for raw in formats)}",
+            file=file,
+            remedy="remove the package of one of them",
+        )
+    raise RawFormatError(
+        UNKNOWN_FORMAT,
+        file=file,
+        remedy=f"formats are {', '.join(raw_formats())}; install the package of any other format,"
+        " or make the pattern of the instrument leave the file out",
+    )
+
+
+def read_raw_header(file: RawFile, known: str = "") -> RawHeader:
+    """Read and check the header of a file, not its counts; see `parse_raw_header`."""
+    return file.read_header(
+        lambda head: parse_raw_header(head, file=file.path, size=file.size, known=known)
+    )

@@ -1,0 +1,235 @@
+"""Header of a raw file of any format: what the catalog and the data model need of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.errors import RawFormatError
+from lidarops.records import ChannelLayout, DetectionMode
+
+HeaderOrder = Literal["longitude_first", "latitude_first"]
+
+Stretches = tuple[tuple[int, int], ...]
+"""Stretches of bins of a channel, ascending: first bin, and the one past the last."""
+
+
+class IncompleteHeaderError(RawFormatError):
+    """Bytes that end inside the header."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawChannel:
+    """One analog or photon-counting channel that a raw file stores."""
+
+    name: str
+    """Unique in its file: mode, wavelength in nm and polarisation, such as ``photon_532o``."""
+    mode: DetectionMode
+    wavelength: float
+    """m; NaN where the header gives no plausible wavelength."""
+    wavelength_label: str
+    """Wavelength as written; what stands before its first dot is a whole number of nm."""
+    bins: int
+    bin_width: float
+    """m."""
+    shots: int
+    scale: float
+    """Physical value of one count, mV (analog) or MHz (photon counting); NaN without shots."""
+    place: int
+    """Where the file holds the counts, for the format's own use: byte, column or number."""
+    adc_bits: int = 0
+    """0 for photon counting."""
+    polarisation: str = "o"
+    """o none, p parallel, s perpendicular, r and l circular."""
+    device: str = ""
+    input_range: float | None = None
+    """V; None unless analog."""
+    laser: int | None = None
+    high_voltage: float | None = None
+    """V."""
+    discriminator: float | None = None
+    """V; None unless photon counting."""
+    bin_shift: float | None = None
+    """Bins."""
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.place, self.shots))
+
+    @property
+    def units(self) -> str:
+        """Unit of the physical values."""
+        return "mV" if self.mode is DetectionMode.ANALOG else "MHz"
+
+    @property
+    def full_scale(self) -> int | None:
+        """Counts of a saturated digitiser, ``shots (2^adc_bits - 1)``; None without one."""
+        analog = self.mode is DetectionMode.ANALOG
+        return self.shots * ((1 << self.adc_bits) - 1) if analog else None
+
+
+class RawHeader(NamedTuple):
+    """Header of one raw file; a tuple, because millions are made."""
+
+    format: str
+    """Name of the raw format."""
+    path: str
+    """File, for messages."""
+    size: int
+    """Bytes of the file."""
+    start: datetime
+    """UTC."""
+    stop: datetime
+    """UTC."""
+    channels: tuple[RawChannel, ...]
+    """In file order. Files with equal channels should share one tuple, for speed."""
+    digest: str
+    """At most 16 characters; equal for files with equal site and channels."""
+    zenith_angle: float | None = None
+    """degree, 0 = up."""
+    azimuth: float | None = None
+    """degree in [0, 360)."""
+    altitude: float | None = None
+    """m above the geoid."""
+    coordinates: tuple[float, float] | None = None
+    """degree; longitude and latitude, unless the instrument writes them the other way round."""
+    site: str = ""
+    notes: tuple[str, ...] = ()
+    """Oddities of the header, in words."""
+    record: Any = None
+    """The header as its format holds it, a dataclass; ``lidarops inspect`` shows its fields too."""
+
+    def position(self, order: HeaderOrder = "longitude_first") -> tuple[float, float] | None:
+        """Return latitude and longitude in degree; None where the header holds none.
+
+        Parameters
+        ----------
+        order : {"longitude_first", "latitude_first"}
+            Coordinate that the instrument writes first.
+
+        Raises
+        ------
+        RawFormatError
+            If the pair is impossible in this order.
+        """
+        if self.coordinates is None:
+            return None
+        return place_on_earth(*self.coordinates, order, self.path)
+
+    @property
+    def layout(self) -> tuple[ChannelLayout, ...]:
+        """Channels and their range grids, in file order."""
+        return _layout(self.channels)
+
+
+def place_on_earth(
+    longitude: float, latitude: float, order: HeaderOrder, file: str
+) -> tuple[float, float]:
+    """Return latitude and longitude of a header, swapped if it holds the latitude first.
+
+    Raises
+    ------
+    RawFormatError
+        If the pair is impossible in this order.
+    """
+    if order == "latitude_first":
+        latitude, longitude = longitude, latitude
+    if abs(latitude) > 90 or abs(longitude) > 180:
+        raise RawFormatError(
+            f"latitude {latitude:g}, longitude {longitude:g} is not a place on Earth",
+            file=file,
+            field="position",
+            remedy=f"header_position is {order}: choose the other order, or 'ignore',"
+            " in the campaign",
+        )
+    return latitude, longitude
+
+
+@lru_cache(maxsize=128)
+def _layout(channels: tuple[RawChannel, ...]) -> tuple[ChannelLayout, ...]:
+    return tuple(
+        ChannelLayout(
+            name=channel.name,
+            mode=channel.mode,
+            wavelength=channel.wavelength,
+            bins=channel.bins,
+            bin_width=channel.bin_width,
+            adc_bits=channel.adc_bits,
+        )
+        for channel in channels
+    )
+
+
+def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:
+    """Return channel names without duplicates, also of a single name; None stands for all."""
+    if channels is None:
+        return None
+    return tuple(dict.fromkeys([channels] if isinstance(channels, str) else channels))
+
+
+def select_channels(header: RawHeader, names: tuple[str, ...] | None) -> tuple[RawChannel, ...]:
+    """Return the channels of these names, in their order; all in file order for None.
+
+    Raises
+    ------
+    RawFormatError
+        If a channel is not stored, or there is none; the error names the stored ones.
+    """
+    stored = {channel.name: channel for channel in header.channels}
+    names = tuple(stored) if names is None else names
+    missing = [name for name in names if name not in stored]
+    if missing or not names:
+        raise RawFormatError(
+            f"has no channel {', '.join(missing)}" if missing else "has no channels",
+            file=header.path,
+            field="channels",
+            remedy=f"stored: {', '.join(stored) or 'none'}",
+        )
+    return tuple(stored[name] for name in names)
+
+
+class _Grid(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def bins(self) -> int: ...
+    @property
+    def bin_width(self) -> float: ...
+    @property
+    def adc_bits(self) -> int: ...
+
+
+def check_layout(path: str, channels: Sequence[_Grid], expected: Sequence[_Grid]) -> None:
+    """Raise if channels of a file differ from the `expected` ones in range grid or ADC bits.
+
+    Raises
+    ------
+    RawFormatError
+        Naming file and channels.
+    """
+    if channels is expected:
+        return
+    grid, expected_grid = _grids(channels), _grids(expected)
+    if grid == expected_grid:
+        return
+    differing = sorted({name for name, *_ in grid ^ expected_grid})
+    raise RawFormatError(
+        "is of another layout (channels, bins, bin width or ADC bits) than the files before it",
+        file=path,
+        field=", ".join(differing),
+        remedy="open files of one layout, or choose channels that are equal in all files",
+    )
+
+
+def _grids(channels: Sequence[_Grid]) -> set[tuple[str, int, float, int]]:
+    return {(c.name, c.bins, c.bin_width, c.adc_bits) for c in channels}
+
+
+def to_physical(counts: NDArray[np.int32], scale: float, out: NDArray[Any]) -> None:
+    """Fill `out` with ``counts * scale``, computed in double precision."""
+    np.multiply(counts, scale, out=out, casting="same_kind")

@@ -1,0 +1,52 @@
+"""What packages add to lidarops by entry points: kinds of product, raw formats."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Protocol, TypeVar
+
+from lidarops.errors import LidarOpsError
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+_Part = TypeVar("_Part", bound=_Named)
+
+
+def registered(group: str, of: type[_Part], noun: str) -> dict[str, _Part]:
+    """Return the objects of a group of entry points by name.
+
+    Parameters
+    ----------
+    group : str
+        Group of entry points.
+    of : type
+        Class of the objects, whose attribute ``name`` is that of the entry point.
+    noun : str
+        What they are, in messages.
+
+    Raises
+    ------
+    LidarOpsError
+        If an entry point cannot be loaded, is of another class or name, or two have one name.
+    """
+    parts: dict[str, _Part] = {}
+    for point in entry_points(group=group):
+        try:
+            part = point.load()
+        except (ImportError, AttributeError) as error:
+            raise LidarOpsError(
+                f"{noun} {point.name!r} cannot be loaded from {point.value}: {error}",
+                remedy="repair or remove the package that registers it",
+            ) from error
+        if not isinstance(part, of) or part.name != point.name or part.name in parts:
+            raise LidarOpsError(
+                f"{noun} {point.name!r} of {point.value} is no {of.__name__} of that name, or the"
+                " name is taken",
+                remedy="repair or remove the package that registers it",
+            )
+        parts[part.name] = part
+    return parts

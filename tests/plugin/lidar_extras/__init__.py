@@ -1,0 +1,1 @@
+"""What a package outside of lidarops adds to it: a raw format."""
