@@ -16,7 +16,6 @@ class SignalSettings(ChannelProduct):
     background_range: tuple[Metres, Metres] | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
     )
-
     background: Literal["tail_mean", "cubic"] = Field(
         default="tail_mean",
         description="mean of background_range, or the cubic of a homogeneous section there",
@@ -26,4 +25,13 @@ class SignalSettings(ChannelProduct):
     def _rising(self) -> Self:
         if self.background_range and self.background_range[0] >= self.background_range[1]:
             raise ValueError("background_range must end farther than it starts")
+        return self
+
+    @model_validator(mode="after")
+    def _has_its_section(self) -> Self:
+        if self.background == "cubic" and self.background_range is None:
+            raise ValueError(
+                "background: cubic needs background_range, the section in m where the air is"
+                " homogeneous and the signal strong"
+            )
         return self
