@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarops.flags import Quality
-from lidarops.kinds import kinds
+from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import NO_STANDARD_NAME, Row, layout_of
 
 PAGE = Path(__file__).with_name("products.md")
@@ -44,15 +43,13 @@ def _bits() -> Iterator[str]:
     yield "\n## Bits of `quality_flag`\n"
     yield "| bit | value | severity | meaning | products |"
     yield "| --- | --- | --- | --- | --- |"
-    for bit in Quality:
-        carriers = [
-            str(kind)
-            for kind in kinds()
-            for layout in [layout_of(kind)]
-            if bit & (layout.row("quality_flag").flags or Quality(0))
-        ]
-        name, severity = str(bit.name).lower(), bit.severity.name.lower()
-        yield f"| `{name}` | {int(bit)} | {severity} | {bit.description} | {', '.join(carriers)} |"
+    carriers: dict[tuple[int, str, str, str], list[str]] = {}
+    for kind in kinds():
+        for bit in flags_of(kind):
+            row = (int(bit), bit.word, bit.severity.name.lower(), bit.description)
+            carriers.setdefault(row, []).append(kind)
+    for (value, word, severity, description), names in sorted(carriers.items()):
+        yield f"| `{word}` | {value} | {severity} | {description} | {', '.join(names)} |"
 
 
 def main() -> None:

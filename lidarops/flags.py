@@ -1,14 +1,26 @@
 """Quality flags: the bits of ``quality_flag``, with their severity and description.
 
-The CF flag attributes of every product follow from this module. A value of ``quality_flag`` is a
-bit mask; 0 means that no test failed. The retrievals in `lidarops.retrieve` and the steps in
-`lidarops.process` raise the bits. `lidarops/products/KIND/variables.py` lists the bits that a kind
-of product can carry.
+A value of ``quality_flag`` is a bit mask; 0 means that no test failed. Bits that raw data, signals
+and background raise, and that mean the same in every kind of product, are in `Quality`; their
+places are the same in all kinds. A retrieval has an enum of its own bits beside it, at places from
+`FIRST_OWN` on, which the retrievals of other kinds use for other bits. ``products/KIND/flags.py``
+states by `Flags` which bits a kind of product can carry. The CF flag attributes follow from that.
+
+Readers of files go by the ``flag_masks`` and ``flag_meanings`` of the file
+(`lidarops.netcdf.stored_flags`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from typing import Final, NamedTuple, Self
+
+FIRST_OWN: Final = 17
+"""Place of the first bit of a kind's own; the bits of `Quality` have lower places."""
+PLACES: Final = 31
+"""Places of bits in ``quality_flag``, an int32 that is never negative."""
 
 
 class Severity(IntEnum):
@@ -20,217 +32,184 @@ class Severity(IntEnum):
     """Do not use: the value does not represent the named quantity."""
 
 
-class Quality(IntFlag):
-    """Quality bits of all products. Their names in lower case are the CF ``flag_meanings``."""
+class Meaning(NamedTuple):
+    """What a bit means, apart from its name."""
 
-    INPUT_MISSING = 1 << 0
-    SATURATED = 1 << 1
-    PILE_UP = 1 << 2
-    INCOMPLETE_OVERLAP = 1 << 3
-    TOO_FEW_BINS = 1 << 4
-    NO_SIGNAL = 1 << 5
-    LOW_SIGNAL = 1 << 6
-    POORLY_DETERMINED = 1 << 7
-    NEGATIVE_AMPLITUDE = 1 << 8
-    AT_BOUND = 1 << 9
-    POOR_FIT = 1 << 10
-    NOT_HOMOGENEOUS = 1 << 11
-    OUTLIER = 1 << 12
-    NO_REAL_SOLUTION = 1 << 13
-    NOT_LEVEL = 1 << 14
-    BACKGROUND_UNCERTAIN = 1 << 15
-    NO_GLUING = 1 << 16
-    CLOUD = 1 << 17
-    NO_REFERENCE = 1 << 18
-    UNSTABLE_INVERSION = 1 << 19
-    NO_LEVERAGE = 1 << 20
-    POOR_STRATIFICATION = 1 << 21
-    PRIOR_DOMINATED = 1 << 22
-    EXTRAPOLATED = 1 << 23
-    INTERPOLATED = 1 << 24
-    ONE_SIDED = 1 << 25
-    LOW_LEVERAGE = 1 << 26
-    NO_RESIDUAL = 1 << 27
-    UNDERSMOOTHED = 1 << 28
-    HIGH_CORRELATION = 1 << 29
-    HORIZONTAL_GRADIENT = 1 << 30
+    severity: Severity
+    description: str
+
+
+class FlagBit(IntFlag):
+    """Base of enums of quality bits, whose members are given as place, severity, description.
+
+    Places count from 0. Names in lower case are the CF ``flag_meanings``. Members of different
+    enums may be the same number: compare them within one kind of product only.
+    """
+
+    severity: Severity
+    description: str
+    """As a phrase without a full stop."""
+
+    def __new__(cls, place: int, severity: Severity, description: str) -> Self:
+        """Return the bit at a place."""
+        bit = int.__new__(cls, 1 << place)
+        bit._value_ = 1 << place
+        bit.severity = severity
+        bit.description = description
+        return bit
 
     @property
-    def description(self) -> str:
-        """What a single bit means, as a phrase without a full stop."""
-        return _ABOUT[self][1]
-
-    @property
-    def severity(self) -> Severity:
-        """Severity of a single bit."""
-        return _ABOUT[self][0]
-
-    @classmethod
-    def rejecting(cls) -> Quality:
-        """Return the union of the bits whose severity is `Severity.REJECT`."""
-        union = cls(0)
-        for bit in cls:
-            if bit.severity is Severity.REJECT:
-                union |= bit
-        return union
+    def word(self) -> str:
+        """Name of a single bit in ``flag_meanings``."""
+        return str(self.name).lower()
 
 
-_ABOUT: dict[Quality, tuple[Severity, str]] = {
-    Quality.INPUT_MISSING: (
+class Quality(FlagBit):
+    """Bits that kinds of product share."""
+
+    INPUT_MISSING = 0, Severity.REJECT, "the raw data are missing or not finite"
+    SATURATED = (
+        1,
         Severity.REJECT,
-        "the raw data are missing or not finite",
-    ),
-    Quality.SATURATED: (
-        Severity.REJECT,
-        (
-            "the digitiser is at full scale in at least some shots, or the photon counter is "
-            "paralysed"
-        ),
-    ),
-    Quality.PILE_UP: (
+        "the digitiser is at full scale in at least some shots, or the photon counter is paralysed",
+    )
+    PILE_UP = (
+        2,
         Severity.CARE,
         (
-            "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the "
-            "dead time is unknown"
+            "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the dead"
+            " time is unknown"
         ),
-    ),
-    Quality.INCOMPLETE_OVERLAP: (
+    )
+    INCOMPLETE_OVERLAP = (
+        3,
         Severity.REJECT,
         (
-            "the range is shorter than that of full overlap between laser beam and telescope "
-            "field of view"
+            "the range is shorter than that of full overlap between laser beam and telescope field"
+            " of view"
         ),
-    ),
-    Quality.TOO_FEW_BINS: (
-        Severity.REJECT,
-        "the section has fewer than 8 valid range bins",
-    ),
-    Quality.NO_SIGNAL: (
-        Severity.REJECT,
-        "the profile is constant: it contains no backscatter",
-    ),
-    Quality.LOW_SIGNAL: (
+    )
+    TOO_FEW_BINS = 4, Severity.REJECT, "the section has fewer than 8 valid range bins"
+    NO_SIGNAL = 5, Severity.REJECT, "the profile is constant: it contains no backscatter"
+    LOW_SIGNAL = (
+        6,
         Severity.REJECT,
         (
-            "the backscatter signal is less than 5 times its standard error, or so small that "
-            "noise may have shifted the root of the cubic"
+            "the backscatter signal is less than 5 times its standard error, or so small that noise"
+            " may have shifted the root of the cubic"
         ),
-    ),
-    Quality.POORLY_DETERMINED: (
-        Severity.REJECT,
-        "the standard error of extinction exceeds 15 percent of (extinction + 1 / mean range)",
-    ),
-    Quality.NEGATIVE_AMPLITUDE: (
-        Severity.REJECT,
-        "the fitted amplitude is not positive",
-    ),
-    Quality.AT_BOUND: (
-        Severity.REJECT,
-        "the extinction lies at a bound of its physical range",
-    ),
-    Quality.POOR_FIT: (
-        Severity.REJECT,
-        "the residuals do not match the stated noise: too large or too small (reduced chi-square)",
-    ),
-    Quality.NOT_HOMOGENEOUS: (
+    )
+    NEGATIVE_AMPLITUDE = 8, Severity.REJECT, "the fitted amplitude is not positive"
+    NOT_HOMOGENEOUS = (
+        11,
         Severity.REJECT,
         "the residuals vary systematically with range: the path is not homogeneous",
-    ),
-    Quality.OUTLIER: (
-        Severity.CARE,
-        "at least one bin deviates by more than 5 standard errors",
-    ),
-    Quality.NO_REAL_SOLUTION: (
-        Severity.REJECT,
-        "the estimating equation has no admissible real root",
-    ),
-    Quality.NOT_LEVEL: (
-        Severity.REJECT,
-        (
-            "the altitude of the path changes by more than 100 m along the section, so a vertical "
-            "gradient of backscatter would mimic extinction"
-        ),
-    ),
-    Quality.BACKGROUND_UNCERTAIN: (
+    )
+    OUTLIER = 12, Severity.CARE, "at least one bin deviates by more than 5 standard errors"
+    NO_REAL_SOLUTION = 13, Severity.REJECT, "the estimating equation has no admissible real root"
+    BACKGROUND_UNCERTAIN = (
+        15,
         Severity.CARE,
         (
-            "the background may contain signal: signal before the far range implies some there, or "
-            "the bins of the background do not look like what its method assumes"
+            "the background may contain signal: signal before the far range implies some there, or"
+            " the bins of the background do not look like what its method assumes"
         ),
-    ),
-    Quality.NO_GLUING: (
+    )
+    NO_GLUING = (
+        16,
         Severity.REJECT,
         (
-            "there is no range in which the analog and the photon-counting signal are both "
-            "linear, so they are not glued"
+            "there is no range in which the analog and the photon-counting signal are both linear,"
+            " so they are not glued"
         ),
-    ),
-    Quality.CLOUD: (
-        Severity.CARE,
-        (
-            "in a cloud, or behind one as seen from the start of the inversion, where the lidar "
-            "ratio of aerosol does not hold"
-        ),
-    ),
-    Quality.NO_REFERENCE: (
-        Severity.REJECT,
-        ("no range window passes the tests for aerosol-free air, so the profile is not calibrated"),
-    ),
-    Quality.UNSTABLE_INVERSION: (
-        Severity.REJECT,
-        (
-            "numerically unstable (near-zero denominator), or beyond the range that the boundary "
-            "value constrains"
-        ),
-    ),
-    Quality.NO_LEVERAGE: (
-        Severity.REJECT,
-        "the zenith angles are too few or too similar to determine an optical depth",
-    ),
-    Quality.POOR_STRATIFICATION: (
-        Severity.REJECT,
-        "the signals of the slant paths differ by more than level layers allow",
-    ),
-    Quality.PRIOR_DOMINATED: (
-        Severity.CARE,
-        "smoothness or another prior determines the extinction more than the data do",
-    ),
-    Quality.EXTRAPOLATED: (
-        Severity.REJECT,
-        "beyond the reach of the signals, where only the prior would determine the value",
-    ),
-    Quality.INTERPOLATED: (
-        Severity.CARE,
-        "in a gap of the data, interpolated from the altitudes above and below",
-    ),
-    Quality.ONE_SIDED: (
-        Severity.CARE,
-        (
-            "the scan covers one side of the zenith only, so a horizontal gradient cannot be "
-            "detected and its systematic error is stated separately"
-        ),
-    ),
-    Quality.LOW_LEVERAGE: (
-        Severity.CARE,
-        "the slant paths differ little, so the result is sensitive to small signal errors",
-    ),
-    Quality.NO_RESIDUAL: (
-        Severity.CARE,
-        "there are as many unknowns as angles, so no residual tests the result",
-    ),
-    Quality.UNDERSMOOTHED: (
-        Severity.CARE,
-        "the profile has more vertical structure than its errors explain",
-    ),
-    Quality.HIGH_CORRELATION: (
-        Severity.CARE,
-        (
-            "errors of neighbouring altitudes are correlated by more than 0.85: confidence "
-            "intervals are too narrow"
-        ),
-    ),
-    Quality.HORIZONTAL_GRADIENT: (
-        Severity.REJECT,
-        "the residuals over zenith angle show a horizontal gradient",
-    ),
-}
+    )
+
+
+def rejecting(bits: Iterable[FlagBit]) -> int:
+    """Return the union of the bits whose severity is `Severity.REJECT`."""
+    return sum({int(bit) for bit in bits if bit.severity is Severity.REJECT})
+
+
+@dataclass(frozen=True, slots=True)
+class Flags:
+    """Bits that a kind of product can carry.
+
+    Raises
+    ------
+    ValueError
+        If two bits have one place or name, or a place is not that of a shared or an own bit.
+    """
+
+    kind: str
+    version: int
+    """Raised when a bit gets another place. Version 1 is that of files that state none."""
+    bits: tuple[FlagBit, ...]
+    """Bits of `Quality`, then the kind's own; rising."""
+
+    def __post_init__(self) -> None:
+        places = [bit.bit_length() - 1 for bit in self.bits]
+        right = all(
+            place < FIRST_OWN if isinstance(bit, Quality) else FIRST_OWN <= place < PLACES
+            for bit, place in zip(self.bits, places, strict=True)
+        )
+        names = {bit.name for bit in self.bits}
+        if not right or places != sorted(set(places)) or len(names) != len(places):
+            raise ValueError(
+                f"flags of {self.kind}: names and places must differ, and places rise: shared bits"
+                f" below {FIRST_OWN}, own bits from {FIRST_OWN} to {PLACES - 1}"
+            )
+
+    def __iter__(self) -> Iterator[FlagBit]:
+        """Iterate over the bits, rising."""
+        return iter(self.bits)
+
+    @property
+    def layout(self) -> str:
+        """Name of the places, such as ``elastic 2``."""
+        return f"{self.kind} {self.version}"
+
+    @property
+    def rejecting(self) -> int:
+        """Union of the bits that reject a value."""
+        return rejecting(self.bits)
+
+    @property
+    def caring(self) -> int:
+        """Union of the bits of values to be used with care."""
+        return sum(self.bits) - self.rejecting
+
+    def raised(self, value: int) -> tuple[FlagBit, ...]:
+        """Return the bits that a value carries; bits that the kind does not have are left out."""
+        return tuple(bit for bit in self.bits if value & bit)
+
+    def named(self, word: str) -> FlagBit | None:
+        """Return a bit by its name in any case; None if the kind does not have it."""
+        return next((bit for bit in self.bits if bit.word == word.lower()), None)
+
+
+# Meanings that several retrievals give to bits of their own.
+POORLY_DETERMINED: Final = Meaning(
+    Severity.REJECT,
+    "the standard error of extinction exceeds 15 percent of (extinction + 1 / mean range)",
+)
+POOR_FIT: Final = Meaning(
+    Severity.REJECT,
+    "the residuals do not match the stated noise: too large or too small (reduced chi-square)",
+)
+UNSTABLE_INVERSION: Final = Meaning(
+    Severity.REJECT,
+    "numerically unstable (near-zero denominator), or beyond the range that the boundary value"
+    " constrains",
+)
+PRIOR_DOMINATED: Final = Meaning(
+    Severity.CARE,
+    "smoothness or another prior determines the extinction more than the data do",
+)
+EXTRAPOLATED: Final = Meaning(
+    Severity.REJECT,
+    "beyond the reach of the signals, where only the prior would determine the value",
+)
+LOW_LEVERAGE: Final = Meaning(
+    Severity.CARE,
+    "the slant paths differ little, so the result is sensitive to small signal errors",
+)

@@ -22,6 +22,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from lidarops.errors import LidarOpsError
+from lidarops.flags import Flags
 from lidarops.registry import registered
 from lidarops.settings import ChannelProduct, NetworkProduct
 
@@ -113,6 +114,25 @@ def kind_of(name: str) -> Kind:
             remedy=f"kinds are {', '.join(known)}; install the package of any other kind",
         )
     return known[name]
+
+
+@cache
+def flags_of(name: str) -> Flags:
+    """Return the quality bits of a kind of product, by the name of the kind.
+
+    Raises
+    ------
+    LidarOpsError
+        If there is no such kind, or it has no valid flags.
+    """
+    kind = kind_of(name)
+    try:
+        flags: Flags = kind.part("flags", "FLAGS")
+    except ValueError as error:
+        raise LidarOpsError(
+            str(error), remedy=f"correct the bits in {kind.package}.flags"
+        ) from error
+    return flags
 
 
 def kinds_of(scope: Scope) -> tuple[Kind, ...]:

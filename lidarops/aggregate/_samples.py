@@ -15,7 +15,8 @@ from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened, within
 from lidarops.aggregate.means_variables import averaged, budget_of, systematic
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of
+from lidarops.netcdf.stored_flags import recoded
 from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
 
 
@@ -29,6 +30,7 @@ class Profiles:
     """s since 1970, middle of each profile."""
     samples: Mapping[str, Sample]
     flags: NDArray[np.int32]
+    """Bits at the places of now, whatever their places in the file."""
     shots: Array
 
 
@@ -47,13 +49,15 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
     Raises
     ------
     ProductError
-        If the product cannot be read, or has changed since its facts were read.
+        If the product cannot be read, has changed since its facts were read, or carries a quality
+        bit that its kind does not have.
     """
     with opened(within(root, facts.path)) as product:
         if product.attrs["id"] != facts.id:
             raise ProductError("changed while it was read", file=facts.path, remedy="run again")
-        flags = product[QUALITY_FLAG].values
-        usable = (flags & np.int32(Quality.rejecting())) == 0
+        stored, known = product[QUALITY_FLAG], flags_of(facts.kind)
+        flags = recoded(stored.values, stored.attrs, known)
+        usable = (flags & np.int32(known.rejecting)) == 0
         rows = [row for row in averaged(facts.kind) if row.name in product]
         return Profiles(
             facts,

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
 from lidarops.kinds import kinds
-from lidarops.netcdf.variables import PROVENANCE, layout_of
+from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
+from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""
@@ -250,8 +250,9 @@ def read_facts(root: Path, path: str) -> Facts:
     with opened(file) as product:
         attributes = product.attrs
         kind = _kind_of(product, file)
-        flags = product["quality_flag"].values
-        rejecting = np.int32(Quality.rejecting())
+        flags = product[QUALITY_FLAG].values
+        bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
+        rejecting = np.int32(rejecting_mask(bits))
         height = "station_altitude" if "station_altitude" in product else "altitude"
         return Facts(
             path=path,
@@ -276,7 +277,7 @@ def read_facts(root: Path, path: str) -> Facts:
             unflagged=flags.size - int(np.count_nonzero(flags)),
             grid=_grid_digest(product, kind),
             code_version=attributes["lidarops_code_version"],
-            flagged=_flagged(flags),
+            flagged={bit.word.upper(): n for bit, n in count_bits(flags, bits).items()},
         )
 
 
@@ -444,11 +445,6 @@ def _moment(text: str) -> datetime:
 def _middle(product: xr.Dataset, name: str) -> float:
     """Return a coordinate of the station, or its mean over a network; NaN if missing."""
     return float(product[name].values.mean()) if name in product else float("nan")
-
-
-def _flagged(flags: NDArray[np.int32]) -> dict[str, int]:
-    counts = {str(bit.name): int(np.count_nonzero(flags & int(bit))) for bit in Quality}
-    return {name: count for name, count in counts.items() if count}
 
 
 def _sha256(file: Path) -> str:

@@ -21,7 +21,7 @@ from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate.facts import FOLDER, Facts, ProductSelection
 from lidarops.aggregate.selection import parse_selection
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of, kinds
 from lidarops.system.files import write_atomically
 
 INDEX: Final = "products.parquet"
@@ -104,9 +104,9 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
         name: arrow.array([cell(facts) for facts in rows], types[kind])
         for name, (kind, cell) in _COLUMNS.items()
     }
-    for bit in Quality:
-        counts = [facts.flagged.get(str(bit.name), 0) for facts in rows]
-        arrays[_flag_column(bit)] = arrow.array(counts, arrow.int64())
+    for name in _flag_names(rows):
+        counts = [facts.flagged.get(name, 0) for facts in rows]
+        arrays[f"flag_{name.lower()}"] = arrow.array(counts, arrow.int64())
     table = arrow.table(arrays).replace_schema_metadata({_KEY: FORMAT})
     stream = io.BytesIO()
     parquet.write_table(
@@ -135,8 +135,10 @@ def _types(arrow: Any) -> dict[str, Any]:
     }
 
 
-def _flag_column(bit: Quality) -> str:
-    return f"flag_{str(bit.name).lower()}"
+def _flag_names(products: Iterable[Facts]) -> list[str]:
+    """Return the names of the bits of all kinds, then those of older products."""
+    known = [str(bit.name) for kind in kinds() for bit in flags_of(kind)]
+    return list(dict.fromkeys([*known, *(name for facts in products for name in facts.flagged)]))
 
 
 def find_products(

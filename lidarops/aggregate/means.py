@@ -27,6 +27,7 @@ from lidarops.aggregate.means_file import (
 from lidarops.aggregate.means_variables import MeansDescription, Period, Weights, systematic
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_product
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
@@ -128,7 +129,7 @@ class _PeriodSums:
                 self.quantities[name] = Sums.like(part, inverse_variance=inverse)
             self.quantities[name].add(part)
         flags = profiles.flags[chosen]
-        usable = (flags & np.int32(Quality.rejecting())) == 0
+        usable = (flags & np.int32(flags_of(self.kind).rejecting)) == 0
         self.profiles += chosen.size
         self.usable = self.usable + usable.sum(axis=0)
         self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)

@@ -156,7 +156,7 @@ def _data(table: Layout, periods: Periods, frame: Frame) -> Iterator[tuple[str, 
     for row in table.variables:
         values: NDArray[Any]
         if row.summary:
-            values = rows.summarize_flags(flags)
+            values = rows.summarize_flags(flags, table.flags)
         elif row.name == rows.QUALITY_FLAG:
             values = flags
         elif row.name in periods.records[0]:

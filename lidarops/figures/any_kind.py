@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lidarops.figures import svg, svg_series
 from lidarops.figures.kind_figures import PageFigures, no_figures, preferred_variables
 from lidarops.figures.series_data import NumberedSeries, SeriesEstimate, quality_bits
+from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
 
 Floats = NDArray[np.float64]
@@ -65,6 +66,8 @@ def read_main_variable(
     variable = some[name]
     table, unknown = _table(variable), np.full(variable.sizes["time"], np.nan)
     flags = quality_bits(_beside(some, QUALITY_FLAG, name, 0.0)).reshape(table.shape)
+    stated = some[QUALITY_FLAG].attrs if QUALITY_FLAG in some else {}
+    rejecting = rejecting_mask(stored_bits(stated, some.attrs.get("lidarops_kind")))
     errors = _table(_beside(some, f"{name}_standard_error", name, np.nan))
     units = str(variable.attrs.get("units", ""))
     most_values = np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:most]
@@ -72,6 +75,7 @@ def read_main_variable(
         NumberedSeries(
             time=some["time"].values.astype("datetime64[ns]"),
             flag=flags[:, k],
+            rejecting=rejecting,
             estimates={name: SeriesEstimate(table[:, k], errors[:, k], unknown, units)},
             noun=str(variable.dims[1]) if variable.ndim > 1 else "",
             number=k,

@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from lidarops.figures.raster import Raster, colour_limits, joined, share_with_care
 from lidarops.figures.series_data import TimeSeries, compare, normalised_error, thin
 from lidarops.figures.time_axis import TimeAxis, Times, segments
-from lidarops.figures.wording import bit_name, counted, percent, visible
-from lidarops.flags import Quality
+from lidarops.figures.wording import counted, percent, visible
+from lidarops.flags import Quality, Severity
 
 Floats = NDArray[np.float64]
 
@@ -411,15 +411,15 @@ def _blocks(
 
 
 def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> str:
-    bits = Quality(0)
-    for raster in rasters:
-        bits |= raster.bits
+    bits = dict.fromkeys(bit for raster in rasters for bit in raster.bits)
+    rejecting = [bit.word for bit in sorted(bits) if bit.severity is Severity.REJECT]
+    caring = [bit.word for bit in sorted(bits) if bit.severity is Severity.CARE]
     handles: list[Artist] = []
     notes: list[str] = []
     if any(raster.flagged.any() for raster in rasters):
-        names = [bit_name(bit) for bit in bits & Quality.rejecting() & ~Quality.INPUT_MISSING]
-        notes.append(f"black: flagged {', '.join(names)}")
-        handles.append(Patch(color=_REJECT_COLOR, label=_wrapped(f"flagged: {', '.join(names)}")))
+        names = ", ".join(word for word in rejecting if word != Quality.INPUT_MISSING.word)
+        notes.append(f"black: flagged {names}")
+        handles.append(Patch(color=_REJECT_COLOR, label=_wrapped(f"flagged: {names}")))
     clouds = sum(int(np.isfinite(raster.clouds).sum()) for raster in rasters)
     if clouds:
         label = f"base of the lowest cloud or dense layer, in {counted(clouds, 'column')}"
@@ -439,8 +439,7 @@ def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> s
         notes.append(f"shown to {far / 1e3:.3g} of {full / 1e3:.3g} km: noise dominates beyond")
     care = share_with_care(rasters)
     if care > 0:
-        names = [bit_name(bit) for bit in bits & ~Quality.rejecting()]
-        notes.append(f"{percent(care)} of all bins: use with care ({', '.join(names)})")
+        notes.append(f"{percent(care)} of all bins: use with care ({', '.join(caring)})")
     if notes[len(handles) :]:
         words = _wrapped("; ".join(notes[len(handles) :]))
         handles.append(Line2D([], [], linestyle="none", label=words))

@@ -24,8 +24,7 @@ from lidarops.figures.raster import Raster
 from lidarops.figures.report_sources import Group, Sources
 from lidarops.figures.series_data import TimeSeries
 from lidarops.figures.time_axis import Times, time_axis
-from lidarops.figures.wording import bit_name, counted, percent, visible
-from lidarops.flags import Quality, Severity
+from lidarops.figures.wording import counted, percent, visible
 
 DPI: Final = 150
 
@@ -115,13 +114,14 @@ def draw_series(
     return figure, panel_stack
 
 
-def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str = "") -> Figure:
+def flags_overview(shares: Mapping[str, Mapping[str, float]], *, title: str = "") -> Figure:
     """Draw the share of values that carry each quality bit, by product.
 
     Parameters
     ----------
     shares : mapping
-        Label of a product -> bit -> share of its values, 0 to 1. At least one product.
+        Label of a product -> name of a bit, with * where it asks for care -> share of its values,
+        0 to 1. At least one product. Bits are shown in the order of their first product.
     title : str, optional
 
     Returns
@@ -129,7 +129,8 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
     Figure
         A shaded table of percentages; only bits that occur.
     """
-    bits = [bit for bit in Quality if any(share.get(bit, 0.0) > 0 for share in shares.values())]
+    named = dict.fromkeys(bit for share in shares.values() for bit in share)
+    bits = [bit for bit in named if any(share.get(bit, 0.0) > 0 for share in shares.values())]
     labels = [" ".join(visible(label).split()) for label in shares]
     width = 1.5 + 0.085 * max(len(label) for label in labels) + 0.8 * max(len(bits), 5)
     figure = Figure(figsize=(width, 1.9 + 0.32 * len(labels)), dpi=DPI, layout="constrained")
@@ -144,8 +145,7 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
     for (row, column), value in np.ndenumerate(values):
         ink = "white" if value > 0.8 else panels.INK if value > 0 else panels.GREY
         panel.text(column, row, percent(value), ha="center", va="center", fontsize=8.5, color=ink)
-    names = [bit_name(b) + ("" if b.severity is Severity.REJECT else " *") for b in bits]
-    panel.set_xticks(range(len(bits)), names, rotation=30, ha="right", fontsize=9)
+    panel.set_xticks(range(len(bits)), bits, rotation=30, ha="right", fontsize=9)
     panel.set_yticks(range(len(labels)), labels, fontsize=9, parse_math=False)
     panel.tick_params(length=0)
     panel.spines[:].set_visible(False)
@@ -154,7 +154,7 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
     return described(
         figure,
         f"{title}: share of values by quality bit. The largest share is"
-        f" {percent(values[row, column])}, {bit_name(bits[column])} in {labels[row]}.",
+        f" {percent(values[row, column])}, {bits[column].removesuffix(' *')} in {labels[row]}.",
     )
 
 

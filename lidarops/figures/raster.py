@@ -5,8 +5,6 @@ Products are read in blocks of bounded memory.
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -18,7 +16,8 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.figures.series_data import quality_bits, require
 from lidarops.figures.time_axis import Times, segments, usual_step
-from lidarops.flags import Quality, Severity
+from lidarops.flags import FlagBit, Flags, Quality
+from lidarops.kinds import flags_of
 
 Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
@@ -50,9 +49,6 @@ _VISIBLE: Final = 1.0
 """The reach of a signal ends where its median falls below this many standard errors."""
 _DECADES: Final = 4.0
 """Most decades of a colour scale."""
-
-_REJECTED: Final = int(Quality.rejecting() & ~Quality.INPUT_MISSING)
-_WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +86,7 @@ class Raster:
     """(column,) Range of the lowest cloud base, m; NaN without a cloud."""
     units: str
     background_units: str
-    bits: Quality
+    bits: tuple[FlagBit, ...]
     """All bits that any bin carries."""
     altitude: tuple[float, float] | None
     """Altitude at range 0 in m, and its change per m of range; None if unknown."""
@@ -151,7 +147,9 @@ def _along_both(quantity: str) -> tuple[str, ...]:
     return quantity, f"{quantity}_standard_error", "quality_flag"
 
 
-def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int = 0) -> Raster:
+def read_raster(
+    product: xr.Dataset, *, quantity: str = "signal", kind: str = "signal", profiles: int = 0
+) -> Raster:
     """Reduce one quantity of a product to block means.
 
     Parameters
@@ -160,6 +158,8 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
         Dimensions (time, range); may be lazy, because it is read in blocks.
     quantity : str, optional
         A variable of the product with a standard error.
+    kind : str, optional
+        Kind of the product, whose quality bits it has.
     profiles : int, optional
         Profiles per column; 0 for about `COLUMNS` columns. Columns do not extend across gaps in
         time.
@@ -183,7 +183,8 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
     size = profiles or -(-time.size // COLUMNS)
     columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(time)])
     rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
-    blocks = list(_reduced(product, quantity, columns, rows))
+    flags = flags_of(kind)
+    blocks = list(_reduced(product, quantity, flags, columns, rows))
     background, background_error = _background(product, columns)
     start, stop = _column_edges(time, columns)
     return Raster(
@@ -202,7 +203,7 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
         clouds=_clouds(product, columns),
         units=str(product[quantity].attrs.get("units", "")),
         background_units=str(product["background"].attrs.get("units", "")),
-        bits=Quality(int(np.bitwise_or.reduce([block.bits for block in blocks]))),
+        bits=flags.raised(int(np.bitwise_or.reduce([block.bits for block in blocks]))),
         altitude=_altitude(product, ranges),
     )
 
@@ -244,7 +245,7 @@ def _joined(rasters: Sequence[Raster]) -> Raster:
         rasters[0],
         **along_time,
         with_care=sum(raster.with_care for raster in rasters),
-        bits=functools.reduce(operator.or_, (raster.bits for raster in rasters)),
+        bits=tuple(sorted({bit for raster in rasters for bit in raster.bits})),
     )
 
 
@@ -261,7 +262,11 @@ class _Block:
 
 
 def _reduced(
-    product: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
+    product: xr.Dataset,
+    quantity: str,
+    flags: Flags,
+    columns: NDArray[np.intp],
+    rows: NDArray[np.intp],
 ) -> Iterator[_Block]:
     bins = product.sizes["range"]
     edges = [*columns, product.sizes["time"]]
@@ -271,12 +276,16 @@ def _reduced(
         while last < columns.size and (edges[last + 1] - edges[first]) * bins * 8 <= _READ_BYTES:
             last += 1
         block = product.isel(time=slice(int(edges[first]), int(edges[last])))
-        yield _sums(block, quantity, columns[first:last] - edges[first], rows)
+        yield _sums(block, quantity, flags, columns[first:last] - edges[first], rows)
         first = last
 
 
 def _sums(
-    product: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
+    product: xr.Dataset,
+    quantity: str,
+    flags: Flags,
+    columns: NDArray[np.intp],
+    rows: NDArray[np.intp],
 ) -> _Block:
     def total(values: Floats | NDArray[np.bool_]) -> Sums:
         if values.dtype == np.bool_ and not values.any():
@@ -290,14 +299,14 @@ def _sums(
     signal = product[quantity].values.astype(np.float64)
     error = product[f"{quantity}_standard_error"].values.astype(np.float64)
     flag = quality_bits(product["quality_flag"])
-    rejected = (flag & _REJECTED) != 0
+    rejected = (flag & flags.rejecting & ~int(Quality.INPUT_MISSING)) != 0
     good = np.isfinite(signal) & ~rejected & ((flag & int(Quality.INPUT_MISSING)) == 0)
     return _Block(
         total=total(np.where(good, signal, 0.0)),
         variance=total(np.where(good, error, 0.0) ** 2),
         used=total(good),
         rejected=total(rejected),
-        with_care=int(np.count_nonzero(flag & _WITH_CARE)),
+        with_care=int(np.count_nonzero(flag & flags.caring)),
         bits=int(np.bitwise_or.reduce(flag, axis=None)),
     )
 

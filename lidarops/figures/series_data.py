@@ -42,7 +42,9 @@ class TimeSeries:
     time: Times
     """(time,) Middles of profiles, UTC, rising."""
     flag: NDArray[np.int64]
-    """(time,) Bits of `Quality`."""
+    """(time,) Bits of the kind."""
+    rejecting: int
+    """Union of the bits of the kind that reject a value."""
     estimates: Mapping[str, SeriesEstimate]
     """By name of the quantity."""
 
@@ -59,7 +61,7 @@ class TimeSeries:
     @property
     def rejected(self) -> NDArray[np.bool_]:
         """(time,) Whether a quality bit rejects the value."""
-        return np.asarray((self.flag & int(Quality.rejecting())) != 0)
+        return np.asarray((self.flag & self.rejecting) != 0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.flags import Quality
 from lidarops.records import Unmet
 
 _REORDERING: Final = frozenset(
@@ -17,11 +16,6 @@ _REORDERING: Final = frozenset(
     "\N{LEFT-TO-RIGHT ISOLATE}\N{RIGHT-TO-LEFT ISOLATE}"
     "\N{FIRST STRONG ISOLATE}\N{POP DIRECTIONAL ISOLATE}"
 )
-
-
-def bit_name(bit: Quality) -> str:
-    """Return the name of a single bit as in the CF ``flag_meanings``."""
-    return (bit.name or "").lower()
 
 
 def percent(share: float) -> str:

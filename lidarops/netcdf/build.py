@@ -149,7 +149,7 @@ class ProductEncoder:
             if not _over_time(row.dims) or (row.optional and row.name not in source):
                 continue
             if row.summary:
-                encoded[row.name] = rows.summarize_flags(flags)
+                encoded[row.name] = rows.summarize_flags(flags, self._layout.flags)
                 continue
             # Bits refer to retrieved values; an optional derived value may be missing without one.
             judging = row.dims == judged.dims and not row.optional

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
+from lidarops.netcdf.stored_flags import places
 from lidarops.netcdf.variables import Layout, Row
 
 Values = npt.NDArray[Any]
@@ -121,15 +121,12 @@ def check_flags(row: Row, values: Values) -> None:
     ProductError
         If any other bit is set.
     """
-    foreign = int(np.bitwise_or.reduce(values & ~np.int32(row.flags or 0), axis=None))
+    foreign = int(np.bitwise_or.reduce(values & ~np.int32(sum(row.flags or ())), axis=None))
     if foreign:
-        known = int(sum(Quality))
-        names = [str(bit.name).lower() for bit in Quality if foreign & bit]
-        names += [f"unknown bits {foreign & ~known:#x}"] if foreign & ~known else []
         raise ProductError(
-            f"holds bits that this kind of product does not have: {', '.join(names)}",
+            f"holds bits that this kind of product does not have: {places(foreign)}",
             field=row.name,
-            remedy="add them to the flags in lidarops/products/KIND/variables.py",
+            remedy="add them to products/KIND/flags.py",
         )
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
+from lidarops.flags import FlagBit, Flags
+from lidarops.kinds import flags_of
 from lidarops.netcdf.build import ProductEncoder
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.input_checks import Values
@@ -65,7 +66,7 @@ def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[
     """
     encoder = ProductEncoder(frame, context)
     with ExitStack() as until_complete:
-        writer = ProductWriter(encoder, path, until_complete)
+        writer = ProductWriter(encoder, flags_of(context.kind), path, until_complete)
         yield writer
         writer.refuse_empty()
 
@@ -73,14 +74,17 @@ def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[
 class ProductWriter:
     """A product that is being written; see `create_product`."""
 
-    def __init__(self, encoder: ProductEncoder, path: Path, until_complete: ExitStack) -> None:
+    def __init__(
+        self, encoder: ProductEncoder, flags: Flags, path: Path, until_complete: ExitStack
+    ) -> None:
         self._encoder = encoder
         self._path = path
         self._until_complete = until_complete
         self._values = 0
         self._unflagged = 0
         self._rejected = 0
-        self._flagged: Counter[Quality] = Counter()
+        self._flags = flags
+        self._flagged: Counter[FlagBit] = Counter()
         # The first profiles decide on optional variables.
         self._file: RowFile | None = None
 
@@ -107,9 +111,9 @@ class ProductWriter:
     def _count(self, flags: Values) -> None:
         self._values += flags.size
         self._unflagged += flags.size - int(np.count_nonzero(flags))
-        self._rejected += int(np.count_nonzero(flags & np.int32(Quality.rejecting())))
+        self._rejected += int(np.count_nonzero(flags & np.int32(self._flags.rejecting)))
         # Few bits occur in a product: count only these.
-        for bit in Quality(int(np.bitwise_or.reduce(flags, axis=None))):
+        for bit in self._flags.raised(int(np.bitwise_or.reduce(flags, axis=None))):
             self._flagged[bit] += int(np.count_nonzero(flags & np.int32(bit)))
 
     def refuse_empty(self) -> RowFile:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -22,8 +22,13 @@ from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from xarray.core import indexing
 
 from lidarops.errors import ProductError
+from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf._deflate import inflate_chunk
+from lidarops.netcdf.stored_flags import is_moved, recoded
+from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.netcdf.write import OTHER_DIMENSION
+
+_Recoding = Callable[[NDArray[Any]], NDArray[Any]]
 
 _ATTRIBUTES: Final = (
     "units",
@@ -47,6 +52,7 @@ def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:
     """Open a product for some of its variables.
 
     They are decoded as by `xarray.open_dataset`: missing values are NaN, times datetime64[ns].
+    The bits of ``quality_flag`` are at the places that its kind gives them now.
 
     Parameters
     ----------
@@ -65,7 +71,8 @@ def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:
     Raises
     ------
     ProductError
-        If there is no such file or it cannot be read; possibly only when values are read.
+        If there is no such file or it cannot be read; if ``quality_flag`` carries a bit that its
+        kind does not have; possibly only when values are read.
     """
     with ExitStack() as until_closed:
         file = _File(Path(path))
@@ -152,12 +159,27 @@ class _File:
             return None
         dims, attributes = _dimensions(dataset, name), _attributes(dataset)
         fill = _own_fill(dataset.dtype, attributes)
+        recode = self._recoding(dataset) if name == QUALITY_FLAG else None
         if dataset.size * dataset.dtype.itemsize < LAZY_BYTES:
             # Small variables are read at once: most are used several times.
             values = _unfilled(np.asarray(dataset[()]), fill)
+            if recode is not None:
+                values = recode(values)
             return xr.Variable(dims, values, attributes, fastpath=True)
-        lazy = indexing.LazilyIndexedArray(_Stored(self, dataset, fill))
+        lazy = indexing.LazilyIndexedArray(_Stored(self, dataset, fill, recode))
         return xr.Variable(dims, lazy, attributes, fastpath=True)
+
+    def _recoding(self, dataset: h5py.Dataset) -> _Recoding | None:
+        """Return what moves quality bits to their places of now; None where they are there."""
+        kind = self._file.attrs.get("lidarops_kind", b"")
+        kind = kind.decode() if isinstance(kind, bytes) else kind
+        if kind not in kinds() or "flag_masks" not in dataset.attrs:
+            return None
+        stated = {name: _attribute(dataset, name) for name in ("flag_masks", "flag_meanings")}
+        flags = flags_of(kind)
+        if not is_moved(stated, flags):
+            return None
+        return lambda values: recoded(values, stated, flags)
 
     def _decoded(self, name: str, stored: xr.Variable) -> xr.Variable:
         if _is_plain(stored):
@@ -174,10 +196,17 @@ class _File:
 class _Stored(BackendArray):
     """The values of a variable, read on indexing; NaN where they are missing."""
 
-    def __init__(self, file: _File, dataset: h5py.Dataset, fill: np.floating[Any] | None) -> None:
+    def __init__(
+        self,
+        file: _File,
+        dataset: h5py.Dataset,
+        fill: np.floating[Any] | None,
+        recode: _Recoding | None,
+    ) -> None:
         self._file = file
         self._dataset = dataset
         self._fill = fill
+        self._recode = recode
         self._deflated = _is_deflated(dataset)
         self.shape = dataset.shape
         self.dtype = dataset.dtype
@@ -185,7 +214,7 @@ class _Stored(BackendArray):
     def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
         support = indexing.IndexingSupport.BASIC
         values = indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
-        return np.asarray(values)
+        return np.asarray(values if self._recode is None else self._recode(values))
 
     def _read(self, key: tuple[Any, ...]) -> NDArray[Any]:
         if self._deflated and all(isinstance(index, slice) for index in key):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarops import __version__
 from lidarops.errors import ProductError
-from lidarops.flags import Quality, Severity
+from lidarops.flags import Flags, Severity
 from lidarops.kinds import kind_of, kinds
 from lidarops.records import DetectionMode
 
@@ -39,6 +39,8 @@ NO_STANDARD_NAME: Final = f"The {STANDARD_NAME_TABLE} has no name for this quant
 
 QUALITY_FLAG: Final = "quality_flag"
 USABLE: Final = "usable"
+FLAG_LAYOUT: Final = "lidarops_flag_layout"
+"""Attribute of ``quality_flag`` with the name of the places of its bits (`Flags.layout`)."""
 
 
 class ErrorKind(StrEnum):
@@ -110,7 +112,7 @@ class Row:
     """Whether a product may lack it."""
     follows_beam: bool = False
     """Whether the variable gets ``time`` as first dimension where the beam moves."""
-    flags: Quality | None = None
+    flags: Flags | None = None
     """The bits that a flag variable can carry."""
     summary: bool = False
     """Whether it is `usable`, which is computed from the flags and never passed in."""
@@ -171,6 +173,20 @@ class Layout:
     def variables(self) -> tuple[Row, ...]:
         """Data rows, each followed by its derived rows: standard error, summary of flags."""
         return tuple(_with_derived(self.data))
+
+    @property
+    def flags(self) -> Flags:
+        """Bits that ``quality_flag`` can carry.
+
+        Raises
+        ------
+        ProductError
+            If its row states none.
+        """
+        flags = self.row(QUALITY_FLAG).flags
+        if flags is None:
+            raise ProductError("states no flags", field=QUALITY_FLAG, remedy="use `quality`")
+        return flags
 
     @property
     def rounded(self) -> bool:
@@ -254,21 +270,23 @@ def usable(flags: Row) -> Row:
     )
 
 
-def summarize_flags(flags: NDArray[np.int32]) -> NDArray[np.int8]:
+def summarize_flags(values: NDArray[np.int32], flags: Flags) -> NDArray[np.int8]:
     """Return the values of ``usable``: the severity of the worst bit, 0 without any bit.
 
     Parameters
     ----------
-    flags : ndarray of int32
-        Bits of `lidarops.flags.Quality`.
+    values : ndarray of int32
+        Values of ``quality_flag``.
+    flags : Flags
+        Bits of the kind of product.
 
     Returns
     -------
     ndarray of int8
         0 good, 1 use with care, 2 do not use.
     """
-    severity = np.where(flags == 0, 0, int(Severity.CARE)).astype(np.int8)
-    severity[(flags & np.int32(Quality.rejecting())) != 0] = int(Severity.REJECT)
+    severity = np.where(values == 0, 0, int(Severity.CARE)).astype(np.int8)
+    severity[(values & np.int32(flags.rejecting)) != 0] = int(Severity.REJECT)
     return severity
 
 
@@ -335,16 +353,13 @@ def _has_fill(row: Row) -> bool:
     return np.dtype(row.dtype).kind == "f" and row.coverage is not Coverage.COORDINATE
 
 
-def _flag_attributes(flags: Quality, stored: np.dtype[Any]) -> dict[str, Any]:
-    bits = list(flags)
+def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
     return {
-        "flag_masks": np.array([int(bit) for bit in bits], dtype=stored),
-        "flag_meanings": " ".join(str(bit.name).lower() for bit in bits),
+        FLAG_LAYOUT: flags.layout,
+        "flag_masks": np.array([int(bit) for bit in flags], dtype=stored),
+        "flag_meanings": " ".join(bit.word for bit in flags),
         "comment": "0: no test failed. "
-        + "; ".join(
-            f"{str(bit.name).lower()} ({bit.severity.name.lower()}): {bit.description}"
-            for bit in bits
-        )
+        + "; ".join(f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in flags)
         + ". reject: do not use the value; care: the value is valid, but its stated uncertainty"
         " may be too small.",
     }
@@ -595,7 +610,7 @@ def shots(*, of: str) -> Row:
     )
 
 
-def quality(dims: tuple[str, ...], flags: Quality) -> Row:
+def quality(dims: tuple[str, ...], flags: Flags) -> Row:
     """Return the row of the quality bits of a kind of product."""
     return Row(
         name=QUALITY_FLAG,

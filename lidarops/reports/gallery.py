@@ -20,8 +20,8 @@ from lidarops.figures import any_kind_report, product_figures
 from lidarops.figures.kind_figures import ReportFigure, report_figures_of
 from lidarops.figures.reading import UNREADABLE, Readers, reason
 from lidarops.figures.report_sources import Compared, Group, Problem, Sources
-from lidarops.flags import Quality
-from lidarops.kinds import rank_of
+from lidarops.flags import Severity
+from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
 from lidarops.system.files import write_atomically
 
@@ -191,18 +191,27 @@ def _flags(record: RunRecord, readers: Readers) -> _PendingFigure | None:
     return _started(readers, figure, "Flagged values", figure.name, "")
 
 
-def _shares(record: RunRecord) -> Mapping[str, Mapping[Quality, float]]:
+def _shares(record: RunRecord) -> Mapping[str, Mapping[str, float]]:
+    """Return label -> name of a bit, with * where it asks for care only -> share, by place."""
     values: Counter[str] = Counter()
-    carried: dict[str, Counter[Quality]] = defaultdict(Counter)
+    order: dict[str, int] = {}
+    carried: dict[str, Counter[str]] = defaultdict(Counter)
     for group in _groups(record):
         label = f"{group.label}, {group.kind}"
         for _, product in group.members:
             values[label] += product.values
+            flags = flags_of(group.kind) if group.kind in kinds() else None
             for name, count in product.flagged.items():
-                if name.upper() in Quality.__members__:
-                    carried[label][Quality[name.upper()]] += count
+                bit = flags.named(name) if flags is not None else None
+                if bit is not None:
+                    shown = bit.word if bit.severity is Severity.REJECT else f"{bit.word} *"
+                    order.setdefault(shown, int(bit))
+                    carried[label][shown] += count
     rows = {
-        label: {bit: count / values[label] for bit, count in carried[label].items()}
+        label: {
+            bit: carried[label][bit] / values[label]
+            for bit in sorted(order, key=lambda name: order[name])
+        }
         for label in values
         if values[label] > 0
     }

@@ -19,8 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
-from lidarops.flags import Quality
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
+from lidarops.netcdf.stored_flags import count_bits, stored_bits
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
 
@@ -141,6 +141,7 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     if "quality_flag" not in dataset.variables:
         return []
     flags = dataset["quality_flag"].to_numpy().astype(np.int64)
+    bits = stored_bits(dataset["quality_flag"].attrs, dataset.attrs.get("lidarops_kind"))
     rows = []
     if "usable" in dataset.variables:
         usable = dataset["usable"].to_numpy()
@@ -148,12 +149,9 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
             _counted(name, "verdict", int(np.count_nonzero(usable == value)), flags.size, "")
             for value, name in enumerate(_VERDICTS)
         ]
-    for bit in Quality:
-        count = int(np.count_nonzero(flags & int(bit)))
-        if count:
-            severity = bit.severity.name.lower()
-            name = str(bit.name).lower()
-            rows.append(_counted(name, severity, count, flags.size, bit.description))
+    for bit, count in count_bits(flags, bits).items():
+        severity = "unknown" if bit.severity is None else bit.severity.name.lower()
+        rows.append(_counted(bit.word, severity, count, flags.size, bit.description))
     return rows
 
 

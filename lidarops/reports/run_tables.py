@@ -9,13 +9,16 @@ from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.figures.wording import counted, decided_on, duration, percent
-from lidarops.flags import Quality, Severity
+from lidarops.flags import PLACES, FlagBit, Severity
+from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome
 from lidarops.steps.reading import idle_window
 
 _MOST_NAMES: Final = 8
 """Most names listed in one cell."""
+_LAST: Final = 1 << PLACES
+"""Place of unknown bits in a table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,9 +269,11 @@ def flags(record: RunRecord) -> list[FlagRow]:
                     products[product.kind, name.lower()] += 1
     rows = []
     for kind in sorted(counts):
-        for name in sorted(counts[kind], key=_bit_order):
+        known = flags_of(kind) if kind in kinds() else ()
+        bits = {bit.word: bit for bit in known}
+        for name in sorted(counts[kind], key=lambda name: (bits.get(name, _LAST), name)):
             count = counts[kind][name]
-            severity, description = _about(name)
+            severity, description = _about(bits.get(name))
             rows.append(
                 FlagRow(
                     kind=kind,
@@ -396,14 +401,8 @@ def _instrument_row(
     )
 
 
-def _bit_order(name: str) -> tuple[int, str]:
-    known = Quality.__members__.get(name.upper())
-    return (int(known), name) if known is not None else (1 << 62, name)
-
-
-def _about(name: str) -> tuple[str, str]:
-    known = Quality.__members__.get(name.upper())
-    if known is None:
+def _about(bit: FlagBit | None) -> tuple[str, str]:
+    if bit is None:
         return "unknown", "bit unknown to this version of lidarops"
-    word = "do not use" if known.severity is Severity.REJECT else "use with care"
-    return word, known.description
+    word = "do not use" if bit.severity is Severity.REJECT else "use with care"
+    return word, bit.description

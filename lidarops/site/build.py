@@ -24,6 +24,7 @@ from lidarops.errors import CatalogError, ProductError
 from lidarops.figures import any_kind
 from lidarops.figures.kind_figures import PageFigures, figures_of, no_figures
 from lidarops.kinds import kinds
+from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.site import pages, product_contents
 from lidarops.site.paths import (
@@ -250,7 +251,7 @@ def _draw(opened: xr.Dataset, kind: str) -> tuple[PageFigures, str]:
     problem = ""
     try:
         if figures is not None:
-            return figures.page(opened), ""
+            return figures.page(with_current_flags(opened)), ""
     except _UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
@@ -320,6 +321,8 @@ def _version() -> str:
     package = Path(__file__).resolve().parents[1]
     sources = [
         package / "flags.py",
+        *package.glob("products/*/flags.py"),
+        *package.glob("retrieve/*/flags.py"),
         *(package / "figures").glob("*.py"),
         package / "reports/run_record.py",
     ]

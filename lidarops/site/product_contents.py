@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -12,15 +13,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.series_data import quality_bits
-from lidarops.figures.wording import bit_name, percent
-from lidarops.flags import Quality, Severity
+from lidarops.figures.wording import percent
+from lidarops.netcdf.stored_flags import StoredBit, count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.site.product_entry import UNKNOWN
 
 PROVENANCE: Final = "provenance"
 _READ_BYTES: Final = 16_000_000
 """Most bytes of flags in memory."""
-_BITS: Final = 31
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,17 +113,16 @@ def count_quality(product: xr.Dataset) -> QualityCounts:
     """
     if QUALITY_FLAG not in product:
         return QualityCounts(0, 0, 0, ())
-    counts = np.zeros(_BITS, dtype=np.int64)
+    bits = stored_bits(product[QUALITY_FLAG].attrs, product.attrs.get("lidarops_kind"))
+    counts: Counter[StoredBit] = Counter()
     values = usable = unflagged = 0
-    rejecting = np.int64(Quality.rejecting())
+    rejecting = np.int64(rejecting_mask(bits))
     for flags in _blocks(product[QUALITY_FLAG]):
         values += flags.size
         usable += int(np.count_nonzero((flags & rejecting) == 0))
-        raised = flags[flags != 0]
-        unflagged += flags.size - raised.size
-        for bit in range(_BITS):
-            counts[bit] += np.count_nonzero(raised & np.int64(1 << bit))
-    rows = [_flag_row(1 << bit, int(counts[bit]), values) for bit in range(_BITS) if counts[bit]]
+        unflagged += flags.size - int(np.count_nonzero(flags))
+        counts.update(count_bits(flags, bits))
+    rows = [_flag_row(bit, counts[bit], values) for bit in bits if counts[bit]]
     return QualityCounts(values, usable, unflagged, tuple(rows))
 
 
@@ -138,15 +137,13 @@ def _blocks(flags: xr.DataArray) -> Iterator[NDArray[np.int64]]:
         yield quality_bits(flags.isel({first: slice(start, start + step)}))
 
 
-def _flag_row(bit: int, count: int, values: int) -> FlagRow:
-    known = bit in [int(member) for member in Quality]
-    rejects = known and Quality(bit).severity is Severity.REJECT
-    severity = "do not use" if rejects else "use with care"
+def _flag_row(bit: StoredBit, count: int, values: int) -> FlagRow:
+    severity = "do not use" if bit.rejects else "use with care"
     return FlagRow(
-        bit=bit_name(Quality(bit)) if known else f"bit {bit.bit_length() - 1}",
-        severity=severity if known else "unknown",
-        css="bad" if rejects or not known else "care",
-        meaning=Quality(bit).description if known else "bit unknown to this version of lidarops",
+        bit=bit.word,
+        severity="unknown" if bit.severity is None else severity,
+        css="bad" if bit.rejects else "care",
+        meaning=bit.description,
         count=count,
         share=percent(count / values),
         width=max(1, round(100 * count / values)),

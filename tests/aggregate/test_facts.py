@@ -24,7 +24,7 @@ from lidarops.aggregate.facts import (
     within,
 )
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_plain
 
 
@@ -37,7 +37,7 @@ def test_facts_are_those_of_the_file(tmp_path: Path):
         assert facts.start == datetime(2026, 3, 3, 10, tzinfo=UTC)
         assert facts.stop == datetime(2026, 3, 3, 10, 50, tzinfo=UTC)
     assert facts.values == flags.size == 15
-    assert facts.usable == np.count_nonzero((flags & int(Quality.rejecting())) == 0)
+    assert facts.usable == np.count_nonzero((flags & flags_of(facts.kind).rejecting) == 0)
     assert facts.unflagged == np.count_nonzero(flags == 0)
     assert facts.flagged == {"NO_SIGNAL": 1, "LOW_SIGNAL": 1}
     assert facts.wavelength == pytest.approx(532e-9)

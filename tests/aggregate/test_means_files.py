@@ -25,8 +25,7 @@ from lidarops.aggregate.means_variables import (
 )
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
-from lidarops.kinds import kinds
+from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import ErrorKind, layout_of
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.labeled import Definition, visibility_of_extinction
@@ -146,7 +145,7 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
         errors = means[f"{name}_standard_error"].to_numpy()
         np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
     assert np.isnan(means.backscatter.to_numpy()[~some]).all()
-    assert (means.quality_flag.to_numpy()[~some] & int(Quality.rejecting()) != 0).all()
+    assert (means.quality_flag.to_numpy()[~some] & flags_of("elastic").rejecting != 0).all()
     assert (means.usable.to_numpy()[~some] == 2).all()
 
 

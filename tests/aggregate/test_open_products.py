@@ -13,7 +13,7 @@ from support.archives.aggregate_archive import add_day, facts_of
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import summarize_flags
 
 
@@ -49,7 +49,7 @@ def test_unusable_values_are_missing(level: int, archive: Path):
     data = open_products(archive, kind="elastic", usable=level).load()
     everything = open_products(archive, kind="elastic", usable=2).load()
     flags = everything.quality_flag.to_numpy()
-    worst = summarize_flags(flags)
+    worst = summarize_flags(flags, flags_of("elastic"))
     np.testing.assert_array_equal(data.usable, worst)
     assert set(np.unique(worst)) == {0, 1, 2}
     np.testing.assert_array_equal(
@@ -132,7 +132,9 @@ def test_wrong_arguments_raise_clear_errors(archive: Path, tmp_path: Path):
         open_products(tmp_path / "nothing.nc")
 
 
-def test_rejecting_bits_are_those_of_the_flags():
-    for bit in Quality:
-        rejects = bool(bit & Quality.rejecting())
-        assert summarize_flags(np.array([int(bit)], np.int32))[0] == (2 if rejects else 1)
+@pytest.mark.parametrize("kind", kinds())
+def test_rejecting_bits_are_those_of_the_flags(kind: str):
+    flags = flags_of(kind)
+    for bit in flags:
+        rejects = bool(bit & flags.rejecting)
+        assert summarize_flags(np.array([int(bit)], np.int32), flags)[0] == (2 if rejects else 1)

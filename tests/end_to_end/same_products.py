@@ -5,6 +5,8 @@ For changes that must not change a value, such as moved modules. In the root of 
     python tests/end_to_end/same_products.py make OUT [--only NAME ...]
     python tests/end_to_end/same_products.py compare BEFORE AFTER [--only NAME ...]
 
+Values of flags are compared by the ``flag_meanings`` of each file, since their places may move.
+
 ``make`` uses the command line of that checkout only. ``compare`` exits with 1 where a value, a
 flag, a type, a variable, a raw file or an exit code differs. Reworded texts are listed, each once.
 ``--renamed OLD=NEW ...`` gives words of variable names that were renamed on purpose.
@@ -335,7 +337,11 @@ def _compare_variables(
     """Compare type, shape, storage, attributes and values of two variables."""
     name = old.name
     comparison.counts["variables"] += 1
-    _compare_attributes(path, name, _attributes(old), _attributes(new), comparison)
+    stated = [_attributes(variable) for variable in (old, new)]
+    by_meaning = all("flag_masks" in attributes for attributes in stated)
+    if by_meaning:
+        _compare_meanings(path, name, *stated, comparison)
+    _compare_attributes(path, name, *map(_placeless, stated), comparison)
     text = old.dtype in (str, np.dtype("S1")) and new.dtype in (str, np.dtype("S1"))
     forms = [_form(variable, text=text) for variable in (old, new)]
     if forms[0] != forms[1]:
@@ -351,12 +357,45 @@ def _compare_variables(
             comparison.failures.append(f"{path}: {name} is {_short(after)}, was {_short(before)}")
         return
     before, after = np.asarray(old[...]), np.asarray(new[...])
+    if by_meaning:
+        before, after = map(_by_meaning, (before, after), stated)
     comparison.counts["values"] += before.size
     count, most = _differing(before, after)
     comparison.counts["values differing"] += count
     if count:
         by = f"by {most:.3g} at most" if most else "in NaN or signs of zero"
         comparison.failures.append(f"{path}: {name}: {count} of {before.size} values differ, {by}")
+
+
+def _placeless(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a variable without those that follow the places of its flags."""
+    places = {"flag_masks", "lidarops_flag_layout"}
+    places |= {"flag_meanings"} if "flag_masks" in attributes else set()
+    return {name: value for name, value in attributes.items() if name not in places}
+
+
+def _masks(attributes: Mapping[str, Any]) -> dict[str, int]:
+    """Return meaning -> mask of a variable of flags."""
+    masks = np.atleast_1d(attributes["flag_masks"]).tolist()
+    return dict(zip(attributes["flag_meanings"].split(), masks, strict=True))
+
+
+def _compare_meanings(
+    path: str, name: str, old: Mapping[str, Any], new: Mapping[str, Any], comparison: Comparison
+) -> None:
+    before, after = sorted(_masks(old)), sorted(_masks(new))
+    comparison.counts["variables of flags"] += 1
+    if before != after:
+        comparison.failures.append(f"{path}: {name} has meanings {after}, had {before}")
+
+
+def _by_meaning(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:
+    """Return values with their flags in the order of their names, then bits without a name."""
+    masks = _masks(attributes)
+    unnamed = values.astype(np.int64) & ~sum(masks.values())
+    for place, name in enumerate(sorted(masks)):
+        unnamed |= ((values & masks[name]) != 0).astype(np.int64) << (32 + place)
+    return unnamed
 
 
 def _form(variable: netCDF4.Variable, *, text: bool) -> tuple[Any, ...]:
@@ -494,7 +533,7 @@ def _print(comparison: Comparison) -> None:
     counts = comparison.counts
     numbers = [
         f"{counts[item]} {item}"
-        for item in ("archives", "NetCDF files", "other files", "variables")
+        for item in ("archives", "NetCDF files", "other files", "variables", "variables of flags")
     ]
     print(
         f"\n{', '.join(numbers)}; {counts['values']} values compared,"

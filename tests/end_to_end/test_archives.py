@@ -19,6 +19,7 @@ from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.flags import Quality
 from lidarops.records import RunRecord, Status
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.run.archive import (
     Options,
     Selection,
@@ -335,5 +336,5 @@ def test_the_campaign_knows_the_pointing_better_than_the_header(tmp_path: Path) 
         (path,) = (product.path for product in record.scenes[0].products)
         product = xr.load_dataset(Path(record.products) / path)
         assert product["zenith_angle"] == (0.0 if zenith_angle is None else zenith_angle)
-        raised = (product["quality_flag"].values & Quality.NOT_LEVEL) != 0
+        raised = (product["quality_flag"].values & HomogeneousQuality.NOT_LEVEL) != 0
         assert raised.all() == (not level)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 import xarray as xr
+from lidarops.plan.preview import GAP, OMITTED, refine_plan
+from lidarops.plan.rule_table import RULES
 from support import factories
 from support.archives import mixed_campaign, raw_archives
 from support.archives.scene_jobs import catalogued_scenes
@@ -17,21 +19,19 @@ from support.archives.scene_jobs import catalogued_scenes
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.flags import Quality
-from lidarops.steps import dependence
-from lidarops.plan.preview import GAP, OMITTED, refine_plan
-from lidarops.plan.rule_table import RULES
 from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW, plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.steps.reading import idle_window, read_windows
 from lidarops.process import channel_steps
 from lidarops.process import scene as processing
 from lidarops.process.scene import Job, process_scene
 from lidarops.raw.file import RawFile
-from lidarops.records import Plan, Role, RunRecord, PlannedStep
+from lidarops.records import Plan, PlannedStep, Role, RunRecord
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
+from lidarops.steps import dependence
+from lidarops.steps.reading import idle_window, read_windows
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
 HOMOGENEOUS = {"homogeneous": SECTIONS}

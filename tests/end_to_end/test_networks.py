@@ -13,7 +13,7 @@ from support.archives import network_campaigns as made
 from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import Campaign
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.process.scene import process_scene
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.run.archive import Options, Selection, reprocess
@@ -137,7 +137,7 @@ def test_values_are_flagged_after_a_lidar_stops(tmp_path):
     bits = product["quality_flag"].values
     assert (bits[:2] == 0).all()
     assert (bits[2:] != 0).all()
-    assert ((bits[2:] & int(Quality.rejecting())) != 0).any(axis=1).all()
+    assert ((bits[2:] & flags_of("visibility").rejecting) != 0).any(axis=1).all()
     assert (np.isnan(product["visibility_in_air"]) <= (product["usable"] == 2)).all()
 
 

@@ -13,6 +13,7 @@ from support.archives.scene_jobs import catalogued_scenes
 
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.records import Role, RunRecord
 from lidarops.run.archive import report_run, reprocess
@@ -151,7 +152,7 @@ def test_nothing_is_invented_where_photon_counting_is_paralysed(pilar: RunRecord
         product = _open(pilar, "elastic", channel)
         flags = product["quality_flag"].values
         assert (flags & bit).all()
-        assert ((flags & int(Quality.rejecting())) != 0).all() or (flags != 0).all()
+        assert ((flags & flags_of("elastic").rejecting) != 0).all() or (flags != 0).all()
     glued = _open(pilar, "elastic", "glued_532p")
     assert np.isnan(glued["backscatter"].values).all()
 

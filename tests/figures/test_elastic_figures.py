@@ -19,11 +19,13 @@ from lidarops.errors import ProductError
 from lidarops.figures import product_figures
 from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_product
 from lidarops.products.elastic.figure_data import CAUSES, clearest_profile
 from lidarops.products.elastic.report_figures import error_budget_figure
 from lidarops.records import RunRecord
 from lidarops.reports import gallery
+from lidarops.retrieve.elastic.flags import ElasticQuality
 
 MEGA = 1e6
 QUANTITY = "attenuated_backscatter"
@@ -48,7 +50,7 @@ def product(made: xr.Dataset, tmp_path: Path) -> xr.Dataset:
 
 
 def backscatter_quicklook(product, *, title=""):
-    raster = read_raster(product, quantity=QUANTITY)
+    raster = read_raster(product, quantity=QUANTITY, kind="elastic")
     return product_figures.draw_image([raster], title=title, what="attenuated backscatter")
 
 
@@ -62,8 +64,8 @@ def legend_texts(panel):
 
 class TestRaster:
     def test_means_are_over_usable_bins(self, product):
-        raster = read_raster(product, quantity=QUANTITY, profiles=4)
-        rejected = (product["quality_flag"] & int(Quality.rejecting())) != 0
+        raster = read_raster(product, quantity=QUANTITY, kind="elastic", profiles=4)
+        rejected = (product["quality_flag"] & flags_of("elastic").rejecting) != 0
         values = product[QUANTITY].where(~rejected).to_numpy()
         assert raster.total.shape[0] == 2
         for column, members in enumerate((slice(0, 4), slice(4, 8))):
@@ -75,15 +77,17 @@ class TestRaster:
     def test_the_lowest_cloud_of_a_column_is_kept(self, made, tmp_path):
         made["cloud_base_range"][:] = [90.0, np.nan, 40.0, 60.0, *[np.nan] * 4]
         product = stored(tmp_path / "clouds.nc", made)
-        raster = read_raster(product, quantity=QUANTITY, profiles=4)
+        raster = read_raster(product, quantity=QUANTITY, kind="elastic", profiles=4)
         np.testing.assert_array_equal(raster.clouds, [40.0, np.nan])
-        none = read_raster(product.drop_vars("cloud_base_range"), quantity=QUANTITY, profiles=4)
+        none = read_raster(
+            product.drop_vars("cloud_base_range"), quantity=QUANTITY, kind="elastic", profiles=4
+        )
         assert np.isnan(none.clouds).all()
 
     @pytest.mark.parametrize("name", [QUANTITY, f"{QUANTITY}_standard_error", "quality_flag"])
     def test_a_missing_variable_is_named(self, product, name):
         with pytest.raises(ProductError) as caught:
-            read_raster(product.drop_vars(name), quantity=QUANTITY)
+            read_raster(product.drop_vars(name), quantity=QUANTITY, kind="elastic")
         assert caught.value.field == name
 
 
@@ -126,7 +130,7 @@ class TestQuicklook:
         assert [c for c in figure.axes[0].collections if c.get_gid() == "flagged-signal"]
 
     def test_an_empty_panel_has_a_note(self, made, tmp_path):
-        made["quality_flag"][:] |= np.int32(Quality.NO_REFERENCE)
+        made["quality_flag"][:] |= np.int32(ElasticQuality.NO_REFERENCE)
         empty = stored(tmp_path / "empty.nc", made)
         figure = backscatter_quicklook(empty)
         product_figures.render(figure)
@@ -147,7 +151,7 @@ class TestClearestProfile:
         assert profile.range[-1] <= 1.15 * 250.0 < profile.range[-1] + 7.5
         shown = slice(0, profile.range.size)
         flag = product["quality_flag"].to_numpy()[4, shown]
-        good = (flag & int(Quality.rejecting())) == 0
+        good = (flag & flags_of("elastic").rejecting) == 0
         assert np.isnan(profile.backscatter[~good]).all()
         values = product["backscatter"].to_numpy()[4, shown]
         np.testing.assert_allclose(profile.backscatter[good], values[good])
@@ -259,7 +263,7 @@ class TestGallery:
         assert len(drawn.pictures) == 2
 
     def test_a_run_without_references_has_no_profile(self, archive, made, tmp_path):
-        made["quality_flag"][:] |= np.int32(Quality.NO_REFERENCE)
+        made["quality_flag"][:] |= np.int32(ElasticQuality.NO_REFERENCE)
         made["reference_bottom"][:] = np.nan
         made["reference_top"][:] = np.nan
         drawn = gallery.fill(_run(archive, ("e/none.nc", made)), tmp_path)

@@ -28,8 +28,10 @@ from lidarops.figures import product_figures
 from lidarops.figures.raster import COLUMNS, read_raster
 from lidarops.figures.series_data import join
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.products.homogeneous import report_figures
 from lidarops.products.homogeneous.figure_data import read_sections
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 INSTRUMENT = {"instrument": "horizontal", "channel": CHANNEL}
 
@@ -104,7 +106,7 @@ class TestRetrieval:
     def test_flagged_values_are_hollow_grey_crosses(self):
         product = homogeneous(times(START, 200, 300.0), flagged=0.3)
         panel = retrieval([product]).axes[0]
-        rejected = (product["quality_flag"].values & int(Quality.rejecting())) != 0
+        rejected = (product["quality_flag"].values & flags_of("homogeneous").rejecting) != 0
         value = 1e3 * product["extinction"].values[rejected]
         (marks,) = lines(panel, "flagged-extinction")
         assert marks.get_marker() == "X"
@@ -145,7 +147,7 @@ class TestRetrieval:
 
     def test_flagged_values_do_not_set_the_axis(self):
         product = homogeneous(times(START, 40, 300.0), flagged=0.0)
-        product["quality_flag"].values[5, 0] = int(Quality.AT_BOUND)
+        product["quality_flag"].values[5, 0] = int(HomogeneousQuality.AT_BOUND)
         product["extinction"].values[5, 0] = 5.0
         assert retrieval([product]).axes[0].get_ylim()[1] < 0.5
 
@@ -177,7 +179,7 @@ class TestRetrieval:
     def test_one_profile_and_all_flagged_and_all_missing(self):
         product_figures.render(retrieval([homogeneous(times(START, 1, 60.0), flagged=0.0)]))
         product = homogeneous(times(START, 5, 60.0))
-        product["quality_flag"][:] = int(Quality.POOR_FIT)
+        product["quality_flag"][:] = int(HomogeneousQuality.POOR_FIT)
         product_figures.render(retrieval([product]))
         for name in ("extinction", "background"):
             product[name][:] = np.nan
@@ -232,7 +234,7 @@ class TestQuicklook:
         image, below = figure.axes[:2]
         mesh, flagged = (item for item in image.collections if isinstance(item, QuadMesh))
         flag = product["quality_flag"].values
-        usable = (flag & int(Quality.rejecting())) == 0
+        usable = (flag & flags_of("signal").rejecting) == 0
         shown = mesh.get_array().T
         low = mesh.norm.vmin
         expected = product["signal"].values[:, : shown.shape[1]]
@@ -312,8 +314,8 @@ class TestQuicklook:
 class TestFlags:
     def test_cells_hold_the_shares(self):
         shares = {
-            "a $x$": {Quality.POOR_FIT: 0.25, Quality.OUTLIER: 0.0001},
-            "b": {Quality.SATURATED: 1.0, Quality.NO_SIGNAL: 0.0},
+            "a $x$": {"saturated": 0.0, "poor_fit": 0.25, "outlier *": 0.0001},
+            "b": {"saturated": 1.0, "no_signal": 0.0},
         }
         figure = product_figures.flags_overview(shares, title="Flags")
         (panel,) = figure.axes

@@ -14,8 +14,10 @@ from support.products.fabricated import CHANNEL, START, Archive, outcome, run_re
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.products.multiangle import figure_data, report_figures
 from lidarops.reports import gallery
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
 STATION = 180.0
 ALTITUDE = STATION + 300.0 + 50.0 * np.arange(90)
@@ -46,9 +48,9 @@ def multiangle(cycles=12, *, seed=0, tilt=0.02):
     time = times(START, cycles, 1020.0)
     shape = (cycles, ALTITUDE.size)
     beyond = np.broadcast_to(ALTITUDE > REACH, shape)
-    flag = np.where(beyond, int(Quality.EXTRAPOLATED), 0).astype(np.int32)
-    flag[:, (ALTITUDE > 1450) & (ALTITUDE < 1600)] |= int(Quality.PRIOR_DOMINATED)
-    flag[:, ALTITUDE < 600] |= int(Quality.HORIZONTAL_GRADIENT)
+    flag = np.where(beyond, int(MultiAngleQuality.EXTRAPOLATED), 0).astype(np.int32)
+    flag[:, (ALTITUDE > 1450) & (ALTITUDE < 1600)] |= int(MultiAngleQuality.PRIOR_DOMINATED)
+    flag[:, ALTITUDE < 600] |= int(MultiAngleQuality.HORIZONTAL_GRADIENT)
     depth_error = np.broadcast_to(0.002 + 1e-6 * ALTITUDE, shape)
     error = np.broadcast_to(4e-6 + 2e-9 * ALTITUDE, shape)
     depth = true_depth(ALTITUDE) + depth_error * random.standard_normal(shape)
@@ -154,7 +156,9 @@ def half_width(band, z):
 class TestClearestCycle:
     def test_most_unflagged_values_win(self):
         product = multiangle()
-        product["quality_flag"][7] = np.where(ALTITUDE > REACH, int(Quality.EXTRAPOLATED), 0)
+        product["quality_flag"][7] = np.where(
+            ALTITUDE > REACH, int(MultiAngleQuality.EXTRAPOLATED), 0
+        )
         profile = figure_data.clearest_cycle(product)
         assert profile.time == product["time"].values[7]
         assert profile.altitude[-1] <= ALTITUDE[0] + 1.15 * (REACH - ALTITUDE[0])
@@ -162,15 +166,15 @@ class TestClearestCycle:
 
     def test_where_all_carry_a_bit_of_care_rejections_decide_then_the_first(self):
         product = multiangle(cycles=4)
-        flag = np.full((4, ALTITUDE.size), int(Quality.ONE_SIDED))
-        flag[0, :5] |= int(Quality.POOR_STRATIFICATION)
-        flag[:, ALTITUDE > REACH] |= int(Quality.EXTRAPOLATED)
+        flag = np.full((4, ALTITUDE.size), int(MultiAngleQuality.ONE_SIDED))
+        flag[0, :5] |= int(MultiAngleQuality.POOR_STRATIFICATION)
+        flag[:, ALTITUDE > REACH] |= int(MultiAngleQuality.EXTRAPOLATED)
         product["quality_flag"] = (BOTH, flag)
         assert figure_data.clearest_cycle(product).time == product["time"].values[1]
 
     def test_where_all_are_rejected_the_cycle_with_most_values_is_shown(self):
         product = multiangle()
-        product["quality_flag"][:] = int(Quality.POOR_STRATIFICATION)
+        product["quality_flag"][:] = int(MultiAngleQuality.POOR_STRATIFICATION)
         product["optical_depth"][:9, :3] = np.nan
         profile = figure_data.clearest_cycle(product)
         assert profile.time == product["time"].values[9]
@@ -280,7 +284,7 @@ class TestProfileFigure:
         line = artist(panel, f"values-{quantity}")
         value, z = line.get_xdata(), line.get_ydata()
         chosen = product.isel(time=0, altitude=slice(0, value.size))
-        use = (chosen["quality_flag"].values & int(Quality.rejecting())) == 0
+        use = (chosen["quality_flag"].values & flags_of("multiangle").rejecting) == 0
         np.testing.assert_array_equal(np.isfinite(value), use)
         np.testing.assert_allclose(value[use], scale * chosen[quantity].values[use])
         np.testing.assert_allclose(z, chosen["altitude"].values / 1e3)
@@ -429,12 +433,12 @@ class TestResiduals:
     def test_what_is_zero_by_construction_is_left_out(self):
         product = multiangle()
         product["residual"][:6] = 0.0
-        product["quality_flag"][:6] |= int(Quality.NO_RESIDUAL)
+        product["quality_flag"][:6] |= int(MultiAngleQuality.NO_RESIDUAL)
         read = figure_data.read_residuals(product)
         assert read.cycles == 6
         kept = 100 * product["residual"].values[6:][..., ALTITUDE <= REACH]
         np.testing.assert_allclose(read.rms, np.sqrt((kept**2).mean(axis=(0, 2))))
-        product["quality_flag"][:] |= int(Quality.NO_RESIDUAL)
+        product["quality_flag"][:] |= int(MultiAngleQuality.NO_RESIDUAL)
         assert figure_data.read_residuals(product) is None
 
     def test_reading_in_parts_changes_nothing(self, monkeypatch):
@@ -531,7 +535,7 @@ class TestQuicklook:
         panel = figure.axes[0]
         mesh, black = (item for item in panel.collections if isinstance(item, QuadMesh))
         assert black.get_gid() == "flagged-signal"
-        use = (product["quality_flag"].values & int(Quality.rejecting())) == 0
+        use = (product["quality_flag"].values & flags_of("multiangle").rejecting) == 0
         rows = mesh.get_array().shape[0]
         good = use.T[:rows]
         value = np.maximum(1e3 * product["extinction"].values.T[:rows][good], 0.0)
@@ -667,7 +671,9 @@ class TestGallery:
 
     def test_figures_without_values_are_left_out(self, tmp_path):
         product = multiangle()
-        product["quality_flag"][:] = int(Quality.NO_LEVERAGE | Quality.NO_RESIDUAL)
+        product["quality_flag"][:] = int(
+            MultiAngleQuality.NO_LEVERAGE | MultiAngleQuality.NO_RESIDUAL
+        )
         product["optical_depth"][:] = np.nan
         made, _ = self.run(tmp_path, {"a.nc": product})
         assert not made.problems

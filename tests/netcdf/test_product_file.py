@@ -17,6 +17,7 @@ from support.products.made_products import MAKERS, context, elastic, homogeneous
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.netcdf import write as writer
 from lidarops.netcdf.product_file import ProductWriter, WrittenProduct, create_product
 from lidarops.netcdf.write import CHUNK_BYTES, write_product
@@ -89,9 +90,9 @@ def test_flags_are_counted(large: xr.Dataset, tmp_path: Path):
     flags = large["quality_flag"].to_numpy()
     assert written.values == flags.size
     assert written.unflagged == np.count_nonzero(flags == 0)
-    assert written.usable == np.count_nonzero((flags & int(Quality.rejecting())) == 0)
+    assert written.usable == np.count_nonzero((flags & flags_of("signal").rejecting) == 0)
     assert written.flagged == {
-        bit.name: np.count_nonzero(flags & bit) for bit in Quality if (flags & bit).any()
+        bit.name: np.count_nonzero(flags & bit) for bit in flags_of("signal") if (flags & bit).any()
     }
     assert list(written.flagged) == [
         "INPUT_MISSING", "SATURATED", "PILE_UP", "INCOMPLETE_OVERLAP"

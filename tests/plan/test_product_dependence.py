@@ -7,8 +7,8 @@ import hashlib
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarops.steps import dependence
 from lidarops.records import InputRecord, Role
+from lidarops.steps import dependence
 
 DIGESTS = st.integers(0, 3).map(lambda k: hashlib.sha256(bytes([k])).hexdigest())
 RECORDS = st.builds(InputRecord, st.text(), st.sampled_from(Role), DIGESTS)

@@ -1,4 +1,4 @@
-"""Quality bits: distinct, documented, carried by files unchanged, and each raised by some scene."""
+"""Quality bits: at their published places, documented, carried by files, raised by some scene."""
 
 from __future__ import annotations
 
@@ -13,79 +13,142 @@ from hypothesis import strategies as st
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
-from lidarops.flags import Quality, Severity
-from lidarops.kinds import kinds
+from lidarops.flags import FIRST_OWN, PLACES, FlagBit, Flags, Quality, Severity
+from lidarops.kinds import flags_of
 from lidarops.netcdf.variables import layout_of, summarize_flags
 from lidarops.netcdf.write import write_product
-from lidarops.retrieve.multiangle import labeled
+from lidarops.retrieve.multiangle import labeled as multiangle
+from lidarops.retrieve.network import labeled as network
 
-BITS = list(Quality)
+SHARED = {
+    "input_missing": 0,
+    "saturated": 1,
+    "pile_up": 2,
+    "incomplete_overlap": 3,
+    "too_few_bins": 4,
+    "no_signal": 5,
+    "low_signal": 6,
+    "negative_amplitude": 8,
+    "not_homogeneous": 11,
+    "outlier": 12,
+    "no_real_solution": 13,
+    "background_uncertain": 15,
+    "no_gluing": 16,
+}
+OWN = {
+    "signal": {},
+    "homogeneous": {"poorly_determined": 17, "poor_fit": 18, "at_bound": 19, "not_level": 20},
+    "elastic": {"cloud": 17, "no_reference": 18, "unstable_inversion": 19},
+    "multiangle": {
+        "no_leverage": 20,
+        "poor_stratification": 21,
+        "prior_dominated": 22,
+        "extrapolated": 23,
+        "interpolated": 24,
+        "one_sided": 25,
+        "low_leverage": 26,
+        "no_residual": 27,
+        "undersmoothed": 28,
+        "high_correlation": 29,
+        "horizontal_gradient": 30,
+    },
+    "visibility": {
+        "poorly_determined": 17,
+        "poor_fit": 18,
+        "unstable_inversion": 19,
+        "prior_dominated": 22,
+        "extrapolated": 23,
+        "low_leverage": 26,
+    },
+}
+"""Published places of layout version 2. Add new bits; never change or delete an entry, nor give its
+place to another bit: that would need a new version of the layout."""
+
+LEFT = {
+    "shared": 4,
+    "signal": 14,
+    "homogeneous": 10,
+    "elastic": 11,
+    "multiangle": 3,
+    "visibility": 8,
+}
+"""Places left for new bits, as `CONTRIBUTING.md` states them."""
 
 SCENES = {
-    Quality.INPUT_MISSING: "test_cubic_and_tail::test_variance_that_is_not_finite_is_missing",
-    Quality.SATURATED: "test_labeled_homogeneous::"
+    "Quality.INPUT_MISSING": "test_cubic_and_tail::test_variance_that_is_not_finite_is_missing",
+    "Quality.SATURATED": "test_labeled_homogeneous::"
     "test_bad_bins_are_excluded_and_their_bits_carried",
-    Quality.PILE_UP: "test_labeled_homogeneous::test_bad_bins_are_excluded_and_their_bits_carried",
-    Quality.INCOMPLETE_OVERLAP: "test_labeled_homogeneous::"
+    "Quality.PILE_UP": "test_labeled_homogeneous::"
     "test_bad_bins_are_excluded_and_their_bits_carried",
-    Quality.TOO_FEW_BINS: "test_path_fit::test_few_bins",
-    Quality.NO_SIGNAL: "test_path_fit::test_constant_profile_has_no_signal",
-    Quality.LOW_SIGNAL: "test_cubic_and_tail::test_lost_roots_are_flagged",
-    Quality.POORLY_DETERMINED: "test_path_fit::test_single_weak_shot_of_counts_is_flagged",
-    Quality.NEGATIVE_AMPLITUDE: "test_path_fit::test_inverted_profile_has_negative_amplitude",
-    Quality.AT_BOUND: "test_path_fit::test_extinction_stays_within_given_bounds_and_is_flagged",
-    Quality.POOR_FIT: "test_path_fit::test_wrong_noise_variance_is_flagged",
-    Quality.NOT_HOMOGENEOUS: "test_path_fit::"
+    "Quality.INCOMPLETE_OVERLAP": "test_labeled_homogeneous::"
+    "test_bad_bins_are_excluded_and_their_bits_carried",
+    "Quality.TOO_FEW_BINS": "test_path_fit::test_few_bins",
+    "Quality.NO_SIGNAL": "test_path_fit::test_constant_profile_has_no_signal",
+    "Quality.LOW_SIGNAL": "test_cubic_and_tail::test_lost_roots_are_flagged",
+    "HomogeneousQuality.POORLY_DETERMINED": "test_path_fit::"
+    "test_single_weak_shot_of_counts_is_flagged",
+    "Quality.NEGATIVE_AMPLITUDE": "test_path_fit::test_inverted_profile_has_negative_amplitude",
+    "HomogeneousQuality.AT_BOUND": "test_path_fit::"
+    "test_extinction_stays_within_given_bounds_and_is_flagged",
+    "HomogeneousQuality.POOR_FIT": "test_path_fit::test_wrong_noise_variance_is_flagged",
+    "Quality.NOT_HOMOGENEOUS": "test_path_fit::"
     "test_backscatter_that_varies_along_the_path_is_flagged",
-    Quality.OUTLIER: "test_path_fit::test_cloud_and_outlier_are_flagged",
-    Quality.BACKGROUND_UNCERTAIN: "test_labeled_elastic::"
+    "Quality.OUTLIER": "test_path_fit::test_cloud_and_outlier_are_flagged",
+    "Quality.BACKGROUND_UNCERTAIN": "test_labeled_elastic::"
     "test_aerosol_in_the_far_range_makes_the_background_uncertain",
-    Quality.NO_GLUING: "test_labeled_gluing::test_no_gluing_where_no_range_is_linear_in_both",
-    Quality.CLOUD: "test_labeled_elastic::"
+    "Quality.NO_GLUING": "test_labeled_gluing::test_no_gluing_where_no_range_is_linear_in_both",
+    "ElasticQuality.CLOUD": "test_labeled_elastic::"
     "test_a_cloud_below_the_reference_is_flagged_with_all_bins_below_it",
-    Quality.NO_REFERENCE: "test_labeled_elastic::test_an_opaque_cloud_leaves_no_reference",
-    Quality.UNSTABLE_INVERSION: "test_labeled_elastic::"
+    "ElasticQuality.NO_REFERENCE": "test_labeled_elastic::test_an_opaque_cloud_leaves_no_reference",
+    "ElasticQuality.UNSTABLE_INVERSION": "test_labeled_elastic::"
     "test_an_inversion_away_from_the_reference_stops_where_it_is_unstable",
-    Quality.NO_LEVERAGE: "test_labeled_multiangle::"
+    "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
-    Quality.POOR_STRATIFICATION: "test_labeled_multiangle::"
+    "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"
     "test_extinction_stays_withheld_if_single_altitudes_replace_joint",
-    Quality.EXTRAPOLATED: "test_labeled_multiangle::"
+    "MultiAngleQuality.EXTRAPOLATED": "test_labeled_multiangle::"
     "test_every_missing_value_is_explained_whatever_the_method",
-    Quality.ONE_SIDED: "test_labeled_multiangle::"
+    "MultiAngleQuality.ONE_SIDED": "test_labeled_multiangle::"
     "test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error",
-    Quality.HIGH_CORRELATION: "test_labeled_multiangle::"
+    "MultiAngleQuality.HIGH_CORRELATION": "test_labeled_multiangle::"
     "test_single_altitudes_stay_valid_if_shot_energy_jitters",
-    Quality.NOT_LEVEL: "test_archives::test_the_campaign_knows_the_pointing_better_than_the_header",
+    "HomogeneousQuality.NOT_LEVEL": "test_archives::"
+    "test_the_campaign_knows_the_pointing_better_than_the_header",
+    "NetworkQuality.PRIOR_DOMINATED": "test_labeled_network::test_a_missing_beam_gives_a_reason",
 }
 """The test of a scene that raises the bit; the bit stands in it by name."""
 
 BY_FIELD = {
-    Quality.PRIOR_DOMINATED: (
+    "MultiAngleQuality.PRIOR_DOMINATED": (
         "prior_dominated",
         "test_mld::test_published_claim_is_not_reproduced_at_15_degrees",
     ),
-    Quality.INTERPOLATED: (
+    "MultiAngleQuality.INTERPOLATED": (
         "interpolated",
         "test_optical_depth::test_invalid_profiles_do_not_affect_others",
     ),
-    Quality.LOW_LEVERAGE: (
+    "MultiAngleQuality.LOW_LEVERAGE": (
         "low_leverage",
         "test_optical_depth::test_tiny_leverage_is_flagged_and_has_a_correct_error",
     ),
-    Quality.NO_RESIDUAL: (
+    "MultiAngleQuality.NO_RESIDUAL": (
         "no_residual",
         "test_smooth_profile::test_noise_estimated_from_few_residuals_widens_the_errors",
     ),
-    Quality.UNDERSMOOTHED: (
+    "MultiAngleQuality.UNDERSMOOTHED": (
         "undersmoothed",
         "test_smooth_profile::test_profile_with_too_much_structure_for_smoothing_is_flagged",
     ),
-    Quality.HORIZONTAL_GRADIENT: ("gradient", "test_kano_hamilton"),
+    "MultiAngleQuality.HORIZONTAL_GRADIENT": ("gradient", "test_kano_hamilton"),
+    "NetworkQuality.POORLY_DETERMINED": ("ill_conditioned", "test_network_extremes"),
+    "NetworkQuality.POOR_FIT": ("outlying", "test_network_outlying_bins"),
+    "NetworkQuality.UNSTABLE_INVERSION": ("pole", "test_network_extremes"),
+    "NetworkQuality.EXTRAPOLATED": ("far_start", "test_network_extremes"),
+    "NetworkQuality.LOW_LEVERAGE": ("weak_signal", "test_network_noise"),
 }
-"""As above, where the bit is a boolean of a result that `labeled_multiangle` turns into it."""
+"""As above, where the bit is a boolean of a result that the shell `labeled` turns into it."""
 
-GUARDS = {Quality.NO_REAL_SOLUTION}
+GUARDS = {"Quality.NO_REAL_SOLUTION"}
 """Raised only where arithmetic fails; no scene is known that does it."""
 
 
@@ -106,35 +169,97 @@ def source(repository: Path, scene: str) -> str:
     return "\n".join(lines[first - 1 : functions[0].end_lineno])
 
 
-def test_bits_are_distinct_powers_of_two_of_one_type():
-    values = [int(bit) for bit in BITS]
-    assert values == [1 << number for number in range(len(values))]
-    assert max(values) <= np.iinfo(np.int32).max
-    assert {layout.row("quality_flag").dtype for layout in map(layout_of, kinds())} == {"i4"}
+def bit_id(bit: FlagBit) -> str:
+    return f"{type(bit).__name__}.{bit.name}"
 
 
-@pytest.mark.parametrize("bit", BITS, ids=lambda bit: bit.name)
-def test_every_bit_is_documented_in_some_kind_and_raised_by_some_scene(
-    bit: Quality, repository: Path
-):
+BITS = list({bit_id(bit): bit for kind in OWN for bit in flags_of(kind)}.values())
+
+
+@pytest.mark.parametrize("kind", OWN)
+def test_published_places_do_not_change(kind: str):
+    flags = flags_of(kind)
+    places = {bit.word: int(bit).bit_length() - 1 for bit in flags}
+    assert flags.layout == f"{kind} 2"
+    assert {word: SHARED[word] for word in places if word in SHARED} | OWN[kind] == places
+    assert {int(bit) for bit in flags} == {1 << place for place in places.values()}
+    assert sorted({*places.values()}) == list(places.values())
+    assert layout_of(kind).row("quality_flag").dtype == "i4"
+    assert sum(flags) <= np.iinfo(np.int32).max
+
+
+def test_shared_places_are_the_same_for_all_and_left_free_by_the_own_bits():
+    assert {bit.word: int(bit).bit_length() - 1 for bit in Quality} == SHARED
+    assert all(place < FIRST_OWN for place in SHARED.values())
+    assert all(FIRST_OWN <= place < PLACES for own in OWN.values() for place in own.values())
+
+
+def test_there_is_room_for_new_bits(repository: Path):
+    left = {kind: PLACES - FIRST_OWN - len(own) for kind, own in OWN.items()}
+    assert left | {"shared": FIRST_OWN - len(SHARED)} == LEFT
+    text = " ".join((repository / "CONTRIBUTING.md").read_text(encoding="utf-8").split())
+    for name, count in LEFT.items():
+        assert f"{name} {count}" in text
+
+
+class Twins(FlagBit):
+    """Own bits of a kind in another package."""
+
+    ODD = FIRST_OWN, Severity.CARE, "a test of the other package failed"
+    HIGH = PLACES, Severity.CARE, "beyond the type of the variable"
+    LOW = 7, Severity.CARE, "among the shared bits"
+    OUTLIER = FIRST_OWN + 1, Severity.REJECT, "has the name of a shared bit"
+
+
+@pytest.mark.parametrize(
+    "bits",
+    [
+        (Twins.ODD, Twins.ODD),
+        (Twins.ODD, Quality.OUTLIER),
+        (Twins.HIGH,),
+        (Twins.LOW,),
+        (Quality.OUTLIER, Twins.OUTLIER),
+    ],
+)
+def test_flags_that_would_be_ambiguous_are_refused(bits: tuple[FlagBit, ...]):
+    with pytest.raises(ValueError, match="flags of other: names and places"):
+        Flags("other", 1, bits)
+
+
+def test_a_kind_of_another_package_states_its_bits_by_itself():
+    flags = Flags("other", 3, (Quality.SATURATED, Quality.OUTLIER, Twins.ODD))
+    assert flags.layout == "other 3"
+    assert flags.rejecting == Quality.SATURATED
+    assert flags.caring == Quality.OUTLIER | Twins.ODD
+    assert flags.raised(int(Quality.OUTLIER | Twins.ODD) | 1) == (Quality.OUTLIER, Twins.ODD)
+    assert flags.named("ODD") is flags.named("odd") is Twins.ODD
+    assert flags.named("input_missing") is None
+    assert (Twins.ODD.word, Twins.ODD.severity) == ("odd", Severity.CARE)
+
+
+@pytest.mark.parametrize("bit", BITS, ids=bit_id)
+def test_every_bit_is_documented_and_raised_by_some_scene(bit: FlagBit, repository: Path):
+    name = bit_id(bit)
     assert len(bit.description.split()) > 3
     assert bit.severity in Severity
-    assert any(bit & (layout.row("quality_flag").flags or 0) for layout in map(layout_of, kinds()))
-    if bit in SCENES:
-        assert f"Quality.{bit.name}" in source(repository, SCENES[bit])
-    elif bit in BY_FIELD:
-        field, scene = BY_FIELD[bit]
+    if name in SCENES:
+        assert name in source(repository, SCENES[name])
+    elif name in BY_FIELD:
+        field, scene = BY_FIELD[name]
         assert f".{field}" in source(repository, scene)
-        written = Path(str(labeled.__file__)).read_text(encoding="utf-8")
-        assert f'"{field}": Quality.{bit.name}' in written
+        shell = network if name.startswith("Network") else multiangle
+        written = Path(str(shell.__file__)).read_text(encoding="utf-8")
+        assert f'"{field}": {name}' in written
     else:
-        assert bit in GUARDS, "name a scene that raises it"
+        assert name in GUARDS, "name a scene that raises it"
 
 
-@given(bits=st.sets(st.sampled_from(BITS)))
-def test_usable_is_the_worst_of_any_set_of_bits(bits: set[Quality]):
-    flags = np.array([sum(bits)], np.int32)
-    assert summarize_flags(flags)[0] == max((bit.severity for bit in bits), default=0)
+@given(data=st.data(), kind=st.sampled_from(list(OWN)))
+def test_usable_is_the_worst_of_any_set_of_bits(data: st.DataObject, kind: str):
+    bits = data.draw(st.sets(st.sampled_from(list(flags_of(kind)))))
+    values = np.array([sum(bits)], np.int32)
+    worst = max((bit.severity for bit in bits), default=0)
+    assert summarize_flags(values, flags_of(kind))[0] == worst
 
 
 @settings(
@@ -146,7 +271,7 @@ def test_any_bits_come_back_from_a_file_by_mask_and_meaning(
     kind: str, data: st.DataObject, tmp_path: Path
 ):
     results = MAKERS[kind](profiles=2).fillna(1.0)
-    allowed = list(layout_of(kind).row("quality_flag").flags or Quality(0))
+    allowed = list(flags_of(kind))
     sets = data.draw(st.lists(st.sets(st.sampled_from(allowed)), min_size=1, max_size=8))
     values = np.array([sum(each) for each in sets], np.int32)
     shape = results["quality_flag"].shape
@@ -158,7 +283,8 @@ def test_any_bits_come_back_from_a_file_by_mask_and_meaning(
         stored = variable[...].ravel()
         names = dict(zip(variable.flag_meanings.split(), variable.flag_masks, strict=True))
         assert variable.flag_masks.dtype == variable.dtype
+        assert variable.lidarops_flag_layout == f"{kind} 2"
         for index in range(len(sets)):
             if index < stored.size:
                 read = {name for name, mask in names.items() if stored[index] & mask}
-                assert read == {str(bit.name).lower() for bit in sets[index]}
+                assert read == {bit.word for bit in sets[index]}

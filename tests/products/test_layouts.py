@@ -10,7 +10,6 @@ import pytest
 from compliance_checker.cfunits import Unit
 
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import (
     PROVENANCE,
@@ -194,7 +193,7 @@ def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
     assert len(masks) == len(meanings) == len(set(meanings))
     assert all(mask > 0 and mask & (mask - 1) == 0 for mask in masks.tolist())
     for mask, meaning in zip(masks.tolist(), meanings, strict=True):
-        bit = Quality[meaning.upper()]
+        bit = layout.flags.named(meaning)
         assert bit == mask
         assert f"{meaning} ({bit.severity.name.lower()}): {bit.description}" in found["comment"]
 

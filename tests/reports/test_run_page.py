@@ -26,8 +26,9 @@ from support.products.fabricated import (
 
 from lidarops.errors import CatalogError
 from lidarops.figures.wording import counted, duration, percent, size
-from lidarops.flags import Quality
-from lidarops.records import LeftOut, Plan, ProductRecord, PlannedStep, Unmet
+from lidarops.flags import Severity
+from lidarops.kinds import flags_of
+from lidarops.records import LeftOut, Plan, PlannedStep, ProductRecord, Unmet
 from lidarops.reports import run_page, run_tables
 from lidarops.reports import run_record as record
 
@@ -122,9 +123,9 @@ class TestSimulatedRun:
             share = percent((product.values - product.unflagged) / product.values)
             assert f"Flagged, {product.kind} {share} of {product.values:,} values" in page.text
             for name, count in product.flagged.items():
-                bit = Quality[name.upper()]
+                bit = flags_of(product.kind).named(name)
                 row = f"{product.kind} {name} "
-                row += "use with care" if not bit & Quality.rejecting() else "do not use"
+                row += "use with care" if bit.severity is Severity.CARE else "do not use"
                 row += f" {bit.description} {count:,} {percent(count / product.values)} 1"
                 assert row in page.text
 
@@ -168,7 +169,9 @@ class TestSimulatedRun:
         words = "too many beyond 3"
         assert words in built(simulated, tmp_path / "without", figures=0).text
         plan = simulated.scenes[0].plan
-        plan = replace(plan, steps=(*plan.steps, PlannedStep("dark", CHANNEL, {"files": 2}, "2 files")))
+        plan = replace(
+            plan, steps=(*plan.steps, PlannedStep("dark", CHANNEL, {"files": 2}, "2 files"))
+        )
         scene = replace(simulated.scenes[0], plan=plan)
         assert (
             words
@@ -410,7 +413,9 @@ class TestManyScenes:
         assert hashes[0] == hashes[1]
 
     def test_a_range_window_without_effect_is_marked(self, tmp_path):
-        window = PlannedStep("range_window", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
+        window = PlannedStep(
+            "range_window", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins"
+        )
         signal = PlannedStep("signal", CHANNEL, {}, "requested")
         scenes = [
             outcome(name, plan=Plan(name, steps, ()))

@@ -22,12 +22,12 @@ from lidarops.records import (
     InputRecord,
     LeftOut,
     Plan,
+    PlannedStep,
     ProductRecord,
     Role,
     RunRecord,
     SceneOutcome,
     Status,
-    PlannedStep,
     Unmet,
 )
 from lidarops.reports.run_record import FILE_NAME, load_run_record, save_run_record

@@ -19,7 +19,6 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.steps.dependence import plan_closure, planned_products
 from lidarops.reports import gallery, run_record
 from lidarops.run import archive as pipeline
 from lidarops.run import session
@@ -31,6 +30,7 @@ from lidarops.run.archive import (
     report_run,
     reprocess,
 )
+from lidarops.steps.dependence import plan_closure, planned_products
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 

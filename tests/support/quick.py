@@ -9,9 +9,9 @@ from pathlib import Path
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
-from lidarops.steps import dependence
 from lidarops.process.scene import Job, _digest, failed_outcome
 from lidarops.records import ProductRecord, SceneOutcome
+from lidarops.steps import dependence
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
@@ -25,9 +25,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     products = []
     for kind, channel in dependence.planned_products(job.plan):
         closure = dependence.plan_closure(job.plan, [(kind, channel)])
-        used = sorted(
-            record.sha256 for record in dependence.product_inputs(closure, inputs)
-        )
+        used = sorted(record.sha256 for record in dependence.product_inputs(closure, inputs))
         fields = [closure.as_dict(), settings.of(job.scene, closure, channel), used]
         content = json.dumps(fields, sort_keys=True).encode()
         path = f"{scene.instrument}/{scene.id}_{kind}_{channel}.nc"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_product
 
 
@@ -96,7 +96,9 @@ def test_cf_xarray_finds_axes_bounds_and_flags(product: Path):
         flags = opened.cf["quality_flag"]
         known = flags.attrs["flag_meanings"].split()
         for bit in known:
-            expected = (flags.to_numpy() & int(Quality[bit.upper()])) != 0
+            expected = (
+                flags.to_numpy() & int(flags_of(opened.attrs["lidarops_kind"]).named(bit))
+            ) != 0
             np.testing.assert_array_equal((flags.cf == bit).to_numpy(), expected)
         usable = opened.cf["aggregate_quality_flag"]
         np.testing.assert_array_equal(usable.cf == "do_not_use", usable == 2)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import CampaignError, RawFormatError
-from lidarops.flags import Quality
+from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
@@ -217,7 +217,7 @@ def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
 
 
 def _estimates(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> BackgroundEstimates:
-    return BackgroundEstimates(value, error, (quality & Quality.rejecting()) != 0)
+    return BackgroundEstimates(value, error, (quality & rejecting(Quality)) != 0)
 
 
 def least_error(sky: SimulatedSky, level: float) -> float:

@@ -10,8 +10,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.flags import Quality
+from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
 
 Array = npt.NDArray[np.float64]
@@ -218,7 +219,7 @@ def estimates(fit: HomogeneousResult) -> Estimates:
         {name: getattr(fit, name) for name in SOLVED},
         {name: getattr(fit, f"{name}_standard_error") for name in SOLVED},
         flagged=fit.quality != 0,
-        rejected=(fit.quality & Quality.rejecting()) != 0,
+        rejected=(fit.quality & rejecting((*Quality, *HomogeneousQuality))) != 0,
     )
 
 

@@ -16,6 +16,7 @@ from lidarops.products.elastic.settings import ReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import known_shape
 from lidarops.retrieve.elastic import inversion, layers, outlying_bins, reference_window
+from lidarops.retrieve.elastic.flags import ElasticQuality
 
 Random = np.random.Generator
 
@@ -332,16 +333,18 @@ def _scored(
     r = base.range
     window, clouds, solved = processed.window, processed.clouds, processed.solved
     inside = (r >= _COMPARED[0]) & (r <= _COMPARED[1])
-    bits = np.where(solved.valid, np.int32(0), np.int32(Quality.UNSTABLE_INVERSION))
-    bits |= np.where(window.chosen, np.int32(0), np.int32(Quality.NO_REFERENCE))[:, np.newaxis]
-    bits |= np.where(clouds.mask, np.int32(Quality.CLOUD), np.int32(0))
+    bits = np.where(solved.valid, np.int32(0), np.int32(ElasticQuality.UNSTABLE_INVERSION))
+    bits |= np.where(window.chosen, np.int32(0), np.int32(ElasticQuality.NO_REFERENCE))[
+        :, np.newaxis
+    ]
+    bits |= np.where(clouds.mask, np.int32(ElasticQuality.CLOUD), np.int32(0))
     # Values with an uncertain background are rejected.
     uncertain = np.asarray(processed.background.quality) & int(Quality.NOT_HOMOGENEOUS)
     bits |= uncertain[:, np.newaxis]
     # As in the product: bins below a cloud were inverted through it.
     with np.errstate(invalid="ignore"):
         behind_cloud = (window.top > clouds.cloud_base_range)[:, np.newaxis]
-    bits |= np.where(behind_cloud, np.int32(Quality.CLOUD), np.int32(0))
+    bits |= np.where(behind_cloud, np.int32(ElasticQuality.CLOUD), np.int32(0))
     budget = solved.budget
     systematic: Any = np.sqrt(
         budget.reference**2 + budget.lidar_ratio**2 + budget.molecular**2 + budget.background**2
@@ -349,7 +352,8 @@ def _scored(
     error = (solved.backscatter - sky.particles)[:, inside]
     return ScoredValues(
         failure, "backscatter", error, budget.noise[:, inside], systematic[:, inside],
-        bits[:, inside], uncertain=(bits[:, inside] & int(Quality.CLOUD)) != 0,
+        bits[:, inside], ElasticQuality,
+        uncertain=(bits[:, inside] & int(ElasticQuality.CLOUD)) != 0,
         hidden=None if hidden is None else np.broadcast_to(hidden[:, np.newaxis], error.shape),
     )  # fmt: skip
 

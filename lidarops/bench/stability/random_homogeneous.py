@@ -13,6 +13,7 @@ from lidarops.bench.accuracy.multiangle_cases import correlated
 from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 Random = np.random.Generator
 
@@ -275,16 +276,16 @@ def _solved(
     yield (
         ScoredValues(
             failure, "extinction", fit.extinction - violated.extinction,
-            fit.extinction_standard_error, fit.extinction_model_error, bits, solvable=expected,
-            hidden=hidden,
+            fit.extinction_standard_error, fit.extinction_model_error, bits,
+            HomogeneousQuality, solvable=expected, hidden=hidden,
         ),
         count,
     )  # fmt: skip
     yield (
         ScoredValues(
             failure, "background", fit.background - paths.background[:, 0],
-            fit.background_standard_error, fit.background_model_error, bits, solvable=expected,
-            hidden=hidden,
+            fit.background_standard_error, fit.background_model_error, bits,
+            HomogeneousQuality, solvable=expected, hidden=hidden,
         ),
         count,
     )  # fmt: skip

@@ -12,13 +12,13 @@ from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.errors import LidarOpsError
-from lidarops.flags import Quality
 from lidarops.retrieve.network import extinction_field
+from lidarops.retrieve.network.flags import NetworkQuality
 
 Random = np.random.Generator
 
 _FULL_OVERLAP: Final = 100.0
-_DOUBTED: Final = np.int32(Quality.UNSTABLE_INVERSION)
+_DOUBTED: Final = np.int32(NetworkQuality.UNSTABLE_INVERSION)
 """Quality bit that stands for any flag of the retrieval that doubts a value."""
 
 
@@ -169,7 +169,9 @@ def score_networks(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, 
         with np.errstate(invalid="ignore"):
             solvable = np.isfinite(error) & (stated < 0.1 * truth)
         yield (
-            ScoredValues(failure, "extinction", error, stated, 0.0, bits, solvable=solvable),
+            ScoredValues(
+                failure, "extinction", error, stated, 0.0, bits, NetworkQuality, solvable=solvable
+            ),
             profiles,
         )
 

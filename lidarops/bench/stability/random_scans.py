@@ -15,6 +15,7 @@ from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.bench.stability.stiff_scans import BITS
 from lidarops.retrieve.multiangle import optical_depth
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
 Random = np.random.Generator
 
@@ -131,8 +132,8 @@ def _score_quantities(
         yield (
             ScoredValues(
                 failure, quantity, error, getattr(result, f"{name}_standard_error"),
-                getattr(result, f"{name}_gradient_error"), bits, uncertain=result.flags.doubtful(),
-                solvable=np.isfinite(error),
+                getattr(result, f"{name}_gradient_error"), bits, MultiAngleQuality,
+                uncertain=result.flags.doubtful(), solvable=np.isfinite(error),
             ),
             profiles,
         )  # fmt: skip

@@ -6,7 +6,7 @@ it differs from the truth by more than 4 stated standard errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
-from lidarops.bench.stability.stiff_cases import REJECTING, Array
+from lidarops.bench.stability.stiff_cases import Array
+from lidarops.flags import FlagBit, Quality, rejecting
 
 Mask = npt.NDArray[np.bool_]
 
@@ -82,6 +83,8 @@ class ScoredValues:
     systematic: Any
     """Stated systematic error; 0 where none is stated."""
     bits: npt.NDArray[np.int32]
+    own: Iterable[FlagBit]
+    """The retrieval's own bits, beside `lidarops.flags.Quality`."""
     uncertain: Mask | None = None
     """Where flags of the retrieval mark the stated error as uncertain; None: where rejected."""
     solvable: Mask | None = None
@@ -258,7 +261,7 @@ def _count(values: ScoredValues) -> dict[str, float]:
     size = np.abs(values.error)
     valued = np.isfinite(size)
     bits = np.broadcast_to(values.bits, shape)
-    rejected = (bits & REJECTING) != 0
+    rejected = (bits & rejecting((*Quality, *values.own))) != 0
     uncertain = rejected if values.uncertain is None else values.uncertain | rejected
     solvable = np.zeros_like(valued) if values.solvable is None else values.solvable
     hidden = np.zeros_like(valued) if values.hidden is None else values.hidden

@@ -14,6 +14,7 @@ from lidarops.bench.stability.stiff_cases import Array
 from lidarops.bench.stability.stiff_signals import RANGE
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.simulate import counting
 
@@ -122,7 +123,9 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Errors:
     added = haze * rng.uniform(0.2, 1.0) * np.exp(-sky.range / 3000.0)
     shape = sky.shape * (1.0 + added)
     fit = known_shape.fit_known_shape(counts, sky.range, shape, variance=variance)
-    bits = fit.quality | np.where(fit.singular, np.int32(Quality.POORLY_DETERMINED), np.int32(0))
+    bits = fit.quality | np.where(
+        fit.singular, np.int32(HomogeneousQuality.POORLY_DETERMINED), np.int32(0)
+    )
     hidden = None
     if haze:
         # Misfit of the wrong shape in the chosen window, without noise.
@@ -198,8 +201,9 @@ def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
         solvable = np.isfinite(error) if failure.satisfied and "cubic" not in failure.name else None
         yield (
             ScoredValues(
-                failure, quantity, error, random, 0.0, np.asarray(bits), solvable=solvable,
-                uncertain=(bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0, hidden=hidden,
+                failure, quantity, error, random, 0.0, np.asarray(bits), HomogeneousQuality,
+                solvable=solvable, hidden=hidden,
+                uncertain=(bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
             ),
             profiles,
         )  # fmt: skip

@@ -7,8 +7,8 @@ known value within a tolerance, a flag, or an error that names the wrong field.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Final, Protocol
 
@@ -16,13 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import LidarOpsError
-from lidarops.flags import Quality
+from lidarops.flags import FlagBit, Quality, rejecting
+from lidarops.retrieve.elastic.flags import ElasticQuality
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
+from lidarops.retrieve.network.flags import NetworkQuality
 
 Array = npt.NDArray[np.float64]
 Reference = float | Array | Callable[[], "float | Array"]
 """Reference value, or a function that returns it where it is costly."""
 
-REJECTING: Final = int(Quality.rejecting())
 _CRASHES: Final = (
     ArithmeticError,
     AttributeError,
@@ -47,6 +50,16 @@ class Retrieval(StrEnum):
     FORWARD = "forward model"
 
 
+_OWN: Final[Mapping[Retrieval, Iterable[FlagBit]]] = {
+    Retrieval.HOMOGENEOUS: HomogeneousQuality,
+    Retrieval.SIGNAL: HomogeneousQuality,
+    Retrieval.ELASTIC: ElasticQuality,
+    Retrieval.MULTIANGLE: MultiAngleQuality,
+    Retrieval.NETWORK: NetworkQuality,
+}
+"""A cubic of the signal chain that is singular counts as poorly determined."""
+
+
 def _no_bits() -> npt.NDArray[np.int32]:
     return np.zeros(1, dtype=np.int32)
 
@@ -57,7 +70,9 @@ class Answer:
 
     values: Mapping[str, Any]
     quality: npt.NDArray[np.int32] = field(default_factory=_no_bits)
-    """Bits of `lidarops.flags.Quality`, broadcast against the values."""
+    """Quality bits, broadcast against the values."""
+    own: Iterable[FlagBit] = ()
+    """The retrieval's own bits, beside `lidarops.flags.Quality`."""
 
     def value(self, name: str) -> Array:
         """Return the values of a quantity."""
@@ -65,7 +80,7 @@ class Answer:
 
     def rejected(self) -> npt.NDArray[np.bool_]:
         """Return where a bit rejects the value."""
-        return np.asarray((self.quality & REJECTING) != 0)
+        return np.asarray((self.quality & rejecting((*Quality, *self.own))) != 0)
 
 
 class Expectation(Protocol):
@@ -214,19 +229,37 @@ class Missing:
 class Flagged:
     """At least one of these bits is set, for all or at least a share of the values."""
 
-    bits: Quality
+    bits: FlagBit
     share: float = 1.0
 
     def describe(self) -> str:
         """Return the condition in words."""
         least = "" if self.share == 1.0 else f" on at least {100.0 * self.share:g} %"
-        if int(self.bits) == REJECTING:
-            return f"rejected{least}"
-        return f"flag {_flag_names(int(self.bits), ' or ')}{least}"
+        words = dict.fromkeys(bit.word for bit in (*Quality, *type(self.bits)) if self.bits & bit)
+        return f"flag {' or '.join(words)}{least}"
 
     def met(self, answer: Answer) -> bool:
         """Return whether an answer meets the condition."""
         return bool(np.mean((answer.quality & int(self.bits)) != 0) >= self.share)
+
+    def got(self, answer: Answer) -> str:
+        """Return the answer in the same words."""
+        return f"flag {_flag_shares(answer)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A bit rejects, for all or at least a share of the values."""
+
+    share: float = 1.0
+
+    def describe(self) -> str:
+        """Return the condition in words."""
+        return "rejected" if self.share == 1.0 else f"rejected on at least {100.0 * self.share:g} %"
+
+    def met(self, answer: Answer) -> bool:
+        """Return whether an answer meets the condition."""
+        return bool(np.mean(answer.rejected()) >= self.share)
 
     def got(self, answer: Answer) -> str:
         """Return the answer in the same words."""
@@ -337,7 +370,7 @@ def evaluate(case: StiffCase) -> CaseOutcome:
 
 def _run(case: StiffCase) -> tuple[bool, str]:
     try:
-        answer = case.solve(**case.build())
+        answer = replace(case.solve(**case.build()), own=_OWN.get(case.retrieval, ()))
     except LidarOpsError as error:
         first = case.expected[0]
         refused = isinstance(first, Refused) and first.raised(error)
@@ -361,19 +394,12 @@ def format_values(values: Array) -> str:
     return f"{finite.min():.4g} to {finite.max():.4g} ({flat.size} values{not_finite})"
 
 
-def _flag_names(bits: int, between: str = ", ") -> str:
-    """Return the names of quality bits."""
-    names = [(bit.name or "").lower() for bit in Quality if bits & int(bit)]
-    return between.join(names) or "none"
-
-
 def _flag_shares(answer: Answer) -> str:
     """Return the names of all bits, and the share of the values that have them."""
     count = answer.quality.size
     names = []
-    for bit in Quality:
+    for bit in (*Quality, *answer.own):
         share = np.count_nonzero(answer.quality & int(bit)) / count if count else 0.0
         if share:
-            name = (bit.name or "").lower()
-            names.append(name if share == 1.0 else f"{name} ({100.0 * share:.3g} %)")
+            names.append(bit.word if share == 1.0 else f"{bit.word} ({100.0 * share:.3g} %)")
     return ", ".join(names) or "none"

@@ -12,7 +12,6 @@ from scipy import special
 
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.stability.stiff_cases import (
-    REJECTING,
     Accepted,
     Answer,
     Array,
@@ -26,12 +25,11 @@ from lidarops.bench.stability.stiff_cases import (
     StiffCase,
 )
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
 from lidarops.retrieve.elastic import inversion, layers, reference_window
+from lidarops.retrieve.elastic.flags import ElasticQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.ELASTIC)
-_ANY: Final = Quality(REJECTING)
-_LOST: Final = Quality.UNSTABLE_INVERSION | Quality.NO_REFERENCE
+_LOST: Final = ElasticQuality.UNSTABLE_INVERSION | ElasticQuality.NO_REFERENCE
 _SCALE: Final = 2e-5
 """m-1 sr-1, of the particles below 1.75 km."""
 
@@ -74,8 +72,8 @@ def solve_elastic(compared: tuple[float, float] = (500.0, 6000.0), **arguments: 
     result = inversion.invert_elastic(**arguments)
     r = np.asarray(arguments["range"])
     inside = (r >= compared[0]) & (r <= compared[1])
-    bits = np.where(result.valid, np.int32(0), np.int32(Quality.UNSTABLE_INVERSION))
-    no_reference = np.where(result.calibrated, np.int32(0), np.int32(Quality.NO_REFERENCE))
+    bits = np.where(result.valid, np.int32(0), np.int32(ElasticQuality.UNSTABLE_INVERSION))
+    no_reference = np.where(result.calibrated, np.int32(0), np.int32(ElasticQuality.NO_REFERENCE))
     bits = np.bitwise_or(bits, no_reference[..., np.newaxis])
     return Answer(
         {
@@ -256,7 +254,7 @@ def _choose_window(power: Array, variance: Array, air: elastic_cases.SimulatedSk
         power, air.range, variance, molecular_attenuated=air.shape,
         candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
     )  # fmt: skip
-    bits = np.where(window.chosen, np.int32(0), np.int32(Quality.NO_REFERENCE))
+    bits = np.where(window.chosen, np.int32(0), np.int32(ElasticQuality.NO_REFERENCE))
     return Answer({"bottom": window.bottom, "top": window.top}, bits)
 
 
@@ -274,13 +272,13 @@ def _windows() -> tuple[StiffCase, ...]:
         _case("reference, clear above 6 km", build=lambda: _window(10.0), solve=_choose_window,
               expected=(Between("bottom", 5700.0, 12000.0), Accepted(0.9))),
         _case("reference, haze at all heights", build=lambda: _window(10.0, haze=20.0),
-              solve=_choose_window, expected=(Flagged(Quality.NO_REFERENCE, 0.9),)),
+              solve=_choose_window, expected=(Flagged(ElasticQuality.NO_REFERENCE, 0.9),)),
         _case("reference, background 1e8 counts", build=lambda: _window(1e8), solve=_choose_window,
-              expected=(Flagged(Quality.NO_REFERENCE, 0.9),)),
+              expected=(Flagged(ElasticQuality.NO_REFERENCE, 0.9),)),
         _case("reference, all NaN", solve=_choose_window,
               build=lambda: dict(_window(1.0)) | {"power": np.full((2, sky().range.size), np.nan),
                                                   "variance": np.ones(sky().range.size)},
-              expected=(Flagged(Quality.NO_REFERENCE),)),
+              expected=(Flagged(ElasticQuality.NO_REFERENCE),)),
     )  # fmt: skip
 
 

@@ -18,7 +18,6 @@ from lidarops.bench.accuracy.network_cases import (
     signals,
 )
 from lidarops.bench.stability.stiff_cases import (
-    REJECTING,
     Accepted,
     Answer,
     Array,
@@ -28,18 +27,18 @@ from lidarops.bench.stability.stiff_cases import (
     Missing,
     Near,
     Refused,
+    Rejected,
     Retrieval,
     StiffCase,
 )
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility
 from lidarops.retrieve.network import cycles, extinction_field, geometry
 from lidarops.retrieve.network.extinction_field import NetworkResult
+from lidarops.retrieve.network.flags import NetworkQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.NETWORK)
-_ANY: Final = Quality(REJECTING)
-FLAGGED: Final = Quality.UNSTABLE_INVERSION
+FLAGGED: Final = NetworkQuality.UNSTABLE_INVERSION
 """Quality bit that stands for any flag of the retrieval that doubts a value."""
 _PROFILES: Final = 200
 
@@ -176,17 +175,17 @@ def _network_cases() -> tuple[StiffCase, ...]:
     honest = Covered("extinction", 2e-3, most=5e-3)
     return (
         _case("A a beams through one point: nothing is determined", solve=_solve_start_crossing,
-              build=lambda: _cycle_arguments(46.1024, 0.01), expected=(Flagged(_ANY),)),
+              build=lambda: _cycle_arguments(46.1024, 0.01), expected=(Rejected(),)),
         _case("A b beams nearly through one point, noise 1 %", solve=_solve_start_crossing,
               build=lambda: _cycle_arguments(47.0, 0.01),
-              expected=(Flagged(_ANY, 0.9), Covered("extinction", 2e-3, most=5e-3))),
+              expected=(Rejected(0.9), Covered("extinction", 2e-3, most=5e-3))),
         _case("A c start at the far crossing", solve=_solve_start_crossing,
-              build=lambda: _cycle_arguments(30.0, 0.01), expected=(Flagged(_ANY),)),
+              build=lambda: _cycle_arguments(30.0, 0.01), expected=(Rejected(),)),
         _case("A c start at the far crossing, all crossings together", solve=_solve_network,
               build=lambda: network_arguments(_triangle_with_elevation(30.0)), expected=(honest,)),
         _case("A d visibility of 150 km, noise 0.5 %, exact cycle",
               build=lambda: network_arguments(air=homogeneous(2e-5), noise=0.005, method="cycle"),
-              solve=_solve_network, expected=(Flagged(_ANY, 0.99),)),
+              solve=_solve_network, expected=(Rejected(0.99),)),
         _case("A d visibility of 150 km, noise 0.5 %, network",
               build=lambda: network_arguments(air=homogeneous(2e-5), noise=0.005),
               solve=_solve_network, expected=(Covered("extinction", 2e-5, most=5e-3),)),
@@ -212,7 +211,7 @@ def _network_cases() -> tuple[StiffCase, ...]:
         ),
         *(
             _case(f"A h a beam of {value:g}", build=partial(_bad_beam, value), solve=_solve_network,
-                  expected=(Flagged(_ANY),))
+                  expected=(Rejected(),))
             for value in (np.nan, 0.0, -1.0, np.inf)
         ),
         *(
@@ -222,10 +221,10 @@ def _network_cases() -> tuple[StiffCase, ...]:
         ),
         _case("A i one crossing of two beams, without prior", build=_two_lidars,
               solve=partial(_solve_network, near=False),
-              expected=(Missing("extinction"), Flagged(_ANY))),
+              expected=(Missing("extinction"), Rejected())),
         _case("A j multiplier beyond the pole", solve=_solve_start_crossing,
               build=lambda: _cycle_arguments(25.0, 0.01)
-              | {"method": "multiplier", "multiplier": 0.9}, expected=(Flagged(_ANY),)),
+              | {"method": "multiplier", "multiplier": 0.9}, expected=(Rejected(),)),
         *(
             _case(f"signals times {factor:g}", build=partial(dict, factor=factor),
                   solve=_scaled, expected=(Near("change", 0.0, 1e-9, relative=False),
@@ -245,7 +244,7 @@ def _network_cases() -> tuple[StiffCase, ...]:
               | {name: network_arguments()[name][0] for name in ("power", "variance")},
               expected=(honest,)),
         _case("no noise stated", build=lambda: network_arguments() | {"variance": 0.0},
-              solve=_solve_network, expected=(Flagged(_ANY),)),
+              solve=_solve_network, expected=(Rejected(),)),
     )  # fmt: skip
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scene
 from lidarops.bench.stability.stiff_cases import (
-    REJECTING,
     Accepted,
     Answer,
     Array,
@@ -21,28 +20,29 @@ from lidarops.bench.stability.stiff_cases import (
     Missing,
     Near,
     Refused,
+    Rejected,
     Retrieval,
     StiffCase,
 )
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import optical_depth
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.MULTIANGLE)
-_ANY: Final = Quality(REJECTING)
 BITS: Final = {
-    "no_data": Quality.NO_LEVERAGE,
-    "extrapolated": Quality.EXTRAPOLATED,
-    "interpolated": Quality.INTERPOLATED,
-    "no_residual": Quality.NO_RESIDUAL,
-    "low_leverage": Quality.LOW_LEVERAGE,
-    "one_sided": Quality.ONE_SIDED,
-    "gradient": Quality.HORIZONTAL_GRADIENT,
-    "poor_stratification": Quality.POOR_STRATIFICATION,
-    "prior_dominated": Quality.PRIOR_DOMINATED,
-    "saturated": Quality.PRIOR_DOMINATED,
-    "undersmoothed": Quality.UNDERSMOOTHED,
-    "high_correlation": Quality.HIGH_CORRELATION,
+    "no_data": MultiAngleQuality.NO_LEVERAGE,
+    "extrapolated": MultiAngleQuality.EXTRAPOLATED,
+    "interpolated": MultiAngleQuality.INTERPOLATED,
+    "no_residual": MultiAngleQuality.NO_RESIDUAL,
+    "low_leverage": MultiAngleQuality.LOW_LEVERAGE,
+    "one_sided": MultiAngleQuality.ONE_SIDED,
+    "gradient": MultiAngleQuality.HORIZONTAL_GRADIENT,
+    "poor_stratification": MultiAngleQuality.POOR_STRATIFICATION,
+    "prior_dominated": MultiAngleQuality.PRIOR_DOMINATED,
+    "saturated": MultiAngleQuality.PRIOR_DOMINATED,
+    "undersmoothed": MultiAngleQuality.UNDERSMOOTHED,
+    "high_correlation": MultiAngleQuality.HIGH_CORRELATION,
     "outlier": Quality.OUTLIER,
 }
 """Quality bit of each flag, as in the products."""
@@ -271,20 +271,21 @@ def _solved_cases() -> tuple[StiffCase, ...]:
     honest = Covered("optical_depth", _truth, most=1e-3)
     return (
         _case("a one beam", build=lambda: scan_arguments(_one_beam), solve=_solve_scan,
-              expected=(Flagged(Quality.NO_LEVERAGE), Missing("optical_depth"))),
+              expected=(Flagged(MultiAngleQuality.NO_LEVERAGE), Missing("optical_depth"))),
         _case("b all beams at one angle", build=lambda: scan_arguments(_equal_beams),
-              solve=_solve_scan, expected=(Flagged(Quality.NO_LEVERAGE), Missing("optical_depth"))),
+              solve=_solve_scan,
+              expected=(Flagged(MultiAngleQuality.NO_LEVERAGE), Missing("optical_depth"))),
         _case("slant paths from 1 to 1.035", build=lambda: scan_arguments(_narrow),
               solve=_solve_scan,
-              expected=(Flagged(Quality.LOW_LEVERAGE),
+              expected=(Flagged(MultiAngleQuality.LOW_LEVERAGE),
                         Covered("optical_depth", partial(_truth, _narrow), most=1e-3))),
         _case("c slant paths from 1 to 1.001", build=lambda: scan_arguments(_narrowest),
               solve=_solve_scan,
-              expected=(Flagged(Quality.LOW_LEVERAGE | Quality.NO_LEVERAGE),
+              expected=(Flagged(MultiAngleQuality.LOW_LEVERAGE | MultiAngleQuality.NO_LEVERAGE),
                         Covered("optical_depth", partial(_truth, _narrowest), most=1e-3))),
         _case("c the same, altitude by altitude: a standard error of 14",
               build=lambda: scan_arguments(_narrowest, method="kano_hamilton"), solve=_solve_scan,
-              expected=(Flagged(Quality.LOW_LEVERAGE),
+              expected=(Flagged(MultiAngleQuality.LOW_LEVERAGE),
                         Between("random error at the top", 7.0, 28.0))),
         _case("d beams along the horizon are ignored", build=dict, solve=_with_horizontal_beams,
               expected=same),
@@ -302,7 +303,7 @@ def _solved_cases() -> tuple[StiffCase, ...]:
               solve=_solve_scan, expected=(honest,)),
         _case("f all signals negative", solve=_solve_scan,
               build=lambda: scan_arguments() | {"signal": -scan_arguments()["signal"]},
-              expected=(Missing("optical_depth"), Missing("extinction"), Flagged(_ANY))),
+              expected=(Missing("optical_depth"), Missing("extinction"), Rejected())),
         _case("all NaN", solve=_solve_scan,
               build=lambda: scan_arguments()
               | {"signal": np.full_like(scan_arguments()["signal"], np.nan)},
@@ -320,7 +321,7 @@ def _solved_cases() -> tuple[StiffCase, ...]:
               expected=(Covered("optical_depth", partial(_truth, _thick), most=5e-3),)),
         _case("h and nothing beyond its reach", build=lambda: scan_arguments(_thick, 100),
               solve=partial(_solve_scan, slice(30, 60)),
-              expected=(Missing("optical_depth"), Flagged(Quality.EXTRAPOLATED))),
+              expected=(Missing("optical_depth"), Flagged(MultiAngleQuality.EXTRAPOLATED))),
         _case("i constant extinction: smoothing has no bias, and most blocks are saturated",
               build=dict, solve=_blocks_of_constant,
               expected=(Near("optical depth at the top", 0.24, 0.01),
@@ -355,7 +356,8 @@ def _solved_cases() -> tuple[StiffCase, ...]:
         _case("o cloud at 15 degrees, extinction varies: withheld",
               build=lambda: scan_arguments(_varying, 64), solve=partial(_solve_scan, inside),
               expected=(Missing("extinction"),
-                        Flagged(Quality.POOR_STRATIFICATION | Quality.EXTRAPOLATED))),
+                        Flagged(MultiAngleQuality.POOR_STRATIFICATION
+                                | MultiAngleQuality.EXTRAPOLATED))),
         *(
             _case(f"without noise, span {span:g}, signals times {scale:g}",
                   build=partial(dict, span=span, scale=scale), solve=_solve_without_noise,

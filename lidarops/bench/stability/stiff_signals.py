@@ -23,6 +23,7 @@ from lidarops.bench.stability.stiff_cases import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.signal import averaging, counts_to_signal, gluing, lag
 from lidarops.simulate import counting
 
@@ -227,7 +228,9 @@ def shaped(**arguments: Any) -> Answer:
     errors = [f"{name}_standard_error" for name in names]
     values |= {name: getattr(result, name) for name in errors}
     bits = np.asarray(result.quality)
-    singular = np.where(result.singular, np.int32(Quality.POORLY_DETERMINED), np.int32(0))
+    singular = np.where(
+        result.singular, np.int32(HomogeneousQuality.POORLY_DETERMINED), np.int32(0)
+    )
     return Answer(values, bits | singular)
 
 

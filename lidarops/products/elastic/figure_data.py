@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.series_data import require
-from lidarops.flags import Quality, Severity
+from lidarops.kinds import flags_of
 
 Floats = NDArray[np.float64]
 
@@ -32,8 +32,8 @@ PROFILE_VARIABLES: Final = (
     *_ALONG_BOTH,
 )
 """Variables that `clearest_profile` needs."""
-_REJECTED: Final = int(Quality.rejecting())
-_WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
+_REJECTED: Final = flags_of("elastic").rejecting
+_WITH_CARE: Final = flags_of("elastic").caring
 _BEYOND: Final = 1.15
 """A profile is shown to this many times the top of its reference window."""
 

@@ -30,7 +30,9 @@ _CAUSES: Final = {
 }
 _QUANTITY: Final = "attenuated_backscatter"
 IMAGE: Final = KindImage(
-    raster_variables(_QUANTITY), partial(read_raster, quantity=_QUANTITY), "attenuated backscatter"
+    raster_variables(_QUANTITY),
+    partial(read_raster, quantity=_QUANTITY, kind="elastic"),
+    "attenuated backscatter",
 )
 
 

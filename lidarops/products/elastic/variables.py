@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
-from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     GLUING,
     NO_STANDARD_NAME,
@@ -23,6 +22,7 @@ from lidarops.netcdf.variables import (
     quality,
     shots,
 )
+from lidarops.products.elastic.flags import FLAGS
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12
@@ -56,19 +56,6 @@ _BUDGET: Final = {
 }
 """Source of error -> its name in texts, its kind and a comment, in the order of
 `lidarops.retrieve.elastic.inversion.ErrorBudget`."""
-
-FLAGS: Final = (
-    Quality.INPUT_MISSING
-    | Quality.SATURATED
-    | Quality.PILE_UP
-    | Quality.INCOMPLETE_OVERLAP
-    | Quality.OUTLIER
-    | Quality.BACKGROUND_UNCERTAIN
-    | Quality.NO_GLUING
-    | Quality.CLOUD
-    | Quality.NO_REFERENCE
-    | Quality.UNSTABLE_INVERSION
-)
 
 
 def _error_budget() -> Iterator[Row]:

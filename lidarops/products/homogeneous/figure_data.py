@@ -18,6 +18,7 @@ from lidarops.figures.series_data import (
     require,
 )
 from lidarops.figures.time_axis import Times
+from lidarops.products.homogeneous.flags import FLAGS
 
 Floats = NDArray[np.float64]
 
@@ -90,7 +91,7 @@ def read_sections(
             for name in QUANTITIES
         }
         near, far = float(bounds[k, 0]), float(bounds[k, 1])
-        sections.append(Section(time, flags[:, k], estimates, near, far))
+        sections.append(Section(time, flags[:, k], FLAGS.rejecting, estimates, near, far))
     return sections
 
 

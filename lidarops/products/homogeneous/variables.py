@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     SECTION,
@@ -19,6 +18,7 @@ from lidarops.netcdf.variables import (
     shots,
 )
 from lidarops.netcdf.visibility_rows import visibility_rows
+from lidarops.products.homogeneous.flags import FLAGS
 
 _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
@@ -32,24 +32,6 @@ _UNDETECTED = (
     "This is not an upper bound: departures from the model that its parameters absorb leave no"
     " trace in the residuals. In simulated random departures, this share of the values without a"
     " rejecting flag deviated by more than 4 combined standard errors:"
-)
-
-FLAGS: Final = (
-    Quality.INPUT_MISSING
-    | Quality.SATURATED
-    | Quality.PILE_UP
-    | Quality.INCOMPLETE_OVERLAP
-    | Quality.TOO_FEW_BINS
-    | Quality.NO_SIGNAL
-    | Quality.LOW_SIGNAL
-    | Quality.POORLY_DETERMINED
-    | Quality.NEGATIVE_AMPLITUDE
-    | Quality.AT_BOUND
-    | Quality.POOR_FIT
-    | Quality.NOT_HOMOGENEOUS
-    | Quality.OUTLIER
-    | Quality.NO_REAL_SOLUTION
-    | Quality.NOT_LEVEL
 )
 
 LAYOUT: Final = Layout(

@@ -14,7 +14,8 @@ from lidarops.errors import ProductError
 from lidarops.figures.raster import Raster, bin_edges, read_raster
 from lidarops.figures.series_data import quality_bits, require
 from lidarops.figures.time_axis import usual_step
-from lidarops.flags import Quality, Severity
+from lidarops.kinds import flags_of
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,8 +42,8 @@ RESIDUAL_VARIABLES: Final = (
     "residual",
 )
 """Variables that `read_residuals` needs."""
-_REJECTED: Final = int(Quality.rejecting())
-_WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
+_REJECTED: Final = flags_of("multiangle").rejecting
+_WITH_CARE: Final = flags_of("multiangle").caring
 _UNITS: Final = {"optical_depth": "1", "extinction": "m-1"}
 _BEYOND: Final = 1.15
 """A profile is shown to this many times the height of its reach above the lowest altitude."""
@@ -100,7 +101,7 @@ class ScanProfile:
     estimates: dict[str, ProfileEstimate]
     """Estimate of each of `QUANTITIES`."""
     flag: NDArray[np.int64]
-    """(altitude,) Bits of `Quality`."""
+    """(altitude,) Bits of the kind."""
     reach: float
     """m, highest altitude with an estimate; NaN without one."""
     truth: TrueProfile | None
@@ -317,9 +318,9 @@ def _nearest_upright(
 def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
     """Average the residuals of a product over its cycles.
 
-    Residuals are 100 ln(signal / fit) in percent. Those with `Quality.NO_RESIDUAL` are left out,
-    because they are always zero. Other flagged values are kept, because residuals show the reason
-    of the flag.
+    Residuals are 100 ln(signal / fit) in percent. Those with
+    `MultiAngleQuality.NO_RESIDUAL` are left out, because they are always zero. Other flagged
+    values are kept, because residuals show the reason of the flag.
 
     Parameters
     ----------
@@ -389,7 +390,7 @@ def _sums(product: xr.Dataset) -> _Sums:
     shape = product["residual"].shape[1:]
     sums = _Sums(np.zeros(shape), np.zeros(shape), np.zeros(shape))
     for part in _parts(product):
-        no_residual = (quality_bits(part["quality_flag"]) & int(Quality.NO_RESIDUAL)) != 0
+        no_residual = (quality_bits(part["quality_flag"]) & int(MultiAngleQuality.NO_RESIDUAL)) != 0
         residual = part["residual"].values.astype(np.float64)
         known = np.isfinite(residual) & ~no_residual[:, np.newaxis, :]
         residual = np.where(known, residual, 0.0)
@@ -479,4 +480,4 @@ def read_extinction(product: xr.Dataset, *, profiles: int = 0) -> Raster:
         .assign(background=unknown, background_standard_error=unknown)
     )
     drawn["extinction"].attrs["units"] = "km$^{-1}$"
-    return read_raster(drawn, quantity="extinction", profiles=profiles)
+    return read_raster(drawn, quantity="extinction", kind="multiangle", profiles=profiles)

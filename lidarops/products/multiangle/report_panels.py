@@ -13,8 +13,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import GREY, INK
-from lidarops.figures.wording import bit_name, counted
-from lidarops.flags import Quality
+from lidarops.figures.wording import counted
+from lidarops.kinds import flags_of
 from lidarops.products.multiangle.figure_data import ProfileEstimate, ScanProfile, ScanResiduals
 
 Floats = NDArray[np.float64]
@@ -190,8 +190,8 @@ def _flagged(panel: Axes, profile: ScanProfile, quantity: str, scale: float) -> 
 
 def bits_in_words(profile: ScanProfile) -> str:
     """Return the names of all quality bits of a profile; empty without any."""
-    bits = Quality(int(np.bitwise_or.reduce(profile.flag)))
-    return ", ".join(bit_name(bit) for bit in bits)
+    bits = flags_of("multiangle").raised(int(np.bitwise_or.reduce(profile.flag)))
+    return ", ".join(bit.word for bit in bits)
 
 
 # Residuals -----------------------------------------------------------------------------------

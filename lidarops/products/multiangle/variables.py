@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     PLACE,
@@ -17,31 +16,11 @@ from lidarops.netcdf.variables import (
     quality,
     shots,
 )
+from lidarops.products.multiangle.flags import FLAGS
 
 _LEVELS: Final = ("time", "altitude")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
-
-FLAGS: Final = (
-    Quality.INPUT_MISSING
-    | Quality.SATURATED
-    | Quality.PILE_UP
-    | Quality.INCOMPLETE_OVERLAP
-    | Quality.OUTLIER
-    | Quality.BACKGROUND_UNCERTAIN
-    | Quality.NO_GLUING
-    | Quality.NO_LEVERAGE
-    | Quality.POOR_STRATIFICATION
-    | Quality.PRIOR_DOMINATED
-    | Quality.EXTRAPOLATED
-    | Quality.INTERPOLATED
-    | Quality.ONE_SIDED
-    | Quality.LOW_LEVERAGE
-    | Quality.NO_RESIDUAL
-    | Quality.UNDERSMOOTHED
-    | Quality.HIGH_CORRELATION
-    | Quality.HORIZONTAL_GRADIENT
-)
 
 _ALTITUDE: Final = Row(
     name="altitude",

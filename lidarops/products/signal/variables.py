@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     GLUING,
     NO_STANDARD_NAME,
@@ -18,6 +17,7 @@ from lidarops.netcdf.variables import (
     quality,
     shots,
 )
+from lidarops.products.signal.flags import FLAGS
 
 LAYOUT: Final = Layout(
     title="Range-corrected lidar signals",
@@ -47,16 +47,7 @@ LAYOUT: Final = Layout(
         ),
         SUBTRACTED_BACKGROUND,
         *GLUING,
-        quality(
-            ("time", "range"),
-            Quality.INPUT_MISSING
-            | Quality.SATURATED
-            | Quality.PILE_UP
-            | Quality.INCOMPLETE_OVERLAP
-            | Quality.NO_REAL_SOLUTION
-            | Quality.BACKGROUND_UNCERTAIN
-            | Quality.NO_GLUING,
-        ),
+        quality(("time", "range"), FLAGS),
         shots(of="the profile"),
     ),
 )

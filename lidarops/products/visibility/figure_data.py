@@ -17,7 +17,7 @@ from lidarops.figures.series_data import (
     require,
 )
 from lidarops.figures.time_axis import Times
-from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
 
@@ -122,6 +122,7 @@ def read_crossings(
         NumberedSeries(
             time=time,
             flag=flags[:, v],
+            rejecting=flags_of("visibility").rejecting,
             estimates={
                 "extinction": SeriesEstimate(
                     value[:, v], np.hypot(random, systematic)[:, v], true_extinction[:, v], "m-1"
@@ -174,7 +175,9 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
     crossings = (to_earth_centred(*position) - first) @ turn.T
     ends = origin + 1.08 * reach[:, np.newaxis] * direction
     pair, names = _axes(np.concatenate([origin, crossings]))
-    rejected = (product["quality_flag"].values.astype(np.int64) & int(Quality.rejecting())) != 0
+    rejected = (
+        product["quality_flag"].values.astype(np.int64) & flags_of("visibility").rejecting
+    ) != 0
     visibility = np.where(rejected, np.nan, float_values(product, "visibility_in_air")) / 1e3
     used = np.isfinite(visibility).sum(axis=0)
     return NetworkMap(

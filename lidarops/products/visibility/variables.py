@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     PLACE,
@@ -19,26 +18,11 @@ from lidarops.netcdf.variables import (
     shots,
 )
 from lidarops.netcdf.visibility_rows import visibility_rows
+from lidarops.products.visibility.flags import FLAGS
 
 _SERIES: Final = ("time", "crossing")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
-
-FLAGS: Final = (
-    Quality.INPUT_MISSING
-    | Quality.PILE_UP
-    | Quality.LOW_SIGNAL
-    | Quality.POORLY_DETERMINED
-    | Quality.POOR_FIT
-    | Quality.NOT_HOMOGENEOUS
-    | Quality.OUTLIER
-    | Quality.NO_REAL_SOLUTION
-    | Quality.BACKGROUND_UNCERTAIN
-    | Quality.UNSTABLE_INVERSION
-    | Quality.PRIOR_DOMINATED
-    | Quality.EXTRAPOLATED
-    | Quality.LOW_LEVERAGE
-)
 
 _OF_VALUE: Final = ("condition", "quality_flag", "optical_depth", "reduced_chi2", "shots")
 

@@ -25,6 +25,7 @@ from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic import layers as _layers
 from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic import reference_window as _reference
+from lidarops.retrieve.elastic.flags import ElasticQuality
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -323,11 +324,11 @@ def _solution_flags(
 ) -> Flags:
     """Return the bits of reference, background, outlying bins and inversion."""
     bits = np.zeros(solution.valid.shape, dtype=np.int32)
-    bits[~window.chosen] |= np.int32(Quality.NO_REFERENCE)
+    bits[~window.chosen] |= np.int32(ElasticQuality.NO_REFERENCE)
     bits[signal.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     bits[solution.outlying] |= np.int32(Quality.OUTLIER)
     unsolved = window.chosen[:, np.newaxis] & ~solution.valid & ((quality & _WITHHELD) == 0)
-    bits[unsolved] |= np.int32(Quality.UNSTABLE_INVERSION)
+    bits[unsolved] |= np.int32(ElasticQuality.UNSTABLE_INVERSION)
     return bits
 
 
@@ -343,7 +344,7 @@ def _cloud_flags(
     near, far = distance < bottom, distance >= bottom
     above = np.logical_or.accumulate(clouds.mask & far, axis=-1)
     below = np.logical_or.accumulate((clouds.mask & near)[:, ::-1], axis=-1)[:, ::-1]
-    return (above | below).astype(np.int32) * np.int32(Quality.CLOUD)
+    return (above | below).astype(np.int32) * np.int32(ElasticQuality.CLOUD)
 
 
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:

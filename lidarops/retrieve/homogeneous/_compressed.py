@@ -34,6 +34,7 @@ from lidarops.retrieve.homogeneous._vector_loops import (
     project_6_8,
     residuals,
 )
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -74,10 +75,10 @@ RESULTS: Final = (
 """Rows of the results."""
 
 _LOW_SIGNAL: Final = int(Quality.LOW_SIGNAL)
-_POORLY_DETERMINED: Final = int(Quality.POORLY_DETERMINED)
+_POORLY_DETERMINED: Final = int(HomogeneousQuality.POORLY_DETERMINED)
 _NEGATIVE_AMPLITUDE: Final = int(Quality.NEGATIVE_AMPLITUDE)
-_AT_BOUND: Final = int(Quality.AT_BOUND)
-_POOR_FIT: Final = int(Quality.POOR_FIT)
+_AT_BOUND: Final = int(HomogeneousQuality.AT_BOUND)
+_POOR_FIT: Final = int(HomogeneousQuality.POOR_FIT)
 _NOT_HOMOGENEOUS: Final = int(Quality.NOT_HOMOGENEOUS)
 _OUTLIER: Final = int(Quality.OUTLIER)
 _NO_SIGNAL: Final = int(Quality.NO_SIGNAL)

@@ -17,6 +17,7 @@ from scipy import special
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _estimate
 from lidarops.retrieve.homogeneous._estimate import PathEstimate
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -124,11 +125,11 @@ def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> 
         limits = _limits(fit, unknowns, known_variance=known_variance)
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / noise > LOWEST_SIGNAL**2),
-            (Quality.POORLY_DETERMINED, _determined(fit, noise, limits.widening)),
+            (HomogeneousQuality.POORLY_DETERMINED, _determined(fit, noise, limits.widening)),
             (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
-            (Quality.AT_BOUND, fit.bounded == 0),
-            (Quality.POOR_FIT, reduced >= limits.least_misfit),
-            (Quality.POOR_FIT, reduced <= limits.most_misfit),
+            (HomogeneousQuality.AT_BOUND, fit.bounded == 0),
+            (HomogeneousQuality.POOR_FIT, reduced >= limits.least_misfit),
+            (HomogeneousQuality.POOR_FIT, reduced <= limits.most_misfit),
             (Quality.NOT_HOMOGENEOUS, fit.trend / noise <= limits.trend),
             (Quality.OUTLIER, fit.largest / np.sqrt(noise) <= limits.outlier),
         )

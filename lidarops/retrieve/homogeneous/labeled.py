@@ -13,6 +13,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail as _background
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
 """Bits that exclude a bin from a fit."""
@@ -173,7 +174,8 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
     length = result["section_bounds"].isel(nv=1) - result["section_bounds"].isel(nv=0)
     climb = length * np.abs(np.cos(np.deg2rad(zenith_angle)))
     # Negated, so that an unknown angle does not count as level.
-    bits: xr.DataArray = (~(climb <= LEVEL)).astype(np.int32) * np.int32(Quality.NOT_LEVEL)
+    sloping = ~(climb <= LEVEL)
+    bits: xr.DataArray = sloping.astype(np.int32) * np.int32(HomogeneousQuality.NOT_LEVEL)
     return bits.drop_vars(bits.coords)
 
 

@@ -13,6 +13,7 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.retrieve.background.left_signal import shifts
 from lidarops.retrieve.multiangle import optical_depth, slant_paths
+from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleMethod,
@@ -27,17 +28,17 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 _QUALITY_OF_FLAG: Final = {
-    "no_data": Quality.NO_LEVERAGE,
-    "extrapolated": Quality.EXTRAPOLATED,
-    "interpolated": Quality.INTERPOLATED,
-    "no_residual": Quality.NO_RESIDUAL,
-    "low_leverage": Quality.LOW_LEVERAGE,
-    "one_sided": Quality.ONE_SIDED,
-    "gradient": Quality.HORIZONTAL_GRADIENT,
-    "poor_stratification": Quality.POOR_STRATIFICATION,
-    "prior_dominated": Quality.PRIOR_DOMINATED,
-    "undersmoothed": Quality.UNDERSMOOTHED,
-    "high_correlation": Quality.HIGH_CORRELATION,
+    "no_data": MultiAngleQuality.NO_LEVERAGE,
+    "extrapolated": MultiAngleQuality.EXTRAPOLATED,
+    "interpolated": MultiAngleQuality.INTERPOLATED,
+    "no_residual": MultiAngleQuality.NO_RESIDUAL,
+    "low_leverage": MultiAngleQuality.LOW_LEVERAGE,
+    "one_sided": MultiAngleQuality.ONE_SIDED,
+    "gradient": MultiAngleQuality.HORIZONTAL_GRADIENT,
+    "poor_stratification": MultiAngleQuality.POOR_STRATIFICATION,
+    "prior_dominated": MultiAngleQuality.PRIOR_DOMINATED,
+    "undersmoothed": MultiAngleQuality.UNDERSMOOTHED,
+    "high_correlation": MultiAngleQuality.HIGH_CORRELATION,
     "outlier": Quality.OUTLIER,
 }
 """Of `MultiAngleFlags`; `saturated` is included in `prior_dominated`."""
@@ -146,7 +147,7 @@ def _layer_variables(
     retrieval: MultiAngleResult, quality: Flags, altitude: Array, bounds: Array
 ) -> dict[str, xr.Variable]:
     """Return the variables of layers; NaN where a flag rejects the value at a bound."""
-    rejected = (quality & np.int32(Quality.rejecting())) != 0
+    rejected = (quality & np.int32(REJECTING)) != 0
     # At the station the optical depth is zero, and nothing is rejected.
     rejected = np.hstack([np.zeros((len(quality), 1), dtype=np.bool_), rejected])
     levels = np.searchsorted(altitude, bounds, side="right")
@@ -210,17 +211,21 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     bits |= np.where(empty, np.int32(Quality.INPUT_MISSING), np.int32(0))
     untested = np.isfinite(retrieval.optical_depth) & ~np.isfinite(retrieval.reduced_chi_square)
     untested &= ~raised["interpolated"]
-    bits |= np.where(untested, np.int32(Quality.NO_RESIDUAL), np.int32(0))
+    bits |= np.where(untested, np.int32(MultiAngleQuality.NO_RESIDUAL), np.int32(0))
     unflagged = (bits & ~np.int32(CARE)) == 0
     lost = ~np.isfinite(retrieval.optical_depth) & unflagged
-    reasons = np.where(samples > 1, np.int32(Quality.NO_LEVERAGE), carried & np.int32(WITHHELD))
-    reasons = np.where(reasons == 0, np.int32(Quality.NO_LEVERAGE), reasons)
+    reasons = np.where(
+        samples > 1, np.int32(MultiAngleQuality.NO_LEVERAGE), carried & np.int32(WITHHELD)
+    )
+    reasons = np.where(reasons == 0, np.int32(MultiAngleQuality.NO_LEVERAGE), reasons)
     bits |= np.where(lost, reasons, np.int32(0))
     # The layer that ends at a valid altitude may begin in a gap.
     gapped = np.zeros(lost.shape, dtype=bool)
     for name in _PER_ALTITUDE:
         gapped |= ~np.isfinite(getattr(retrieval, name))
-    return bits | np.where(gapped & unflagged & ~lost, np.int32(Quality.INTERPOLATED), np.int32(0))
+    return bits | np.where(
+        gapped & unflagged & ~lost, np.int32(MultiAngleQuality.INTERPOLATED), np.int32(0)
+    )
 
 
 def _shifted_by_background(

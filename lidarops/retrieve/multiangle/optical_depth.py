@@ -20,6 +20,7 @@ from lidarops.retrieve.multiangle._result import (
     Profiles,
     StepRecord,
 )
+from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.mld import Regularisation
 
 Array = npt.NDArray[np.float64]
@@ -345,7 +346,7 @@ def _quality(profiles: Profiles, observed: npt.NDArray[np.bool_]) -> npt.NDArray
     lost = profiles.flags["extrapolated"] & ~profiles.flags["no_data"]
     quality[lost] |= np.int32(Quality.LOW_SIGNAL)
     quality[profiles.flags["outlier"]] |= np.int32(Quality.OUTLIER)
-    unexplained = np.isnan(profiles.optical_depth) & (quality & int(Quality.rejecting()) == 0)
+    unexplained = np.isnan(profiles.optical_depth) & (quality & REJECTING == 0)
     quality[unexplained & ~observed] |= np.int32(Quality.INPUT_MISSING)
-    quality[unexplained & observed] |= np.int32(Quality.NO_LEVERAGE)
+    quality[unexplained & observed] |= np.int32(MultiAngleQuality.NO_LEVERAGE)
     return quality

@@ -18,6 +18,7 @@ from lidarops.retrieve.background.estimate import from_tail
 from lidarops.retrieve.background.left_signal import shifts
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
+from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 
 Array = npt.NDArray[np.float64]
@@ -29,18 +30,18 @@ _UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
 _WARNINGS: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits of bins that are passed on to the values they contribute to."""
 _QUALITY_OF_FLAG: Final = {
-    "ill_conditioned": Quality.POORLY_DETERMINED,
-    "far_start": Quality.EXTRAPOLATED,
+    "ill_conditioned": NetworkQuality.POORLY_DETERMINED,
+    "far_start": NetworkQuality.EXTRAPOLATED,
     "not_positive": Quality.NO_REAL_SOLUTION,
-    "uncertain": Quality.POORLY_DETERMINED,
+    "uncertain": NetworkQuality.POORLY_DETERMINED,
     "signal_not_positive": Quality.LOW_SIGNAL,
     "signal_missing": Quality.INPUT_MISSING,
-    "weak_signal": Quality.LOW_LEVERAGE,
+    "weak_signal": NetworkQuality.LOW_LEVERAGE,
     "bridged": Quality.OUTLIER,
-    "outlying": Quality.POOR_FIT,
-    "pole": Quality.UNSTABLE_INVERSION,
-    "unsettled": Quality.POOR_FIT,
-    "poor_fit": Quality.POOR_FIT,
+    "outlying": NetworkQuality.POOR_FIT,
+    "pole": NetworkQuality.UNSTABLE_INVERSION,
+    "unsettled": NetworkQuality.POOR_FIT,
+    "poor_fit": NetworkQuality.POOR_FIT,
     "not_homogeneous": Quality.NOT_HOMOGENEOUS,
     "not_measured": Quality.INPUT_MISSING,
 }
@@ -394,11 +395,13 @@ def _quality_flags(
     background_doubt = shifts(errors.tail_signal, errors.random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(
-        uncertain & np.isfinite(result.extinction), np.int32(Quality.POORLY_DETERMINED), np.int32(0)
+        uncertain & np.isfinite(result.extinction),
+        np.int32(NetworkQuality.POORLY_DETERMINED),
+        np.int32(0),
     )
     with np.errstate(invalid="ignore"):
-        bits[result.degrees_of_freedom < 0] |= np.int32(Quality.PRIOR_DOMINATED)
-    unexplained = ~np.isfinite(result.extinction) & ((bits & np.int32(Quality.rejecting())) == 0)
+        bits[result.degrees_of_freedom < 0] |= np.int32(NetworkQuality.PRIOR_DOMINATED)
+    unexplained = ~np.isfinite(result.extinction) & ((bits & np.int32(REJECTING)) == 0)
     reason = np.where(
         result.flags.weak_signal, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION)
     )

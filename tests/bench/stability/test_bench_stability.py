@@ -40,7 +40,7 @@ from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM
 
 HOLDS = Failure("none", satisfied=True)
 HIDDEN = Failure("hidden", unseen="it has the shape of the answer")
-BAD = int(Quality.POOR_FIT)
+BAD = int(Quality.NOT_HOMOGENEOUS)
 CARE = int(Quality.OUTLIER)
 
 
@@ -48,7 +48,7 @@ def scored(failure, error, bits=0, **more):
     error = np.asarray(error, dtype=np.float64)
     stated = {"random": np.ones(error.shape), "systematic": 0.0} | more
     bits = np.broadcast_to(np.int32(bits), error.shape)
-    return ScoredValues(failure, "x", error, bits=bits, **stated)
+    return ScoredValues(failure, "x", error, bits=bits, own=(), **stated)
 
 
 def counted(*chunks, needless=0.05):

@@ -19,6 +19,7 @@ from lidarops.bench.stability.stiff_cases import (
     Missing,
     Near,
     Refused,
+    Rejected,
     Retrieval,
     StiffCase,
     Unflagged,
@@ -30,7 +31,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 
 CASES = study.all_cases()
-BAD = int(Quality.POOR_FIT)
+BAD = int(Quality.NOT_HOMOGENEOUS)
 CARE = int(Quality.OUTLIER)
 
 
@@ -74,7 +75,8 @@ def answer(value, error=1.0, bits=0):
         (Near("x", lambda: 2.0, 0.1), answer([2.0]), answer([np.nan])),
         (Between("x", 1.0, 2.0), answer([1.0, 2.0]), answer([1.5, np.nan])),
         (Missing("x"), answer([np.nan, np.nan]), answer([np.nan, 0.0])),
-        (Flagged(Quality.POOR_FIT), answer([1.0], bits=BAD), answer([1.0], bits=CARE)),
+        (Flagged(Quality.NOT_HOMOGENEOUS), answer([1.0], bits=BAD), answer([1.0], bits=CARE)),
+        (Rejected(), answer([1.0], bits=BAD), answer([1.0], bits=CARE)),
         (Accepted(), answer([1.0], bits=CARE), answer([1.0], bits=BAD)),
         (Unflagged(), answer([1.0]), answer([1.0], bits=CARE)),
         (Covered("x", 0.0), answer([3.9, -3.9]), answer([0.0, 4.1])),

@@ -13,6 +13,7 @@ from lidarops.flags import Quality
 from lidarops.products.elastic.variables import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
+from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import Reference, invert_elastic
 
 GREEN = 532e-9
@@ -274,7 +275,7 @@ def test_a_cloud_below_the_reference_is_flagged_with_all_bins_below_it():
     assert np.all((base > 3250.0) & (base < 3500.0))
     bottom = retrieved["reference_bottom"].to_numpy()
     assert np.all(bottom >= 5000.0)
-    flagged = has(retrieved, Quality.CLOUD)
+    flagged = has(retrieved, ElasticQuality.CLOUD)
     # The inversion starts above: values below the cloud depend on its lidar ratio.
     assert flagged[:, distance < 3550.0].all()
     assert not flagged[:, between(5000.0, 9000.0)].any()
@@ -284,7 +285,7 @@ def test_a_cloud_above_the_reference_flags_the_bins_beyond_it():
     signal = light(distance, backscatter=cloud(8000.0 + STATION, 2e-5))
     window = Reference(5000.0, 7500.0, 1000.0, 1.0, 0.0)
     retrieved = solved(counted(signal, 10, exposure=100 * EXPOSURE), reference=window)
-    flagged = has(retrieved, Quality.CLOUD)
+    flagged = has(retrieved, ElasticQuality.CLOUD)
     assert np.all(np.isfinite(retrieved["reference_bottom"]))
     assert flagged[:, distance > 8100.0].all()
     assert not flagged[:, distance < 7700.0].any()
@@ -303,7 +304,7 @@ def test_values_beyond_either_of_two_clouds_are_flagged():
     retrieved = solved(counted(light(distance, backscatter=both), 5), reference=window)
     assert np.all(retrieved["cloud_base_range"] < 3600.0)
     assert np.all(np.isfinite(retrieved["reference_bottom"]))
-    flagged = has(retrieved, Quality.CLOUD)
+    flagged = has(retrieved, ElasticQuality.CLOUD)
     assert flagged[:, distance < 3550.0].all()
     assert not flagged[:, between(5000.0, 8200.0)].any()
     assert flagged[:, distance > 9100.0].all()
@@ -340,8 +341,8 @@ def test_no_reference_window_holds_a_cloud():
 def test_an_opaque_cloud_leaves_no_reference():
     signal = light(distance, backscatter=cloud(2500.0, 2e-3, 100.0))
     retrieved = solved(counted(signal, 10))
-    assert has(retrieved, Quality.NO_REFERENCE).all()
-    assert has(retrieved, Quality.CLOUD)[:, between(2500.0, 12_000.0)].all()
+    assert has(retrieved, ElasticQuality.NO_REFERENCE).all()
+    assert has(retrieved, ElasticQuality.CLOUD)[:, between(2500.0, 12_000.0)].all()
     assert np.isnan(retrieved["backscatter"]).all()
     for end in ("reference_bottom", "reference_top"):
         assert np.isnan(retrieved[end]).all()
@@ -438,7 +439,7 @@ def assert_missing_is_flagged(retrieved):
         values = retrieved[name].to_numpy()
         assert not np.isinf(values).any(), name
         assert (flags[np.isnan(values)] != 0).all(), name
-    rejected = (flags & int(Quality.NO_REFERENCE | labeled._WITHHELD)) != 0
+    rejected = (flags & int(ElasticQuality.NO_REFERENCE | labeled._WITHHELD)) != 0
     assert np.isnan(retrieved["backscatter"].to_numpy()[rejected]).all()
     assert not (flags & ~np.int32(FLAGS)).any()
 
@@ -472,17 +473,17 @@ def messy(seed=0):
 def test_every_missing_value_carries_a_bit(known_shape, seed):
     retrieved = solved(messy(seed), known_shape=known_shape)
     assert_missing_is_flagged(retrieved)
-    both = BITS[Quality.INPUT_MISSING] | BITS[Quality.NO_REFERENCE]
+    both = BITS[Quality.INPUT_MISSING] | BITS[ElasticQuality.NO_REFERENCE]
     assert ((retrieved["quality_flag"].to_numpy()[0] & both) == both).all()
     for k in (4, 8, 9, 10):
-        assert has(retrieved, Quality.NO_REFERENCE)[k].all()
+        assert has(retrieved, ElasticQuality.NO_REFERENCE)[k].all()
     # Bins withheld for another reason are not marked as unstable.
     assert has(retrieved, Quality.SATURATED)[1, :40].all()
-    assert not has(retrieved, Quality.UNSTABLE_INVERSION)[1, :40].any()
+    assert not has(retrieved, ElasticQuality.UNSTABLE_INVERSION)[1, :40].any()
     # The integration continues over a gap of 75 m, and ends at one of 300 m.
     assert np.isfinite(retrieved["backscatter"][5, 100:290]).all()
     assert np.isnan(retrieved["backscatter"][6, :300]).all()
-    assert has(retrieved, Quality.UNSTABLE_INVERSION)[6, :300].all()
+    assert has(retrieved, ElasticQuality.UNSTABLE_INVERSION)[6, :300].all()
     # Without the last tenth of the bins, only the fit of a shape gives a background.
     assert np.isfinite(retrieved["backscatter"][7, 100:1000]).all() == known_shape
 
@@ -522,8 +523,8 @@ def test_an_inversion_away_from_the_reference_stops_where_it_is_unstable():
     window = Reference(5000.0, 6500.0, 1000.0, 1.0, 0.0)
     retrieved = solved(counted(signal, 5, exposure=100 * EXPOSURE), reference=window)
     assert np.isfinite(retrieved["reference_bottom"]).all()
-    assert has(retrieved, Quality.UNSTABLE_INVERSION)[:, distance > 7100.0].all()
-    assert has(retrieved, Quality.CLOUD)[:, distance > 7100.0].all()
+    assert has(retrieved, ElasticQuality.UNSTABLE_INVERSION)[:, distance > 7100.0].all()
+    assert has(retrieved, ElasticQuality.CLOUD)[:, distance > 7100.0].all()
     assert_missing_is_flagged(retrieved)
 
 

@@ -17,6 +17,7 @@ from lidarops.retrieve.homogeneous import (
     _vector_loops,
 )
 from lidarops.retrieve.homogeneous._functional_tables import make_tables
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 
 KM = 1e-3
@@ -228,7 +229,9 @@ def test_result_is_that_of_converged_least_squares(start, length, known, method,
     variance = 1.0 if known else None
     exact = fit_homogeneous_path(power, r, variance=variance, method="direct")
     fit = fit_homogeneous_path(power, r, variance=variance, method=method)
-    undetermined = Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND
+    undetermined = (
+        Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED | HomogeneousQuality.AT_BOUND
+    )
     valid = (exact.quality & int(undetermined)) == 0
     assert valid.sum() > 1000
     for name in ("extinction", "background", "amplitude"):

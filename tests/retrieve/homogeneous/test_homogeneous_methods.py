@@ -19,8 +19,10 @@ from support.oracles.homogeneous import (
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.background.photon_counts import mean_profile_variance
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 
 KM = 1e-3
@@ -221,7 +223,7 @@ def test_wrong_known_extinction_is_flagged():
     fit = fit_homogeneous_path(
         clean(200), LONG, variance=1.0, method="known_extinction", extinction=0.1 * KM
     )
-    assert np.all(fit.quality & Quality.POOR_FIT)
+    assert np.all(fit.quality & HomogeneousQuality.POOR_FIT)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -379,7 +381,7 @@ def test_published_bias_is_that_of_the_noise_and_the_fit_has_none(length, expect
         assert 0.93 < coverage(fit, "background", 370.0) < 0.97
         assert abs(np.mean(errors)) < 0.05 * (np.mean(published) - 370.0)
     else:
-        assert np.all(fit.quality & Quality.rejecting())
+        assert np.all(fit.quality & flags_of("homogeneous").rejecting)
 
 
 @pytest.mark.parametrize("length", [500.0, 1000.0, 2000.0, 2500.0])
@@ -453,7 +455,7 @@ def test_robust_passes_do_not_hide_that_a_path_is_not_homogeneous():
     wave = 1.0 + 0.3 * np.sin(np.pi * (LONG - LONG[0]) / 1500.0)
     power = 370.0 + signal(LONG, 1e3, 0.03 * KM) * wave + noise(300, seed=20)
     fit = fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=3)
-    rejecting = int(Quality.rejecting())
+    rejecting = flags_of("homogeneous").rejecting
     assert np.all(fit.quality & rejecting)
     assert np.all(fit.valid_bins > 112)
 

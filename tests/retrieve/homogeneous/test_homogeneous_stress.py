@@ -24,8 +24,10 @@ from support.oracles.homogeneous import (
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.background.photon_counts import mean_profile_variance
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 
 METHODS = ("direct", "compressed", "fast")
@@ -33,7 +35,9 @@ KM = 1e-3
 LONG = section(2500.0, 8000.0)
 FIELDS = tuple(HomogeneousResult.__dataclass_fields__)
 WEAK = 0.03 * KM
-UNDETERMINED = Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND
+UNDETERMINED = (
+    Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED | HomogeneousQuality.AT_BOUND
+)
 
 NONE = Quality(0)
 
@@ -59,7 +63,7 @@ def rows_of(fit, rows):
 
 def bits_tested_by(method, known=True):
     """Return the bits that a method tests: the fast one skips some where the noise is known."""
-    skipped = Quality.POOR_FIT | Quality.OUTLIER if method == "fast" and known else NONE
+    skipped = HomogeneousQuality.POOR_FIT | Quality.OUTLIER if method == "fast" and known else NONE
     return ~skipped
 
 
@@ -176,7 +180,9 @@ TABLE = {
     "negative background": Outcome(
         negative_background, accepted=MOST, scatter=0.000319, background=-2.0
     ),
-    "saturated": Outcome(saturated, Quality.POOR_FIT | Quality.AT_BOUND, chi2=(500.0, 5000.0)),
+    "saturated": Outcome(
+        saturated, HomogeneousQuality.POOR_FIT | HomogeneousQuality.AT_BOUND, chi2=(500.0, 5000.0)
+    ),
     "saturated, masked": Outcome(
         lambda power: (saturated(power), saturated_masked(power)), accepted=MOST, scatter=0.00056
     ),
@@ -188,8 +194,8 @@ TABLE = {
         bias=(-2.0, -1.0),
         chi2=(0.98, 1.05),
     ),
-    "overlap at 2 km": Outcome(overlap_far, Quality.POOR_FIT, chi2=(30.0, np.inf)),
-    "cloud": Outcome(cloud, Quality.POOR_FIT | Quality.OUTLIER, chi2=(100.0, np.inf)),
+    "overlap at 2 km": Outcome(overlap_far, HomogeneousQuality.POOR_FIT, chi2=(30.0, np.inf)),
+    "cloud": Outcome(cloud, HomogeneousQuality.POOR_FIT | Quality.OUTLIER, chi2=(100.0, np.inf)),
     # One standard deviation of chi-square is 0.1: some are a poor fit by that alone.
     "spike": Outcome(
         spike, accepted=(0.5, 1.0), scatter=0.000319, bias=(-0.6, 0.6), chi2=(1.2, 1.4)
@@ -216,7 +222,7 @@ def test_robustness_table(case, method):
     fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     for bit in outcome.every & bits_tested_by(method):
         assert share(fit, bit) == 1.0, bit
-    accepted = 1.0 - share(fit, Quality.rejecting())
+    accepted = 1.0 - share(fit, flags_of("homogeneous").rejecting)
     assert outcome.accepted[0] <= accepted <= outcome.accepted[1]
     for name in outcome.missing:
         assert np.isnan(getattr(fit, name)).all(), name
@@ -256,7 +262,7 @@ def test_robust_passes_recover(case, method):
     errors = (fit.extinction - WEAK) / fit.extinction_standard_error
     assert abs(np.mean(errors)) < 0.15
     assert np.std(errors) == pytest.approx(1.0, abs=0.08)
-    assert 1.0 - share(fit, Quality.rejecting()) > 0.99
+    assert 1.0 - share(fit, flags_of("homogeneous").rejecting) > 0.99
     assert share(fit, Quality.OUTLIER) > 0.97
 
 
@@ -454,7 +460,8 @@ def test_s13_saturation(known, method):
     variance = 1.0 if known else None
     assert (
         share(
-            fit_homogeneous_path(power, LONG, variance=variance, method=method), Quality.rejecting()
+            fit_homogeneous_path(power, LONG, variance=variance, method=method),
+            flags_of("homogeneous").rejecting,
         )
         == 1.0
     )
@@ -470,7 +477,7 @@ def test_s14_overlap_that_no_test_can_detect(method):
     fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     bias = np.mean(fit.extinction - WEAK) / np.median(fit.extinction_standard_error)
     assert -2.0 < bias < -1.0
-    assert 1.0 - share(fit, Quality.rejecting()) > 0.9
+    assert 1.0 - share(fit, flags_of("homogeneous").rejecting) > 0.9
     # The model error covers it.
     assert np.all(np.abs(fit.extinction - WEAK) < fit.extinction_model_error)
 
@@ -506,7 +513,7 @@ def test_s18_cloud(known, method):
     power = clean()
     cloud(power)
     fit = fit_homogeneous_path(power, LONG, variance=1.0 if known else None, method=method)
-    doubt = Quality.POOR_FIT & bits_tested_by(method, known) or Quality.NOT_HOMOGENEOUS
+    doubt = HomogeneousQuality.POOR_FIT & bits_tested_by(method, known) or Quality.NOT_HOMOGENEOUS
     assert share(fit, doubt) == 1.0
     if known and method != "fast":
         assert np.all(fit.reduced_chi2 > 100.0)

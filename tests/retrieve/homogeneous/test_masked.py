@@ -7,6 +7,7 @@ from support.oracles.homogeneous import GEOMETRIES, lowest_errors, section, sign
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _masked
 from lidarops.retrieve.homogeneous._estimate import COLUMNS
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
 KM = 1e-3
@@ -16,7 +17,9 @@ CASES = [
     (2500.0, 1700.0, 1e4, 0.03),
     (10500.0, 2500.0, 3e4, 0.1),
 ]
-UNDETERMINED = int(Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND)
+UNDETERMINED = int(
+    Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED | HomogeneousQuality.AT_BOUND
+)
 
 
 def weights_of(kind, count, seed=0):

@@ -18,6 +18,7 @@ from support.oracles.homogeneous import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import (
     HomogeneousMethod,
     HomogeneousResult,
@@ -26,8 +27,8 @@ from lidarops.retrieve.homogeneous.path_fit import (
 
 KM = 1e-3
 LONG = section(2500.0, 8000.0)
-SOLVED = Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.NEGATIVE_AMPLITUDE
-SOLVED |= Quality.AT_BOUND
+SOLVED = Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED | Quality.NEGATIVE_AMPLITUDE
+SOLVED |= HomogeneousQuality.AT_BOUND
 
 
 def noise(count, bins=225, seed=0):
@@ -253,7 +254,7 @@ def test_false_alarms_are_rare(known):
         r = section(2500.0, 8000.0, bins)
         power = clean(20_000 if bins < 500 else 6000, 3e3, seed=7, r=r)
         fit = fit_homogeneous_path(power, r, variance=1.0 if known else None)
-        for bit in (Quality.POOR_FIT, Quality.NOT_HOMOGENEOUS, Quality.OUTLIER):
+        for bit in (HomogeneousQuality.POOR_FIT, Quality.NOT_HOMOGENEOUS, Quality.OUTLIER):
             # 5e-4 as designed, plus three standard deviations of the count.
             assert share(fit, bit) < 5e-4 + 3 * np.sqrt(5e-4 / len(power)), (bins, bit)
         assert share(fit, SOLVED) == 0
@@ -281,7 +282,7 @@ def test_backscatter_that_varies_along_the_path_is_flagged():
         power = 370.0 + signal(LONG, height, 0.03 * KM) * wave + noise(2000)
         for variance in (1.0, None):
             fit = fit_homogeneous_path(power, LONG, variance=variance)
-            assert share(fit, Quality.NOT_HOMOGENEOUS | Quality.POOR_FIT) == 1.0
+            assert share(fit, Quality.NOT_HOMOGENEOUS | HomogeneousQuality.POOR_FIT) == 1.0
 
 
 def test_weak_bend_is_detected_by_the_trend_before_chi_square():
@@ -289,7 +290,7 @@ def test_weak_bend_is_detected_by_the_trend_before_chi_square():
     power = 370.0 + signal(LONG, 2500.0, 0.03 * KM) * bend + noise(500)
     fit = fit_homogeneous_path(power, LONG, variance=1.0)
     assert share(fit, Quality.NOT_HOMOGENEOUS) > 0.95
-    assert share(fit, Quality.POOR_FIT) < 0.7
+    assert share(fit, HomogeneousQuality.POOR_FIT) < 0.7
 
 
 def test_vertical_atmosphere_is_flagged():
@@ -304,8 +305,12 @@ def test_vertical_atmosphere_is_flagged():
 
 def test_wrong_noise_variance_is_flagged():
     power = clean()
-    assert share(fit_homogeneous_path(power, LONG, variance=0.5), Quality.POOR_FIT) == 1.0
-    assert share(fit_homogeneous_path(power, LONG, variance=2.0), Quality.POOR_FIT) == 1.0
+    assert (
+        share(fit_homogeneous_path(power, LONG, variance=0.5), HomogeneousQuality.POOR_FIT) == 1.0
+    )
+    assert (
+        share(fit_homogeneous_path(power, LONG, variance=2.0), HomogeneousQuality.POOR_FIT) == 1.0
+    )
 
 
 def test_dead_time_and_saturation_are_flagged():
@@ -319,8 +324,8 @@ def test_dead_time_and_saturation_are_flagged():
     )
     clipped = np.minimum(clean(), 370.0 + 600.0)
     fit = fit_homogeneous_path(clipped, LONG, variance=1.0)
-    assert np.all(fit.quality & Quality.POOR_FIT)
-    assert np.all(fit.quality & Quality.AT_BOUND)
+    assert np.all(fit.quality & HomogeneousQuality.POOR_FIT)
+    assert np.all(fit.quality & HomogeneousQuality.AT_BOUND)
     masked = fit_homogeneous_path(np.where(clipped < 969.9, clipped, np.nan), LONG, variance=1.0)
     assert np.mean(masked.quality == 0) > 0.995
     assert abs(np.median(masked.extinction) - 0.03 * KM) < 0.05e-6
@@ -329,7 +334,8 @@ def test_dead_time_and_saturation_are_flagged():
 def test_incomplete_overlap_is_flagged_only_where_it_is_visible():
     near = 370.0 + signal(LONG, 1e3, 0.03 * KM) * (1 - np.exp(-((LONG / 2000.0) ** 2)))
     assert np.all(
-        fit_homogeneous_path(near + noise(100), LONG, variance=1.0).quality & Quality.POOR_FIT
+        fit_homogeneous_path(near + noise(100), LONG, variance=1.0).quality
+        & HomogeneousQuality.POOR_FIT
     )
     # Full overlap at 1 km leaves a bias of 1.5 standard errors that no test can detect; an
     # overlap mask is needed. This is a documented limit.
@@ -344,9 +350,9 @@ def test_cloud_and_outlier_are_flagged():
     cloud = clean()
     cloud[:, 100:104] += 200.0
     fit = fit_homogeneous_path(cloud, LONG, variance=1.0)
-    assert np.all(fit.quality & Quality.POOR_FIT)
+    assert np.all(fit.quality & HomogeneousQuality.POOR_FIT)
     assert np.all(fit.reduced_chi2 > 100)
-    assert np.all(fit_homogeneous_path(cloud, LONG).quality & Quality.POOR_FIT)
+    assert np.all(fit_homogeneous_path(cloud, LONG).quality & HomogeneousQuality.POOR_FIT)
     spike = clean()
     spike[:, 150] += 8.0
     for variance in (1.0, None):
@@ -408,7 +414,7 @@ def test_inverted_profile_has_negative_amplitude():
 def test_single_weak_shot_of_counts_is_flagged():
     power = np.random.default_rng(10).poisson(10.0 + signal(LONG, 20.0, 0.03 * KM), (1000, 225))
     fit = fit_homogeneous_path(power, LONG, variance=power.mean(axis=0))
-    assert np.all(fit.quality & Quality.POORLY_DETERMINED)
+    assert np.all(fit.quality & HomogeneousQuality.POORLY_DETERMINED)
 
 
 def test_lower_bound_excludes_the_second_minimum():
@@ -423,12 +429,12 @@ def test_extinction_stays_within_given_bounds_and_is_flagged():
         clean(50), LONG, variance=1.0, extinction_bounds=(0.05 * KM, 1.0 * KM)
     )
     assert np.all(fit.extinction == 0.05 * KM)
-    assert np.all(fit.quality & Quality.AT_BOUND)
+    assert np.all(fit.quality & HomogeneousQuality.AT_BOUND)
     upper = fit_homogeneous_path(
         clean(50), LONG, variance=1.0, extinction_bounds=(-0.02 * KM, 0.02 * KM)
     )
     np.testing.assert_allclose(upper.extinction, 0.02 * KM, rtol=1e-12)
-    assert np.all(upper.quality & Quality.AT_BOUND)
+    assert np.all(upper.quality & HomogeneousQuality.AT_BOUND)
     clear = signal(LONG, 1.0, 1e-8 * KM) + 25.0
     assert fit_homogeneous_path(clear, LONG).quality == 0
 

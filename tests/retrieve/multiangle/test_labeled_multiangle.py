@@ -11,8 +11,10 @@ from support.oracles.angle_scenes import retrieve_scan
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import Background
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod
 
@@ -122,7 +124,7 @@ def errors(product: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Return errors over standard errors, and where only one-sidedness is flagged."""
     truth = optical_depth(ALTITUDE - STATION)
     off = (product["optical_depth"] - truth) / product["optical_depth_standard_error"]
-    plain = (product["quality_flag"].to_numpy() & ~int(Quality.ONE_SIDED)) == 0
+    plain = (product["quality_flag"].to_numpy() & ~int(MultiAngleQuality.ONE_SIDED)) == 0
     return off.to_numpy(), plain
 
 
@@ -156,11 +158,11 @@ def test_unflagged_optical_depths_lie_within_three_standard_errors(
 def test_single_altitudes_stay_valid_if_shot_energy_jitters():
     profiles = scan(32, sigma=0.05, scatter=0.002, jitter=0.02)
     joint = solve(*profiles, method="joint", background=FAR)
-    assert has(joint, Quality.HIGH_CORRELATION).all()
+    assert has(joint, MultiAngleQuality.HIGH_CORRELATION).all()
     product = solve(*profiles, background=FAR)
     assert "left out joint" in product.attrs["steps"]
     off, _ = errors(product)
-    stands = ~has(product, Quality.rejecting())
+    stands = ~has(product, flags_of("multiangle").rejecting)
     assert stands.mean() > 0.5
     assert np.mean(np.abs(off[stands]) < 3) >= 0.99
     assert_explained(product)
@@ -171,7 +173,7 @@ def test_extinction_is_that_of_the_layers():
     tops = np.append(0.0, ALTITUDE - STATION)
     truth = np.diff(optical_depth(tops)) / np.diff(tops)
     off = ((product["extinction"] - truth) / product["extinction_standard_error"]).to_numpy()
-    good = ~has(product, Quality.rejecting())
+    good = ~has(product, flags_of("multiangle").rejecting)
     assert np.mean(np.abs(off[good]) < 3) >= 0.98
     assert float(product["extinction_standard_error"].median()) < 3e-5
 
@@ -191,7 +193,7 @@ def test_optical_depths_of_layers_lie_within_their_errors(method):
             product["layer_optical_depth_gradient_error"],
         )
         off.append(((product["layer_optical_depth"] - truth) / error).to_numpy())
-        reject = has(product, Quality.rejecting())
+        reject = has(product, flags_of("multiangle").rejecting)
         hidden = np.stack([reject[:, 5], reject[:, 5] | reject[:, 20]], axis=1)
         np.testing.assert_array_equal(np.isnan(product["layer_optical_depth"]), hidden)
         # Equal to the difference of the optical depths but for rounding.
@@ -240,7 +242,7 @@ def test_extinction_stays_withheld_if_single_altitudes_replace_joint():
     )
     product = labeled.retrieve_optical_depth(beams, station_altitude=0.0)
     assert "left out joint" in product.attrs["steps"]
-    assert has(product, Quality.POOR_STRATIFICATION).all()
+    assert has(product, MultiAngleQuality.POOR_STRATIFICATION).all()
     assert np.isfinite(product["optical_depth"]).any()
     for name in ("extinction", "extinction_standard_error", "extinction_gradient_error"):
         assert np.isnan(product[name]).all()
@@ -300,12 +302,12 @@ def test_incomplete_cycles_are_used_as_far_as_possible():
     assert product["beams"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
     # Two beams to one side, of a scan to both sides: a gradient does not cancel.
     two, full = product.isel(time=2), product.isel(time=1)
-    assert has(two, Quality.ONE_SIDED)[np.isfinite(two["optical_depth"])].all()
+    assert has(two, MultiAngleQuality.ONE_SIDED)[np.isfinite(two["optical_depth"])].all()
     wider = two["optical_depth_standard_error"] > full["optical_depth_standard_error"]
     assert wider.to_numpy()[np.isfinite(two["optical_depth"])].all()
     assert np.isnan(product["optical_depth"][4]).all()
     assert np.isnan(product["reach"][4])
-    assert has(product, Quality.NO_LEVERAGE)[4].all()
+    assert has(product, MultiAngleQuality.NO_LEVERAGE)[4].all()
     assert_explained(product)
 
 
@@ -322,15 +324,17 @@ def test_every_missing_value_is_explained_whatever_the_method(method):
     assert has(product, Quality.INPUT_MISSING)[2].all()
     assert has(product, Quality.PILE_UP)[0].any()
     assert product["beams"].to_numpy().tolist() == [9, 10, 0, 10, 10]
-    assert has(product, Quality.EXTRAPOLATED).any()
+    assert has(product, MultiAngleQuality.EXTRAPOLATED).any()
 
 
 def test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error():
     one_sided, two_sided = (
         solve(*scan(4, zenith), method="kano_hamilton") for zenith in (ONE_SIDE, TWO_SIDED)
     )
-    assert has(one_sided, Quality.ONE_SIDED)[np.isfinite(one_sided["optical_depth"])].all()
-    assert not has(two_sided, Quality.ONE_SIDED)[:, 5:50].any()
+    assert has(one_sided, MultiAngleQuality.ONE_SIDED)[
+        np.isfinite(one_sided["optical_depth"])
+    ].all()
+    assert not has(two_sided, MultiAngleQuality.ONE_SIDED)[:, 5:50].any()
     ratio = one_sided["optical_depth_gradient_error"] / two_sided["optical_depth_gradient_error"]
     assert float(ratio[:, 5:50].median()) > 100
     half = solve(*scan(4, ONE_SIDE), method="kano_hamilton", largest_gradient=2.5e-5)

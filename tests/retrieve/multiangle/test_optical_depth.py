@@ -20,7 +20,8 @@ from support.oracles.multiangle import (
 )
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
+from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleFlags,
     Regularisation,
@@ -222,7 +223,7 @@ def test_one_path_gives_no_optical_depth(small, method):
         assert np.all(np.isnan(result.optical_depth))
         assert np.all(np.isnan(result.reach))
         assert result.flags.no_data.all()
-        assert np.all(result.quality == Quality.NO_LEVERAGE)
+        assert np.all(result.quality == MultiAngleQuality.NO_LEVERAGE)
 
 
 def test_tiny_leverage_is_flagged_and_has_a_correct_error():
@@ -284,11 +285,13 @@ def test_samples_without_a_variance_count_as_missing(small, method, variance_of)
     assert np.isnan(result.optical_depth[3]).all()
     assert np.all(result.quality[3] & Quality.INPUT_MISSING)
     withheld = np.isnan(result.optical_depth)
-    assert np.all(result.quality[withheld] & int(Quality.rejecting()))
-    assert not np.any(result.quality[~withheld] & (Quality.INPUT_MISSING | Quality.NO_LEVERAGE))
+    assert np.all(result.quality[withheld] & rejecting((*Quality, *MultiAngleQuality)))
+    assert not np.any(
+        result.quality[~withheld] & (Quality.INPUT_MISSING | MultiAngleQuality.NO_LEVERAGE)
+    )
     if method == "kano_hamilton":
         assert np.all(result.quality[5, 20:30] == Quality.INPUT_MISSING)
-        assert np.all(result.quality[6, 40:50] == Quality.NO_LEVERAGE)
+        assert np.all(result.quality[6, 40:50] == MultiAngleQuality.NO_LEVERAGE)
 
 
 def test_gaps_are_interpolated_or_left(small):

@@ -11,8 +11,10 @@ from support.products.made_network import EXTINCTION, beam, network, product, wi
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.network import labeled
+from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.labeled import NetworkSettings, retrieve_network
 
 PLAIN = NetworkSettings(block_intervals=72, visibility=Definition(wavelength=532e-9))
@@ -98,10 +100,10 @@ def test_a_missing_beam_gives_a_reason():
     missing = np.isnan(result["extinction"].values)
     bits = result["quality_flag"].values
     on_beam = np.isfinite(result["beam_range"].values[0])
-    assert (bits[2:4, on_beam] & int(Quality.rejecting())).all()
-    assert (bits[2:4] & int(Quality.PRIOR_DOMINATED)).all()
+    assert (bits[2:4, on_beam] & flags_of("visibility").rejecting).all()
+    assert (bits[2:4] & int(NetworkQuality.PRIOR_DOMINATED)).all()
     assert (bits[[0, 1, 4, 5]] == 0).all()
-    assert ((bits & int(Quality.rejecting())) != 0)[missing].all()
+    assert ((bits & flags_of("visibility").rejecting) != 0)[missing].all()
 
 
 def test_intervals_are_joined_by_the_clock():

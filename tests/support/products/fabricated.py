@@ -10,17 +10,19 @@ import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
+from lidarops.kinds import flags_of
 from lidarops.records import (
     Granule,
     LeftOut,
     Plan,
+    PlannedStep,
     ProductRecord,
     Role,
     RunRecord,
     SceneOutcome,
     Status,
-    PlannedStep,
 )
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 CHANNEL = "photon_532o"
 SECTIONS = ((2500.0, 5000.0), (5000.0, 10500.0))
@@ -60,7 +62,11 @@ def homogeneous(
     flag = np.zeros(shape, dtype=np.int32)
     bad = random.random(shape) < flagged
     flag[bad] = random.choice(
-        [int(Quality.POOR_FIT), int(Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED)], bad.sum()
+        [
+            int(HomogeneousQuality.POOR_FIT),
+            int(Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED),
+        ],
+        bad.sum(),
     )
     if flagged > 0:
         flag[random.random(shape) < flagged / 4] |= int(Quality.OUTLIER)
@@ -69,7 +75,7 @@ def homogeneous(
     for name, value in truth.items():
         error = errors[name] * (0.7 + 0.6 * random.random(shape)) * (1 + np.arange(len(sections)))
         values = value + scale * error * random.standard_normal(shape)
-        values = np.where(flag & int(Quality.rejecting()), values + 25 * error, values)
+        values = np.where(flag & flags_of("homogeneous").rejecting, values + 25 * error, values)
         if name != "amplitude":
             values[(flag & int(Quality.LOW_SIGNAL)) != 0] = np.nan
         attrs = {"units": units[name]}
@@ -185,8 +191,8 @@ class Archive:
         data.to_netcdf(path)
         flag = data["quality_flag"].values
         flagged = {
-            bit.name.lower(): int(((flag & int(bit)) != 0).sum())
-            for bit in Quality
+            bit.word: int(((flag & int(bit)) != 0).sum())
+            for bit in flags_of(kind)
             if ((flag & int(bit)) != 0).any()
         }
         return ProductRecord(
@@ -209,7 +215,9 @@ def granule(path: str, reason: str = "", *, instrument: str = "horizontal") -> G
 
 def plan(scene: str, *left_out: LeftOut) -> Plan:
     """Return a plan of one step."""
-    step = PlannedStep("homogeneous", CHANNEL, {"method": "auto", "sections": [[2500, 5000]]}, "requested")
+    step = PlannedStep(
+        "homogeneous", CHANNEL, {"method": "auto", "sections": [[2500, 5000]]}, "requested"
+    )
     return Plan(scene, (step,), left_out)
 
 

@@ -16,10 +16,13 @@ from lidarops.records import (
     InputRecord,
     LeftOut,
     Plan,
+    PlannedStep,
     Provenance,
     Role,
-    PlannedStep,
 )
+from lidarops.retrieve.elastic.flags import ElasticQuality
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
+from lidarops.retrieve.network.flags import NetworkQuality
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
 SCENE = "lidar-1_20260301T000000"
@@ -43,7 +46,9 @@ def provenance(kind: str = "homogeneous", **changes: Any) -> Provenance:
             PlannedStep("elastic", "photon_532o", {"lidar_ratio": 50.0}, "requested"),
             PlannedStep("multiangle", "photon_532o", {"method": "auto"}, "requested"),
             PlannedStep("visibility", "photon_532o", {"contrast": 0.05}, "requested"),
-            PlannedStep("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
+            PlannedStep(
+                "read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"
+            ),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
     )
@@ -167,9 +172,9 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     shape = (profiles, bins)
     flags = np.zeros(shape, np.int32)
     flags[:, :3] = Quality.INCOMPLETE_OVERLAP
-    flags[-1] |= np.int32(Quality.NO_REFERENCE)
-    flags[0, 5:] |= np.int32(Quality.CLOUD)
-    missing = (flags & int(Quality.INCOMPLETE_OVERLAP | Quality.NO_REFERENCE)) != 0
+    flags[-1] |= np.int32(ElasticQuality.NO_REFERENCE)
+    flags[0, 5:] |= np.int32(ElasticQuality.CLOUD)
+    missing = (flags & int(Quality.INCOMPLETE_OVERLAP | ElasticQuality.NO_REFERENCE)) != 0
     scales = {
         "backscatter": 1e-6,
         "extinction": 5e-5,
@@ -223,9 +228,9 @@ def multiangle(
     angles = np.atleast_1d(np.float64(zenith))
     dims = ("time", "altitude")
     shape = (profiles, levels)
-    flags = np.full(shape, np.int32(Quality.ONE_SIDED))
-    flags[0, 2 * levels // 3 :] = Quality.EXTRAPOLATED
-    flags[-1, 0] |= np.int32(Quality.INTERPOLATED | Quality.HORIZONTAL_GRADIENT)
+    flags = np.full(shape, np.int32(MultiAngleQuality.ONE_SIDED))
+    flags[0, 2 * levels // 3 :] = MultiAngleQuality.EXTRAPOLATED
+    flags[-1, 0] |= np.int32(MultiAngleQuality.INTERPOLATED | MultiAngleQuality.HORIZONTAL_GRADIENT)
     scales = {
         "optical_depth": 0.3,
         "optical_depth_standard_error": 0.01,
@@ -240,7 +245,7 @@ def multiangle(
         "monotone_optical_depth": 0.3,
         "reduced_chi2": 1.0,
     }
-    missing = (flags & int(Quality.EXTRAPOLATED)) != 0
+    missing = (flags & int(MultiAngleQuality.EXTRAPOLATED)) != 0
     residual = rng.normal(0.0, 0.03, (profiles, angles.size, levels))
     residual[0, -1] = np.nan
     along = {} if azimuth is None else {"azimuth": azimuth}
@@ -299,7 +304,7 @@ def visibility(
     pair = ("time", "crossing")
     shape = (profiles, crossings)
     flags = np.zeros(shape, np.int32)
-    flags[-1] = int(Quality.LOW_LEVERAGE)
+    flags[-1] = int(NetworkQuality.LOW_LEVERAGE)
     flags[0, 0] = int(Quality.INPUT_MISSING | Quality.LOW_SIGNAL)
     lost = flags[:, :] == flags[0, 0]
     extinction = rng.uniform(1e-4, 1e-3, shape)

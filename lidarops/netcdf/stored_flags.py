@@ -1,0 +1,162 @@
+"""Quality bits of a file, by the ``flag_masks`` and ``flag_meanings`` that the file states.
+
+Files written by other versions may have a bit at another place than its kind has now, so a number
+alone has no meaning. Results are either those of the file, or given the places of now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.errors import ProductError
+from lidarops.flags import PLACES, Flags, Quality, Severity
+from lidarops.kinds import flags_of, kinds
+from lidarops.netcdf.variables import QUALITY_FLAG
+
+Values = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredBit:
+    """A bit at its place in a file."""
+
+    mask: int
+    word: str
+    """As in ``flag_meanings``; such as ``bit_20`` where the file does not name it."""
+    severity: Severity | None
+    """None where this version does not know the bit."""
+    description: str
+
+    @property
+    def rejects(self) -> bool:
+        """Whether the value must not be used; so where the severity is not known."""
+        return self.severity is not Severity.CARE
+
+
+def stored_bits(attributes: Mapping[str, Any], kind: str | None) -> tuple[StoredBit, ...]:
+    """Return all bits of a file's ``quality_flag``, those first that the file names.
+
+    Parameters
+    ----------
+    attributes : mapping
+        Of ``quality_flag``. Without ``flag_masks``, the places are those of now.
+    kind : str or None
+        Kind of product. Without a known kind, severity is known of shared bits only.
+    """
+    flags = _known(kind)
+    meanings = _meanings(attributes)
+    if meanings is None:
+        meanings = {bit.word: int(bit) for bit in flags or Quality}
+    named = [_bit(word, mask, flags) for word, mask in meanings.items()]
+    stated = sum({bit.mask for bit in named})
+    unnamed = (1 << place for place in range(PLACES) if not stated >> place & 1)
+    return (*named, *(_bit(f"bit_{places(mask)}", mask, None) for mask in unnamed))
+
+
+def rejecting_mask(bits: Iterable[StoredBit]) -> int:
+    """Return the union of the bits that reject a value."""
+    return sum(bit.mask for bit in bits if bit.rejects)
+
+
+def count_bits(values: Values, bits: Iterable[StoredBit]) -> dict[StoredBit, int]:
+    """Return how many values carry each bit, of the bits that occur."""
+    # Few bits occur in a product: count only these.
+    union = int(np.bitwise_or.reduce(values, axis=None))
+    return {bit: int(np.count_nonzero(values & bit.mask)) for bit in bits if union & bit.mask}
+
+
+def recoded(values: Values, attributes: Mapping[str, Any], flags: Flags) -> Values:
+    """Return the values of a file's ``quality_flag`` with the bits at the places of now.
+
+    Parameters
+    ----------
+    values : ndarray of int
+    attributes : mapping
+        Of ``quality_flag``. Without ``flag_masks``, the places are those of now.
+    flags : Flags
+        Of the kind of product, as of now.
+
+    Returns
+    -------
+    ndarray of int
+        `values` itself where no bit has moved.
+
+    Raises
+    ------
+    ProductError
+        If a value carries a bit that the file does not name, or that the kind no longer has.
+    """
+    meanings = _meanings(attributes)
+    if meanings is None or not is_moved(attributes, flags):
+        return values
+    moved = np.zeros_like(values)
+    rest = int(np.bitwise_or.reduce(values, axis=None))
+    for word, mask in meanings.items():
+        bit = flags.named(word)
+        if bit is not None:
+            moved |= np.where(values & mask, int(bit), 0).astype(values.dtype)
+            rest &= ~mask
+    if rest:
+        raise ProductError(
+            f"carries bits that kind {flags.kind} does not have: {places(rest)}",
+            field=QUALITY_FLAG,
+            remedy="make the product again: lidarops reprocess",
+        )
+    return moved
+
+
+def with_current_flags(product: xr.Dataset) -> xr.Dataset:
+    """Return a product of a known kind with the bits of ``quality_flag`` at the places of now.
+
+    Raises
+    ------
+    ProductError
+        As `recoded`.
+    """
+    flags = _known(product.attrs.get("lidarops_kind"))
+    if flags is None or QUALITY_FLAG not in product:
+        return product
+    stored = product[QUALITY_FLAG]
+    if not is_moved(stored.attrs, flags):
+        return product
+    moved = recoded(stored.values, stored.attrs, flags)
+    return product.assign({QUALITY_FLAG: stored.copy(data=moved)})
+
+
+def is_moved(attributes: Mapping[str, Any], flags: Flags) -> bool:
+    """Return whether a file names other bits, or other places of them, than the kind has now."""
+    return _meanings(attributes) not in (None, {bit.word: int(bit) for bit in flags})
+
+
+def places(bits: int) -> str:
+    """Return the numbers of bits in words, counted from 0."""
+    return ", ".join(str(place) for place in range(PLACES + 1) if bits >> place & 1)
+
+
+def _known(kind: object) -> Flags | None:
+    return flags_of(str(kind)) if kind in set(kinds()) else None
+
+
+def _meanings(attributes: Mapping[str, Any]) -> dict[str, int] | None:
+    """Return word -> mask as a file states them; None where it states none."""
+    if "flag_masks" not in attributes:
+        return None
+    masks = np.atleast_1d(attributes["flag_masks"]).tolist()
+    words = str(attributes.get("flag_meanings", "")).split()
+    if len(masks) != len(words):
+        raise ProductError("has not one flag_meanings for each of flag_masks", field=QUALITY_FLAG)
+    return dict(zip(words, masks, strict=True))
+
+
+def _bit(word: str, mask: int, flags: Flags | None) -> StoredBit:
+    shared = {bit.word: bit for bit in Quality}
+    bit = shared.get(word) if flags is None else flags.named(word)
+    if bit is None:
+        return StoredBit(mask, word, None, "bit unknown to this version of lidarops")
+    return StoredBit(mask, word, bit.severity, bit.description)

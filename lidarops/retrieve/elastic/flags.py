@@ -1,0 +1,25 @@
+"""Quality bits of elastic inversions, beside those of `lidarops.flags.Quality`."""
+
+from __future__ import annotations
+
+from lidarops import flags
+from lidarops.flags import FIRST_OWN, FlagBit, Severity
+
+
+class ElasticQuality(FlagBit):
+    """Own bits. A place is never given to another bit."""
+
+    CLOUD = (
+        FIRST_OWN,
+        Severity.CARE,
+        (
+            "in a cloud, or behind one as seen from the start of the inversion, where the lidar"
+            " ratio of aerosol does not hold"
+        ),
+    )
+    NO_REFERENCE = (
+        FIRST_OWN + 1,
+        Severity.REJECT,
+        "no range window passes the tests for aerosol-free air, so the profile is not calibrated",
+    )
+    UNSTABLE_INVERSION = FIRST_OWN + 2, *flags.UNSTABLE_INVERSION

@@ -1,0 +1,26 @@
+"""Quality bits of fits of homogeneous paths, beside those of `lidarops.flags.Quality`."""
+
+from __future__ import annotations
+
+from lidarops import flags
+from lidarops.flags import FIRST_OWN, FlagBit, Severity
+
+
+class HomogeneousQuality(FlagBit):
+    """Own bits. A place is never given to another bit."""
+
+    POORLY_DETERMINED = FIRST_OWN, *flags.POORLY_DETERMINED
+    POOR_FIT = FIRST_OWN + 1, *flags.POOR_FIT
+    AT_BOUND = (
+        FIRST_OWN + 2,
+        Severity.REJECT,
+        "the extinction lies at a bound of its physical range",
+    )
+    NOT_LEVEL = (
+        FIRST_OWN + 3,
+        Severity.REJECT,
+        (
+            "the altitude of the path changes by more than 100 m along the section, so a vertical"
+            " gradient of backscatter would mimic extinction"
+        ),
+    )

@@ -1,0 +1,66 @@
+"""Quality bits of scans over zenith angle, beside those of `lidarops.flags.Quality`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lidarops import flags
+from lidarops.flags import FIRST_OWN, FlagBit, Quality, Severity, rejecting
+
+
+class MultiAngleQuality(FlagBit):
+    """Own bits. A place is never given to another bit."""
+
+    NO_LEVERAGE = (
+        FIRST_OWN + 3,
+        Severity.REJECT,
+        "the zenith angles are too few or too similar to determine an optical depth",
+    )
+    POOR_STRATIFICATION = (
+        FIRST_OWN + 4,
+        Severity.REJECT,
+        "the signals of the slant paths differ by more than level layers allow",
+    )
+    PRIOR_DOMINATED = FIRST_OWN + 5, *flags.PRIOR_DOMINATED
+    EXTRAPOLATED = FIRST_OWN + 6, *flags.EXTRAPOLATED
+    INTERPOLATED = (
+        FIRST_OWN + 7,
+        Severity.CARE,
+        "in a gap of the data, interpolated from the altitudes above and below",
+    )
+    ONE_SIDED = (
+        FIRST_OWN + 8,
+        Severity.CARE,
+        (
+            "the scan covers one side of the zenith only, so a horizontal gradient cannot be"
+            " detected and its systematic error is stated separately"
+        ),
+    )
+    LOW_LEVERAGE = FIRST_OWN + 9, *flags.LOW_LEVERAGE
+    NO_RESIDUAL = (
+        FIRST_OWN + 10,
+        Severity.CARE,
+        "there are as many unknowns as angles, so no residual tests the result",
+    )
+    UNDERSMOOTHED = (
+        FIRST_OWN + 11,
+        Severity.CARE,
+        "the profile has more vertical structure than its errors explain",
+    )
+    HIGH_CORRELATION = (
+        FIRST_OWN + 12,
+        Severity.CARE,
+        (
+            "errors of neighbouring altitudes are correlated by more than 0.85: confidence"
+            " intervals are too narrow"
+        ),
+    )
+    HORIZONTAL_GRADIENT = (
+        FIRST_OWN + 13,
+        Severity.REJECT,
+        "the residuals over zenith angle show a horizontal gradient",
+    )
+
+
+REJECTING: Final = rejecting((*Quality, *MultiAngleQuality))
+"""Union of the bits that reject a value."""
