@@ -176,23 +176,22 @@ class _Chunk:
     """None for counts."""
 
     def __call__(self) -> NDArray[Any]:
-        values = np.empty(
-            (len(self.places), self.bins), np.int32 if self.scales is None else np.float32
-        )
-        row = np.empty(self.bins, np.dtype("<i4"))
+        shape = len(self.places), self.bins
+        counts = np.empty(shape if self.scales is None else shape[1:], np.dtype("<i4"))
+        values = counts if self.scales is None else np.empty(shape, np.float32)
         read_counts = raw_format(self.files.format).read_counts
-        for index, (path, size) in enumerate(zip(self.files.paths, self.files.sizes, strict=True)):
+        files = zip(self.files.paths, self.files.sizes, self.places.tolist(), strict=True)
+        for index, (path, size, place) in enumerate(files):
+            row = counts if self.scales is not None else counts[index]
             with RawFile(path) as file:
                 file.expect(size)
-                read_counts(file, int(self.places[index]), self.kept, row)
-            if self.scales is None:
-                values[index] = row
-            else:
+                read_counts(file, place, self.kept, row)
+            if self.scales is not None:
                 to_physical(row, self.scales[index], values[index])
         count = _COUNT.get()
         if count is not None:
-            count.bytes += len(self.places) * self.bins * row.itemsize
-        return values
+            count.bytes += len(self.places) * self.bins * counts.itemsize
+        return values.astype(np.int32 if self.scales is None else np.float32, copy=False)
 
 
 def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]]:
