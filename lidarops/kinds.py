@@ -73,7 +73,7 @@ class Kind:
         path = f"{self.package}.{module}"
         try:
             return getattr(import_module(path), name)
-        except AttributeError as error:
+        except (AttributeError, ModuleNotFoundError) as error:
             raise LidarOpsError(
                 f"kind of product {self.name!r} is incomplete: {path} has no {name}",
                 remedy=f"complete or remove the package {self.package}",

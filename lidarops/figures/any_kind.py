@@ -40,7 +40,7 @@ class MainVariable:
 
 
 def read_main_variable(
-    product: xr.Dataset, *, most: int = svg_series.SERIES
+    product: xr.Dataset, *, kind: str, most: int = svg_series.SERIES
 ) -> MainVariable | None:
     """Return the main variable of a product as series over time.
 
@@ -48,6 +48,8 @@ def read_main_variable(
     ----------
     product : Dataset
         Of any kind; may be lazy. Of a large variable, only some profiles are read.
+    kind : str
+        Kind of the product, which may be unknown.
     most : int, optional
         Most series.
 
@@ -67,7 +69,7 @@ def read_main_variable(
     table, unknown = _table(variable), np.full(variable.sizes["time"], np.nan)
     flags = quality_bits(_beside(some, QUALITY_FLAG, name, 0.0)).reshape(table.shape)
     stated = some[QUALITY_FLAG].attrs if QUALITY_FLAG in some else {}
-    rejecting = rejecting_mask(stored_bits(stated, some.attrs.get("lidarops_kind")))
+    rejecting = rejecting_mask(stored_bits(stated, kind))
     errors = _table(_beside(some, f"{name}_standard_error", name, np.nan))
     units = str(variable.attrs.get("units", ""))
     most_values = np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:most]
@@ -111,7 +113,7 @@ def _table(variable: xr.DataArray) -> Floats:
 
 def draw_page(product: xr.Dataset) -> PageFigures:
     """Draw the main variable of a product of any kind for a page."""
-    main = read_main_variable(product)
+    main = read_main_variable(product, kind=product.attrs.get("lidarops_kind", ""))
     if main is None:
         return no_figures("no variable to draw")
     units = svg.units(main.series[0].estimates[main.name].units)

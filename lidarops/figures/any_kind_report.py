@@ -20,7 +20,7 @@ from lidarops.netcdf.variables import QUALITY_FLAG, layout_of
 
 
 def _figures(group: Group, sources: Sources) -> Iterator[ReportFigure]:
-    read = functools.partial(read_main_variable, most=panels.SECTIONS)
+    read = functools.partial(read_main_variable, kind=group.kind, most=panels.SECTIONS)
     found = sources.read_all(group, _variables(group.kind), [read] * len(group.members))
     known = [main for main in found if main is not None]
     if known:

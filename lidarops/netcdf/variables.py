@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops import __version__
-from lidarops.errors import ProductError
+from lidarops.errors import LidarOpsError, ProductError
 from lidarops.flags import Flags, Severity
-from lidarops.kinds import kind_of, kinds
+from lidarops.kinds import flags_of, kind_of, kinds
 from lidarops.records import DetectionMode
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
@@ -218,9 +218,16 @@ def layout_of(kind: str) -> Layout:
     Raises
     ------
     LidarOpsError
-        If there is no such kind.
+        If there is no such kind, or its ``variables`` and ``flags`` state different bits.
     """
     layout: Layout = kind_of(kind).part("variables", "LAYOUT")
+    if layout.flags != flags_of(kind):
+        package = kind_of(kind).package
+        raise LidarOpsError(
+            f"kind of product {kind!r}: quality_flag has the bits {layout.flags.layout!r}, not"
+            f" those of {package}.flags",
+            remedy=f"write quality(dims, FLAGS) in {package}.variables",
+        )
     # The step that makes a product has the name of its kind and serves no other kind.
     return replace(layout, unused_steps=layout.unused_steps | (set(kinds()) - {kind}))
 

@@ -33,9 +33,21 @@ from lidarops.settings import ChannelProduct
 
 KIND = Kind("smooth", "Smoothed extinction", __name__, ChannelProduct, rank=25)
 """
+FLAGS = """
+from lidarops.flags import FIRST_OWN, FlagBit, Flags, Quality, Severity
+from lidarops.products.homogeneous.flags import FLAGS as OTHER
+
+
+class SmoothQuality(FlagBit):
+    RIPPLED = FIRST_OWN, Severity.CARE, "the smoothed profile has ripples"
+
+
+FLAGS = Flags("smooth", 1, (*(bit for bit in OTHER if isinstance(bit, Quality)), *SmoothQuality))
+"""
 VARIABLES = """
 from dataclasses import replace
 
+from madeup_smooth.flags import FLAGS
 from lidarops.netcdf.variables import ErrorBudget
 from lidarops.products.homogeneous.variables import LAYOUT as OTHER
 
@@ -44,7 +56,7 @@ LAYOUT = replace(
     data=tuple(
         replace(row, budget=ErrorBudget(comment="All is shared."))
         if row.name == "extinction"
-        else row
+        else replace(row, flags=row.flags and FLAGS)
         for row in OTHER.data
     ),
 )
@@ -80,7 +92,12 @@ def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Regist
     def add(**modules: str) -> None:
         package = tmp_path / "code" / "madeup_smooth"
         package.mkdir(parents=True)
-        for name, text in {"__init__": KIND, "variables": VARIABLES, **modules}.items():
+        for name, text in {
+            "__init__": KIND,
+            "flags": FLAGS,
+            "variables": VARIABLES,
+            **modules,
+        }.items():
             (package / f"{name}.py").write_text(text)
         monkeypatch.syspath_prepend(package.parent)
         point = SimpleNamespace(
@@ -96,6 +113,7 @@ def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Regist
 
     def forget() -> None:
         kinds.kinds.cache_clear()
+        kinds.flags_of.cache_clear()
         layout_of.cache_clear()
         for name in [name for name in sys.modules if name.startswith("madeup_smooth")]:
             del sys.modules[name]

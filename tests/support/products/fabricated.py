@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.kinds import flags_of
+from lidarops.kinds import flags_of, kinds
 from lidarops.records import (
     Granule,
     LeftOut,
@@ -192,7 +192,7 @@ class Archive:
         flag = data["quality_flag"].values
         flagged = {
             bit.word: int(((flag & int(bit)) != 0).sum())
-            for bit in flags_of(kind)
+            for bit in (flags_of(kind) if kind in kinds() else Quality)
             if ((flag & int(bit)) != 0).any()
         }
         return ProductRecord(
