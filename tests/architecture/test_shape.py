@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 
 MOST_PACKAGES = 20
-MOST_LEVELS = 11
+MOST_LEVELS = 10
 MOST_MODULES = 25
 
 
