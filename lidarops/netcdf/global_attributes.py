@@ -13,7 +13,7 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_date, product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import DetectionMode, LeftOut, PlannedStep
+from lidarops.records import DetectionMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ def _description(context: Context, layout: Layout, date: datetime, origin: str) 
         f" {context.instrument_name}",
         "processing_level": layout.processing_level,
         "product_version": f"{__version__}+{context.provenance.code_version}",
-        "history": _history(context, layout, date),
+        "history": _history(context, date),
         "references": "\n".join(text for text in references if text),
         "comment": _sentences(metadata.comment, layout.comment, dates),
         "acknowledgement": metadata.acknowledgement or "Not stated.",
@@ -109,19 +109,17 @@ def _wavelength(context: Context) -> str:
     return "wavelength unknown"
 
 
-def _history(context: Context, layout: Layout, date: datetime) -> str:
+def _history(context: Context, date: datetime) -> str:
     """Return one line for each step, as CF requires: date, step, program."""
     program = f"lidarops {__version__} ({context.provenance.code_version})"
     plan = context.provenance.plan
 
-    def concerns(item: PlannedStep | LeftOut) -> bool:
-        return item.channel in ("", context.channel) and item.name not in layout.unused_steps
-
-    done = [f"{step.name}: {step.reason}" for step in plan.steps if concerns(step)]
+    channels = ("", context.channel)
+    done = [f"{step.name}: {step.reason}" for step in plan.steps if step.channel in channels]
     omitted = [
         f"left out {omission.name}: {omission.reason}"
         for omission in plan.left_out
-        if concerns(omission)
+        if omission.channel in channels
     ]
     lines = [*done, *omitted, f"wrote the {context.kind} product"]
     return "\n".join(f"{_iso(date)} {' '.join(line.split())} [{program}]" for line in lines)

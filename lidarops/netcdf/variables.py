@@ -162,8 +162,6 @@ class Layout:
     comment: str
     sampled: str
     """The dimension besides time."""
-    unused_steps: frozenset[str]
-    """Steps of a scene's plan that only other kinds need."""
     coordinates: tuple[Row, ...]
     data: tuple[Row, ...]
     feature_type: str | None = None
@@ -228,8 +226,7 @@ def layout_of(kind: str) -> Layout:
             f" those of {package}.flags",
             remedy=f"write quality(dims, FLAGS) in {package}.variables",
         )
-    # The step that makes a product has the name of its kind and serves no other kind.
-    return replace(layout, unused_steps=layout.unused_steps | (set(kinds()) - {kind}))
+    return layout
 
 
 def is_retrieved(kind: str) -> bool:

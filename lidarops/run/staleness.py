@@ -31,14 +31,13 @@ from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection
 from lidarops.steps import dependence
-from lidarops.steps.dependence import ProductKey
+from lidarops.steps.dependence import ProductKey, ancillary_files
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
 """Granules that are judged at a time, unless one day has more. Memory holds the current group and,
 if workers process the scenes, the next group."""
 
-_PROFILE_ROLES: Final = {"molecular_profile": Role.MOLECULAR, "overlap_profile": Role.OVERLAP}
 # Settings that change neither the scenes nor the content of a product.
 _OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "simulation"})
 _PLANNING: Final = ("lidarops.plan.scene_plan", "lidarops.plan.scenes")
@@ -358,7 +357,7 @@ class Judge:
                     [granule.path, granule.size, granule.mtime_ns]
                     for granule in (*scene.granules, *scene.dark)
                 ],
-                [[name, self._profile(name)] for name, _ in _profiles(whole)],
+                [[name, self._profile(name)] for name in sorted(ancillary_files(whole.steps))],
             ]
         )
 
@@ -462,7 +461,10 @@ class Judge:
         ]
         return (
             *raw,
-            *(InputRecord(name, role, self._profile(name)) for name, role in _profiles(whole)),
+            *(
+                InputRecord(name, role, self._profile(name))
+                for name, role in sorted(ancillary_files(whole.steps).items())
+            ),
         )
 
     def _content(self, granule: Granule) -> str:
@@ -501,16 +503,6 @@ def _looks_right(root: str, made: RecordedProduct) -> bool:
     except OSError:
         return False
     return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
-
-
-def _profiles(whole: Plan) -> tuple[tuple[str, Role], ...]:
-    profiles = {
-        (step.settings[key], role)
-        for step in whole.steps
-        for key, role in _PROFILE_ROLES.items()
-        if step.settings.get(key)
-    }
-    return tuple(sorted(profiles))
 
 
 def _requested_kinds(campaign: Campaign) -> set[str]:

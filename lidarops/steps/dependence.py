@@ -15,7 +15,8 @@ from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
 from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
-from lidarops.steps.reading import required_by
+from lidarops.steps.conditioning import Dark, Noise
+from lidarops.steps.reading import Read, required_by
 from lidarops.steps.registry import definition, typed_settings
 from lidarops.steps.step import Step
 
@@ -96,10 +97,10 @@ def _needed(
 
 def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> PlannedStep:
     """Return a step whose reason, if it reads a channel, names only what it is read for."""
-    if step.name != "read" or step.instrument:
+    if step.name != Read.name or step.instrument:
         return step
     products = sorted(s.name for s in steps if is_product(s) and s.channel == step.channel)
-    glued = sorted(s.channel for s in steps if f"{step.channel}/noise" in s.needs)
+    glued = sorted(s.channel for s in steps if f"{step.channel}/{Noise.name}" in s.needs)
     return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
 
 
@@ -116,7 +117,7 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
         return plan
     products = [product for product in planned_products(plan) if product[0] in selected]
     closure = plan_closure(plan, products)
-    names = {*selected, "read"}
+    names = {*selected, Read.name}
     left_out = tuple(
         omission
         for omission in plan.left_out
@@ -228,7 +229,7 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     files : iterable of InputRecord
         Files of the scene.
     """
-    dark = any(step.name == "dark" for step in plan.steps)
+    dark = any(step.name == Dark.name for step in plan.steps)
     named = ancillary_files(plan.steps)
     return tuple(
         file

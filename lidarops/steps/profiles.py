@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from lidarops.retrieve.signal import labeled, labeled_gluing
+from lidarops.retrieve.signal.labeled import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 from lidarops.steps.data import Averages, Chunk, Indices, Profiles
 
 _PARTS: Final = ("power", "variance", "quality")
+
+
+class Conditioning(TypedDict):
+    """Arguments of `lidarops.retrieve.signal.labeled.condition`."""
+
+    dead_time: float | None
+    noise_variance: float | None
+    dark: DarkSignals | None
+    range_offset: float
+    full_overlap_range: float
 
 
 class FileProfiles(Profiles):
@@ -24,11 +34,10 @@ class FileProfiles(Profiles):
     archive : xr.Dataset
         The raw counts of the scene, whose ranges are used.
     channel : str
-    settings : mapping
-        Arguments of `lidarops.retrieve.signal.labeled.condition`.
+    settings : Conditioning
     """
 
-    def __init__(self, archive: xr.Dataset, channel: str, settings: Mapping[str, Any]) -> None:
+    def __init__(self, archive: xr.Dataset, channel: str, settings: Conditioning) -> None:
         self._channel, self._settings = channel, settings
         grid = str(archive[channel].dims[-1])
         # As `condition` adds it, in the type of the coordinate.

@@ -16,6 +16,7 @@ from lidarops.figures.series_data import compare, join
 from lidarops.flags import Quality
 from lidarops.products.visibility import report_figures
 from lidarops.products.visibility.figure_data import instruments_of, read_crossings, read_map
+from lidarops.products.visibility.steps import NetworkSettings
 from lidarops.records import LeftOut, Plan, PlannedStep, SceneOutcome
 
 NAMES = ("lidar-0", "lidar-1", "lidar-2")
@@ -162,8 +163,24 @@ def test_a_foreign_product_is_refused(made):
 
 
 def test_instruments_are_those_of_the_plan(made):
-    beams = [{"instrument": name} for name in NAMES]
-    plan = Plan("s", (PlannedStep("visibility", "photon_532o", {"beams": beams}, "why"),), ())
+    beam = {"zenith_angle": 90, "azimuth": 0, "nearest": 100, "farthest": 5000, "exponent": 1}
+    settings = NetworkSettings(
+        beams=[{**beam, "instrument": name} for name in NAMES],
+        wavelength=532e-9,
+        block_seconds=3600,
+        method="network",
+        prior="block",
+        tolerance=15,
+        smallest_angle=2,
+        exponent_relative_error=0.1,
+        lidar_ratio_relative_error=0.02,
+        overlap_relative_error=0.003,
+        contrast=0.05,
+        law="none",
+        exponent_standard_error=0,
+    ).model_dump(mode="json", exclude_none=True)
+    step = PlannedStep("visibility", "photon_532o", settings, "why", product="visibility")
+    plan = Plan("s", (step,), ())
     start = made["time"].values[0].astype("datetime64[us]").item()
     outcome = SceneOutcome("s", "valley", "valley", start, 3, plan)
     assert instruments_of(outcome) == NAMES

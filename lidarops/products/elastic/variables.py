@@ -112,7 +112,6 @@ LAYOUT: Final = Layout(
     " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
     " bin deviates from theirs by more than noise explains.",
     sampled="range",
-    unused_steps=frozenset({"homogeneous", "signal", "background"}),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(

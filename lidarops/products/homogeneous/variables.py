@@ -54,7 +54,6 @@ LAYOUT: Final = Layout(
     " range r. altitude, geospatial_vertical_min and geospatial_vertical_max refer to the midpoint"
     " of a section; altitude_bnds holds its ends where the beam is fixed.",
     sampled="section",
-    unused_steps=frozenset({"average", "background", "molecular", "known_shape", "reference"}),
     coordinates=coordinates((SECTION, SECTION_RANGE), altitude("section", "altitude_bnds")),
     data=(
         Row(

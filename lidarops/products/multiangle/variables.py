@@ -112,7 +112,6 @@ LAYOUT: Final = Layout(
     " Methods without smoothing state noise alone; for them this rule overstates the error of a"
     " mean.",
     sampled="altitude",
-    unused_steps=frozenset({"average", "reference"}),
     coordinates=(
         TIME,
         _ALTITUDE,

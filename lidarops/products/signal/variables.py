@@ -29,7 +29,6 @@ LAYOUT: Final = Layout(
     comment="The standard errors of all range bins of a profile include the error of its"
     " background, which is common to them. lidarops_steps states the method of the background.",
     sampled="range",
-    unused_steps=frozenset({"average", "molecular", "known_shape", "reference"}),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(

@@ -20,6 +20,8 @@ from lidarops.figures.time_axis import Times
 from lidarops.kinds import flags_of
 from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
+from lidarops.steps.dependence import is_product
+from lidarops.steps.registry import typed_settings
 
 Floats = NDArray[np.float64]
 
@@ -74,8 +76,8 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
     """Return the instrument of each beam of a scene from its plan; empty if it lists none."""
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
-        if step.name == "visibility" and "beams" in step.settings:
-            return tuple(str(beam["instrument"]) for beam in step.settings["beams"])
+        if is_product(step):
+            return tuple(beam.instrument for beam in typed_settings(step).beams)
     return ()
 
 

@@ -39,12 +39,19 @@ from lidarops.steps.reading import (
     BINS,
     WAVELENGTH,
     RangeWindow,
+    Read,
     WindowSettings,
     bins_with_noise,
     bins_within,
     merged,
 )
-from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, intervals, setting_of
+from lidarops.steps.registry import (
+    FILE_STEPS,
+    GLUE_STEPS,
+    intervals,
+    setting_of,
+    typed_settings,
+)
 from lidarops.steps.step import (
     ALL_STEPS,
     Datum,
@@ -220,9 +227,9 @@ class _NetworkPlan:
         prepared = [entry for member in able for entry in self._prepared(member)]
         yield from (entry for entry in prepared if isinstance(entry, LeftOut))
         wavelengths = [
-            step.settings["wavelength"]
+            typed_settings(step).wavelength
             for step in prepared
-            if isinstance(step, PlannedStep) and "wavelength" in step.settings
+            if isinstance(step, PlannedStep) and step.name == Read.name
         ]
         beams = [beam for member in able for beam in member.pointings()]
         reason = self._why_none(beams, wavelengths)

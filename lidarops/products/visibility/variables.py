@@ -129,7 +129,6 @@ LAYOUT: Final = Layout(
     " leaves is common to all profiles, so that a mean over time does not reduce it.",
     sampled="crossing",
     feature_type="timeSeries",
-    unused_steps=frozenset({"molecular", "known_shape", "reference"}),
     coordinates=(
         TIME,
         _CROSSING,
