@@ -14,10 +14,6 @@ from lidarops.netcdf import code_version as versions
 from lidarops.run.archive import assess, reprocess
 from lidarops.run.staleness import Judge, Signature
 
-WAITING = pytest.mark.xfail(
-    strict=False, reason="plan and process still import the modules of all kinds"
-)
-
 pytestmark = pytest.mark.usefixtures("quickly")
 
 
@@ -51,9 +47,9 @@ def installed(
 @pytest.mark.parametrize(
     ("module", "kinds"),
     [
-        pytest.param("retrieve/elastic/inversion.py", {"elastic"}, marks=WAITING),
+        ("retrieve/elastic/inversion.py", {"elastic"}),
         ("products/homogeneous/variables.py", {"homogeneous"}),
-        pytest.param("retrieve/network/geometry.py", set(), marks=WAITING),
+        ("retrieve/network/geometry.py", set()),
         ("netcdf/write.py", {"elastic", "homogeneous", "signal"}),
         ("plan/scenes.py", set()),
         ("run/session.py", set()),
@@ -92,7 +88,7 @@ def test_a_day_is_judged_again_if_the_planning_changed(
             return Judge(campaign, store).signatures()
 
     before = state()
-    installed.change("products/visibility/variables.py")
+    installed.change("retrieve/network/geometry.py")
     installed.reload(monkeypatch)
     assert state() == before
     installed.change("plan/scenes.py")
