@@ -6,19 +6,19 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
 from lidarops.kinds import Kind, kind_of, kinds
+from lidarops.raw.formats import GROUP as RAW_FORMATS
 from lidarops.system.source_closure import Sources
 
 _EVERY_PRODUCT: Final = (
     "lidarops.process.scene",
     "lidarops.netcdf.build",
     "lidarops.netcdf.write",
-    # Found by entry point, so that no import leads to it.
-    "lidarops.raw.licel_format",
 )
 """Modules that every product passes through."""
 _OF_KIND: Final = ("settings", "steps", "variables", "flags")
@@ -40,8 +40,9 @@ _WITH_DATA: Final = ("lidarops.products", "lidarops.retrieve")
 def code_version(kind: str, *others: str) -> str:
     """Return a digest of the sources that can change a product of a kind.
 
-    These are the modules of the kind, those that every product passes through, and all that they
-    import of lidarops and of the kind's own package. Comments and docstrings do not count.
+    These are the modules of the kind, those that every product passes through, those of all raw
+    formats, and all that they import of lidarops and of the packages that add kinds or formats.
+    Comments and docstrings do not count.
 
     Parameters
     ----------
@@ -90,17 +91,17 @@ def version_of(kind: Kind, sources: Sources, *others: str) -> str:
     ----------
     kind : Kind
     sources : Sources
-        From `sources_in`.
+        From `sources_in`; of all packages that `source_roots` gives.
     *others : str
         Further modules that count.
     """
     own = (f"{kind.package}.{name}" for name in _OF_KIND)
     modules = (name for name in own if sources.has(name))
-    return sources.digest((*_EVERY_PRODUCT, kind.package, *modules, *others))
+    return sources.digest((*_EVERY_PRODUCT, *_formats(), kind.package, *modules, *others))
 
 
 def sources_in(roots: Mapping[str, Sequence[Path]], cache_folder: Path | None = None) -> Sources:
-    """Return the sources of lidarops and of packages with kinds of product.
+    """Return the sources of lidarops and of packages with kinds of product or raw formats.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ def sources_in(roots: Mapping[str, Sequence[Path]], cache_folder: Path | None = 
 
 @cache
 def source_version() -> str:
-    """Return a digest of all sources of lidarops and of packages with kinds of product.
+    """Return a digest of all sources of lidarops and of packages with kinds or raw formats.
 
     Returns
     -------
@@ -123,9 +124,9 @@ def source_version() -> str:
         16 hexadecimal digits; changes also with sources that can change no product.
     """
     digest = hashlib.sha256()
-    for package, folders in _roots().items():
+    for package, folders in source_roots().items():
         for folder in folders:
-            for path in sorted(folder.rglob("*.py")):
+            for path in [folder] if folder.is_file() else sorted(folder.rglob("*.py")):
                 content = path.read_bytes()
                 name = path.relative_to(folder).as_posix()
                 digest.update(f"{package}/{name}\0{len(content)}\0".encode() + content)
@@ -134,18 +135,26 @@ def source_version() -> str:
 
 @cache
 def _installed() -> Sources:
-    return sources_in(_roots(), _cache_folder())
+    return sources_in(source_roots(), _cache_folder())
 
 
-def _roots() -> dict[str, tuple[Path, ...]]:
-    """Return the folders of lidarops and of the packages with kinds of product."""
-    packages = {"lidarops", *(kind.package.partition(".")[0] for kind in kinds().values())}
+def source_roots() -> dict[str, tuple[Path, ...]]:
+    """Return the folders of lidarops and of the packages with kinds of product or raw formats."""
+    modules = ("lidarops", *(kind.package for kind in kinds().values()), *_formats())
     roots: dict[str, tuple[Path, ...]] = {}
-    for package in sorted(packages):
+    for package in sorted({module.partition(".")[0] for module in modules}):
         spec = find_spec(package)
-        locations = spec.submodule_search_locations if spec else None
-        roots[package] = tuple(Path(location) for location in locations or ())
+        folders = spec.submodule_search_locations if spec else None
+        # A module that is no package has an origin only.
+        places = folders or ([spec.origin] if spec and spec.origin else [])
+        roots[package] = tuple(Path(place) for place in places)
     return roots
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Return the modules of raw formats. No import leads to them, and any file may need any."""
+    return tuple(point.module for point in entry_points(group=RAW_FORMATS))
 
 
 def _cache_folder() -> Path | None:

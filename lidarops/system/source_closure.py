@@ -28,7 +28,8 @@ class Sources:
     Parameters
     ----------
     roots : mapping of str to sequence of Path
-        Folders of each top-level package. Modules of others do not count.
+        Folders of each top-level package, or the file of a top-level module. Modules of others do
+        not count.
     apart : collection of str
         Modules and packages that do not count, whoever imports them.
     with_data : collection of str
@@ -106,7 +107,7 @@ class Sources:
             if not self.has(start):
                 raise LidarOpsError(
                     f"the source of {start} is missing",
-                    remedy="install lidarops and the packages of its kinds with their sources",
+                    remedy="install its package with its sources",
                 )
         files: dict[str, Path] = {}
         waiting = [module for start in waiting for module in self._run_by(start)]
@@ -154,6 +155,8 @@ class Sources:
         return self._paths[module]
 
     def _path_below(self, folder: Path, names: Sequence[str]) -> Path | None:
+        if folder.suffix == ".py":
+            return None if names else folder
         for name in names[:-1]:
             if not self._listing(folder).get(name):
                 return None

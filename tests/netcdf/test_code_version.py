@@ -9,10 +9,12 @@ from support.sources import Copy
 
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import Kind, kind_of, kinds
+from lidarops.netcdf import code_version as versions
 from lidarops.netcdf.code_version import (
     _APART,
     code_version,
     joint_code_version,
+    source_roots,
     sources_in,
     version_of,
 )
@@ -20,6 +22,7 @@ from lidarops.settings import ChannelProduct
 from lidarops.system.source_closure import Sources
 
 ALL = set(kinds())
+OWN = sorted(kind.name for kind in kinds().values() if kind.package.startswith("lidarops."))
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +68,9 @@ def test_comments_docstrings_and_line_ends_of_any_module_change_nothing(copy: Co
         ("retrieve/homogeneous/path_fit.py", "homogeneous"),
         ("retrieve/multiangle/vertical/gaps.py", "multiangle"),
         ("retrieve/network/noise/outlying_bins.py", "visibility"),
-        *((f"products/{kind}/settings.py", kind) for kind in sorted(ALL)),
-        *((f"products/{kind}/steps.py", kind) for kind in sorted(ALL)),
-        *((f"products/{kind}/variables.py", kind) for kind in sorted(ALL)),
+        *((f"products/{kind}/settings.py", kind) for kind in OWN),
+        *((f"products/{kind}/steps.py", kind) for kind in OWN),
+        *((f"products/{kind}/variables.py", kind) for kind in OWN),
     ],
 )
 def test_a_change_of_a_kind_changes_its_version_and_no_other(copy: Copy, module: str, kind: str):
@@ -97,7 +100,8 @@ def test_neighbours_of_what_makes_products_change_no_version(copy: Copy, module:
 @pytest.mark.parametrize(
     "module",
     ["process/scene.py", "netcdf/build.py", "netcdf/write.py", "netcdf/_deflate.py",
-     "netcdf/__init__.py", "raw/licel.py", "records.py", "flags.py", "__init__.py"],
+     "netcdf/__init__.py", "raw/licel_format.py", "raw/licel.py", "records.py", "flags.py",
+     "__init__.py"],
 )  # fmt: skip
 def test_what_every_product_passes_through_changes_all_versions(copy: Copy, module: str):
     assert changed(copy, module) == ALL
@@ -157,7 +161,9 @@ def test_a_kind_of_another_package_counts_its_own_modules(copy: Copy, cache: Pat
     kind = Kind("clouds", "Clouds", "other.clouds", ChannelProduct, 50)
 
     def versions() -> tuple[str, str]:
-        sources = sources_in({"lidarops": (copy.root,), "other": (package,)}, cache)
+        sources = sources_in(
+            {**source_roots(), "lidarops": (copy.root,), "other": (package,)}, cache
+        )
         return version_of(kind, sources), version_of(kind_of("signal"), sources)
 
     first = versions()
@@ -173,6 +179,24 @@ def test_a_kind_of_another_package_counts_its_own_modules(copy: Copy, cache: Pat
         seen.add(versions()[0])
     copy.change("retrieve/elastic/layers.py")
     assert versions()[0] not in seen
+
+
+def test_a_raw_format_of_another_package_counts_for_every_kind(
+    copy: Copy, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    reader = tmp_path / "raymetrics.py"
+    reader.write_text("FORMAT = 1\n")
+    monkeypatch.setattr(versions, "_formats", lambda: ("raymetrics",))
+
+    def now() -> dict[str, str]:
+        sources = sources_in(
+            {**source_roots(), "lidarops": (copy.root,), "raymetrics": (reader,)}, cache
+        )
+        return {kind.name: version_of(kind, sources) for kind in kinds().values()}
+
+    before = now()
+    reader.write_text("FORMAT = 2\n")
+    assert all(version != before[kind] for kind, version in now().items())
 
 
 def test_modules_that_are_kept_apart_are_imported(copy: Copy, cache: Path):

@@ -9,16 +9,22 @@ from pathlib import Path
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
-from lidarops.process.scene import Job, _digest, failed_outcome
+from lidarops.process.input_files import check_files
+from lidarops.process.job import Job
+from lidarops.process.scene import failed_outcome
 from lidarops.records import ProductRecord, SceneOutcome
 from lidarops.steps import dependence
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     """Stand in for `lidarops.process.scene.attempt`."""
-    scene, inputs, refused, _ = _digest(job, Path(job.campaign.archive))
+    scene, inputs, refused, _ = check_files(
+        job.scene, Path(job.campaign.archive), read_all=job.campaign.all_steps
+    )
     try:
-        inputs += Ancillaries.read(job.campaign.folder, job.plan).inputs
+        inputs += Ancillaries.read(
+            job.campaign.folder, dependence.ancillary_files(job.plan.steps)
+        ).inputs
     except LidarOpsError as error:
         return failed_outcome(job, str(error)), True
     settings = dependence.Settings(job.campaign)

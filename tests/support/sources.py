@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from lidarops.kinds import kinds
-from lidarops.netcdf.code_version import sources_in, version_of
+from lidarops.netcdf.code_version import source_roots, sources_in, version_of
 from lidarops.system.source_closure import Sources
 
 
@@ -31,7 +31,7 @@ class Copy:
 
     def sources(self) -> Sources:
         """Return the sources as they are now."""
-        return sources_in({"lidarops": (self.root,)}, self._cache)
+        return sources_in({**source_roots(), "lidarops": (self.root,)}, self._cache)
 
     def versions(self) -> dict[str, str]:
         """Return the code version of every kind."""
