@@ -56,6 +56,10 @@ class ChannelLayout:
     adc_bits: int
     """0 for photon counting."""
 
+    def __hash__(self) -> int:
+        # Layouts are looked up for every file.
+        return hash((self.name, self.bins))
+
 
 @dataclass(frozen=True, slots=True)
 class Granule:

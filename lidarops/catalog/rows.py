@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -18,6 +18,7 @@ RETRY: Final = ""
 """Scan key of a file that could not be read: every scan tries it again."""
 
 _HALF: Final = (1 << 31) - 1
+_EPOCH: Final = date(1970, 1, 1).toordinal()
 
 
 class GranuleRow(NamedTuple):
@@ -41,7 +42,7 @@ def aware(moment: datetime | None) -> datetime | None:
 
 def day_of(moment: datetime) -> int:
     """Return the UTC day of a time, in days since 1970-01-01."""
-    return (moment.astimezone(UTC).date() - datetime(1970, 1, 1, tzinfo=UTC).date()).days
+    return moment.astimezone(UTC).toordinal() - _EPOCH
 
 
 def row_of(granule: Granule, campaign: str, scan_key: str) -> GranuleRow:
