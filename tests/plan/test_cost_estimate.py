@@ -13,8 +13,18 @@ from hypothesis import strategies as st
 from support import factories
 
 from lidarops.errors import CatalogError
+from lidarops.kinds import kinds
 from lidarops.plan import cost_estimate
-from lidarops.plan.cost_estimate import DEFAULTS, Costs, Tally, Term, amounts
+from lidarops.plan.cost_estimate import (
+    Costs,
+    Tally,
+    Term,
+    amounts,
+    default_costs,
+    figure_term,
+    load_term,
+    value_term,
+)
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import ChannelLayout, Plan, Role, Scene
@@ -22,7 +32,8 @@ from lidarops.reports import gallery
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500]]}
 LEVEL = {"homogeneous": SECTIONS}
-UNITS = dict.fromkeys(Term, 1.0)
+DEFAULTS = default_costs()
+UNITS = dict.fromkeys(DEFAULTS, 1.0)
 
 
 def planned(
@@ -37,7 +48,7 @@ def planned(
     return scene, plan_scene(scene, campaign)
 
 
-def of(**changes: Any) -> dict[Term, float]:
+def of(**changes: Any) -> dict[str, float]:
     return amounts(*planned(**changes))
 
 
@@ -49,10 +60,10 @@ def test_amounts_of_sections():
     (window,) = (s for s in planned()[1].steps if s.name == "range_window")
     assert counts[Term.FILE] == 10
     assert counts[Term.DIGEST] == 10 * 1000
-    assert counts[Term.CHANNEL] == counts[Term.HOMOGENEOUS] == counts[Term.LOOK] == 1
+    assert counts[Term.CHANNEL] == counts["homogeneous"] == counts[Term.LOOK] == 1
     assert counts[Term.VALUE] == 10 * window.number
-    assert counts[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
-    assert Term.SIGNAL not in counts
+    assert counts[value_term("homogeneous")] == 10 * (4500 - 750) / 7.5
+    assert "signal" not in counts
 
 
 def test_known_digests_cost_nothing():
@@ -81,7 +92,7 @@ def test_a_glued_channel_reads_both_parts():
     alone = of(products={"elastic": {"channels": ["photon_532o"]}}, **up)
     assert joined[Term.VALUE] == 2 * alone[Term.VALUE] == 10 * 2 * 2000
     # Ten profiles, 5 min apart, in two averages of 30 min.
-    assert joined[Term.ELASTIC_VALUE] == alone[Term.ELASTIC_VALUE] == 2 * 2000
+    assert joined[value_term("elastic")] == alone[value_term("elastic")] == 2 * 2000
 
 
 def test_nothing_to_do_costs_nothing():
@@ -131,7 +142,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_calibration_is_read_as_written(cache: Path):
-    seconds = {term: 0.1 * number for number, term in enumerate(Term)}
+    seconds = {term: 0.1 * number for number, term in enumerate(DEFAULTS)}
     kept = cost_estimate.save_calibration(
         Costs(seconds, processor=cost_estimate.processor(), date="2026-01-02")
     )
@@ -154,8 +165,8 @@ def test_the_note_states_a_missing_calibration(cache: Path):
         ({"processor": "abacus"}, "another processor, abacus"),
         ({"format": "letter"}, "not a calibration"),
         ({"seconds": {}}, "run"),
-        ({"seconds": dict.fromkeys(Term, -1.0)}, "not a finite, non-negative time"),
-        ({"seconds": dict.fromkeys(Term, "soon")}, "soon"),
+        ({"seconds": dict.fromkeys(DEFAULTS, -1.0)}, "not a finite, non-negative time"),
+        ({"seconds": dict.fromkeys(DEFAULTS, "soon")}, "soon"),
     ],
 )
 def test_an_invalid_calibration_is_reported_and_not_used(cache: Path, change: Any, message: str):
@@ -191,5 +202,8 @@ def test_without_a_home_there_is_no_calibration():
 
 
 def test_all_terms_have_defaults():
-    assert set(DEFAULTS) == set(Term)
-    assert all(seconds > 0 for seconds in DEFAULTS.values())
+    assert set(Term) < set(DEFAULTS)
+    for kind in kinds():
+        assert {kind, value_term(kind), load_term(kind), figure_term(kind)} <= set(DEFAULTS)
+    loads = {load_term(kind) for kind in kinds()}
+    assert all(seconds > 0 for term, seconds in DEFAULTS.items() if term not in loads)

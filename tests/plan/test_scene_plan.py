@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from support import factories
 
-from lidarops.plan import product_dependence
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, Role, Scene
 from lidarops.retrieve.signal.dark import dark_profile
+from lidarops.steps import dependence
 
 
 def _scene(*granules: object) -> Scene:
@@ -35,10 +35,10 @@ def test_photon_channel() -> None:
     steps = _steps(result, "photon_532o")
     assert list(steps) == [
         "read",
-        "range_window",
         "overlap",
         "dead_time",
         "noise",
+        "range_window",
         "look",
         "homogeneous",
     ]
@@ -79,7 +79,7 @@ def test_a_channel_without_any_product_is_not_read() -> None:
 )
 def test_steps_of_a_plan_are_those_that_its_products_need(products: dict[str, object]) -> None:
     result = plan_scene(_scene(), factories.campaign(products=products))
-    needed = product_dependence.plan_closure(result, product_dependence.planned_products(result))
+    needed = dependence.plan_closure(result, dependence.planned_products(result))
     assert [(s.channel, s.name, s.settings) for s in result.steps] == [
         (s.channel, s.name, s.settings) for s in needed.steps
     ]
@@ -160,8 +160,8 @@ def test_elastic_steps_in_their_order() -> None:
     assert list(steps) == [
         "read",
         "noise",
-        "average",
         "molecular",
+        "average",
         "known_shape",
         "reference",
         "elastic",
@@ -382,8 +382,8 @@ class TestGlued:
         assert list(steps) == [
             "read",
             "glue",
-            "average",
             "molecular",
+            "average",
             "known_shape",
             "reference",
             "elastic",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from lidarops.kinds import flags_of
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled_altitudes import Background
+from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles, Background
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod
 
 STATION = 120.0
@@ -360,11 +361,11 @@ def test_profiles_of_one_visit_are_averaged_by_their_shots():
     conditioned, pointing = scan(8, np.repeat(ONE_SIDE, 2))
     pointing["shots"][::2] = 1
     pointing["shots"][1::2] = 10**6
-    every = labeled_altitudes.on_altitudes(conditioned, **(pointing | SETTINGS)).compute()
+    every = labeled_altitudes.on_altitudes(conditioned, **(pointing | SETTINGS))
     last = labeled_altitudes.on_altitudes(
         *take(conditioned, pointing, slice(1, None, 2))[:1],
         **(take(conditioned, pointing, slice(1, None, 2))[1] | SETTINGS),
-    ).compute()
+    )
     assert every.sizes["time"] == 8
     np.testing.assert_array_equal(every["shots"], 10 * (10**6 + 1))
     np.testing.assert_allclose(
@@ -395,14 +396,17 @@ def test_an_overlap_divides_the_signal():
 # Values do not depend on chunks
 
 
-@pytest.mark.parametrize("size", [1, 7, 64, 10_000])
-def test_any_chunking_gives_the_same_bits(size):
+@pytest.mark.parametrize("step", [1, 2, 100])
+def test_any_chunks_of_cycles_give_the_same_bits(step):
     conditioned, pointing = scan(40)
-    whole = solve(conditioned, pointing, background=FAR)
-    chunked = solve(
-        conditioned.chunk(time=size, range=-1 if size > 7 else 500), pointing, background=FAR
-    )
-    xr.testing.assert_identical(whole, chunked)
+    whole = labeled_altitudes.on_altitudes(conditioned, **(pointing | SETTINGS))
+    cycles = AltitudeCycles(RANGE, **(pointing | SETTINGS))
+    ends = cycles.ends()
+    assert ends.size > 3
+    edges = [0, *ends[::step], conditioned.sizes["time"]]
+    for first, past in itertools.pairwise(edges):
+        cycles.add(conditioned.isel(time=slice(first, past)), first)
+    xr.testing.assert_identical(cycles.result(), whole)
 
 
 def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypatch):
@@ -411,13 +415,6 @@ def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypa
     monkeypatch.setattr(labeled_altitudes, "_BESIDE", 10**6)
     monkeypatch.setattr(labeled_altitudes, "_AT_ONCE", 5)
     xr.testing.assert_identical(cut, solve(conditioned, pointing, background=FAR))
-
-
-def test_beams_stay_lazy():
-    conditioned, pointing = scan(3)
-    beams = labeled_altitudes.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
-    assert beams["signal"].chunks is not None
-    assert beams["shots"].chunks is None
 
 
 # Refusals

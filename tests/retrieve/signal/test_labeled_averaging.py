@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dask
-import dask.array as da
+import itertools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,7 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.signal.dark import dark_profile
 from lidarops.retrieve.signal.labeled import DarkSignals
-from lidarops.retrieve.signal.labeled_averaging import clock_average
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage, clock_average
 
 BINS = 16
 MIDNIGHT = np.datetime64("2026-03-01T00:00:00", "ns")
@@ -79,7 +79,7 @@ def spoiled(conditioned):
 def test_means_are_those_by_hand():
     conditioned, shots = made([0, 1, 4, 5, 7, 14.5])
     conditioned = spoiled(conditioned)
-    result = clock_average(conditioned, seconds=300, shots=shots).compute()
+    result = clock_average(conditioned, seconds=300, shots=shots)
     for k, members in enumerate([(0, 1, 2), (3, 4), (5,)]):
         mean, variance, bits = by_hand(conditioned, shots, members)
         np.testing.assert_allclose(result["power"][k], mean, rtol=1e-14)
@@ -117,7 +117,7 @@ def test_every_missing_mean_has_a_bit():
 def test_a_profile_without_shots_has_no_weight():
     conditioned, shots = made([0, 1, 2])
     shots[1] = 0
-    result = clock_average(conditioned, seconds=300, shots=shots).compute()
+    result = clock_average(conditioned, seconds=300, shots=shots)
     mean, variance, _ = by_hand(conditioned, shots, (0, 2))
     np.testing.assert_allclose(result["power"][0], mean, rtol=1e-14)
     np.testing.assert_allclose(result["variance"][0], variance, rtol=1e-14)
@@ -177,27 +177,25 @@ class TestIntervals:
 
 LONG = spoiled(made(np.sort(np.random.default_rng(5).uniform(0, 300, 700)), seed=1)[0])
 LONG_SHOTS = made(np.arange(700), seed=2)[1]
-WHOLE = clock_average(LONG, seconds=600, shots=LONG_SHOTS).compute()
+WHOLE = clock_average(LONG, seconds=600, shots=LONG_SHOTS)
 
 
 @settings(max_examples=8, deadline=None)
-@given(
-    along_time=st.lists(st.integers(1, 699), max_size=6, unique=True),
-    along_range=st.sampled_from([5, BINS]),
-    scheduler=st.sampled_from(["synchronous", "threads"]),
-)
-def test_chunks_and_schedulers_do_not_change_a_bit(along_time, along_range, scheduler):
-    edges = [0, *sorted(along_time), 700]
-    chunked = LONG.chunk({"time": tuple(np.diff(edges)), "range": along_range})
-    result = clock_average(chunked, seconds=600, shots=LONG_SHOTS)
-    assert all(isinstance(result[n].data, da.Array) for n in ("power", "variance", "quality"))
-    with dask.config.set(scheduler=scheduler):
-        xr.testing.assert_identical(result.compute(), WHOLE)
+@given(edges=st.lists(st.integers(1, 699), max_size=6, unique=True).map(sorted), dark=st.booleans())
+def test_chunks_do_not_change_a_bit(edges, dark):
+    def shared(times):
+        return np.full((times.size, BINS), 0.25)
+
+    common = {"seconds": 600, "shots": LONG_SHOTS, "shared_variance": shared if dark else None}
+    average = ClockAverage(LONG[["time", "time_bnds"]], LONG["range"].to_numpy(), **common)
+    for first, past in itertools.pairwise([0, *edges, 700]):
+        average.add(LONG.isel(time=slice(first, past)))
+    xr.testing.assert_identical(average.result(), clock_average(LONG, **common))
 
 
-def test_a_mean_may_hold_more_profiles_than_a_task():
+def test_a_mean_may_hold_more_profiles_than_are_averaged_together():
     conditioned, shots = made(np.linspace(0, 500, 600))
-    result = clock_average(conditioned, seconds=86400, shots=shots).compute()
+    result = clock_average(conditioned, seconds=86400, shots=shots)
     assert result.sizes["time"] == 1
     weight = (shots / shots.sum()).to_numpy()
     np.testing.assert_allclose(
@@ -209,7 +207,7 @@ def test_a_mean_may_hold_more_profiles_than_a_task():
 
 def test_the_means_of_an_interval_do_not_depend_on_other_intervals():
     profiles = LONG.isel(time=slice(100, 420))
-    result = clock_average(profiles, seconds=600, shots=LONG_SHOTS[100:420]).compute()
+    result = clock_average(profiles, seconds=600, shots=LONG_SHOTS[100:420])
     inner = result.isel(time=slice(1, -1))
     xr.testing.assert_identical(inner, WHOLE.sel(time=inner["time"]))
 
@@ -238,7 +236,6 @@ class TestSharedVariance:
 
         result = clock_average(conditioned, seconds=600, shots=shots, shared_variance=shared)
         np.testing.assert_array_equal(times_of_call[0], result["time"])
-        result = result.compute()
         assert (result["variance"].to_numpy()[0] >= 0.1).all()
         assert (result["variance"].to_numpy()[1] >= 0.2).all()
 

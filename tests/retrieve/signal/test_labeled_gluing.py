@@ -211,36 +211,37 @@ def test_channels_of_unequal_length_are_glued_over_the_shorter():
     np.testing.assert_array_equal(result["range"], distance[:1500])
 
 
-@pytest.mark.parametrize("chunks", [{"time": 1, "range": 300}, {"time": 4, "range": -1}])
-def test_chunks_do_not_change_a_bit(chunks):
+@pytest.mark.parametrize("profiles", [1, 4])
+def test_each_profile_is_glued_by_itself(profiles):
     analog, photon = recorded(truth())
     whole = labeled_gluing.glue(analog, photon, lag=1.5)
-    lazy = labeled_gluing.glue(analog.chunk(chunks), photon.chunk({"time": 3}), lag=1.5)
-    assert all(array.chunks for array in lazy.data_vars.values())
-    xr.testing.assert_identical(lazy.compute(), whole)
+    rows = [slice(first, first + profiles) for first in range(0, whole.sizes["time"], profiles)]
+    parts = [labeled_gluing.glue(analog.isel(time=r), photon.isel(time=r), lag=1.5) for r in rows]
+    xr.testing.assert_identical(xr.concat(parts, "time", data_vars="minimal"), whole)
+
+
+def powers(channels):
+    return (part["power"].to_numpy() for part in channels)
 
 
 class TestLag:
     @pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 2.5])
     def test_estimate_is_the_lag_of_shared_noise(self, lag):
-        rate = truth()
-        analog, photon = recorded(rate, profiles=40, lag=lag, noise=1e-3, common=True)
-        assert labeled_gluing.estimate_lag(analog, photon) == pytest.approx(lag, abs=0.15)
+        analog, photon = powers(recorded(truth(), profiles=40, lag=lag, noise=1e-3, common=True))
+        estimate = labeled_gluing.estimate_lag(analog, photon, known=100.0)
+        assert estimate == pytest.approx(lag, abs=0.15)
 
-    def test_estimate_falls_back_on_the_ranges(self):
-        analog, photon = recorded(truth(), lag=7.0)
-        assert labeled_gluing.estimate_lag(analog, photon) == 0.0
-        farther = analog.assign_coords(range=analog["range"] - 3 * BIN)
-        assert labeled_gluing.estimate_lag(farther, photon) == pytest.approx(3.0)
+    @pytest.mark.parametrize("known", [0.0, 3.0])
+    def test_estimate_falls_back_on_the_known_lag(self, known):
+        analog, photon = powers(recorded(truth(), lag=7.0))
+        assert labeled_gluing.estimate_lag(analog, photon, known=known) == known
 
     def test_range_lag_is_the_difference_of_the_ranges(self):
-        analog, photon = recorded(truth())
-        farther = analog.assign_coords(range=analog["range"] - 5.5 * BIN)
-        assert labeled_gluing.range_lag(farther, photon) == pytest.approx(5.5)
-        lag = labeled_gluing.range_lag(farther, photon)
+        farther = distance - 5.5 * BIN
+        lag = labeled_gluing.range_lag(farther, distance)
+        assert lag == pytest.approx(5.5)
         # The analog bin that the lag leads to has the range of the photon counting one.
-        index = 100 + lag
-        range_at_lag = np.interp(index, np.arange(distance.size), farther["range"])
+        range_at_lag = np.interp(100 + lag, np.arange(distance.size), farther)
         assert range_at_lag == pytest.approx(distance[100])
 
     def test_a_wrong_lag_of_a_falling_signal_shows(self):
