@@ -2,5 +2,5 @@
 
 `step` defines a step, `case` what its decision sees, `data` what it works on. `registry` finds the
 steps of every kind of product, and what one product needs of a plan follows from their inputs and
-outputs (`closure`).
+outputs (`dependence`).
 """

@@ -414,9 +414,13 @@ class TestManyScenes:
 
     def test_a_range_window_without_effect_is_marked(self, tmp_path):
         window = PlannedStep(
-            "range_window", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins"
+            "range_window",
+            CHANNEL,
+            {"bins": [[0, 9]]},
+            "sections need no farther bins",
+            product="homogeneous",
         )
-        signal = PlannedStep("signal", CHANNEL, {}, "requested")
+        signal = PlannedStep("signal", CHANNEL, {}, "requested", product="signal")
         scenes = [
             outcome(name, plan=Plan(name, steps, ()))
             for name, steps in (("alone", (window,)), ("both", (window, signal)))

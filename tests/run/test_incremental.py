@@ -278,7 +278,7 @@ def test_a_kind_that_nothing_requests_is_wrong_use(archive: Archive) -> None:
     for command in ("plan", "reprocess"):
         refused = CliRunner().invoke(app, [command, str(archive.file), "--product", "visibility"])
         assert refused.exit_code == 2
-        assert "requested: signal, homogeneous, elastic" in refused.stderr
+        assert "requested: homogeneous, elastic, signal" in refused.stderr
 
 
 def test_products_that_were_never_made_are_not_fresh(archive: Archive, tmp_path: Path) -> None:

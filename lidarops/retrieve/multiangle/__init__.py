@@ -2,8 +2,8 @@
 
 A scan passes through these modules in order:
 
-1. `labeled_altitudes.on_altitudes` takes the conditioned profiles of a scene. `scan_cycles` groups
-   them into directions and cycles. The background is subtracted, and `_common_altitude`
+1. `labeled_altitudes.AltitudeCycles` takes the conditioned profiles of a scene. `scan_cycles`
+   groups them into directions and cycles. The background is subtracted, and `_common_altitude`
    interpolates each beam to the common altitudes.
 2. `optical_depth.retrieve_optical_depth` solves the cycles in blocks. `_methods` carries out one
    block. `_sample_mask` takes the logarithms, and `_block` with `_kano_hamilton` fits them against

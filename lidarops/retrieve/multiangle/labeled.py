@@ -76,7 +76,7 @@ def retrieve_optical_depth(
     Parameters
     ----------
     beams : xr.Dataset
-        From `lidarops.retrieve.multiangle.labeled_altitudes.on_altitudes`, in memory. All cycles
+        From `lidarops.retrieve.multiangle.labeled_altitudes.AltitudeCycles`. All cycles
         are one block of `lidarops.retrieve.multiangle.optical_depth.retrieve_optical_depth`.
     station_altitude : float
         m above mean sea level.

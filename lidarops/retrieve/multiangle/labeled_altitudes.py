@@ -199,52 +199,6 @@ class AltitudeCycles:
         )
 
 
-def on_altitudes(
-    conditioned: xr.Dataset,
-    *,
-    zenith_angle: npt.ArrayLike,
-    azimuth: npt.ArrayLike | None,
-    time_bnds: npt.ArrayLike,
-    shots: npt.ArrayLike,
-    altitude_grid: npt.ArrayLike,
-    station_altitude: float,
-    background: Background,
-    overlap: Array | None = None,
-) -> xr.Dataset:
-    """Return all profiles of a scan on common altitudes, sorted by cycle and beam.
-
-    Parameters
-    ----------
-    conditioned : xr.Dataset
-        As for `AltitudeCycles.add`, of the whole scan.
-    zenith_angle, azimuth, time_bnds, shots, altitude_grid, station_altitude, background, overlap
-        As for `AltitudeCycles`.
-
-    Returns
-    -------
-    xr.Dataset
-        As from `AltitudeCycles.result`.
-
-    Raises
-    ------
-    RetrievalInputError
-        For invalid arguments, or if no beam points above the horizon.
-    """
-    cycles = AltitudeCycles(
-        conditioned["range"].to_numpy().astype(np.float64),
-        zenith_angle=zenith_angle,
-        azimuth=azimuth,
-        time_bnds=time_bnds,
-        shots=shots,
-        altitude_grid=altitude_grid,
-        station_altitude=station_altitude,
-        background=background,
-        overlap=overlap,
-    )
-    cycles.add(conditioned, 0)
-    return cycles.result()
-
-
 @dataclass(frozen=True, slots=True)
 class _Order:
     """Cycle and beam of each profile that is used, sorted by cycle, then beam."""

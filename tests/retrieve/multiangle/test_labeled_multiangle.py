@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from support.oracles.angle_scenes import retrieve_scan
+from support.oracles.angle_scenes import on_altitudes, retrieve_scan
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -361,8 +361,8 @@ def test_profiles_of_one_visit_are_averaged_by_their_shots():
     conditioned, pointing = scan(8, np.repeat(ONE_SIDE, 2))
     pointing["shots"][::2] = 1
     pointing["shots"][1::2] = 10**6
-    every = labeled_altitudes.on_altitudes(conditioned, **(pointing | SETTINGS))
-    last = labeled_altitudes.on_altitudes(
+    every = on_altitudes(conditioned, **(pointing | SETTINGS))
+    last = on_altitudes(
         *take(conditioned, pointing, slice(1, None, 2))[:1],
         **(take(conditioned, pointing, slice(1, None, 2))[1] | SETTINGS),
     )
@@ -399,7 +399,7 @@ def test_an_overlap_divides_the_signal():
 @pytest.mark.parametrize("step", [1, 2, 100])
 def test_any_chunks_of_cycles_give_the_same_bits(step):
     conditioned, pointing = scan(40)
-    whole = labeled_altitudes.on_altitudes(conditioned, **(pointing | SETTINGS))
+    whole = on_altitudes(conditioned, **(pointing | SETTINGS))
     cycles = AltitudeCycles(RANGE, **(pointing | SETTINGS))
     ends = cycles.ends()
     assert ends.size > 3

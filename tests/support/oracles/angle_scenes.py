@@ -164,12 +164,15 @@ def retrieve_scan(conditioned, *, station_altitude, **arguments):
         for name in ("method", "largest_gradient", "layers")
         if name in arguments
     }
-    beams = labeled_altitudes.on_altitudes(
-        conditioned, station_altitude=station_altitude, **arguments
-    )
-    return labeled.retrieve_optical_depth(
-        beams.compute(), station_altitude=station_altitude, **method
-    )
+    beams = on_altitudes(conditioned, station_altitude=station_altitude, **arguments)
+    return labeled.retrieve_optical_depth(beams, station_altitude=station_altitude, **method)
+
+
+def on_altitudes(conditioned, **arguments):
+    """Return the cycles of all profiles of a scan on common altitudes."""
+    cycles = labeled_altitudes.AltitudeCycles(conditioned["range"].to_numpy(), **arguments)
+    cycles.add(conditioned, 0)
+    return cycles.result()
 
 
 def estimates(scene, profiles, rng, correlation=0.0, *, outliers=0.0):

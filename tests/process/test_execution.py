@@ -1,4 +1,4 @@
-"""Steps of a plan on counts of a simulated lidar, compared with its truth."""
+"""Products that a plan makes of counts of a simulated lidar, compared with its truth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 
-import dask
 import dask.array as da
 import numpy as np
 import pytest
@@ -21,9 +20,11 @@ from lidarops.flags import Quality
 from lidarops.netcdf.build import Context
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.process import channel_steps
+from lidarops.process import execution
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
+from lidarops.steps import dependence
+from lidarops.steps.data import Chunk, RowProduct, Source, WholeProduct
 
 AIR = MolecularProfile.us_standard()
 STATION = 20.0
@@ -133,13 +134,32 @@ def planned(settings: Campaign, *, dark: bool = False, bins: int = 1200) -> Plan
     return plan_scene(cut_scenes(settings, granules).scenes[0], settings)
 
 
-def carry_out(products, raw=None, *, channel="photon_532o", dark=None, ancillaries=None, **facts):
+def carry_out(
+    products, raw=None, *, channel="photon_532o", dark=None, ancillaries=None, profiles=7, **facts
+):
+    """Return the products of a channel, from chunks of some profiles."""
     raw = archive() if raw is None else raw
     plan = planned(campaign(products, **facts), dark=dark is not None, bins=raw.sizes["range"])
     files = NONE if ancillaries is None else ancillaries
-    return channel_steps.process_channel(
-        channel_steps.SceneData(plan, raw, dark, files, STATION), channel
-    )
+    source = Source(raw, dark, files, STATION)
+    _, streams = execution.channel_data(source, plan.steps, channel)
+    rows = {kind: [] for kind, stream in streams.items() if isinstance(stream, RowProduct)}
+    for chunk in execution.chunks(source, channel, streams.values(), profiles):
+        for kind, stream in streams.items():
+            if isinstance(stream, RowProduct):
+                rows[kind].append(stream.rows(chunk))
+            else:
+                stream.add(chunk)
+    return {
+        kind: joined(stream.frame(), rows[kind]) if kind in rows else stream.result()
+        for kind, stream in streams.items()
+    }
+
+
+def joined(frame, rows):
+    """Return a product of which each profile gives its own rows."""
+    whole = xr.concat(rows, "time", data_vars="minimal", coords="minimal", compat="override")
+    return frame.assign(whole.variables)
 
 
 def read(folder: Path, **files: str) -> Ancillaries:
@@ -148,7 +168,7 @@ def read(folder: Path, **files: str) -> Ancillaries:
         (folder / f"{name}.csv").write_text(content)
     facts = {f"{name}_profile": f"{name}.csv" for name in files}
     plan = planned(campaign({"elastic": ELASTIC}, **facts))
-    return Ancillaries.read(folder, plan)
+    return Ancillaries.read(folder, dependence.ancillary_files(plan.steps))
 
 
 def between(low, high):
@@ -234,11 +254,10 @@ def test_results_can_be_built_into_products(channel: str) -> None:
 
 
 @pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
-@pytest.mark.parametrize("chunk", [1, 13])
-def test_any_chunks_and_threads_give_the_same_bits(channel: str, chunk: int) -> None:
+@pytest.mark.parametrize("profiles", [1, 3, 20])
+def test_any_chunks_give_the_same_bits(channel: str, profiles: int) -> None:
     products = {"elastic": {**ELASTIC, "average": "10min"}}
-    with dask.config.set(scheduler="threads", num_workers=2):
-        product = carry_out(products, archive(chunk=chunk), channel=channel)["elastic"]
+    product = carry_out(products, archive(chunk=13), channel=channel, profiles=profiles)["elastic"]
     xr.testing.assert_identical(product, elastic_products()[channel])
 
 
@@ -446,7 +465,7 @@ def test_geometry_and_shots_go_with_every_product() -> None:
         "elastic": {**ELASTIC, "channels": ["photon_532o"]},
     }
     retrieved = carry_out(products, archive().assign_coords(azimuth=("time", np.full(20, 40.0))))
-    assert list(retrieved) == ["signal", "homogeneous", "elastic"]
+    assert set(retrieved) == {"signal", "homogeneous", "elastic"}
     for data in retrieved.values():
         assert {"time", "time_bnds", "zenith_angle", "azimuth"} <= set(data.coords)
         assert data["shots"].dims == ("time",)
@@ -505,12 +524,48 @@ def test_the_background_follows_the_method_of_the_campaign() -> None:
     assert backgrounds["tail_mean"] == pytest.approx(SKY + tail_signal, abs=0.2 * tail_signal)
 
 
-def test_loading_does_not_change_the_data_of_the_caller():
+def test_a_chunk_holds_the_channel_that_is_processed_and_leaves_the_source_lazy() -> None:
     lazy = archive(profiles=3)
-    scene_data = channel_steps.SceneData(
-        planned(campaign({"signal": {}})), lazy, None, NONE, STATION
-    )
-    near = channel_steps.load_small(scene_data, ["photon_532o"]).archive
-    assert isinstance(near["photon_532o"].data, np.ndarray)
-    assert isinstance(near["analog_532o"].data, da.Array)
+    source = Source(lazy, None, NONE, STATION)
+    (chunk,) = execution.chunks(source, "photon_532o", (), 7)
+    assert isinstance(chunk.counts["photon_532o"].data, np.ndarray)
+    assert "analog_532o" not in chunk.counts
     assert isinstance(lazy["photon_532o"].data, da.Array)
+    (glued,) = execution.chunks(source, "glued_532o", (), 7)
+    assert {"photon_532o", "analog_532o"} <= set(glued.counts)
+
+
+class _Ends(WholeProduct):
+    """A product that allows a chunk to end before some rows only."""
+
+    def __init__(self, *rows: int) -> None:
+        self._rows = np.array(rows)
+
+    def ends(self) -> np.ndarray:
+        return self._rows
+
+    def add(self, chunk: Chunk) -> None:
+        """Take nothing."""
+
+    def result(self) -> xr.Dataset:
+        return xr.Dataset()
+
+
+@pytest.mark.parametrize(
+    ("streams", "profiles", "edges"),
+    [
+        ((), 7, [7, 14, 20]),
+        ((), 50, [20]),
+        ((_Ends(3, 6, 9, 12),), 7, [6, 12, 20]),
+        ((_Ends(3, 6, 9, 12),), 1, [3, 6, 9, 12, 20]),
+        ((_Ends(3, 6, 9, 12), _Ends(2, 6, 10)), 1, [6, 20]),
+        ((_Ends(3), _Ends(2)), 1, [20]),
+    ],
+)
+def test_chunks_end_where_all_products_allow_it(
+    streams: tuple[WholeProduct, ...], profiles: int, edges: list[int]
+) -> None:
+    source = Source(archive(), None, NONE, STATION)
+    made = list(execution.chunks(source, "photon_532o", streams, profiles))
+    assert [chunk.rows.stop for chunk in made] == edges
+    assert [chunk.rows.start for chunk in made] == [0, *edges[:-1]]
