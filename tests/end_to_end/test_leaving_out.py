@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 import xarray as xr
-from lidarops.plan.preview import GAP, OMITTED, refine_plan
-from lidarops.plan.rule_table import RULES
 from support import factories
 from support.archives import mixed_campaign, raw_archives
 from support.archives.scene_jobs import catalogued_scenes
+from support.oracles.angle_scenes import on_altitudes
 
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.flags import Quality
-from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW, plan_scene
+from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.process import channel_steps
-from lidarops.process import scene as processing
-from lidarops.process.scene import Job, process_scene
+from lidarops.process import execution, input_files
+from lidarops.process.job import Job
+from lidarops.process.scene import process_scene
+from lidarops.products.homogeneous.look import GAP
 from lidarops.raw.file import RawFile
 from lidarops.records import Plan, PlannedStep, Role, RunRecord
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -48,13 +48,7 @@ def decided(plan: Plan, rule: str) -> tuple[list[str], list[str]]:
     return steps, [omission.reason for omission in plan.left_out if omission.rule == rule]
 
 
-# The table ------------------------------------------------------------------------------------
-
-
-def test_rules_have_names_and_questions():
-    assert len({rule.name for rule in RULES}) == len(RULES)
-    assert all(rule.question.endswith("?") for rule in RULES)
-    assert {CHANNEL, RANGE_WINDOW, *PRODUCTS} <= set(RULES)
+# Decisions ------------------------------------------------------------------------------------
 
 
 def with_facts(**facts: Any) -> dict[str, Any]:
@@ -218,7 +212,7 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         {"power": (("time", "range"), power), "variance": flat, "quality": flat},
         coords={"range": distance},
     )
-    on_levels = labeled_altitudes.on_altitudes(
+    on_levels = on_altitudes(
         profiles,
         zenith_angle=np.array([granule.zenith_angle for granule in granules]),
         azimuth=np.array([granule.azimuth for granule in granules]),
@@ -229,7 +223,7 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         background=labeled_altitudes.Background(
             (27_000.0, 30_000.0), MolecularProfile.us_standard(), 532e-9
         ),
-    ).compute()
+    )
     scan = slant_paths.make_scan(
         on_levels["beam_zenith_angle"].to_numpy(),
         on_levels["altitude"].to_numpy() - 20.0,
@@ -247,24 +241,6 @@ def test_invalid_angles_are_left_to_the_retrieval():
         [],
         ["fewer than 4 beam directions cannot identify an outlier"],
     )
-
-
-def test_every_decision_has_a_rule_of_the_table():
-    names = {rule.name for rule in RULES}
-    for granules, changes in (
-        ([LEVEL, DARK], {}), ([UP], ELASTIC), ([UP], LATE), (BOTH_SIDES, MULTI), ([LEVEL], FEW),
-    ):  # fmt: skip
-        plan = planned(*granules, **changes)
-        assert {decision.rule for decision in (*plan.steps, *plan.left_out)} <= names
-
-
-def test_every_rule_is_tested():
-    """A test names every rule of the table."""
-    path = Path(__file__)
-    text = path.read_text() + (path.parents[1] / "plan/test_network_plan.py").read_text()
-    missing = {rule.name for rule in RULES if f'"{rule.name}"' not in text}
-    # Tested by the bit that they set.
-    assert missing <= {"section_saturated", "member_background"}
 
 
 # Headers --------------------------------------------------------------------------------------
@@ -316,7 +292,7 @@ def test_the_window_holds_the_farthest_section_and_the_bins_for_its_noise():
         ({**HOMOGENEOUS, "signal": {}}, "signal needs all bins"),
         ({**HOMOGENEOUS, **ELASTIC["products"]}, "elastic needs all bins"),
         ({**HOMOGENEOUS, **GLUED["products"]}, "glued_532o needs all bins"),
-        ({**HOMOGENEOUS, **ELASTIC["products"], "signal": {}}, "signal and elastic need all bins"),
+        ({**HOMOGENEOUS, **ELASTIC["products"], "signal": {}}, "elastic and signal need all bins"),
     ],
 )
 def test_a_window_without_effect_states_why(products, why):
@@ -335,8 +311,15 @@ def test_a_window_without_effect_states_why(products, why):
 
 
 def test_a_window_does_not_depend_on_other_lidars():
-    window = PlannedStep("range_window", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
-    signal = PlannedStep("signal", "photon_532o", {}, "requested", "west")
+    window = PlannedStep(
+        "range_window",
+        "photon_532o",
+        {"bins": [[0, 9]]},
+        "near bins",
+        "east",
+        product="homogeneous",
+    )
+    signal = PlannedStep("signal", "photon_532o", {}, "requested", "west", product="signal")
     assert not idle_window(window, [window, signal])
     assert read_windows([window, signal]) == {"photon_532o": ((0, 9),)}
 
@@ -372,12 +355,17 @@ def sky(light, *, saturated=()):
 
 def looked(profiles, count=600):
     granules = [factories.granule(float(k)) for k in range(count)]
-    return refine_plan(planned(*granules, products=HOMOGENEOUS), granules, profiles)
+    return refined(planned(*granules, products=HOMOGENEOUS), granules, profiles)
+
+
+def refined(plan, granules, profiles):
+    (scene,) = cut_scenes(factories.campaign(products=HOMOGENEOUS), granules).scenes
+    return execution.refined_plan(plan, scene, profiles)
 
 
 def absent(plan):
     (step,) = (step for step in plan.steps if step.name == "homogeneous")
-    return step.settings.get(OMITTED, [])
+    return step.settings["left_out"]
 
 
 def test_sixteen_profiles_with_signal_are_enough():
@@ -421,7 +409,7 @@ def test_sections_that_are_always_saturated_are_left_out():
 def test_a_refined_plan_stays_as_it_is():
     plan = looked(sky(lambda _: 0.0)[0])
     granules = [factories.granule(float(k)) for k in range(600)]
-    assert refine_plan(plan, granules, sky(lambda _: 1.0)[0]) == plan
+    assert refined(plan, granules, sky(lambda _: 1.0)[0]) == plan
 
 
 # Files ----------------------------------------------------------------------------------------
@@ -473,20 +461,20 @@ def test_an_omitted_section_flags_profiles_without_shots(tmp_path, monkeypatch):
     campaign = archive(tmp_path, products=products)
     scene = catalogued_scenes(campaign)[0]
     plan = plan_scene(scene, campaign)
-    absent = {OMITTED: [[700.0, 1500.0, "LOW_SIGNAL"]]}
+    absent = {"left_out": [[700.0, 1500.0, "LOW_SIGNAL"]]}
     steps = [
         replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
         for step in plan.steps
         if step.name != "look"
     ]
-    opened = processing.open_archive
+    opened = input_files.open_archive
 
     def without_shots(*files: Any, **settings: Any) -> xr.Dataset:
         raw = opened(*files, **settings)
         raw["photon_532o_shots"][1] = 0
         return raw
 
-    monkeypatch.setattr(processing, "open_archive", without_shots)
+    monkeypatch.setattr(input_files, "open_archive", without_shots)
     (product,) = process_scene(Job(campaign, scene, replace(plan, steps=tuple(steps)))).products
     flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
     bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
@@ -495,14 +483,14 @@ def test_an_omitted_section_flags_profiles_without_shots(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("bytes_at_once", [0, 10**9])
-def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
+def test_products_are_the_same_bits_read_at_once_and_in_chunks(
     tmp_path, monkeypatch, bytes_at_once
 ):
     campaign = archive(tmp_path)
     scene = catalogued_scenes(campaign)[0]
     job = Job(campaign, scene, plan_scene(scene, campaign))
     usual = [product.sha256 for product in process_scene(job).products]
-    monkeypatch.setattr(channel_steps, "IN_MEMORY", bytes_at_once)
+    monkeypatch.setattr(execution, "IN_MEMORY", bytes_at_once)
     assert [product.sha256 for product in process_scene(job).products] == usual
 
 
