@@ -2,24 +2,94 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 from lidarops.errors import LidarOpsError
-from lidarops.system import syntax_trees
 from lidarops.system.files import write_atomically
-from lidarops.system.syntax_trees import SourceFacts, source_facts
 
 _NO_DATA: Final = (".py", ".pyc", ".pyi", ".nbc", ".nbi", "~")
 """Endings of files beside modules that are no data of them."""
 _MOST_KEPT: Final = 5000
 """Sources whose facts one file of the cache holds."""
+_WITHOUT_MEANING: Final = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
+"""Fields of syntax nodes that follow from others or change nothing."""
+
+
+class SourceFacts(NamedTuple):
+    """What one source says."""
+
+    digest: str
+    """Equal for sources that differ in comments, docstrings, layout or line endings."""
+    imports: tuple[str, ...]
+    """Modules that it may import, also within functions, but not for type checking. ``from a
+    import b`` gives ``a`` and ``a.b``, because ``b`` may be a module; a relative import begins with
+    its dots."""
+
+
+def source_facts(source: bytes) -> SourceFacts:
+    """Return the digest of a source by its syntax tree, and its imports.
+
+    Raises
+    ------
+    SyntaxError, ValueError, RecursionError
+        If it is not Python, or an expression is nested too deeply.
+    """
+    imports: set[str] = set()
+    content = _content(ast.parse(source), imports)
+    return SourceFacts(hashlib.sha256(content.encode()).hexdigest(), tuple(sorted(imports)))
+
+
+def _content(value: Any, imports: set[str]) -> str:
+    """Return a syntax tree as text, and add its imports.
+
+    `ast.dump` and `repr` write other text in other versions of Python.
+    """
+    if isinstance(value, list):
+        items = [_content(item, imports) for item in _effective(value)]
+        return f"[{','.join(items)}]" if items else ""
+    if not isinstance(value, ast.AST):
+        return ascii(value)
+    imports.update(_imports(value))
+    fields = (
+        (name, getattr(value, name, None)) for name in value._fields if name not in _WITHOUT_MEANING
+    )
+    texts = [
+        f"{name}={text}"
+        for name, field in fields
+        if field is not None and (text := _content(field, imports))
+    ]
+    return f"{type(value).__name__}({','.join(texts)})"
+
+
+def _effective(items: Iterable[Any]) -> Iterator[Any]:
+    """Yield the items of a list without those that change nothing."""
+    for item in items:
+        if isinstance(item, ast.If) and "TYPE_CHECKING" in (
+            getattr(item.test, "id", ""),
+            getattr(item.test, "attr", ""),
+        ):
+            yield from _effective(item.orelse)
+        elif not isinstance(item, ast.Pass) and not (
+            isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)
+        ):
+            yield item
+
+
+def _imports(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        module = "." * node.level + (node.module or "")
+        yield module
+        dot = "" if module.endswith(".") else "."
+        yield from (f"{module}{dot}{alias.name}" for alias in node.names)
 
 
 class Sources:
@@ -54,7 +124,6 @@ class Sources:
         self._facts: dict[Path, SourceFacts] = {}
         self._paths: dict[str, Path | None] = {}
         self._imports: dict[str, tuple[str, ...]] = {}
-        self._listings: dict[Path, dict[str, bool]] = {}
 
     def has(self, module: str) -> bool:
         """Whether a module exists."""
@@ -63,15 +132,10 @@ class Sources:
     def digest(self, starts: Iterable[str]) -> str:
         """Return a digest of some modules and of all that they import.
 
-        Parameters
-        ----------
-        starts : iterable of str
-
         Returns
         -------
         str
-            16 hexadecimal digits. Equal for sources with equal syntax trees, but for docstrings,
-            wherever they are installed.
+            16 hexadecimal digits, which do not depend on where the sources are installed.
 
         Raises
         ------
@@ -81,10 +145,10 @@ class Sources:
         closure = self.closure(starts)
         contents = [f"{name}={self._of(path).digest}" for name, path in closure.items()]
         contents += [
-            f"{package}:{data.relative_to(folder).as_posix()}={_data_digest(data)}"
-            for package, folder in _folders(closure)
-            if _within(package, self._with_data)
-            for data in self._data(folder)
+            f"{name}:{data.relative_to(path.parent).as_posix()}={_data_digest(data)}"
+            for name, path in closure.items()
+            if path.name == "__init__.py" and _within(name, self._with_data)
+            for data in _data(path.parent)
         ]
         return hashlib.sha256("\n".join(sorted(contents)).encode()).hexdigest()[:16]
 
@@ -93,24 +157,20 @@ class Sources:
 
         A module runs the packages around it, so these count with their own imports.
 
-        Parameters
-        ----------
-        starts : iterable of str
-
         Raises
         ------
         LidarOpsError
             If a source is missing or cannot be read.
         """
-        waiting = list(starts)
-        for start in waiting:
+        files: dict[str, Path] = {}
+        waiting: list[str] = []
+        for start in starts:
             if not self.has(start):
                 raise LidarOpsError(
                     f"the source of {start} is missing",
                     remedy="install its package with its sources",
                 )
-        files: dict[str, Path] = {}
-        waiting = [module for start in waiting for module in self._run_by(start)]
+            waiting += self._run_by(start)
         while waiting:
             name = waiting.pop()
             path = self._path(name)
@@ -123,8 +183,12 @@ class Sources:
     def _imported(self, module: str, path: Path) -> tuple[str, ...]:
         """Return the modules that the import of a module runs, but for indirect ones."""
         if module not in self._imports:
-            targets = _absolute(self._of(path).imports, module, path)
-            names = (name for target in targets for name in self._run_by(target))
+            package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+            names = (
+                name
+                for target in self._of(path).imports
+                for name in self._run_by(_absolute(target, package))
+            )
             self._imports[module] = tuple(dict.fromkeys(names))
         return self._imports[module]
 
@@ -139,7 +203,7 @@ class Sources:
         if path not in self._facts:
             try:
                 self._facts[path] = self._kept.of(path.read_bytes())
-            except (OSError, SyntaxError, ValueError) as error:
+            except (OSError, SyntaxError, ValueError, RecursionError) as error:
                 raise LidarOpsError(
                     f"is not a source that Python can read: {error}",
                     file=path,
@@ -150,43 +214,15 @@ class Sources:
     def _path(self, module: str) -> Path | None:
         if module not in self._paths:
             root, *names = module.split(".")
-            paths = (self._path_below(folder, names) for folder in self._roots.get(root, ()))
-            self._paths[module] = next((path for path in paths if path is not None), None)
+            paths = (
+                path
+                for folder in self._roots.get(root, ())
+                for place in [folder.joinpath(*names)]
+                for path in (place / "__init__.py", place.with_suffix(".py"))
+                if path.is_file()
+            )
+            self._paths[module] = next(paths, None)
         return self._paths[module]
-
-    def _path_below(self, folder: Path, names: Sequence[str]) -> Path | None:
-        if folder.suffix == ".py":
-            return None if names else folder
-        for name in names[:-1]:
-            if not self._listing(folder).get(name):
-                return None
-            folder /= name
-        listing = self._listing(folder)
-        if not names or listing.get(names[-1]):
-            package = folder.joinpath(*names[-1:])
-            if "__init__.py" in self._listing(package):
-                return package / "__init__.py"
-        if names and f"{names[-1]}.py" in listing:
-            return folder / f"{names[-1]}.py"
-        return None
-
-    def _listing(self, folder: Path) -> Mapping[str, bool]:
-        """Return the names in a folder, and whether each is a folder."""
-        if folder not in self._listings:
-            with os.scandir(folder) as entries:
-                self._listings[folder] = {entry.name: entry.is_dir() for entry in entries}
-        return self._listings[folder]
-
-    def _data(self, folder: Path) -> Iterator[Path]:
-        """Yield the files of a package that are no modules, but not those of its subpackages."""
-        for name, is_folder in self._listing(folder).items():
-            path = folder / name
-            if name.startswith((".", "__pycache__")) or name.endswith(_NO_DATA):
-                continue
-            if not is_folder:
-                yield path
-            elif "__init__.py" not in self._listing(path):
-                yield from self._data(path)
 
 
 def _within(name: str, packages: Collection[str]) -> bool:
@@ -194,20 +230,24 @@ def _within(name: str, packages: Collection[str]) -> bool:
     return name in packages or any(name.startswith(f"{package}.") for package in packages)
 
 
-def _folders(closure: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
-    for name, path in closure.items():
-        if path.name == "__init__.py":
-            yield name, path.parent
+def _absolute(target: str, package: str) -> str:
+    """Return the full name of an imported module, whose leading dots stand for a package."""
+    name = target.lstrip(".")
+    if name == target:
+        return name
+    around = package.split(".")
+    return ".".join([*around[: len(around) - (len(target) - len(name)) + 1], *name.split()])
 
 
-def _absolute(imports: Iterable[str], module: str, path: Path) -> Iterator[str]:
-    """Yield the full names of modules that a module imports."""
-    package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
-    for name in imports:
-        target = name.lstrip(".")
-        level = len(name) - len(target)
-        around = package[: len(package) - level + 1] if level else []
-        yield ".".join([*around, *([target] if target else [])])
+def _data(folder: Path) -> Iterator[Path]:
+    """Yield the files of a package that are no modules, but not those of its subpackages."""
+    for path in folder.iterdir():
+        if path.name.startswith((".", "__pycache__")) or path.name.endswith(_NO_DATA):
+            continue
+        if not path.is_dir():
+            yield path
+        elif not (path / "__init__.py").exists():
+            yield from _data(path)
 
 
 def _data_digest(path: Path) -> str:
@@ -216,17 +256,11 @@ def _data_digest(path: Path) -> str:
 
 
 class _KeptFacts:
-    """Facts about sources by their content, kept in a file because parsing takes long.
-
-    Parameters
-    ----------
-    folder : Path, optional
-        Without it, nothing is kept.
-    """
+    """Facts about sources by their content, kept in a file because parsing takes long."""
 
     def __init__(self, folder: Path | None) -> None:
         # Facts are valid for the code that found them and for the grammar of this Python.
-        code = hashlib.sha256(Path(syntax_trees.__file__).read_bytes()).hexdigest()[:16]
+        code = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
         self._file = None if folder is None else folder / f"syntax-{version}-{code}.json"
         self._facts: dict[str, SourceFacts] = {}
