@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +19,7 @@ from xarray.core import indexing
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.file import RawFile
-from lidarops.raw.header import RawChannel, channel_names, to_physical
+from lidarops.raw.header import RawChannel, RawHeader, channel_names, to_physical
 from lidarops.raw.licel_format import FORMAT, raw_header
 from lidarops.raw.model import Columns, Position, build_raw_dataset
 
@@ -72,14 +71,8 @@ class LicelBackendEntrypoint(BackendEntrypoint):
         columns.append(header)
 
         def signal(_: int, channel: RawChannel) -> Any:
-            array = _Counts(
-                path=header.path,
-                size=header.size,
-                offset=channel.place,
-                bins=channel.bins,
-                scale=channel.scale if mask_and_scale else None,
-            )
-            return indexing.LazilyIndexedArray(_LazyCounts(array))
+            lazy = _LazyChannel(header, channel, scaled=mask_and_scale)
+            return indexing.LazilyIndexedArray(lazy)
 
         opened = build_raw_dataset(columns, signal, scaled=mask_and_scale)
         dropped = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
@@ -98,48 +91,15 @@ class LicelBackendEntrypoint(BackendEntrypoint):
             return False
 
 
-@dataclass(frozen=True, slots=True)
-class _Counts:
-    """Location of the counts of one dataset, and how to read some of them."""
+class _LazyChannel(BackendArray):
+    """One channel of one file as an array (1, bins); reads from the lowest to the highest bin."""
 
-    path: str
-    size: int
-    offset: int
-    bins: int
-    scale: float | None
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype(np.int32 if self.scale is None else np.float32)
-
-    def read(self, selection: range) -> NDArray[Any]:
-        """Return the values of the selected bins; reads from the lowest to the highest."""
-        out = np.empty(len(selection), self.dtype)
-        if not selection:
-            return out
-        low, high = min(selection), max(selection) + 1
-        with RawFile(self.path) as file:
-            file.expect(self.size)
-            if high - low == self.bins:
-                counts = np.empty(self.bins, np.dtype("<i4"))
-                licel.read_datasets(file, self.offset, [counts])
-            else:
-                counts = licel.read_part(file, self.offset + 4 * low, high - low)
-        selected = counts[:: abs(selection.step)][:: int(np.sign(selection.step))]
-        if self.scale is None:
-            out[...] = selected
-        else:
-            to_physical(selected, self.scale, out)
-        return out
-
-
-class _LazyCounts(BackendArray):
-    """One dataset of one file as an array (1, bins)."""
-
-    def __init__(self, counts: _Counts) -> None:
-        self.counts = counts
-        self.shape = (1, counts.bins)
-        self.dtype = counts.dtype
+    def __init__(self, header: RawHeader, channel: RawChannel, *, scaled: bool) -> None:
+        self._path, self._size = header.path, header.size
+        self._place = channel.place
+        self._scale = channel.scale if scaled else None
+        self.shape = (1, channel.bins)
+        self.dtype = np.dtype(np.float32 if scaled else np.int32)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
         support = indexing.IndexingSupport.BASIC
@@ -148,8 +108,17 @@ class _LazyCounts(BackendArray):
 
     def _read(self, key: tuple[int | slice, int | slice]) -> NDArray[Any]:
         time, bins = key
-        if isinstance(bins, slice):
-            profile = self.counts.read(range(self.counts.bins)[bins])
-            return profile[np.newaxis][time]
-        index = range(self.counts.bins)[bins]
-        return self.counts.read(range(index, index + 1))[time]
+        selected = np.asarray(np.arange(self.shape[1])[bins])
+        values = np.empty(selected.shape, self.dtype)
+        if selected.size:
+            low, past = int(selected.min()), int(selected.max()) + 1
+            counts = np.empty(past - low, np.dtype("<i4"))
+            whole = counts.size == self.shape[1]
+            with RawFile(self._path) as file:
+                file.expect(self._size)
+                FORMAT.read_counts(file, self._place, None if whole else ((low, past),), counts)
+            if self._scale is None:
+                values[...] = counts[selected - low]
+            else:
+                to_physical(counts[selected - low], self._scale, values)
+        return values[np.newaxis][time]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.records import ChannelLayout, DetectionMode
 
+_Channel = TypeVar("_Channel")
 HeaderOrder = Literal["longitude_first", "latitude_first"]
 
 Stretches = tuple[tuple[int, int], ...]
@@ -173,20 +174,24 @@ def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:
 
 
 def select_channels(header: RawHeader, names: tuple[str, ...] | None) -> tuple[RawChannel, ...]:
-    """Return the channels of these names, in their order; all in file order for None.
+    """Return the channels of these names; all in file order for None. Errors as `chosen`."""
+    stored = {channel.name: channel for channel in header.channels}
+    return chosen(stored, tuple(stored) if names is None else names, header.path)
+
+
+def chosen(stored: Mapping[str, _Channel], names: Sequence[str], file: str) -> tuple[_Channel, ...]:
+    """Return the channels of these names, in their order.
 
     Raises
     ------
     RawFormatError
-        If a channel is not stored, or there is none; the error names the stored ones.
+        If one is not stored, or there is none; the error names the stored ones.
     """
-    stored = {channel.name: channel for channel in header.channels}
-    names = tuple(stored) if names is None else names
     missing = [name for name in names if name not in stored]
     if missing or not names:
         raise RawFormatError(
             f"has no channel {', '.join(missing)}" if missing else "has no channels",
-            file=header.path,
+            file=file,
             field="channels",
             remedy=f"stored: {', '.join(stored) or 'none'}",
         )

@@ -29,6 +29,7 @@ from lidarops.raw.header import (
     HeaderOrder,
     channel_names,
     check_layout,
+    chosen,
     to_physical,
 )
 from lidarops.raw.licel_header import (
@@ -149,17 +150,8 @@ def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Datas
     """
     stored = {d.name: d for d in header.datasets if d.offset is not None}
     names = channel_names(channels)
-    if names is None:
-        names = tuple(d.name for d in header.channels)
-    missing = [name for name in names if name not in stored]
-    if missing or not names:
-        raise RawFormatError(
-            f"has no channel {', '.join(missing)}" if missing else "has no channels",
-            file=header.path or header.name,
-            field="channels",
-            remedy=f"stored: {', '.join(stored) or 'none'}",
-        )
-    return tuple(stored[name] for name in names)
+    signals = [d.name for d in header.channels]
+    return chosen(stored, signals if names is None else names, header.path or header.name)
 
 
 def select_signals(header: Header, channels: Iterable[str] | None = None) -> tuple[Dataset, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -130,7 +129,6 @@ def fit_known_shape(
     start: npt.ArrayLike | None = None,
     stop: npt.ArrayLike | None = None,
     mask: npt.ArrayLike | None = None,
-    start_shares: Sequence[float] = START_SHARES,
 ) -> KnownShapeResult:
     r"""Fit background and amplitude of a signal whose shape is known, by weighted least squares.
 
@@ -163,14 +161,12 @@ def fit_known_shape(
         For Poisson counts: counts per unit of power. That is the number of shots where power is
         a mean count per shot, and shots times bin time in microseconds where it is in MHz.
     start, stop : (...) float, optional
-        m, ends of the window. Where `start` is not given, windows from each of `start_shares`
+        m, ends of the window. Where `start` is not given, windows from each of `START_SHARES`
         of the farthest usable range are tried. The result is that of the longest window whose
         residuals show neither curvature nor waves and whose background agrees with those of all
         shorter windows (each at 1 % false alarms), else that of the shortest.
     mask : (..., range) bool, optional
         True where a bin may be used; broadcast against `power`.
-    start_shares : sequence of float
-        Ascending, each between 0 and 1.
 
     Returns
     -------
@@ -199,7 +195,7 @@ def fit_known_shape(
     allowed = _mask_rows(mask, grid, leading)
     noise = _noise(variance, exposure, grid, leading)
     pasts = _pasts(rows, allowed, stop, grid.values, leading)
-    firsts = _firsts(start, start_shares, pasts, grid.values, leading)
+    firsts = _firsts(start, pasts, grid.values, leading)
     out = np.full((len(rows), _shape_fit.COLUMNS), np.nan)
     limits = _limits(REJECTION)
     _shape_fit.fit_shape(
@@ -270,7 +266,6 @@ def _pasts(
 
 def _firsts(
     start: npt.ArrayLike | None,
-    shares: Sequence[float],
     pasts: npt.NDArray[np.intp],
     range_: Array,
     leading: tuple[int, ...],
@@ -283,18 +278,9 @@ def _firsts(
                 f"lies beyond the range, which ends at {range_[-1]:g} m", field="start"
             )
         return np.searchsorted(range_, starts, side="left").astype(np.intp)[:, np.newaxis]
-    start_shares = np.asarray(shares, dtype=np.float64)
-    inside = start_shares.size > 0 and start_shares[0] > 0 and start_shares[-1] < 1
-    if not inside or np.any(np.diff(start_shares) <= 0):
-        raise RetrievalInputError(
-            f"are {tuple(shares)}",
-            field="start_shares",
-            remedy="give ascending values between 0 and 1",
-        )
     farthest = range_[np.maximum(pasts - 1, 0)]
-    return np.searchsorted(range_, farthest[:, np.newaxis] * start_shares, side="left").astype(
-        np.intp
-    )
+    earliest = farthest[:, np.newaxis] * np.asarray(START_SHARES)
+    return np.searchsorted(range_, earliest, side="left").astype(np.intp)
 
 
 def _limits(false_alarm: float) -> _shape_fit.Limits:
@@ -364,21 +350,24 @@ def _result(
     start = np.where(empty, np.nan, range_[np.minimum(first, range_.size - 1)])
     stop = np.where(empty, np.nan, range_[np.maximum(pasts - 1, 0)])
     return KnownShapeResult(
-        background=out[:, _shape_fit.BACKGROUND].reshape(leading),
-        background_standard_error=np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE] * level).reshape(
-            leading
-        ),
-        amplitude=out[:, _shape_fit.AMPLITUDE].reshape(leading),
-        amplitude_standard_error=amplitude_error.reshape(leading),
-        covariance=(out[:, _shape_fit.COVARIANCE] * level).reshape(leading),
-        chi2=out[:, _shape_fit.CHI2].reshape(leading),
-        degrees_of_freedom=freedom.reshape(leading),
-        condition=condition.reshape(leading),
-        curvature=curvature.reshape(leading),
-        waves=waves.reshape(leading),
-        start=start.reshape(leading),
-        stop=stop.reshape(leading),
-        poor_fit=poor.reshape(leading),
-        singular=singular.reshape(leading),
-        quality=quality.reshape(leading),
+        *(
+            column.reshape(leading)
+            for column in (
+                out[:, _shape_fit.BACKGROUND],
+                np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE] * level),
+                out[:, _shape_fit.AMPLITUDE],
+                amplitude_error,
+                out[:, _shape_fit.COVARIANCE] * level,
+                out[:, _shape_fit.CHI2],
+                freedom,
+                condition,
+                curvature,
+                waves,
+                start,
+                stop,
+                poor,
+                singular,
+                quality,
+            )
+        )
     )

@@ -94,62 +94,47 @@ def time_mean(
         raise RetrievalInputError(
             f"is {axis}, but profiles have the shape {values.shape}", field="axis"
         )
+    if least_count < 1:
+        raise RetrievalInputError(
+            f"is {least_count}", field="least_count", remedy="a mean needs at least 1 value"
+        )
+    axis %= values.ndim
     group = _checked_groups(groups, values.shape[axis])
-    return _grouped_mean(
-        values,
-        variance,
-        0.0 if shared_variance is None else shared_variance,
-        1.0 if weights is None else weights,
-        _Grouping(
-            axis % values.ndim, group, int(group.max(initial=0)) + 1, _checked_least(least_count)
-        ),
-    )
+    before, after = values.shape[:axis], values.shape[axis + 1 :]
+    number = int(group.max(initial=0)) + 1
+    sums = np.zeros((4, math.prod(before), number, math.prod(after)))
+    count = np.zeros(sums.shape[1:], dtype=np.int64)
+    _add(sums, count, values, variance, shared_variance, weights, group, axis)
+    return _averages(sums, count, (*before, number, *after), least_count)
 
 
-@dataclass(frozen=True, slots=True)
-class _Grouping:
-    """The groups of an axis that are averaged."""
-
-    axis: int
-    group: npt.NDArray[np.intp]
-    number: int
-    least_count: int
-
-
-def _grouped_mean(
+def _add(
+    sums: Array,
+    count: Counts,
     values: inputs.Floats,
     variance: npt.ArrayLike,
-    shared: npt.ArrayLike,
-    weights: npt.ArrayLike,
-    grouping: _Grouping,
-) -> Averages:
-    before, after = values.shape[: grouping.axis], values.shape[grouping.axis + 1 :]
-    outer, inner = math.prod(before), math.prod(after)
-    shape = (outer, grouping.group.size, inner)
-    sums = np.zeros((4, outer, grouping.number, inner))
-    count = np.zeros((outer, grouping.number, inner), dtype=np.int64)
+    shared: npt.ArrayLike | None,
+    weights: npt.ArrayLike | None,
+    group: npt.NDArray[np.intp],
+    axis: int = 0,
+) -> None:
+    """Add profiles to the sums of their groups, (4, before, group, after)."""
+    whole = values.shape
+    shape = (math.prod(whole[:axis]), whole[axis], math.prod(whole[axis + 1 :]))
+    shared, weights = 0.0 if shared is None else shared, 1.0 if weights is None else weights
     _weighted_sums.add_profiles(
         frozen(values.reshape(shape)),
-        _flat_term(variance, "variance", values.shape, shape, grouping.axis),
-        _flat_term(shared, "shared_variance", values.shape, shape, grouping.axis),
-        _flat_term(weights, "weights", values.shape[: grouping.axis + 1], shape[:2], grouping.axis),
-        frozen(grouping.group),
+        _flat_term(variance, "variance", whole, shape, axis),
+        _flat_term(shared, "shared_variance", whole, shape, axis),
+        _flat_term(weights, "weights", whole[: axis + 1], shape[:2], axis),
+        frozen(group),
         sums,
         count,
     )
-    value, noise, systematic = _means(sums, count, grouping.least_count)
-    shape_of_means = (*before, grouping.number, *after)
-    return Averages(
-        value.reshape(shape_of_means),
-        noise.reshape(shape_of_means),
-        systematic.reshape(shape_of_means),
-        count.reshape(shape_of_means),
-        sums[0].reshape(shape_of_means),
-    )
 
 
-def _means(sums: Array, count: Counts, least_count: int) -> tuple[Array, Array, Array]:
-    """Turn sums into means, in place: values, their variance, and their shared variance."""
+def _averages(sums: Array, count: Counts, shape: tuple[int, ...], least_count: int = 1) -> Averages:
+    """Turn sums into means, in place."""
     total, value, noise, systematic = sums
     with np.errstate(invalid="ignore", divide="ignore"):
         value /= total
@@ -158,7 +143,7 @@ def _means(sums: Array, count: Counts, least_count: int) -> tuple[Array, Array, 
         systematic **= 2
     for means in (value, noise, systematic):
         means[count < least_count] = np.nan
-    return value, noise, systematic
+    return Averages(*(part.reshape(shape) for part in (value, noise, systematic, count, total)))
 
 
 class RunningMean:
@@ -197,24 +182,12 @@ class RunningMean:
         weights : (time,) float
             Number of shots of each profile.
         """
-        shape = (1, *profiles.shape)
-        _weighted_sums.add_profiles(
-            frozen(profiles[np.newaxis]),
-            _flat_term(variance, "variance", profiles.shape, shape, 0),
-            _flat_term(
-                0.0 if shared_variance is None else shared_variance,
-                "shared_variance", profiles.shape, shape, 0,
-            ),
-            _flat_term(weights, "weights", profiles.shape[:1], shape[:2], 0),
-            frozen(np.ascontiguousarray(groups, dtype=np.intp)),
-            self._sums,
-            self._count,
-        )  # fmt: skip
+        group = np.ascontiguousarray(groups, dtype=np.intp)
+        _add(self._sums, self._count, profiles, variance, shared_variance, weights, group)
 
     def averages(self) -> Averages:
         """Return the means of what was added; no more can be added."""
-        value, noise, systematic = _means(self._sums, self._count, least_count=1)
-        return Averages(value[0], noise[0], systematic[0], self._count[0], self._sums[0, 0])
+        return _averages(self._sums, self._count, self._count.shape[1:])
 
 
 def _flat_term(
@@ -252,11 +225,3 @@ def _checked_groups(groups: npt.ArrayLike | None, length: int) -> npt.NDArray[np
             remedy=f"give one whole number for each of the {length} profiles",
         )
     return np.ascontiguousarray(group, dtype=np.intp)
-
-
-def _checked_least(least_count: int) -> int:
-    if least_count < 1:
-        raise RetrievalInputError(
-            f"is {least_count}", field="least_count", remedy="a mean needs at least 1 value"
-        )
-    return int(least_count)

@@ -26,18 +26,8 @@ from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
 _Block = npt.NDArray[Any]
 
 _SIGNAL_NAMES = ("power", "variance", "quality")
-_SIGNAL_DTYPES: Final[list[np.dtype[Any]]] = [
-    np.dtype(np.float64),
-    np.dtype(np.float64),
-    np.dtype(np.int32),
-]
-_RANGE_CORRECTED_DTYPES: Final[list[np.dtype[Any]]] = [
-    np.dtype(np.float32),
-    np.dtype(np.float32),
-    np.dtype(np.int32),
-    np.dtype(np.float64),
-    np.dtype(np.float64),
-]
+_SIGNAL_DTYPES: Final = (np.float64, np.float64, np.int32)
+_RANGE_CORRECTED_DTYPES: Final = (np.float32, np.float32, np.int32, np.float64, np.float64)
 _PROFILES_IN_CACHE: Final = 64
 """Profiles processed together; their arrays fit the processor cache."""
 
@@ -116,11 +106,7 @@ def range_corrected_signals(
     *,
     background_range: tuple[float, float],
     background_method: str = "tail_mean",
-    dead_time: float | None = None,
-    noise_variance: float | None = None,
-    dark: DarkSignals | None = None,
-    range_offset: float = 0.0,
-    full_overlap_range: float = 0.0,
+    **settings: Any,
 ) -> xr.Dataset:
     """Return range-corrected signals without background of one channel from its raw counts.
 
@@ -131,7 +117,7 @@ def range_corrected_signals(
     ----------
     background_range, background_method
         As in `correct_for_range`.
-    archive, channel, dead_time, noise_variance, dark, range_offset, full_overlap_range
+    archive, channel, **settings
         As in `condition`.
 
     Returns
@@ -139,15 +125,7 @@ def range_corrected_signals(
     xr.Dataset
         As from `correct_for_range`.
     """
-    source = _Source(
-        archive,
-        channel,
-        dead_time=dead_time,
-        noise_variance=noise_variance,
-        dark=dark,
-        range_offset=range_offset,
-        full_overlap_range=full_overlap_range,
-    )
+    source = _Source(archive, channel, **settings)
     method = inputs.choice(background_method, BackgroundMethod, "background_method")
     arrays = source.mapped(
         _signals,
@@ -202,7 +180,7 @@ def correct_for_range(
             "background_method": method,
         },
         dask="parallelized",
-        output_dtypes=_RANGE_CORRECTED_DTYPES,
+        output_dtypes=list(_RANGE_CORRECTED_DTYPES),
     )
     return _named(arrays, method, background_range)
 
@@ -235,11 +213,11 @@ class _Source:
         archive: xr.Dataset,
         channel: str,
         *,
-        dead_time: float | None,
-        noise_variance: float | None,
-        dark: DarkSignals | None,
-        range_offset: float,
-        full_overlap_range: float,
+        dead_time: float | None = None,
+        noise_variance: float | None = None,
+        dark: DarkSignals | None = None,
+        range_offset: float = 0.0,
+        full_overlap_range: float = 0.0,
     ) -> None:
         counts = archive[channel]
         grid = str(counts.dims[-1])
@@ -271,7 +249,7 @@ class _Source:
         *,
         ranged: int,
         plain: int,
-        dtypes: Sequence[np.dtype[Any]],
+        dtypes: Sequence[type[np.generic]],
         **settings: Any,
     ) -> tuple[xr.DataArray, ...]:
         """Apply a function that returns `ranged` arrays over range and `plain` without range."""
@@ -328,7 +306,8 @@ def read_dark(archive: xr.Dataset, channel: str, *, method: str) -> DarkSignals:
 
 
 def _conditioned(*inputs: _Block, photon: bool, **settings: Any) -> tuple[_Block, _Block, _Block]:
-    return (_photon if photon else _analog)(*inputs, **settings)
+    result = (counts_to_signal.photon_signal if photon else _analog)(*inputs, **settings)
+    return result.power, result.variance, result.quality
 
 
 def _analog(
@@ -339,30 +318,11 @@ def _analog(
     *,
     dark: DarkSignals | None = None,
     **settings: Any,
-) -> tuple[_Block, _Block, _Block]:
-    if dark is None or times is None:
-        return _tuple(
-            counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
-        )
-    dark_at_times = dark.at(times.astype("datetime64[ns]"))
-    return _tuple(
-        counts_to_signal.analog_signal(
-            counts,
-            shots,
-            input_range=input_range,
-            dark=dark_at_times.dark,
-            dark_variance=dark_at_times.variance,
-            **settings,
-        )
-    )
-
-
-def _photon(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, _Block, _Block]:
-    return _tuple(counts_to_signal.photon_signal(counts, shots, **settings))
-
-
-def _tuple(result: Signal) -> tuple[_Block, _Block, _Block]:
-    return result.power, result.variance, result.quality
+) -> Signal:
+    if dark is not None and times is not None:
+        at_times = dark.at(times.astype("datetime64[ns]"))
+        settings |= {"dark": at_times.dark, "dark_variance": at_times.variance}
+    return counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
 
 
 def _corrected(

@@ -75,16 +75,10 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
     inputs = [channel[name] for channel in (analog, photon) for name in _PARTS]
-    settings = {
-        "lag": lag,
-        "distance": photon["range"].to_numpy().astype(np.float64),
-    }
+    settings = {"lag": lag, "distance": photon["range"].to_numpy().astype(np.float64)}
     outputs = xr.apply_ufunc(
         _glue,
-        *(
-            array.drop_vars("range").chunk(range=-1) if array.chunks else array.drop_vars("range")
-            for array in inputs
-        ),
+        *(array.drop_vars("range") for array in inputs),
         input_core_dims=[["range"]] * 6,
         output_core_dims=[["range"]] * 3 + [[]] * 4,
         kwargs=settings,
@@ -134,15 +128,8 @@ def _glue(
     variance[..., ahead] = glued.variance + glued.systematic_variance
     quality = _quality(glued, analog_quality, photon_quality, distance)
     power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
-    return (
-        power,
-        variance,
-        quality,
-        glued.slope,
-        glued.slope_standard_error,
-        glued.start,
-        glued.stop,
-    )
+    line = (glued.slope, glued.slope_standard_error, glued.start, glued.stop)
+    return power, variance, quality, *line
 
 
 def _quality(

@@ -343,9 +343,6 @@ def test_no_bit_depends_on_batch_order_or_layout():
         ({"start": np.nan}, "start"),
         ({"stop": [1.0, 2.0]}, "stop"),
         ({"mask": np.ones(1000)}, "mask"),
-        ({"start_shares": ()}, "start_shares"),
-        ({"start_shares": (0.5, 0.4)}, "start_shares"),
-        ({"start_shares": (0.5, 1.0)}, "start_shares"),
     ],
 )
 def test_invalid_arguments_are_refused(change, field):
