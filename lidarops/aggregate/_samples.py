@@ -16,7 +16,7 @@ from lidarops.aggregate.facts import Facts, opened, within
 from lidarops.aggregate.means_variables import averaged, budget_of, systematic
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
-from lidarops.netcdf.stored_flags import recoded
+from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
 
 
@@ -55,9 +55,8 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
     with opened(within(root, facts.path)) as product:
         if product.attrs["id"] != facts.id:
             raise ProductError("changed while it was read", file=facts.path, remedy="run again")
-        stored, known = product[QUALITY_FLAG], flags_of(facts.kind)
-        flags = recoded(stored.values, stored.attrs, known)
-        usable = (flags & np.int32(known.rejecting)) == 0
+        flags = with_current_flags(product)[QUALITY_FLAG].values
+        usable = (flags & np.int32(flags_of(facts.kind).rejecting)) == 0
         rows = [row for row in averaged(facts.kind) if row.name in product]
         return Profiles(
             facts,

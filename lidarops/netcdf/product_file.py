@@ -12,13 +12,13 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.flags import FlagBit, Flags
+from lidarops.flags import FlagBit
 from lidarops.kinds import flags_of
 from lidarops.netcdf.build import ProductEncoder
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.input_checks import Values
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.netcdf.write import RowFile, create_file
+from lidarops.netcdf.write import RowFile, create_file, written_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,29 +64,29 @@ def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[
         If data do not match the layout, profiles are missing at the end, or the file cannot be
         written. Other errors of the ``with`` block are raised as they are.
     """
-    encoder = ProductEncoder(frame, context)
     with ExitStack() as until_complete:
-        writer = ProductWriter(encoder, flags_of(context.kind), path, until_complete)
+        writer = ProductWriter(frame, context, path, until_complete)
         yield writer
-        writer.refuse_empty()
+        if writer.file is None:
+            raise ProductError("has no profiles", file=path)
 
 
 class ProductWriter:
     """A product that is being written; see `create_product`."""
 
     def __init__(
-        self, encoder: ProductEncoder, flags: Flags, path: Path, until_complete: ExitStack
+        self, frame: xr.Dataset, context: Context, path: Path, until_complete: ExitStack
     ) -> None:
-        self._encoder = encoder
+        self._encoder = ProductEncoder(frame, context)
         self._path = path
         self._until_complete = until_complete
         self._values = 0
         self._unflagged = 0
         self._rejected = 0
-        self._flags = flags
+        self._flags = flags_of(context.kind)
         self._flagged: Counter[FlagBit] = Counter()
-        # The first profiles decide on optional variables.
-        self._file: RowFile | None = None
+        self.file: RowFile | None = None
+        """None until the first profiles, which decide on optional variables."""
 
     def add(self, profiles: xr.Dataset) -> None:
         """Write the next profiles.
@@ -102,10 +102,10 @@ class ProductWriter:
             If they do not match the layout or the profiles before, or cannot be written.
         """
         encoded = self._encoder.encode(profiles)
-        if self._file is None:
+        if self.file is None:
             skeleton = self._encoder.skeleton(encoded)
-            self._file = self._until_complete.enter_context(create_file(skeleton, self._path))
-        self._file.add(encoded)
+            self.file = self._until_complete.enter_context(create_file(skeleton, self._path))
+        self.file.add(encoded)
         self._count(encoded[QUALITY_FLAG])
 
     def _count(self, flags: Values) -> None:
@@ -116,18 +116,6 @@ class ProductWriter:
         for bit in self._flags.raised(int(np.bitwise_or.reduce(flags, axis=None))):
             self._flagged[bit] += int(np.count_nonzero(flags & np.int32(bit)))
 
-    def refuse_empty(self) -> RowFile:
-        """Return the file, if there were profiles.
-
-        Raises
-        ------
-        ProductError
-            If there were none.
-        """
-        if self._file is None:
-            raise ProductError("has no profiles", file=self._path)
-        return self._file
-
     @property
     def written(self) -> WrittenProduct:
         """The product, after the ``with`` block.
@@ -137,7 +125,7 @@ class ProductWriter:
         ProductError
             If it is not written.
         """
-        file = self.refuse_empty().written
+        file = written_file(self.file, self._path)
         return WrittenProduct(
             sha256=file.sha256,
             size=file.size,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -22,13 +22,10 @@ from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from xarray.core import indexing
 
 from lidarops.errors import ProductError
-from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf._deflate import inflate_chunk
-from lidarops.netcdf.stored_flags import is_moved, recoded
+from lidarops.netcdf.stored_flags import Recoding, recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.netcdf.write import OTHER_DIMENSION
-
-_Recoding = Callable[[NDArray[Any]], NDArray[Any]]
 
 _ATTRIBUTES: Final = (
     "units",
@@ -169,17 +166,11 @@ class _File:
         lazy = indexing.LazilyIndexedArray(_Stored(self, dataset, fill, recode))
         return xr.Variable(dims, lazy, attributes, fastpath=True)
 
-    def _recoding(self, dataset: h5py.Dataset) -> _Recoding | None:
-        """Return what moves quality bits to their places of now; None where they are there."""
+    def _recoding(self, dataset: h5py.Dataset) -> Recoding | None:
         kind = self._file.attrs.get("lidarops_kind", b"")
-        kind = kind.decode() if isinstance(kind, bytes) else kind
-        if kind not in kinds() or "flag_masks" not in dataset.attrs:
-            return None
-        stated = {name: _attribute(dataset, name) for name in ("flag_masks", "flag_meanings")}
-        flags = flags_of(kind)
-        if not is_moved(stated, flags):
-            return None
-        return lambda values: recoded(values, stated, flags)
+        names = [name for name in ("flag_masks", "flag_meanings") if name in dataset.attrs]
+        attributes = {name: _attribute(dataset, name) for name in names}
+        return recoding(attributes, kind.decode() if isinstance(kind, bytes) else kind)
 
     def _decoded(self, name: str, stored: xr.Variable) -> xr.Variable:
         if _is_plain(stored):
@@ -201,7 +192,7 @@ class _Stored(BackendArray):
         file: _File,
         dataset: h5py.Dataset,
         fill: np.floating[Any] | None,
-        recode: _Recoding | None,
+        recode: Recoding | None,
     ) -> None:
         self._file = file
         self._dataset = dataset

@@ -6,8 +6,9 @@ alone has no meaning. Results are either those of the file, or given the places 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import QUALITY_FLAG
 
 Values = NDArray[Any]
+Recoding = Callable[[Values], Values]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,30 +73,30 @@ def count_bits(values: Values, bits: Iterable[StoredBit]) -> dict[StoredBit, int
     return {bit: int(np.count_nonzero(values & bit.mask)) for bit in bits if union & bit.mask}
 
 
-def recoded(values: Values, attributes: Mapping[str, Any], flags: Flags) -> Values:
-    """Return the values of a file's ``quality_flag`` with the bits at the places of now.
+def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:
+    """Return what moves the bits of a file's ``quality_flag`` to their places of now.
 
     Parameters
     ----------
-    values : ndarray of int
     attributes : mapping
         Of ``quality_flag``. Without ``flag_masks``, the places are those of now.
-    flags : Flags
-        Of the kind of product, as of now.
+    kind : object
+        Kind of product that the file states.
 
     Returns
     -------
-    ndarray of int
-        `values` itself where no bit has moved.
-
-    Raises
-    ------
-    ProductError
-        If a value carries a bit that the file does not name, or that the kind no longer has.
+    callable or None
+        Raises `ProductError` where a value carries a bit that the file does not name, or that the
+        kind no longer has. None where no bit has moved, or the kind is not known.
     """
-    meanings = _meanings(attributes)
-    if meanings is None or not is_moved(attributes, flags):
-        return values
+    flags = _known(kind)
+    meanings = None if flags is None else _meanings(attributes)
+    if not flags or not meanings or meanings == {bit.word: int(bit) for bit in flags}:
+        return None
+    return partial(_recoded, meanings=meanings, flags=flags)
+
+
+def _recoded(values: Values, *, meanings: Mapping[str, int], flags: Flags) -> Values:
     moved = np.zeros_like(values)
     rest = int(np.bitwise_or.reduce(values, axis=None))
     for word, mask in meanings.items():
@@ -117,21 +119,15 @@ def with_current_flags(product: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     ProductError
-        As `recoded`.
+        If a value carries a bit that the file does not name, or that the kind no longer has.
     """
-    flags = _known(product.attrs.get("lidarops_kind"))
-    if flags is None or QUALITY_FLAG not in product:
+    if QUALITY_FLAG not in product:
         return product
     stored = product[QUALITY_FLAG]
-    if not is_moved(stored.attrs, flags):
+    recode = recoding(stored.attrs, product.attrs.get("lidarops_kind"))
+    if recode is None:
         return product
-    moved = recoded(stored.values, stored.attrs, flags)
-    return product.assign({QUALITY_FLAG: stored.copy(data=moved)})
-
-
-def is_moved(attributes: Mapping[str, Any], flags: Flags) -> bool:
-    """Return whether a file names other bits, or other places of them, than the kind has now."""
-    return _meanings(attributes) not in (None, {bit.word: int(bit) for bit in flags})
+    return product.assign({QUALITY_FLAG: stored.copy(data=recode(stored.values))})
 
 
 def places(bits: int) -> str:

@@ -165,7 +165,7 @@ def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Forma
         rows = {name: variable.values for name, variable in skeleton.with_rows().items()}
         if rows:
             file.add(rows)
-    return file.written
+    return written_file(file, path)
 
 
 @contextmanager
@@ -210,7 +210,11 @@ def create_file(
                 file.complete()
             finally:
                 file.close()
-        file.settle(temporary)
+        with _disk_errors(path):
+            written = _settle(temporary)
+            temporary.replace(path)
+            _sync(path.parent)
+        file.written = written
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -224,7 +228,8 @@ class RowFile:
         self._path = path
         self._stream = stream
         self._rows = 0
-        self._written: Written | None = None
+        self.written: Written | None = None
+        """The file, when it is complete and has its name."""
         self._chunks = {name: _chunk(var) for name, var in skeleton.variables.items() if var.dims}
         self._columns = {
             name: RowBlocks(name, variable.shape[0], self._chunks[name][0])
@@ -313,13 +318,7 @@ class RowFile:
                 self._stream.check()
 
     def complete(self) -> None:
-        """Check that all rows came and are in the file, and close it.
-
-        Raises
-        ------
-        ProductError
-            If they are not.
-        """
+        """Close the file, if all rows came and are in it."""
         if self._rows != self._total:
             raise ProductError(f"has {self._rows} of {self._total} rows", file=self._path)
         with _disk_errors(self._path):
@@ -333,32 +332,18 @@ class RowFile:
         with NETCDF4_PYTHON_LOCK:
             self._file.close()
 
-    def settle(self, temporary: Path) -> None:
-        """Give the closed file its name, when it is on disk.
 
-        Raises
-        ------
-        ProductError
-            If the file system refuses.
-        """
-        with _disk_errors(self._path):
-            written = _settle(temporary)
-            temporary.replace(self._path)
-            _sync(self._path.parent)
-        self._written = written
+def written_file(file: RowFile | None, path: Path) -> Written:
+    """Return a file that is complete and has its name.
 
-    @property
-    def written(self) -> Written:
-        """The file, when it is complete and has its name.
-
-        Raises
-        ------
-        ProductError
-            If it is not.
-        """
-        if self._written is None:
-            raise ProductError("is not written", file=self._path)
-        return self._written
+    Raises
+    ------
+    ProductError
+        If it is not, or was never begun.
+    """
+    if file is None or file.written is None:
+        raise ProductError("is not written", file=path)
+    return file.written
 
 
 def _chunk(variable: xr.Variable) -> tuple[int, ...]:

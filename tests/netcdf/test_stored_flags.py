@@ -18,7 +18,7 @@ from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Quality, Severity
 from lidarops.kinds import flags_of
 from lidarops.netcdf.read import open_product
-from lidarops.netcdf.stored_flags import count_bits, recoded, stored_bits, with_current_flags
+from lidarops.netcdf.stored_flags import count_bits, recoding, stored_bits, with_current_flags
 from lidarops.netcdf.write import write_product
 from lidarops.reports.inspection import describe
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -98,10 +98,11 @@ def test_bits_without_a_name_are_reported_by_number(tmp_path: Path):
 
 def test_bits_that_a_kind_no_longer_has_are_refused_only_where_they_are_raised():
     attributes = {"flag_masks": np.array([1, 2]), "flag_meanings": "input_missing gone"}
-    flags = flags_of("signal")
-    np.testing.assert_array_equal(recoded(np.array([0, 1]), attributes, flags), [0, 1])
+    recode = recoding(attributes, "signal")
+    assert recode is not None
+    np.testing.assert_array_equal(recode(np.array([0, 1])), [0, 1])
     with pytest.raises(ProductError, match="kind signal does not have: 1"):
-        recoded(np.array([0, 3]), attributes, flags)
+        recode(np.array([0, 3]))
 
 
 def test_masks_and_meanings_must_agree():

@@ -78,7 +78,10 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
     settings = {"lag": lag, "distance": photon["range"].to_numpy().astype(np.float64)}
     outputs = xr.apply_ufunc(
         _glue,
-        *(array.drop_vars("range") for array in inputs),
+        *(
+            array.drop_vars("range").chunk(range=-1) if array.chunks else array.drop_vars("range")
+            for array in inputs
+        ),
         input_core_dims=[["range"]] * 6,
         output_core_dims=[["range"]] * 3 + [[]] * 4,
         kwargs=settings,
