@@ -91,7 +91,7 @@ def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:
     """
     flags = _known(kind)
     meanings = None if flags is None else _meanings(attributes)
-    if not flags or not meanings or meanings == {bit.word: int(bit) for bit in flags}:
+    if flags is None or meanings is None or meanings == {bit.word: int(bit) for bit in flags}:
         return None
     return partial(_recoded, meanings=meanings, flags=flags)
 
