@@ -53,10 +53,6 @@ class RowBlocks:
         ----------
         rows : ndarray, shape (n, ...)
             No more than are still to come. A copy is kept of rows whose block is incomplete.
-
-        Yields
-        ------
-        Block
         """
         while len(rows):
             size = min(self._step, self._total - self._first)

@@ -175,10 +175,6 @@ class ProductEncoder:
         encoded : mapping of str to ndarray
             The first profiles, from `encode`; which variables they have and of what type counts.
 
-        Returns
-        -------
-        Skeleton
-
         Raises
         ------
         ProductError

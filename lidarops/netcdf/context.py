@@ -42,10 +42,6 @@ class Context:
 def product_path(context: Context) -> str:
     """Return the path of a product's file.
 
-    Parameters
-    ----------
-    context : Context
-
     Returns
     -------
     str

@@ -82,17 +82,6 @@ def locate_product(
 ) -> tuple[list[Coordinate], Extents]:
     """Return the coordinates of a product in the order of its layout, and their extents.
 
-    Parameters
-    ----------
-    source : CheckedInput
-    layout : Layout
-    context : Context
-
-    Returns
-    -------
-    list of Coordinate
-    Extents
-
     Raises
     ------
     ProductError

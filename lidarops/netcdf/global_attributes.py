@@ -37,18 +37,7 @@ class Extents:
 
 
 def global_attributes(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
-    """Return the global attributes of a product, in the order in which they are written.
-
-    Parameters
-    ----------
-    context : Context
-    layout : Layout
-    extents : Extents
-
-    Returns
-    -------
-    dict of str to str, float or numpy scalar
-    """
+    """Return the global attributes of a product, in the order in which they are written."""
     date, origin = product_date(extents.stop)
     profiles = "timeSeriesProfile" if extents.vertical else None
     feature_type = layout.feature_type or profiles

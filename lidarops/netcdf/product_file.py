@@ -54,10 +54,6 @@ def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[
         Missing folders are created. A former file is replaced at the end, and stays if anything
         fails.
 
-    Yields
-    ------
-    ProductWriter
-
     Raises
     ------
     ProductError

@@ -37,10 +37,6 @@ def prov_json(provenance: Provenance) -> str:
 
     Inputs with equal content are one entity, because a product depends on content only.
 
-    Parameters
-    ----------
-    provenance : Provenance
-
     Returns
     -------
     str
@@ -152,10 +148,6 @@ def _software(provenance: Provenance) -> dict[str, Any]:
 def product_id(provenance: Provenance) -> str:
     """Return the identifier of a product: equal for equal inputs, plan, settings and code.
 
-    Parameters
-    ----------
-    provenance : Provenance
-
     Returns
     -------
     str
@@ -181,10 +173,6 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
     ----------
     path : path or str
         A product file.
-
-    Returns
-    -------
-    dict
 
     Raises
     ------

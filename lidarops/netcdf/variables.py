@@ -306,10 +306,6 @@ def attributes(
         Determines the unit of the signal.
     coordinates : tuple of str
         Names of the variable's auxiliary coordinates.
-
-    Returns
-    -------
-    dict of str to str, numpy scalar or numpy array
     """
     stored = np.dtype(row.dtype)
     limit = stored.type if stored.kind in "if" else None

@@ -64,10 +64,6 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     path : path or str
         Path of the file; missing folders are created.
 
-    Returns
-    -------
-    Written
-
     Raises
     ------
     ProductError
@@ -87,10 +83,6 @@ def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
         In memory; may hold times and text.
     path : path or str
         Path of the file; missing folders are created.
-
-    Returns
-    -------
-    Written
 
     Raises
     ------
@@ -133,10 +125,6 @@ def chunk_sizes(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
     shape : tuple of int
     itemsize : int
         Bytes of an element.
-
-    Returns
-    -------
-    tuple of int
     """
     chunk = list(shape)
     for axis in range(len(chunk)):
@@ -184,10 +172,6 @@ def create_file(
         fails.
     model : str
         Data model of netCDF.
-
-    Yields
-    ------
-    RowFile
 
     Raises
     ------

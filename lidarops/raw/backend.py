@@ -53,10 +53,6 @@ class LicelBackendEntrypoint(BackendEntrypoint):
         header_position : {"longitude_first", "latitude_first", "ignore"}
             Which coordinate the instrument writes first.
 
-        Returns
-        -------
-        xarray.Dataset
-
         Raises
         ------
         RawFormatError

@@ -21,10 +21,6 @@ _HEADER_LIMIT: Final = 512 * 1024
 class RawFile:
     """An open local raw file; all raw files are opened here.
 
-    Parameters
-    ----------
-    path : path or str
-
     Raises
     ------
     RawFormatError

@@ -53,10 +53,6 @@ def preload_modules(modules: Collection[str]) -> None:
 
     Otherwise each process would take seconds to load the modules. The server ends with the last
     process that uses it. Does nothing if forks are not safe, or if the server exists.
-
-    Parameters
-    ----------
-    modules : collection of str
     """
     if not sys.platform.startswith("linux") or os.getpid() in _LOADED:
         return

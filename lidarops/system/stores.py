@@ -77,10 +77,6 @@ def without_keys(text: str) -> str:
 class RemoteStore:
     """The objects below one URL.
 
-    Parameters
-    ----------
-    url : str
-
     Raises
     ------
     CatalogError
@@ -165,11 +161,6 @@ class RemoteStore:
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files to a local folder under their paths; skip files that the store lacks.
 
-        Parameters
-        ----------
-        paths : sequence of str
-        folder : path
-
         Raises
         ------
         CatalogError
@@ -202,10 +193,6 @@ class RemoteStore:
             Path relative to `root` -> SHA-256 in the ledger.
         journal : path
             Text file of this method, one per store; without it everything is sent again.
-
-        Returns
-        -------
-        Published
 
         Raises
         ------
