@@ -47,11 +47,6 @@ class DarkProfile:
     """(...), variance of the level of a single dark file, which drifts. This error is common to
     all bins and does not average down, but subtracting a fitted background removes it. NaN for
     fewer than two files."""
-    weights: Array
-    """(time, dark), weight of each dark file in each dark signal; rows sum to 1, unused files
-    have 0."""
-    age: Array
-    """(time,), s between each time and the nearest dark file that was used."""
 
 
 def dark_profile(
@@ -60,12 +55,10 @@ def dark_profile(
     times: npt.ArrayLike,
     *,
     method: str = "nearest",
-    session_gap: float = SESSION_GAP,
-    smoothing: int = 1,
 ) -> DarkProfile:
     r"""Return the dark signal of each profile from the dark files.
 
-    Consecutive dark files within `session_gap` form a session, with mean :math:`\bar D_s` at its
+    Consecutive dark files within `SESSION_GAP` form a session, with mean :math:`\bar D_s` at its
     mean time. Between two sessions,
 
     .. math:: D(t) = (1 - u) \bar D_1 + u \bar D_2, \quad u = \frac{t - t_1}{t_2 - t_1}, \qquad
@@ -80,13 +73,6 @@ def dark_profile(
     times : (time,) float in s, or datetime64
         Middle of each profile.
     method : {"nearest", "interpolated"}
-    session_gap : float
-        s.
-    smoothing : int
-        Odd number of bins over which the dark signal is averaged along range, fewer towards the
-        ends (the window stays symmetric); 1 for no smoothing. For noise that is independent from
-        bin to bin this divides the variance by that number and correlates neighbouring bins.
-        Narrower features of the dark signal are smoothed out.
 
     Returns
     -------
@@ -110,18 +96,13 @@ def dark_profile(
             field="dark_signals",
             remedy="the axis before the last is that of dark_times",
         )
-    _check_settings(session_gap, smoothing, signals.shape[-1])
-    sessions = _sessions(dark_seconds, session_gap)
+    sessions = _sessions(dark_seconds)
     means, variances = _means(signals, sessions)
-    if smoothing > 1:
-        means, variances = _smooth(means, variances, smoothing)
     shares = _shares(dark_seconds, sessions, seconds, chosen)
     return DarkProfile(
         _weighted_sum(shares, means),
         _weighted_sum(shares**2, variances),
         _level_variance(signals),
-        _file_weights(shares, sessions),
-        _age(shares, sessions, dark_seconds, seconds),
     )
 
 
@@ -168,21 +149,10 @@ def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Ar
     return dark_seconds, seconds
 
 
-def _check_settings(session_gap: float, smoothing: int, bins: int) -> None:
-    if not session_gap > 0:
-        raise RetrievalInputError(f"is {session_gap}", field="session_gap", remedy="give s above 0")
-    if smoothing != int(smoothing) or not 1 <= smoothing <= bins or smoothing % 2 == 0:
-        raise RetrievalInputError(
-            f"is {smoothing} with {bins} bins",
-            field="smoothing",
-            remedy="choose an odd number of bins",
-        )
-
-
-def _sessions(dark_seconds: Array, gap: float) -> list[npt.NDArray[np.intp]]:
+def _sessions(dark_seconds: Array) -> list[npt.NDArray[np.intp]]:
     """Return the indices of the dark files of each session, in time order."""
     order = np.argsort(dark_seconds, kind="stable")
-    breaks = np.flatnonzero(np.diff(dark_seconds[order]) > gap) + 1
+    breaks = np.flatnonzero(np.diff(dark_seconds[order]) > SESSION_GAP) + 1
     return [np.sort(files) for files in np.split(order, breaks)]
 
 
@@ -204,9 +174,7 @@ def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array,
         freedoms.append(np.maximum(count - 1, 0))
     all_squares = np.stack([*squares, sum(squares)], axis=-2)
     all_freedoms = np.stack([*freedoms, sum(freedoms)], axis=-2).astype(np.float64)
-    scatter = _ratio(
-        _window_sum(all_squares, VARIANCE_WINDOW), _window_sum(all_freedoms, VARIANCE_WINDOW)
-    )
+    scatter = _ratio(_window_sum(all_squares), _window_sum(all_freedoms))
     session_scatter, pooled = scatter[..., :-1, :], scatter[..., -1:, :]
     file_variance = np.where(np.isfinite(session_scatter), session_scatter, pooled)
     file_variance = np.where(np.isfinite(file_variance), file_variance, _far_variance(signals))
@@ -245,24 +213,14 @@ def _ratio(total: Array, count: npt.NDArray[np.int64] | Array) -> Array:
     return np.asarray(total / counted, dtype=np.float64)
 
 
-def _window_sum(values: Array, window: int) -> Array:
-    """Return sums over symmetric windows of that many bins, shorter towards the ends."""
+def _window_sum(values: Array) -> Array:
+    """Return sums over symmetric windows of `VARIANCE_WINDOW` bins, fewer towards the ends."""
     index = np.arange(values.shape[-1])
-    half = np.minimum(np.minimum(index, index[::-1]), window // 2)
+    half = np.minimum(np.minimum(index, index[::-1]), VARIANCE_WINDOW // 2)
     sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
     np.cumsum(values, axis=-1, out=sums[..., 1:])
     total: Array = sums[..., index + half + 1] - sums[..., index - half]
     return total
-
-
-def _smooth(means: Array, variances: Array, window: int) -> tuple[Array, Array]:
-    finite = np.isfinite(means) & np.isfinite(variances)
-    count = _window_sum(finite.astype(np.float64), window)
-    # Deviations from the level keep the rounding error of cumulative sums below the noise.
-    level = np.where(finite, means, 0.0).mean(axis=-1, keepdims=True)
-    smooth = level + _ratio(_window_sum(np.where(finite, means - level, 0.0), window), count)
-    variance = _ratio(_window_sum(np.where(finite, variances, 0.0), window), count**2)
-    return np.where(finite, smooth, np.nan), np.where(finite, variance, np.nan)
 
 
 def _shares(
@@ -297,20 +255,3 @@ def _weighted_sum(shares: Array, values: Array) -> Array:
         used = share > 0
         total[..., used, :] += share[used, np.newaxis] * values[..., session, np.newaxis, :]
     return total
-
-
-def _file_weights(shares: Array, sessions: list[npt.NDArray[np.intp]]) -> Array:
-    weights = np.zeros((len(shares), sum(files.size for files in sessions)))
-    for session, files in enumerate(sessions):
-        weights[:, files] = shares[:, session, np.newaxis] / files.size
-    return weights
-
-
-def _age(
-    shares: Array, sessions: list[npt.NDArray[np.intp]], dark_seconds: Array, seconds: Array
-) -> Array:
-    age = np.full(seconds.size, np.inf)
-    for session, files in enumerate(sessions):
-        distance = np.abs(dark_seconds[files] - seconds[:, np.newaxis]).min(axis=1)
-        age = np.where(shares[:, session] > 0, np.minimum(age, distance), age)
-    return age
