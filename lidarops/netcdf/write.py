@@ -249,14 +249,14 @@ class RowFile:
         Parameters
         ----------
         rows : mapping of str to ndarray, shape (n, ...)
-            Values of every variable that has rows, with its type; n is at least 1.
+            Values of every variable that has rows, with its type and shape; n is at least 1, and
+            at most the number of rows that are missing.
 
         Raises
         ------
         ProductError
-            If rows do not fit the file, or cannot be written.
+            If they cannot be written.
         """
-        count = self._count(rows)
         blocks = [
             block for name, column in self._columns.items() for block in column.take(rows[name])
         ]
@@ -264,29 +264,7 @@ class RowFile:
         blocks.sort(key=lambda block: block.end)
         with _disk_errors(self._path):
             self._write(blocks)
-        self._rows += count
-
-    def _count(self, rows: Mapping[str, _Array]) -> int:
-        """Return the number of rows, if they fit the file."""
-        if rows.keys() != self._columns.keys():
-            name = min(rows.keys() ^ self._columns.keys())
-            raise ProductError("is missing or unknown", file=self._path, field=name)
-        count = len(next(iter(rows.values())))
-        for name, values in rows.items():
-            declared = self._variables[name]
-            expected = (count, *declared.shape[1:])
-            if values.shape != expected or values.dtype != declared.dtype:
-                raise ProductError(
-                    f"has rows {values.dtype} {values.shape}, not {declared.dtype} {expected}",
-                    file=self._path,
-                    field=name,
-                )
-        if not 0 < count <= self._total - self._rows:
-            raise ProductError(
-                f"gets {count} rows, but {self._total - self._rows} of {self._total} are missing",
-                file=self._path,
-            )
-        return count
+        self._rows += len(next(iter(rows.values())))
 
     def _write(self, blocks: Iterable[Block]) -> None:
         for block in blocks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import fields
 from functools import lru_cache
 from typing import Final
 
@@ -16,6 +17,10 @@ from lidarops.raw.formats import RawFormat
 from lidarops.raw.header import RawChannel, RawHeader, Stretches
 
 _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
+
+
+_COMMON: Final = tuple(field.name for field in fields(RawChannel) if field.name != "place")
+"""Properties of channels that datasets have under the same name."""
 
 
 def _recognises(head: bytes) -> bool:
@@ -49,25 +54,7 @@ def raw_header(header: licel.Header) -> RawHeader:
 @lru_cache(maxsize=128)
 def _channels(datasets: tuple[licel.Dataset, ...]) -> tuple[RawChannel, ...]:
     return tuple(
-        RawChannel(
-            name=dataset.name,
-            mode=dataset.mode,
-            wavelength=dataset.wavelength,
-            wavelength_label=dataset.wavelength_label,
-            bins=dataset.bins,
-            bin_width=dataset.bin_width,
-            shots=dataset.shots,
-            scale=dataset.scale,
-            place=dataset.offset,
-            adc_bits=dataset.adc_bits,
-            polarisation=dataset.polarisation,
-            device=dataset.device,
-            input_range=dataset.input_range,
-            laser=dataset.laser,
-            high_voltage=dataset.high_voltage,
-            discriminator=dataset.discriminator,
-            bin_shift=dataset.bin_shift,
-        )
+        RawChannel(place=dataset.offset, **{name: getattr(dataset, name) for name in _COMMON})
         for dataset in datasets
         if dataset.offset is not None and dataset.mode is not None
     )
