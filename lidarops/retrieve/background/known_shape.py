@@ -279,7 +279,7 @@ def _firsts(
             )
         return np.searchsorted(range_, starts, side="left").astype(np.intp)[:, np.newaxis]
     farthest = range_[np.maximum(pasts - 1, 0)]
-    earliest = farthest[:, np.newaxis] * np.asarray(START_SHARES)
+    earliest: Array = farthest[:, np.newaxis] * np.array(START_SHARES)
     return np.searchsorted(range_, earliest, side="left").astype(np.intp)
 
 
@@ -349,25 +349,21 @@ def _result(
     empty = bins == 0
     start = np.where(empty, np.nan, range_[np.minimum(first, range_.size - 1)])
     stop = np.where(empty, np.nan, range_[np.maximum(pasts - 1, 0)])
+    error = np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE] * level)
     return KnownShapeResult(
-        *(
-            column.reshape(leading)
-            for column in (
-                out[:, _shape_fit.BACKGROUND],
-                np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE] * level),
-                out[:, _shape_fit.AMPLITUDE],
-                amplitude_error,
-                out[:, _shape_fit.COVARIANCE] * level,
-                out[:, _shape_fit.CHI2],
-                freedom,
-                condition,
-                curvature,
-                waves,
-                start,
-                stop,
-                poor,
-                singular,
-                quality,
-            )
-        )
+        background=out[:, _shape_fit.BACKGROUND].reshape(leading),
+        background_standard_error=error.reshape(leading),
+        amplitude=out[:, _shape_fit.AMPLITUDE].reshape(leading),
+        amplitude_standard_error=amplitude_error.reshape(leading),
+        covariance=(out[:, _shape_fit.COVARIANCE] * level).reshape(leading),
+        chi2=out[:, _shape_fit.CHI2].reshape(leading),
+        degrees_of_freedom=freedom.reshape(leading),
+        condition=condition.reshape(leading),
+        curvature=curvature.reshape(leading),
+        waves=waves.reshape(leading),
+        start=start.reshape(leading),
+        stop=stop.reshape(leading),
+        poor_fit=poor.reshape(leading),
+        singular=singular.reshape(leading),
+        quality=quality.reshape(leading),
     )

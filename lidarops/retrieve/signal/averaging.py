@@ -143,7 +143,13 @@ def _averages(sums: Array, count: Counts, shape: tuple[int, ...], least_count: i
         systematic **= 2
     for means in (value, noise, systematic):
         means[count < least_count] = np.nan
-    return Averages(*(part.reshape(shape) for part in (value, noise, systematic, count, total)))
+    return Averages(
+        value.reshape(shape),
+        noise.reshape(shape),
+        systematic.reshape(shape),
+        count.reshape(shape),
+        total.reshape(shape),
+    )
 
 
 class RunningMean:
