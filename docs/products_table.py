@@ -18,13 +18,18 @@ def tables() -> str:
 
 
 def _kinds() -> Iterator[str]:
-    for kind in kinds():
+    for kind in _own_kinds():
         layout = layout_of(kind)
         yield f"\n## Variables of `{kind}`\n\n{layout.title}. {layout.comment}\n"
         yield "| variable | dimensions | unit | standard name | what it is |"
         yield "| --- | --- | --- | --- | --- |"
         for row in (*layout.coordinates, *layout.variables):
             yield _line(row)
+
+
+def _own_kinds() -> list[str]:
+    """Return the kinds of product of lidarops, without those that other packages add."""
+    return [name for name, kind in kinds().items() if kind.package.startswith("lidarops.")]
 
 
 def _line(row: Row) -> str:
@@ -44,7 +49,7 @@ def _bits() -> Iterator[str]:
     yield "| bit | value | severity | meaning | products |"
     yield "| --- | --- | --- | --- | --- |"
     carriers: dict[tuple[int, str, str, str], list[str]] = {}
-    for kind in kinds():
+    for kind in _own_kinds():
         for bit in flags_of(kind):
             row = (int(bit), bit.word, bit.severity.name.lower(), bit.description)
             carriers.setdefault(row, []).append(kind)

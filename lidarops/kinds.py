@@ -6,7 +6,7 @@ it. Without the last two, its main variable is drawn. A package outside lidarops
 entry point of the group ``lidarops.product_kinds``::
 
     [project.entry-points."lidarops.product_kinds"]
-    integrated = "mypackage.integrated:KIND"
+    wind = "mypackage.wind:KIND"
 """
 
 from __future__ import annotations

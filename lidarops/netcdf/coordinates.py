@@ -128,7 +128,7 @@ _Place = tuple[dict[str, Coordinate], _Vertical]
 
 def _beam_place(source: CheckedInput, layout: Layout, station: float, profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie along the beam."""
-    names = _ALONG[layout.sampled]
+    names = _names_along(layout)
     by_name = {name: _along(source, layout.row(name)) for name in names}
     zenith = _beam(source, layout.row("zenith_angle"), profiles)
     altitude, vertical = _altitude(layout.row("altitude"), by_name[names[-1]], zenith, station)
@@ -149,7 +149,7 @@ def _air_positions(
     if by_name["zenith_angle"].dims or by_name["azimuth"].dims:
         return {}
     station = context.station
-    along = by_name[_ALONG[layout.sampled][-1]]
+    along = by_name[_names_along(layout)[-1]]
     zenith, azimuth = (by_name[name].values for name in ("zenith_angle", "azimuth"))
     angle = np.deg2rad(zenith)
     ahead, up = along.values * np.sin(angle), along.values * np.cos(angle)
@@ -208,8 +208,10 @@ def _fixed(context: Context) -> dict[str, float]:
     }
 
 
-_ALONG: Final = {"range": ("range",), "section": ("section", "section_range")}
-"""Coordinates along the beam; the last holds metres."""
+def _names_along(layout: Layout) -> list[str]:
+    """Return the coordinates along the beam, of which the last holds metres."""
+    along = (row for row in layout.coordinates if row.dims == (layout.sampled,))
+    return [row.name for row in along if not row.follows_beam]
 
 
 def _time(source: CheckedInput, row: Row) -> Coordinate:

@@ -363,7 +363,12 @@ def _read(document: Any) -> Costs:
         raise ValueError("it is not a calibration")
     if document["processor"] != processor():
         raise ValueError(f"it is for another processor, {document['processor']}")
-    seconds = {term: float(document["seconds"][term]) for term in default_costs()}
+    measured = document["seconds"]
+    missing = [term for term in _SHARED_COSTS if term not in measured]
+    if missing:
+        raise ValueError(f"it lacks {missing[0]}")
+    # It may be older than a kind of product, which is then estimated from the costs of its step.
+    seconds = {term: float(measured.get(term, cost)) for term, cost in default_costs().items()}
     if not all(math.isfinite(cost) and cost >= 0 for cost in seconds.values()):
         raise ValueError("a cost is not a finite, non-negative time")
     return Costs(seconds, processor=processor(), date=str(document["date"]))

@@ -253,6 +253,9 @@ def _report(campaign: Campaign, record: RunRecord) -> dict[str, float]:
              if (first_product := tuple(p for p in scene.products if p.kind == kind)[:1])),
             key=lambda scene: scene.products[0].values,
         )  # fmt: skip
+        if not scenes:
+            # The campaign makes no product of a kind of another package.
+            continue
         smallest_cost = max(_page(campaign, replace(record, scenes=(scenes[0],))) - page, 0.0)
         costs[cost_estimate.figure_term(kind)] = smallest_cost
         if kind == "signal":
@@ -288,7 +291,7 @@ def first_times(path: str) -> None:
             jobs.setdefault(kind, Job(campaign, assessment.scene, plan))
     times = {}
     # Code that all kinds load counts for the first of them, signals.
-    for kind in kinds():
+    for kind in [kind for kind in kinds() if kind in jobs]:
         times[kind] = [process_scene(jobs[kind]).cpu_seconds for _ in range(2)]
     sys.stdout.write(json.dumps(times))
 

@@ -1,0 +1,124 @@
+"""Steps of the product ``integrated``."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from lidar_extras.integrated.integral import Window
+from lidarops.records import Plan, Scene
+from lidarops.retrieve.signal.labeled import background_words, correct_for_range
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.channels import channel_ranges
+from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.data import Chunk, Data, RowProduct
+from lidarops.steps.products import (
+    BACKGROUND_METHOD,
+    BACKGROUND_RANGE,
+    FEWEST_BINS,
+    Background,
+    tail,
+)
+from lidarops.steps.profiles import gluing
+from lidarops.steps.registry import bins_of
+from lidarops.steps.step import REQUESTED, Decisions, Leave, ProductStep, Run, UnitCosts
+
+
+class WindowSettings(SettingsModel):
+    """Settings of the step ``integrated``."""
+
+    windows: tuple[tuple[float, float], ...]
+    """m."""
+
+
+class Integrated(ProductStep[WindowSettings]):
+    """Integrate the range-corrected signal over windows of range."""
+
+    name = "integrated"
+    settings = WindowSettings
+    inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
+    costs = UnitCosts(product=0.05, value=1e-8, figure=0.4)
+
+    def decide(self, case: ChannelCase) -> Decisions:
+        """Run for the windows that hold a bin, where the range of the background holds enough."""
+        start, stop = tail(case, case.request.background_range)
+        bins = (stop - start) / case.channel.bin_width
+        if bins < FEWEST_BINS:
+            reason = f"background_range {start:g}-{stop:g} m holds fewer than {FEWEST_BINS} bins"
+            yield Leave(reason, number=bins)
+            return
+        centres = channel_ranges(case.channel, case.facts)
+        kept = []
+        for near, far in case.request.windows:
+            if ((near <= centres) & (centres < far)).any():
+                kept.append((near, far))
+            else:
+                reason = f"window {near:g}-{far:g} m holds no bin; the last ends at {case.last:g} m"
+                yield Leave(reason, number=near, rule="window_inside")
+        if kept:
+            yield Run(REQUESTED, WindowSettings(windows=tuple(kept)), number=float(len(kept)))
+
+    def stream(self, settings: WindowSettings, data: Data) -> RowProduct:
+        """Return the product, which is written as profiles come."""
+        return _Integrals(settings, data)
+
+    def values(self, settings: WindowSettings, scene: Scene, plan: Plan) -> float:
+        """Return the number of bins of all profiles, for each window."""
+        bins = bins_of(scene, self.name, plan)
+        return float(len(scene.granules) * bins * len(settings.windows))
+
+
+class _Integrals(RowProduct):
+    """Integrals of each profile."""
+
+    def __init__(self, settings: WindowSettings, data: Data) -> None:
+        self._profiles = data[PROFILES]
+        self._background = data[BACKGROUND_RANGE], data[BACKGROUND_METHOD]
+        self._geometry = data.source.geometry
+        self._limits = np.array(settings.windows)
+        centres, overlap = self._profiles.range, data.get(OVERLAP)
+        known = np.ones(centres.size) if overlap is None else overlap(centres)
+        self._windows = [Window.of(centres, known, limits) for limits in settings.windows]
+
+    def frame(self) -> xr.Dataset:
+        """Return times and pointing of all profiles, and the windows."""
+        background_range, method = self._background
+        frame = self._geometry.assign_coords(
+            window=("window", np.arange(len(self._windows), dtype=np.int32)),
+            window_range=("window", self._limits.mean(axis=1)),
+            window_bounds=(("window", "nv"), self._limits),
+        )
+        bins = np.array([window.weights.size for window in self._windows], np.int32)
+        words = background_words(method, background_range)
+        return frame.assign(bins=("window", bins)).assign_attrs(steps=words)
+
+    def rows(self, chunk: Chunk) -> xr.Dataset:
+        """Return the integrals of profiles."""
+        conditioned = chunk.profiles(self._profiles)
+        signals = correct_for_range(conditioned, *self._background)
+        sky = signals[["background", "background_standard_error"]]
+        integrals = [
+            window.integrals(
+                conditioned["power"].to_numpy(),
+                conditioned["variance"].to_numpy(),
+                (sky["background"].to_numpy(), sky["background_standard_error"].to_numpy()),
+                signals["quality_flag"].to_numpy(),
+            )
+            for window in self._windows
+        ]
+        dims = ("time", "window")
+        return sky.assign(
+            integral=(dims, np.stack([part.values for part in integrals], axis=1)),
+            integral_standard_error=(
+                dims, np.stack([part.standard_errors for part in integrals], axis=1),
+            ),
+            quality_flag=(dims, np.stack([part.flags for part in integrals], axis=1)),
+            shots=self._profiles.shots(chunk.counts),
+            **gluing(conditioned),
+        ).assign_coords(chunk.geometry.variables)
+
+
+STEPS: Final = (Background(), Integrated())
