@@ -77,7 +77,7 @@ def _description(context: Context, layout: Layout, date: datetime, origin: str) 
         "processing_level": layout.processing_level,
         "product_version": f"{__version__}+{context.provenance.code_version}",
         "history": _history(context, date),
-        "references": "\n".join(text for text in references if text),
+        "references": "\n".join(text for text in references if text) or "Not stated.",
         "comment": _sentences(metadata.comment, layout.comment, dates),
         "acknowledgement": metadata.acknowledgement or "Not stated.",
         "license": metadata.license or "Not stated.",

@@ -113,7 +113,8 @@ class _Integrals(RowProduct):
         return sky.assign(
             integral=(dims, np.stack([part.values for part in integrals], axis=1)),
             integral_standard_error=(
-                dims, np.stack([part.standard_errors for part in integrals], axis=1),
+                dims,
+                np.stack([part.standard_errors for part in integrals], axis=1),
             ),
             quality_flag=(dims, np.stack([part.flags for part in integrals], axis=1)),
             shots=self._profiles.shots(chunk.counts),
