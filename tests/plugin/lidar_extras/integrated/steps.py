@@ -110,7 +110,7 @@ class _Integrals(RowProduct):
             for window in self._windows
         ]
         dims = ("time", "window")
-        return sky.assign(
+        values = sky.assign(
             integral=(dims, np.stack([part.values for part in integrals], axis=1)),
             integral_standard_error=(
                 dims,
@@ -118,8 +118,8 @@ class _Integrals(RowProduct):
             ),
             quality_flag=(dims, np.stack([part.flags for part in integrals], axis=1)),
             shots=self._profiles.shots(chunk.counts),
-            **gluing(conditioned),
-        ).assign_coords(chunk.geometry.variables)
+        )
+        return values.assign(gluing(conditioned)).assign_coords(chunk.geometry.variables)
 
 
 STEPS: Final = (Background(), Integrated())
