@@ -43,7 +43,9 @@ class FlagBit(IntFlag):
     """Base of enums of quality bits, whose members are given as place, severity, description.
 
     Places count from 0. Names in lower case are the CF ``flag_meanings``. Members of different
-    enums may be the same number: compare them within one kind of product only.
+    enums may be the same number: compare them within one kind of product only. A union of members
+    of two enums is a mask, which cannot be iterated over: see `Flags.raised`. So is the complement
+    of a number, ``~int(bit)``; that of a member lacks the bits of other enums.
     """
 
     severity: Severity
