@@ -24,6 +24,7 @@ from lidarops.bench.throughput import (
     archives,
     campaigns,
     cost_calibration,
+    memory,
     networks,
     readers,
     retrieval_reports,
@@ -50,6 +51,7 @@ class Benchmark(StrEnum):
     COSTS = "costs"
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
+    MEMORY = "memory"
     MULTIANGLE = "multiangle"
     NETWORK = "network"
     READER = "reader"
@@ -95,6 +97,7 @@ def run_benchmark(
         Benchmark.COSTS: lambda: cost_calibration.run_cost_calibration(kind, effort=effort),
         Benchmark.ELASTIC: lambda: _elastic(kind, data, effort),
         Benchmark.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
+        Benchmark.MEMORY: lambda: memory.run_memory(kind, effort=effort),
         Benchmark.MULTIANGLE: lambda: _multiangle(kind, effort),
         Benchmark.NETWORK: lambda: _network(kind, effort),
         Benchmark.READER: lambda: _reader(files, effort),
