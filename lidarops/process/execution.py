@@ -14,13 +14,19 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.records import LeftOut, Plan, PlannedStep, Scene
 from lidarops.steps.channels import file_channels
 from lidarops.steps.conditioning import PROFILES
-from lidarops.steps.data import GEOMETRY, Chunk, Data, ProductStream, Source, WholeProduct
+from lidarops.steps.data import (
+    CHUNK_BYTES,
+    GEOMETRY,
+    Chunk,
+    Data,
+    ProductStream,
+    Source,
+    WholeProduct,
+)
 from lidarops.steps.dependence import is_product
 from lidarops.steps.registry import definition, product_step, typed_settings
 from lidarops.steps.step import Look
 
-CHUNK_BYTES: Final = 4_000_000
-"""Bytes of raw counts that are processed together."""
 IN_MEMORY: Final = 2_000_000
 """Bytes of counts up to which a scene is one chunk: below, chunks cost more than they save."""
 READ_TOGETHER: Final = 8

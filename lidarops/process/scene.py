@@ -113,7 +113,7 @@ def _too_large(error: MemoryError) -> SceneError:
     return SceneError(
         f"the scene does not fit in memory: {error or 'no memory left'}",
         remedy="process fewer profiles at a time with a smaller --profiles-per-chunk, or give each"
-        " worker more memory",
+        " process more memory",
     )
 
 
@@ -216,10 +216,11 @@ class _Work:
     def _chunk_profiles(self, source: Source, channel: str) -> int:
         """Return the number of profiles of a channel that are processed together."""
         counts = [source.archive[name] for name in file_channels(channel)]
-        if sum(array.nbytes for array in counts) <= execution.IN_MEMORY:
+        requested = self.job.profiles_per_chunk
+        if requested is None and sum(array.nbytes for array in counts) <= execution.IN_MEMORY:
             return int(source.archive.sizes["time"])
         bins = sum(int(array.shape[1]) for array in counts)
-        return execution.chunk_profiles(bins, self.job.profiles_per_chunk)
+        return execution.chunk_profiles(bins, requested)
 
     @contextmanager
     def _writer(self, frame: xr.Dataset, context: Context) -> Iterator[ProductWriter]:

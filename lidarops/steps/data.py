@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from lidarops.steps.step import Datum
 T = TypeVar("T")
 Indices = npt.NDArray[np.int64]
 
+CHUNK_BYTES: Final = 4_000_000
+"""Bytes of raw counts that are processed together."""
 GEOMETRY = ("time", "time_bnds", "zenith_angle", "azimuth")
 """Coordinates that every product over the time of the profiles has."""
 

@@ -284,7 +284,7 @@ class MultiAngle(ProductStep[ScanSettings]):
 
 
 _BYTES_OF_AN_ALTITUDE: Final = 400.0
-"""Bytes per altitude of a beam of a cycle at the peak of the retrieval."""
+"""Bytes per altitude of a beam of a cycle at the peak of the retrieval; assumed, not measured."""
 
 
 class _Scans(WholeProduct):

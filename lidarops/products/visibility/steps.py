@@ -198,7 +198,8 @@ class Visibility(NetworkProductStep):
 
 
 _BYTES_OF_A_BIN: Final = 60.0
-"""Bytes per bin of an average of a beam: power, variance and quality, and copies."""
+"""Bytes per bin of an average of a beam: power, variance and quality, and copies; assumed, not
+measured."""
 
 _AVERAGE: Final = Average(
     "signals are averaged before the retrieval: noise biases means of retrieved values"
