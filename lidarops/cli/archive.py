@@ -143,11 +143,12 @@ def show_plan(
 ) -> None:
     """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
 
-    Also shows the estimated CPU time.
+    Also shows the estimated CPU time, and the memory that a process needs for each scene.
 
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.plan import cost_estimate
+    from lidarops.plan.memory_estimate import scene_memory
     from lidarops.run.archive import assess
     from lidarops.run.selection import selects_no_scene
 
@@ -165,14 +166,22 @@ def show_plan(
             "to_be_made": making.add(scene, judged.needed(), whole=whole),
             "everything": everything.add(scene, judged.requested, whole=whole),
         }
+        memory = {
+            "to_be_made": scene_memory(scene, judged.needed()).total,
+            "everything": scene_memory(scene, judged.requested).total,
+        }
         if as_json:
-            scenes.append({**_plain(judged), "estimated_cpu_seconds": times})
+            estimates = {"estimated_cpu_seconds": times, "estimated_memory_bytes": memory}
+            scenes.append({**_plain(judged), **estimates})
             continue
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+        needs = {
+            name: f"about {times[name]:.2g} s of CPU time and {memory[name] / 1e6:.0f} MB of memory"
+            for name in times
+        }
         if not stale:
-            cpu_time = f"about {times['everything']:.2g} s of CPU time"
-            show(_plan_table(f"{title}, {cpu_time}", judged.requested))
-        show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", judged))
+            show(_plan_table(f"{title}, {needs['everything']}", judged.requested))
+        show(_stale_table(f"{title}, {needs['to_be_made']}", judged))
     no_scene = no_scene and selects_no_scene(settings, selection)
     # With --stale, fresh scenes were not judged.
     tallies = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
@@ -228,7 +237,9 @@ def reprocess(
     memory_limit: Annotated[
         str | None,
         typer.Option(
-            "--memory-limit", help="Memory limit of a worker, such as 2GiB.", callback=_size
+            "--memory-limit",
+            help="Memory limit of each process, such as 2GiB: larger scenes are read in smaller chunks.",
+            callback=_size,
         ),
     ] = None,
     wait: WaitOption = 0.0,
@@ -241,7 +252,11 @@ def reprocess(
         ),
     ] = False,
     profiles_per_chunk: Annotated[
-        int | None, typer.Option(min=1, help="Profiles per dask chunk; affects no result.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Profiles that are processed together, whatever the limit; affects no result.",
+        ),
     ] = None,
     all_steps: AllStepsOption = False,
     log_level: LogLevelOption = "warning",

@@ -14,6 +14,8 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
+from dask.utils import parse_bytes
+
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -338,7 +340,11 @@ class _Pass:
             taken = partial(self._take, note=used_client is None)
             if first is not None:
                 others = chain([first], jobs)
-                self._enter(process_jobs(others, client=used_client, stop=stop, taken=taken), stop)
+                memory = None if options.memory is None else parse_bytes(options.memory)
+                ended = process_jobs(
+                    others, client=used_client, stop=stop, taken=taken, memory=memory
+                )
+                self._enter(ended, stop)
             if self._suspects and not stop:
                 if used_client is None:
                     own = partial(local_client, 1, memory=options.memory)
@@ -378,7 +384,8 @@ class _Pass:
         for scene in ended:
             judged = self._judgements.pop(scene.job.scene.id)
             outcome = session.end(judged, scene.outcome, final=scene.final)
-            self._failing = self._failing + 1 if outcome.error and not scene.final else 0
+            if not scene.refused:
+                self._failing = self._failing + 1 if outcome.error and not scene.final else 0
             if self._failing >= MOST_FAILURES_IN_A_ROW:
                 stop.now(
                     f"{MOST_FAILURES_IN_A_ROW} scenes in a row failed, the last: {outcome.error}"

@@ -24,6 +24,7 @@ from lidarops.process.job import Job
 from lidarops.process.scene import attempt, failed_outcome, internal_error
 from lidarops.records import SceneOutcome
 from lidarops.run import worker
+from lidarops.run.memory import fitted
 from lidarops.system.processes import keep_memory, start_method
 
 if TYPE_CHECKING:
@@ -73,6 +74,8 @@ class EndedScene:
     outcome: SceneOutcome
     final: bool
     """Whether another try on the same inputs would end the same way."""
+    refused: bool = False
+    """Whether it was not read, because it does not fit into the memory limit."""
 
 
 class StopRequest:
@@ -196,6 +199,7 @@ def process_jobs(
     client: Client | None = None,
     stop: StopRequest | None = None,
     taken: Callable[[Job], None] | None = None,
+    memory: int | None = None,
 ) -> Iterator[EndedScene]:
     """Process jobs and yield the scenes in the order in which they end.
 
@@ -209,6 +213,8 @@ def process_jobs(
         Checked before every scene.
     taken : callable, optional
         Called with a job before it starts.
+    memory : int, optional
+        Bytes that this process may use; workers have limits of their own.
 
     Yields
     ------
@@ -216,13 +222,16 @@ def process_jobs(
     """
     stop = StopRequest() if stop is None else stop
     if client is None:
-        yield from _process_here(jobs, stop, taken)
+        yield from _process_here(jobs, stop, taken, memory)
     else:
         yield from _ClusterQueue(client, stop, taken).run(jobs)
 
 
 def _process_here(
-    jobs: Iterable[Job], stop: StopRequest, taken: Callable[[Job], None] | None
+    jobs: Iterable[Job],
+    stop: StopRequest,
+    taken: Callable[[Job], None] | None,
+    memory: int | None,
 ) -> Iterator[EndedScene]:
     keep_memory()
     for job in jobs:
@@ -230,7 +239,17 @@ def _process_here(
             return
         if taken:
             taken(job)
-        yield EndedScene(job, *attempt(job))
+        yield EndedScene(job, *_attempt(job, memory))
+
+
+def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:
+    """Process a scene within a memory limit; return the outcome as `EndedScene` states it."""
+    try:
+        job = fitted(job, memory)
+    except SceneError as error:
+        # With a larger limit it may be processed.
+        return failed_outcome(job, str(error)), False, True
+    return *attempt(job), False
 
 
 def process_one_by_one(
@@ -272,13 +291,15 @@ def _submit(client: Client, job: Job) -> Future:
     return client.submit(_on_worker, pickle.dumps(job), joint_code_version(), pure=False)
 
 
-def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool] | str:
-    """Process a scene; return its outcome and whether it is final, or why it was not tried."""
+def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool, bool] | str:
+    """Process a scene; return how it ended, or why it was not tried."""
+    from distributed import get_worker  # noqa: PLC0415 - takes a second to import
+
     # First, because other code may not be able to unpickle the job.
     if joint_code_version() != code:
         return f"the worker has other code of lidarops: {joint_code_version()}, not {code}"
     job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
-    return attempt(job)
+    return _attempt(job, get_worker().memory_manager.memory_limit)
 
 
 def _wait(future: Future, workers: _Workers) -> None:

@@ -30,7 +30,7 @@ class Options:
     workers: int = 1
     """Local processes; they scan and report also if a cluster processes the scenes."""
     memory: str | None = None
-    """Memory limit of a local worker, such as ``2GiB``."""
+    """Memory limit of this process, or of a local worker, such as ``2GiB``."""
     cluster: Callable[[], AbstractContextManager[Client]] | None = None
     """Starts or reaches a cluster to run on instead; called only if something is stale."""
     wait: float = 0.0

@@ -1,0 +1,94 @@
+"""Estimate the memory of a scene from its plan: process, profiles in work, and what is held."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Final
+
+from lidarops.records import Plan, PlannedStep, Scene
+from lidarops.steps.channels import file_channels
+from lidarops.steps.data import CHUNK_BYTES
+from lidarops.steps.dependence import is_product, plan_closure
+from lidarops.steps.registry import product_step, typed_settings
+
+PROCESS: Final = 420_000_000
+"""Bytes of a process with the code of all kinds loaded. ``lidarops bench throughput --case memory``
+measured 390 to 410 MB."""
+OF_A_COUNT: Final = 26.0
+"""Bytes at the peak of a chunk of ``signal``, for each byte of its counts: the same benchmark
+measured 103 MB for chunks of 4 MB. Other kinds and other counts take down to 8 bytes."""
+OF_A_FILE: Final = 5_000
+"""Bytes of the facts about a raw file: 9 MB more were measured for 2,300 more files."""
+_COUNT: Final = 4
+"""Bytes of a raw count."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMemory:
+    """Memory of a process that processes a scene, bytes."""
+
+    held: float
+    """Held for the whole scene, besides the process."""
+    profile: float
+    """Raw counts of one profile of the widest channel."""
+    profiles: int
+    """Number of profiles."""
+    process: float = PROCESS
+
+    @property
+    def total(self) -> float:
+        """Bytes with chunks of the usual size."""
+        return self.of(max(1, int(CHUNK_BYTES // max(self.profile, 1))))
+
+    def of(self, profiles: int) -> float:
+        """Return the bytes with chunks of some profiles."""
+        return self.process + self.held + OF_A_COUNT * self.profile * min(profiles, self.profiles)
+
+    def profiles_within(self, limit: float) -> int:
+        """Return the largest number of profiles of a chunk within a limit; 0 where none fits."""
+        if self.of(1) > limit:
+            return 0
+        left = limit - self.process - self.held
+        return max(1, int(left // max(OF_A_COUNT * self.profile, 1)))
+
+
+def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
+    """Return the estimated memory of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    plan : Plan
+        Before it is refined in the worker.
+    """
+    held: defaultdict[str, float] = defaultdict(float)
+    for step in plan.steps:
+        if is_product(step):
+            closure = plan_closure(plan, [(step.name, step.channel)])
+            # Channels are processed one after the other.
+            held[step.channel] += product_step(step.name).held(typed_settings(step), scene, closure)
+    files = len(scene.granules) + len(scene.dark)
+    return SceneMemory(
+        held=OF_A_FILE * files + max(held.values(), default=0.0),
+        profile=float(
+            _COUNT * _most_bins(scene, [step for step in plan.steps if is_product(step)])
+        ),
+        profiles=max((len(member.granules) for member in scene.members or (scene,)), default=0),
+    )
+
+
+def _most_bins(scene: Scene, products: list[PlannedStep]) -> int:
+    """Return the largest number of bins that a profile of a product is made from."""
+    layouts = [
+        {channel.name: channel.bins for channel in member.layout}
+        for member in scene.members or (scene,)
+    ]
+    return max(
+        (
+            sum(bins.get(name, 0) for name in file_channels(step.channel))
+            for step in products
+            for bins in layouts
+        ),
+        default=0,
+    )
