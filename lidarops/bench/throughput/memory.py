@@ -160,7 +160,12 @@ def _settings(zenith_angle: int, products: Mapping[str, Any]) -> dict[str, Any]:
 def write_files(folder: Path, size: float) -> int:
     """Write the raw files of a scene of `size` MB of counts; return their number."""
     folder.mkdir(parents=True)
-    layout = {"wavelength": 532e-9, "bins": BINS, "bin_width": _BIN_WIDTH, "shots": _SHOTS}
+    layout: dict[str, Any] = {
+        "wavelength": 532e-9,
+        "bins": BINS,
+        "bin_width": _BIN_WIDTH,
+        "shots": _SHOTS,
+    }
     kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
     datasets = [licel_write.new_dataset(kind=kind, **layout) for kind in kinds]
     counts = _counts()
