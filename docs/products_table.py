@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from lidarops.flags import FIRST_OWN, PLACES, Quality
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import NO_STANDARD_NAME, Row, layout_of
 
@@ -55,6 +56,9 @@ def _bits() -> Iterator[str]:
             carriers.setdefault(row, []).append(kind)
     for (value, word, severity, description), names in sorted(carriers.items()):
         yield f"| `{word}` | {value} | {severity} | {description} | {', '.join(names)} |"
+    own = {kind: sum(bit >= 1 << FIRST_OWN for bit in flags_of(kind)) for kind in kinds()}
+    left = [f"{PLACES - FIRST_OWN - count} in `{kind}`" for kind, count in own.items()]
+    yield f"\nPlaces left for new bits: {FIRST_OWN - len(Quality)} in all kinds, {', '.join(left)}."
 
 
 def main() -> None:
