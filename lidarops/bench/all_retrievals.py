@@ -13,19 +13,16 @@ import numpy as np
 from lidarops.bench import overview
 from lidarops.bench.accuracy import (
     elastic,
+    elastic_report,
+    homogeneous,
     homogeneous_report,
     multiangle_report,
+    multiangle_scores,
     network,
     network_report,
 )
-from lidarops.bench.accuracy import (
-    homogeneous as accuracy,
-)
-from lidarops.bench.accuracy.elastic import Elastic
-from lidarops.bench.accuracy.multiangle_scores import MultiAngle
-from lidarops.bench.accuracy.multiangle_scores import measure_multiangle as measure_scans
 from lidarops.bench.accuracy.network_scores import NetworkAccuracy
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, Effort, facts
+from lidarops.bench.harness.benchmark import Effort, study_page
 from lidarops.bench.harness.timing import Machine, least_times, machine
 from lidarops.bench.overview import Baseline, WorkPrecision
 from lidarops.reports.benchmark_page import BenchmarkReport, Part
@@ -44,13 +41,13 @@ class AllRetrievals:
     machine: Machine
     baselines: tuple[Baseline, ...]
     works: tuple[WorkPrecision, ...]
-    homogeneous: accuracy.Accuracy
-    elastic: Elastic
-    multiangle: MultiAngle
+    homogeneous: homogeneous.Accuracy
+    elastic: elastic.Elastic
+    multiangle: multiangle_scores.MultiAngle
     network: NetworkAccuracy
 
 
-def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> BenchmarkOutput:
+def measure_all(effort: Effort, *, data: Path | None = None) -> AllRetrievals:
     """Measure error against run time of all retrievals.
 
     Parameters
@@ -66,17 +63,12 @@ def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Benchmark
     RawFormatError
         If a published file cannot be read.
     """
-    quick, date, progress = effort.quick, effort.date, effort.progress
-    paths = accuracy.measure_homogeneous(quick=quick, date=date, progress=progress)
-    vertical = elastic.measure_elastic_accuracy(
-        quick=quick, date=date, data=data, progress=progress
-    )
-    scans = measure_scans(quick=quick, date=date, progress=progress)
-    networks = network.measure_network(
-        quick=quick, date=date, repeats=effort.repeats, progress=progress
-    )
-    result = AllRetrievals(
-        date=date,
+    paths = homogeneous.measure_homogeneous(effort)
+    vertical = elastic.measure_elastic_accuracy(effort, data=data)
+    scans = multiangle_scores.measure_multiangle(effort)
+    networks = network.measure_network(effort)
+    return AllRetrievals(
+        date=effort.date,
         machine=machine(),
         baselines=tuple(_baselines()),
         works=overview.work_precision_rows(paths, vertical, scans, networks),
@@ -85,7 +77,6 @@ def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Benchmark
         multiangle=scans,
         network=networks,
     )
-    return BenchmarkOutput(result, _report(result))
 
 
 def _baselines() -> Iterator[Baseline]:
@@ -103,31 +94,24 @@ def _baselines() -> Iterator[Baseline]:
     )
 
 
-def _report(result: AllRetrievals) -> BenchmarkReport:
-    reports = (
-        (
-            "Homogeneous path",
-            "homogeneous",
-            homogeneous_report.homogeneous_accuracy_report(result.homogeneous),
-        ),
-        ("Elastic inversion", "elastic", elastic.elastic_accuracy_report(result.elastic)),
-        ("Scans", "multiangle", multiangle_report.multiangle_accuracy_report(result.multiangle)),
-        ("Networks", "network", network_report.network_accuracy_report(result.network)),
-    )
-    chapters = [
-        _prefixed(chapter, title, name)
-        for title, name, report in reports
-        for chapter in report.parts
-    ]
-    return BenchmarkReport(
-        title="All retrievals: error against run time",
-        facts=facts(result.date, result.machine),
-        parts=(overview.overview(result.works, result.baselines), *chapters),
-        data=RESULT,
+def all_retrievals_report(result: AllRetrievals) -> BenchmarkReport:
+    """Return the page of all retrievals."""
+    reports = {
+        "homogeneous": homogeneous_report.homogeneous_accuracy_report(result.homogeneous),
+        "elastic": elastic_report.elastic_accuracy_report(result.elastic),
+        "multiangle": multiangle_report.multiangle_accuracy_report(result.multiangle),
+        "network": network_report.network_accuracy_report(result.network),
+    }
+    chapters = [_prefixed(part, name) for name, report in reports.items() for part in report.parts]
+    return study_page(
+        "All retrievals: error against run time",
+        result,
+        overview.overview(result.works, result.baselines),
+        *chapters,
     )
 
 
-def _prefixed(chapter: Part, title: str, name: str) -> Part:
+def _prefixed(chapter: Part, name: str) -> Part:
     """Return a chapter with the retrieval in its title and file names, which makes them unique."""
     charts = tuple(replace(chart, name=f"{name}-{chart.name}") for chart in chapter.charts)
-    return replace(chapter, title=f"{title}: {chapter.title}", charts=charts)
+    return replace(chapter, title=f"{name.capitalize()}: {chapter.title}", charts=charts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,11 +12,21 @@ import numpy as np
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.accuracy.elastic import Elastic
 from lidarops.bench.accuracy.elastic_costs import ALL_STEPS
-from lidarops.bench.accuracy.homogeneous import Accuracy, MonteCarloFigure, outcomes_of
+from lidarops.bench.accuracy.homogeneous import Accuracy, outcomes_of
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.network_scores import NetworkAccuracy
 from lidarops.bench.accuracy.peers import iterative_peers
-from lidarops.figures.charts import Chart, Panel, Series, pareto
+from lidarops.bench.harness.rows import (
+    CPU_TIME,
+    MonteCarloFigure,
+    Quantity,
+    Row,
+    Unit,
+    error_against_time,
+    rows_of,
+    table,
+)
+from lidarops.figures.charts import Chart
 from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import Part, Table
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
@@ -47,9 +57,14 @@ _SCAN_PEERS: Final = frozenset({"numpy lstsq", "Tikhonov, L-curve", "scipy lsq_l
 _WHOLE: Final = "chosen, error carried"
 """Chain of all steps of the elastic retrieval."""
 _EXTINCTION: Final = "extinction"
-_NONE: Final = "-"
 _INNER: Final = 1
 """Index of the 95 percent interval among the scored ones."""
+_RMSE: Final = Quantity("RMSE", "error")
+_OF_WORK: Final = (
+    _RMSE,
+    Quantity("95 %", "coverage", Unit.SHARE),
+    Quantity(CPU_TIME, "nanoseconds", Unit.TIME),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,24 +196,40 @@ def _network_rows(accuracy: NetworkAccuracy) -> Iterator[WorkPrecision]:
                 )
 
 
-def overview(rows: Sequence[WorkPrecision], baselines: Sequence[Baseline]) -> Part:
+def overview(works: Sequence[WorkPrecision], baselines: Sequence[Baseline]) -> Part:
     """Return the chapter that compares all retrievals."""
-    retrievals = list(dict.fromkeys(work.retrieval for work in rows))
-    floors = Table(
-        title="Minimal operations, measured in the same run",
-        columns=("operation", "CPU time"),
-        rows=tuple((floor.what, format_time(floor.nanoseconds)) for floor in baselines),
-    )
+    retrievals = list(dict.fromkeys(work.retrieval for work in works))
+    floors = [row for floor in baselines for row in rows_of("", floor.what, floor, (_OF_WORK[-1],))]
     return Part(
         title="Error against run time, all retrievals",
         text="All methods of all retrievals, with common baselines and iterative peers, on "
         "simulated profiles with known truth. Root mean square error over the profiles that a "
         "method does not reject; CPU time per profile on one core. The chapters below describe "
         "the simulations and give bias, coverage and flags.",
-        charts=tuple(_chart(rows, retrieval) for retrieval in retrievals),
-        tables=(best_methods(rows), floors),
-        details=tuple(_table(rows, retrieval) for retrieval in retrievals),
+        charts=tuple(_chart(works, retrieval) for retrieval in retrievals),
+        tables=(
+            best_methods(works),
+            table("Minimal operations, measured in the same run", floors, method="operation"),
+        ),
+        details=tuple(
+            table(
+                f"{retrieval.capitalize()}: all methods",
+                [
+                    row
+                    for work in works
+                    if work.retrieval == retrieval
+                    for row in _rows(work, f"{work.quantity}; {work.setting}")
+                ],
+                case="error of",
+            )
+            for retrieval in retrievals
+        ),
     )
+
+
+def _rows(work: WorkPrecision, case: str) -> list[Row]:
+    method = work.method if work.ours else f"peer: {work.method}"
+    return rows_of(case, method, work, _OF_WORK)
 
 
 def best_methods(works: Sequence[WorkPrecision]) -> Table:
@@ -206,7 +237,7 @@ def best_methods(works: Sequence[WorkPrecision]) -> Table:
 
     Of methods whose errors differ by less than 2 Monte Carlo errors, the best is the fastest.
     """
-    rows = []
+    rows: list[Row] = []
     for retrieval, quantity in dict.fromkeys((work.retrieval, work.quantity) for work in works):
         group = [
             work
@@ -218,14 +249,14 @@ def best_methods(works: Sequence[WorkPrecision]) -> Table:
         for ours in (True, False):
             candidates = [work for work in group if work.ours is ours and work.setting == setting]
             if candidates:
-                rows.append((f"{retrieval}, {setting}: {quantity}", *_cells(_best(candidates))))
-    return Table(
-        title="The most accurate of our methods and of the peers",
-        columns=("error of", "method", "RMSE", "95 %", "per profile"),
-        rows=tuple(rows),
-        note="Of methods whose errors differ by less than 2 Monte Carlo errors, the fastest. One "
+                rows += _rows(_best(candidates), f"{retrieval}, {setting}: {quantity}")
+    return table(
+        "The most accurate of our methods and of the peers",
+        rows,
+        "Of methods whose errors differ by less than 2 Monte Carlo errors, the fastest. One "
         "setting of each retrieval; the tables below list all. 95 %: share of truths in the "
         "stated interval. In brackets: Monte Carlo standard error.",
+        case="error of",
     )
 
 
@@ -240,84 +271,21 @@ def _best(works: Sequence[WorkPrecision]) -> WorkPrecision:
     return min(equal, key=lambda work: work.nanoseconds)
 
 
-def _cells(work: WorkPrecision) -> tuple[str, ...]:
-    return (
-        work.method if work.ours else f"peer: {work.method}",
-        f"{work.error.value:.3g} ({work.error.error:.1g})",
-        _NONE if work.coverage is None else percent(work.coverage.value),
-        format_time(work.nanoseconds),
-    )
-
-
-def format_time(nanoseconds: float) -> str:
-    """Return a time in s, ms, µs or ns."""
-    for unit, size in (("s", 1e9), ("ms", 1e6), ("µs", 1e3)):
-        if nanoseconds >= size:
-            return f"{nanoseconds / size:.3g} {unit}"
-    return f"{nanoseconds:.3g} ns"
-
-
-def _table(works: Sequence[WorkPrecision], retrieval: str) -> Table:
-    rows = [(w.setting, w.quantity, *_cells(w)) for w in works if w.retrieval == retrieval]
-    return Table(
-        title=f"{retrieval.capitalize()}: all methods",
-        columns=("setting", "error of", "method", "RMSE", "95 %", "per profile"),
-        rows=tuple(rows),
-    )
-
-
 def _chart(works: Sequence[WorkPrecision], retrieval: str) -> Chart:
-    of_retrieval = [work for work in works if work.retrieval == retrieval]
-    quantity = of_retrieval[0].quantity
-    shown = [work for work in of_retrieval if work.quantity == quantity]
-    settings = list(dict.fromkeys(work.setting for work in shown))
-    chosen = dict.fromkeys((settings[0], _SHOWN.get(retrieval, settings[-1])))
-    methods = list(dict.fromkeys(work.method for work in shown))
-    return Chart(
-        name="all-" + retrieval.replace(" ", "-"),
-        title=f"{retrieval.capitalize()}: error against CPU time",
-        caption=f"RMSE of {quantity}, with bars of 2 Monte Carlo standard errors. Hollow: peers, "
-        "and methods that know more than the profile. The steps join the methods that no other "
-        "beats in both error and time.",
-        panels=tuple(
-            _panel([work for work in shown if work.setting == setting], setting, methods)
-            for setting in chosen
-        ),
+    quantity = next(work.quantity for work in works if work.retrieval == retrieval)
+    drawn = [work for work in works if (work.retrieval, work.quantity) == (retrieval, quantity)]
+    settings = list(dict.fromkeys(work.setting for work in drawn))
+    chosen = (settings[0], _SHOWN.get(retrieval, settings[-1]))
+    chart = error_against_time(
+        "all-" + retrieval.replace(" ", "-"),
+        [
+            row
+            for work in drawn
+            if work.setting in chosen
+            for row in rows_of(work.setting, work.method, work, _OF_WORK)
+        ],
+        _RMSE.name,
+        hollow={w.method for w in drawn if not w.ours or w.method in _WITH_PRIOR_KNOWLEDGE},
+        gain=1.0,
     )
-
-
-def _panel(works: Sequence[WorkPrecision], setting: str, methods: Sequence[str]) -> Panel:
-    by_method = {work.method: work for work in works}
-    return Panel(
-        title=setting,
-        x_label="CPU time per profile (µs)",
-        y_label="RMSE",
-        # A method without value keeps its place, so that a mark means the same in all panels.
-        series=tuple(
-            _point(by_method[method]) if method in by_method else Series(method, (), ())
-            for method in methods
-        ),
-        front=pareto(
-            [
-                (_micro(work), work.error.value)
-                for work in works
-                if work.method not in _WITH_PRIOR_KNOWLEDGE
-            ]
-        ),
-    )
-
-
-def _point(work: WorkPrecision) -> Series:
-    error = work.error
-    return Series(
-        work.method,
-        (_micro(work),),
-        (error.value,),
-        (max(error.value - 2 * error.error, 0.5 * error.value),),
-        (error.value + 2 * error.error,),
-        hollow=not work.ours or work.method in _WITH_PRIOR_KNOWLEDGE,
-    )
-
-
-def _micro(work: WorkPrecision) -> float:
-    return work.nanoseconds / 1e3
+    return replace(chart, title=f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import (
     elastic,
+    elastic_report,
     homogeneous,
     homogeneous_report,
     multiangle_report,
@@ -30,10 +32,9 @@ from lidarops.bench.throughput import (
     retrieval_reports,
     retrievals,
     scan_kernels,
-    scan_report,
 )
 from lidarops.errors import CampaignError
-from lidarops.reports import benchmark_page
+from lidarops.reports.benchmark_page import BenchmarkReport, build_benchmark_page
 
 STABILITY: Final = "stability"
 """The benchmark that is no `BenchmarkKind`, because it has no cases to choose from."""
@@ -89,98 +90,77 @@ def run_benchmark(
     kind = _member(BenchmarkKind, what, "benchmark", STABILITY)
     default = Benchmark.ALL if kind is BenchmarkKind.ACCURACY else Benchmark.HOMOGENEOUS
     benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
-    _check(kind, benchmark, files, data)
-    runs: dict[Benchmark, Callable[[], BenchmarkOutput]] = {
-        Benchmark.ALL: lambda: all_retrievals.run_all_retrievals(effort, data=data),
-        Benchmark.ARCHIVE: lambda: archives.run_archives(kind, effort=effort),
-        Benchmark.CAMPAIGNS: lambda: campaigns.run_campaigns(kind, effort=effort),
-        Benchmark.COSTS: lambda: cost_calibration.run_cost_calibration(kind, effort=effort),
-        Benchmark.ELASTIC: lambda: _elastic(kind, data, effort),
-        Benchmark.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
-        Benchmark.MEMORY: lambda: memory.run_memory(kind, effort=effort),
-        Benchmark.MULTIANGLE: lambda: _multiangle(kind, effort),
-        Benchmark.NETWORK: lambda: _network(kind, effort),
-        Benchmark.READER: lambda: _reader(files, effort),
+    if benchmark is not Benchmark.READER and files:
+        raise CampaignError(f"the case {benchmark.value!r} takes no files", remedy="leave them out")
+    published = benchmark in {Benchmark.ELASTIC, Benchmark.ALL} and kind is BenchmarkKind.ACCURACY
+    if data is not None and not published:
+        raise CampaignError(
+            "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
+        )
+    if benchmark is Benchmark.READER and kind is BenchmarkKind.THROUGHPUT:
+        return _reader(files, effort)
+    if benchmark is Benchmark.MEMORY:
+        return memory.run_memory(kind, effort=effort)
+    studies = _accuracy(data) if kind is BenchmarkKind.ACCURACY else _throughput()
+    if benchmark not in studies:
+        raise CampaignError(
+            f"the case {benchmark.value!r} has no {kind.value}",
+            remedy=f"choose: {' or '.join(studies)}",
+        )
+    measure, report = studies[benchmark]
+    result = measure(effort)
+    return BenchmarkOutput(result, report(result))
+
+
+_Study = tuple[Callable[..., Any], Callable[[Any], BenchmarkReport]]
+"""Measures with an `Effort`, and makes the page of the result."""
+
+
+def _accuracy(data: Path | None) -> dict[Benchmark, _Study]:
+    measure_all = partial(all_retrievals.measure_all, data=data)
+    measure_elastic = partial(elastic.measure_elastic_accuracy, data=data)
+    return {
+        Benchmark.ALL: (measure_all, all_retrievals.all_retrievals_report),
+        Benchmark.ELASTIC: (measure_elastic, elastic_report.elastic_accuracy_report),
+        Benchmark.HOMOGENEOUS: (
+            homogeneous.measure_homogeneous,
+            homogeneous_report.homogeneous_accuracy_report,
+        ),
+        Benchmark.MULTIANGLE: (
+            multiangle_scores.measure_multiangle,
+            multiangle_report.multiangle_accuracy_report,
+        ),
+        Benchmark.NETWORK: (network.measure_network, network_report.network_accuracy_report),
     }
-    return runs[benchmark]()
+
+
+def _throughput() -> dict[Benchmark, _Study]:
+    return {
+        Benchmark.ARCHIVE: (archives.measure_archives, archives.archives_report),
+        Benchmark.CAMPAIGNS: (campaigns.measure_campaigns, campaigns.campaigns_report),
+        Benchmark.COSTS: (cost_calibration.calibrate, cost_calibration.calibration_report),
+        Benchmark.ELASTIC: (
+            retrievals.measure_elastic,
+            retrieval_reports.elastic_throughput_report,
+        ),
+        Benchmark.HOMOGENEOUS: (
+            retrievals.measure_solvers,
+            retrieval_reports.homogeneous_throughput_report,
+        ),
+        Benchmark.MULTIANGLE: (
+            scan_kernels.measure_scan_kernels,
+            retrieval_reports.multiangle_throughput_report,
+        ),
+        Benchmark.NETWORK: (
+            networks.measure_network_throughput,
+            retrieval_reports.network_throughput_report,
+        ),
+    }
 
 
 def _reader(files: Sequence[Path], effort: Effort) -> BenchmarkOutput:
     rates = readers.measure_readers(files, repeats=effort.repeats or _REPEATS)
-    return BenchmarkOutput(
-        rates, retrieval_reports.reader_report(rates, effort.date, machine(), RESULT)
-    )
-
-
-def _homogeneous(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
-    if kind is BenchmarkKind.ACCURACY:
-        accuracy = homogeneous.measure_homogeneous(
-            quick=effort.quick, date=effort.date, progress=effort.progress
-        )
-        return BenchmarkOutput(
-            accuracy, homogeneous_report.homogeneous_accuracy_report(accuracy, RESULT)
-        )
-    throughput = retrievals.measure_solvers(
-        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-    )
-    return BenchmarkOutput(
-        throughput, retrieval_reports.homogeneous_throughput_report(throughput, RESULT)
-    )
-
-
-def _elastic(kind: BenchmarkKind, data: Path | None, effort: Effort) -> BenchmarkOutput:
-    if kind is BenchmarkKind.ACCURACY:
-        accuracy = elastic.measure_elastic_accuracy(
-            quick=effort.quick, date=effort.date, data=data, progress=effort.progress
-        )
-        return BenchmarkOutput(accuracy, elastic.elastic_accuracy_report(accuracy, RESULT))
-    throughput = retrievals.measure_elastic(
-        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-    )
-    return BenchmarkOutput(
-        throughput, retrieval_reports.elastic_throughput_report(throughput, RESULT)
-    )
-
-
-def _multiangle(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
-    if kind is BenchmarkKind.ACCURACY:
-        accuracy = multiangle_scores.measure_multiangle(
-            quick=effort.quick, date=effort.date, progress=effort.progress
-        )
-        return BenchmarkOutput(
-            accuracy, multiangle_report.multiangle_accuracy_report(accuracy, RESULT)
-        )
-    throughput = scan_kernels.measure_scan_kernels(
-        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-    )
-    return BenchmarkOutput(throughput, scan_report.multiangle_throughput_report(throughput, RESULT))
-
-
-def _network(kind: BenchmarkKind, effort: Effort) -> BenchmarkOutput:
-    if kind is BenchmarkKind.ACCURACY:
-        accuracy = network.measure_network(
-            quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-        )
-        return BenchmarkOutput(accuracy, network_report.network_accuracy_report(accuracy, RESULT))
-    throughput = networks.measure_network_throughput(
-        quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
-    )
-    return BenchmarkOutput(throughput, networks.network_throughput_report(throughput, RESULT))
-
-
-def _check(kind: BenchmarkKind, case: Benchmark, files: Sequence[Path], data: Path | None) -> None:
-    if case is Benchmark.READER and kind is BenchmarkKind.ACCURACY:
-        raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
-    if case is Benchmark.ALL and kind is BenchmarkKind.THROUGHPUT:
-        raise CampaignError("the case 'all' has no throughput", remedy="choose another case")
-    if case is not Benchmark.READER and files:
-        raise CampaignError(f"the case {case.value!r} takes no files", remedy="leave them out")
-    if data is not None and (
-        case not in {Benchmark.ELASTIC, Benchmark.ALL} or kind is not BenchmarkKind.ACCURACY
-    ):
-        raise CampaignError(
-            "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
-        )
+    return BenchmarkOutput(rates, retrieval_reports.reader_report(rates, effort.date, machine()))
 
 
 def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
@@ -192,7 +172,7 @@ def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
         If the folder cannot be written.
     """
     results.save(output.result, folder / RESULT)
-    return benchmark_page.build_benchmark_page(output.report, folder)
+    return build_benchmark_page(output.report, folder)
 
 
 def _member(names: type[_Names], value: str, what: str, *other_choices: str) -> _Names:

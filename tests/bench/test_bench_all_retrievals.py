@@ -14,10 +14,10 @@ from lidarops.bench.accuracy import (
     multiangle_scores,
     network,
 )
-from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.multiangle_scores import StudySize
-from lidarops.bench.harness import results
+from lidarops.bench.harness import results, rows
 from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import MonteCarloFigure
 
 SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20, random=4)
 
@@ -29,7 +29,7 @@ def output():
     small = {
         (homogeneous, "measure_homogeneous"): partial(homogeneous.measure_homogeneous, profiles=64),
         (elastic, "measure_elastic_accuracy"): partial(elastic.measure_elastic_accuracy, draws=4),
-        (all_retrievals, "measure_scans"): partial(
+        (multiangle_scores, "measure_multiangle"): partial(
             multiangle_scores.measure_multiangle, size=SMALL
         ),
         (network, "measure_network"): partial(
@@ -63,11 +63,11 @@ def test_rows_hold_the_figures_of_the_retrievals(output):
     assert (row.error, row.nanoseconds) == (score.rmse, score.nanoseconds)
     case = output.result.network.cases[0]
     method, networked = next(iter(case.scores.items()))
-    rows = [
+    networks = [
         w for w in output.result.works if w.retrieval == overview.NETWORKS and w.method == method
     ]
-    assert rows[0].nanoseconds == pytest.approx(1e3 * networked.microseconds)
-    assert rows[0].error == networked.rmse
+    assert networks[0].nanoseconds == pytest.approx(1e3 * networked.microseconds)
+    assert networks[0].error == networked.rmse
 
 
 def test_the_first_table_shows_the_best_method_without_prior_knowledge(output):
@@ -120,4 +120,4 @@ def test_minimal_operations_are_measured(output):
     ("nanoseconds", "text"), [(3.21, "3.21 ns"), (4.2e3, "4.2 µs"), (5e6, "5 ms"), (2e9, "2 s")]
 )
 def test_times_have_a_suitable_unit(nanoseconds, text):
-    assert overview.format_time(nanoseconds) == text
+    assert rows.format_time(nanoseconds) == text

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -17,19 +16,15 @@ from lidarops.bench.accuracy.elastic_cases import (
     Inverted,
     SimulatedSky,
 )
-from lidarops.bench.accuracy.elastic_costs import cost_part, elastic_costs
+from lidarops.bench.accuracy.elastic_costs import elastic_costs
 from lidarops.bench.accuracy.homogeneous import (
     BackgroundScore,
     InversionScore,
-    MonteCarloFigure,
     background_score,
     inversion_score,
 )
-from lidarops.bench.harness.benchmark import facts
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import Machine, StepCost, machine
-from lidarops.figures.charts import Chart, Panel, Series
-from lidarops.figures.wording import percent
-from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
@@ -105,27 +100,17 @@ class Elastic:
 
 
 def measure_elastic_accuracy(
-    *,
-    quick: bool = False,
-    date: str = "",
-    draws: int | None = None,
-    data: Path | None = None,
-    progress: Callable[[int], object] = lambda _: None,
+    effort: Effort, *, draws: int | None = None, data: Path | None = None
 ) -> Elastic:
     """Retrieve background and particles of simulated profiles at each level of the background.
 
     Parameters
     ----------
-    quick : bool
-        Fewer profiles.
-    date : str
-        Date stated in the result.
+    effort : Effort
     draws : int, optional
         Profiles per level, at least 2.
     data : Path, optional
         Folder of the published files (`elastic_cases.read_published_profiles`).
-    progress : callable
-        Called with 1 after each level.
 
     Raises
     ------
@@ -133,17 +118,17 @@ def measure_elastic_accuracy(
         If the published files cannot be read.
     """
     published = _published(data) if data is not None else ()
-    count = draws or (QUICK_DRAWS if quick else DRAWS)
+    count = draws or (QUICK_DRAWS if effort.quick else DRAWS)
     levels = []
     for seed, level in enumerate(elastic_cases.LEVELS):
         levels.append(_level(elastic_cases.simulated_sky(), level, count, seed))
-        progress(1)
+        effort.progress(1)
     return Elastic(
-        date,
+        effort.date,
         machine(),
         tuple(levels),
         tuple(_closed(elastic_cases.simulated_sky(), level) for level in (None, *CLOSED_LEVELS)),
-        tuple(elastic_costs(min(count, _BATCH), _QUICK_REPEATS if quick else _REPEATS)),
+        tuple(elastic_costs(min(count, _BATCH), _QUICK_REPEATS if effort.quick else _REPEATS)),
         published,
     )
 
@@ -278,326 +263,3 @@ def _file_scores(file: elastic_cases.Published, sky: SimulatedSky) -> list[Publi
             )
         )
     return scores
-
-
-# Pages ----------------------------------------------------------------------------------------
-
-_DRAWN: Final = (
-    elastic_cases.KNOWN_SHAPE,
-    elastic_cases.KNOWN_CLEAN_RANGE,
-    elastic_cases.TAIL_MEAN,
-)
-_NONE: Final = "-"
-
-
-def elastic_accuracy_report(accuracy: Elastic, data: str = "") -> BenchmarkReport:
-    """Return the page of the accuracy benchmark."""
-    chapters = [_backgrounds(accuracy), _inversions(accuracy), _without_noise(accuracy.closed)]
-    if accuracy.published:
-        chapters.append(_files(accuracy.published))
-    return BenchmarkReport(
-        title="Elastic inversion: error against the level of the background",
-        facts=facts(accuracy.date, accuracy.machine),
-        parts=(*chapters, cost_part(accuracy.costs, elastic_cases.RANGE.size)),
-        data=data,
-    )
-
-
-def _backgrounds(accuracy: Elastic) -> Part:
-    names = list(elastic_cases.background_methods())
-    return Part(
-        title="Background",
-        text="Simulated like the EARLINET elastic intercomparison: 532 nm, aerosol below 6 km "
-        "(optical depth 1.4), 1005 bins of 15 m, means of 1000 shots with Poisson noise; "
-        f"{accuracy.levels[0].profiles:,} profiles per level, one in {SLOW_SHARE} of them for "
-        "homogeneous. known_shape selects its window, or knows that the air is clean above 6 km. "
-        "tail_mean averages the last tenth of the bins, including the signal there. The methods "
-        "homogeneous and cubic are not in the figure, because they assume a homogeneous path. "
-        "Above 6 km the decreasing air density looks like extinction, which biases their "
-        "background by about one count for any noise, and the additional unknown increases its "
-        "scatter (folded tables, above 6 km).",
-        charts=(_background_chart(accuracy),),
-        tables=tuple(_background_table(accuracy, name) for name in _DRAWN),
-        details=tuple(_background_table(accuracy, name) for name in names if name not in _DRAWN),
-    )
-
-
-def _background_chart(accuracy: Elastic) -> Chart:
-    scores = {
-        name: [
-            (level.level, level.backgrounds[name])
-            for level in accuracy.levels
-            if name in level.backgrounds
-        ]
-        for name in _DRAWN
-    }
-    drawn = {
-        name: [_Drawn(level, score.rmse.value, score.bias, score.stated) for level, score in pairs]
-        for name, pairs in scores.items()
-    }
-    return Chart(
-        name="background",
-        title="Error of the background against its level",
-        caption=_CAPTION,
-        panels=_panels(drawn, "error of background (counts per shot)"),
-    )
-
-
-_CAPTION: Final = (
-    "Root mean square error, and size of the mean error where it exceeds 2 Monte Carlo standard "
-    "errors (bars). Shaded: up to the stated standard error. Full marks on its edge mean that "
-    "errors are as stated."
-)
-
-
-@dataclass(frozen=True, slots=True)
-class _Drawn:
-    """One level of one panel."""
-
-    level: float
-    rmse: float
-    bias: MonteCarloFigure
-    stated: float
-
-    @property
-    def significant(self) -> bool:
-        return abs(self.bias.value) > 2.0 * self.bias.error
-
-
-def _panels(drawn: Mapping[str, Sequence[_Drawn]], y_label: str) -> tuple[Panel, ...]:
-    heights = [height for points in drawn.values() for p in points for height in (p.rmse, p.stated)]
-    floor = 0.2 * min(heights, default=1.0)
-    return tuple(
-        Panel(
-            title=name,
-            x_label="background (counts per shot)",
-            y_label="" if number else y_label,
-            series=(_rmse_series(points, floor), _bias_series(points, floor)),
-        )
-        for number, (name, points) in enumerate(drawn.items())
-    )
-
-
-def _rmse_series(points: Sequence[_Drawn], floor: float) -> Series:
-    return Series(
-        "root mean square error, stated error shaded",
-        tuple(p.level for p in points),
-        tuple(p.rmse for p in points),
-        tuple(floor for _ in points),
-        tuple(p.stated for p in points),
-        joined=True,
-        band=True,
-    )
-
-
-def _bias_series(points: Sequence[_Drawn], floor: float) -> Series:
-    significant = [p for p in points if p.significant and abs(p.bias.value) > floor]
-    sizes = [abs(p.bias.value) for p in significant]
-    bars = [2.0 * p.bias.error for p in significant]
-    return Series(
-        "size of the mean error",
-        tuple(p.level for p in significant),
-        tuple(sizes),
-        tuple(max(size - bar, floor) for size, bar in zip(sizes, bars, strict=True)),
-        tuple(size + bar for size, bar in zip(sizes, bars, strict=True)),
-        hollow=True,
-    )
-
-
-def _background_table(accuracy: Elastic, name: str) -> Table:
-    rows = []
-    for level in accuracy.levels:
-        score = level.backgrounds.get(name)
-        cells = [_NONE] * 7 if score is None else _background_cells(score)
-        rejected = percent(level.rejected[name])
-        rows.append((_decade(level.level), *cells, f"{level.least_error:.3g}", rejected))
-    return Table(
-        title=f"Background by {name}, counts per shot",
-        columns=(
-            "background",
-            "mean error",
-            "RMSE",
-            "stated",
-            "mean / stated",
-            "RMS / stated",
-            "within 1",
-            "within 1.96",
-            "bound",
-            "rejected",
-        ),
-        rows=tuple(rows),
-        note="In brackets: Monte Carlo standard error of the last digits. Stated: median standard "
-        "error. Mean and root mean square of the error over the stated one, and share of profiles "
-        "within 1 and 1.96 stated errors: 68.3 and 95 % if errors are as stated. Bound: "
-        "Cramér-Rao, above 6 km. Rejected profiles are excluded.",
-    )
-
-
-def _background_cells(score: BackgroundScore) -> list[str]:
-    return [
-        _signed(score.bias),
-        f"{score.rmse.value:.3g}",
-        f"{score.stated:.3g}",
-        f"{score.deviation.value:+.2f}",
-        f"{score.spread.value:.2f}",
-        *(percent(share_.value) for share_ in score.coverage),
-    ]
-
-
-def _inversions(accuracy: Elastic) -> Part:
-    return Part(
-        title="Backscatter",
-        text="Backscatter of particles from 0.5 to 6 km, in percent of its mean there, with the "
-        "true lidar ratio. The reference window is given, 7 to 8 km, or chosen from windows of "
-        "1 km between 4 and 12 km, some of which hold a tenuous layer of up to 0.4 per Mm and sr. "
-        "Error carried: 1.5 standard errors of the window are stated as error of the reference, "
-        "for particles hidden by noise. Bins without value are excluded: where few bins are "
-        "solved, noise has selected them.",
-        charts=(_inversion_chart(accuracy),),
-        tables=tuple(_inversion_table(accuracy, name) for name in elastic_cases.chains()),
-    )
-
-
-def _inversion_chart(accuracy: Elastic) -> Chart:
-    scores = {
-        name: [
-            (level.level, level.inversions[name])
-            for level in accuracy.levels
-            if name in level.inversions
-        ]
-        for name in elastic_cases.chains()
-    }
-    drawn = {
-        name: [
-            _Drawn(level, 100.0 * score.rmse.value, _percents(score.bias), 100.0 * score.stated)
-            for level, score in pairs
-        ]
-        for name, pairs in scores.items()
-    }
-    return Chart(
-        name="backscatter",
-        title="Error of backscatter, 0.5 to 6 km, against the level of the background",
-        caption=f"{_CAPTION} Only bins with a value.",
-        panels=_panels(drawn, "error of backscatter (% of its mean)"),
-    )
-
-
-def _percents(figure: MonteCarloFigure) -> MonteCarloFigure:
-    return MonteCarloFigure(100.0 * figure.value, 100.0 * figure.error)
-
-
-def _inversion_table(accuracy: Elastic, name: str) -> Table:
-    rows = [
-        (_decade(level.level), *_inversion_cells(level.inversions.get(name)))
-        for level in accuracy.levels
-    ]
-    return Table(
-        title=f"Backscatter by {name}, percent of its mean",
-        columns=("background", *_INVERSION_COLUMNS),
-        rows=tuple(rows),
-        note="Solved: share of bins with a value. Mean error and scatter of a profile; RMSE and "
-        "stated standard error of a bin. Share of bins within 1 and 1.96 stated standard errors.",
-    )
-
-
-_INVERSION_COLUMNS: Final = (
-    "solved",
-    "mean error",
-    "scatter",
-    "RMSE",
-    "stated",
-    "within 1",
-    "within 1.96",
-)
-
-
-def _inversion_cells(score: InversionScore | None) -> tuple[str, ...]:
-    if score is None:
-        return (_NONE,) * len(_INVERSION_COLUMNS)
-    single = score.profiles == 1
-    bias = _percents(score.bias)
-    return (
-        percent(score.solved),
-        f"{bias.value:+.3g}" if single else _signed(bias),
-        _NONE if single else f"{100.0 * score.scatter:.3g}",
-        f"{100.0 * score.rmse.value:.3g}",
-        f"{100.0 * score.stated:.3g}",
-        *(percent(inside.value) for inside in score.coverage),
-    )
-
-
-def _without_noise(closed: tuple[ClosedLoop, ...]) -> Part:
-    rows = tuple(
-        (
-            "none" if loop.level is None else _decade(loop.level),
-            f"{loop.background:+.1e}",
-            f"{100.0 * loop.bias:+.4f} %",
-            f"{100.0 * loop.largest:.4f} %",
-        )
-        for loop in closed
-    )
-    return Part(
-        title="Without noise",
-        text="Errors of the method itself: the signal is integrated by Gauss quadrature, the "
-        "inversion and the molecular shape by trapezoids over bins of 15 m.",
-        tables=(
-            Table(
-                title="Closed loop without noise",
-                columns=("background", "its error (counts)", "mean error", "largest error"),
-                rows=rows,
-                note="Of backscatter from 0.5 to 6 km, over its mean there.",
-            ),
-        ),
-    )
-
-
-def _files(published: tuple[PublishedProfileScore, ...]) -> Part:
-    backgrounds = tuple(
-        (
-            _decade(score.level),
-            score.method,
-            f"{score.background:+.3g}",
-            f"{score.deviation:+.2f}",
-            f"{score.truth_error:.2g}",
-        )
-        for score in published
-        if score.method in elastic_cases.background_methods()
-    )
-    inversions = tuple(
-        (_decade(score.level), score.method, *_inversion_cells(score.inversion))
-        for score in published
-        if score.method in elastic_cases.chains()
-    )
-    return Part(
-        title="Files of the intercomparison",
-        text="The published files at 532 nm, one per level, lidar ratio 39 sr. The true background "
-        "is the fit of the noise-free signal to the same file, the true backscatter the inversion "
-        "of the noise-free signal with the reference from 7 to 8 km. From 2.5 to 5.5 km particles "
-        "scatter 0.2 % of what air does, which no test of shape detects in noise. A window chosen "
-        "there is biased by that amount.",
-        tables=(
-            Table(
-                title="Background of published files, counts per shot",
-                columns=("background", "method", "error", "error / stated", "error of the truth"),
-                rows=backgrounds,
-            ),
-            Table(
-                title="Backscatter of published files, percent of its mean",
-                columns=("background", "method", *_INVERSION_COLUMNS),
-                rows=inversions,
-                note="From 0.5 to 6 km, one profile per row, so without scatter.",
-            ),
-        ),
-    )
-
-
-def _decade(level: float) -> str:
-    return f"1e{round(math.log10(level))}"
-
-
-def _signed(figure: MonteCarloFigure) -> str:
-    """Return a figure with its error in the last digits."""
-    if not figure.error > 0.0:
-        return f"{figure.value:+.3g}"
-    digits = max(-math.floor(math.log10(figure.error)), 0)
-    return f"{figure.value:+.{digits}f}({figure.error * 10**digits:.0f})"

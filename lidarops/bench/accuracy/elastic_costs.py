@@ -10,9 +10,6 @@ import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.harness.timing import READ, StepCost, affordable, least_times
-from lidarops.figures.charts import Ladder
-from lidarops.figures.wording import counted
-from lidarops.reports.benchmark_page import Part, Table
 
 ALL_STEPS: Final = "all steps"
 ELASTIC_LEVEL: Final = 1e4
@@ -101,53 +98,3 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
         "Klett, Python": lambda few: elastic_cases.klett_python(whole[:few], sky),
     }
     return ours, others
-
-
-def cost_part(costs: tuple[StepCost, ...], bins: int) -> Part:
-    """Return the section on the CPU time of the steps of the elastic retrieval."""
-    batches = sorted({cost.batch for cost in costs})
-    return Part(
-        title="CPU time per profile",
-        text=f"Profiles of {bins} bins, float64, one thread, least CPU time of interleaved "
-        "repeats. Steps of lidarops compute all errors and flags; all steps: background, clouds, "
-        "reference window and inversion with its error budget. The peers give values without "
-        "errors: a weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy "
-        "and in plain Python. The read is a vectorised maximum of the same array in the same run.",
-        charts=(_cost_ladder(costs, batches, bins),),
-        tables=tuple(_cost_table(costs, batch) for batch in batches),
-    )
-
-
-def _cost_ladder(costs: tuple[StepCost, ...], batches: list[int], bins: int) -> Ladder:
-    steps = list(dict.fromkeys(cost.step for cost in costs))
-    spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in costs}
-    return Ladder(
-        name="elastic-time",
-        title=f"CPU time per profile of {bins} bins",
-        caption="By the number of profiles per call.",
-        x_label="CPU time per profile (µs)",
-        rows=tuple(steps),
-        series=tuple(
-            (counted(batch, "profile"), tuple(spent.get((batch, step)) for step in steps))
-            for batch in batches
-        ),
-    )
-
-
-def _cost_table(costs: tuple[StepCost, ...], batch: int) -> Table:
-    return Table(
-        title=f"Calls of {counted(batch, 'profile')}",
-        columns=("step", "code", "profiles", "µs each", "reads"),
-        rows=tuple(
-            (
-                cost.step,
-                "lidarops" if cost.ours else "peer" if cost.step != READ else "floor",
-                f"{cost.profiles:,}",
-                f"{cost.nanoseconds / 1e3:,.2f}",
-                f"{cost.reads:,.1f}",
-            )
-            for cost in costs
-            if cost.batch == batch
-        ),
-        note=f"Reads: multiples of {READ}. Profiles: per call, fewer for slow steps.",
-    )

@@ -6,7 +6,7 @@ The scores of the elastic retrieval are here too; `lidarops.bench.accuracy.elast
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -26,6 +26,8 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     scenarios,
 )
 from lidarops.bench.accuracy.peers import iterative_peers
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import MonteCarloFigure
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.retrieve.background.cubic_and_tail import cubic
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
@@ -44,14 +46,6 @@ _PAPER_STEP: Final = 15.0
 _PAPER_SIGNAL: Final = 17.0
 _PAPER_EXTINCTION: Final = 3e-5
 _AVERAGED: Final = 100
-
-
-@dataclass(frozen=True, slots=True)
-class MonteCarloFigure:
-    """Statistic of random profiles, with its Monte Carlo standard error."""
-
-    value: float
-    error: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,33 +124,22 @@ class Accuracy:
     offsets: tuple[Offset, ...]
 
 
-def measure_homogeneous(
-    *,
-    quick: bool = False,
-    date: str = "",
-    profiles: int | None = None,
-    progress: Callable[[int], object] = lambda _: None,
-) -> Accuracy:
+def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Accuracy:
     """Solve simulated profiles by every method of `fit_homogeneous_path` and by iterative peers.
 
     Parameters
     ----------
-    quick : bool
-        8 scenarios, fewer profiles.
-    date : str
-        Date to state.
+    effort : Effort
     profiles : int, optional
         Per scenario; the peers of scipy get a twentieth of them, at least 16.
-    progress : callable
-        Called with 1 after each scenario.
     """
-    count = profiles or (QUICK_PROFILES if quick else PROFILES)
+    count = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
     solvers = {**methods(), **iterative_peers()}
     cases = []
-    for seed, scenario in enumerate(scenarios(quick=quick)):
+    for seed, scenario in enumerate(scenarios(quick=effort.quick)):
         cases.append(_case(scenario, solvers, scenario.powers(count, seed)))
-        progress(1)
-    return Accuracy(date, machine(), tuple(cases), tuple(offsets(count)))
+        effort.progress(1)
+    return Accuracy(effort.date, machine(), tuple(cases), tuple(offsets(count)))
 
 
 def offsets(count: int) -> list[Offset]:

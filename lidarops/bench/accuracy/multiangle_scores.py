@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 from typing import Final
@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.bench.accuracy import multiangle_cases as cases
-from lidarops.bench.accuracy.homogeneous import SIGMAS, MonteCarloFigure
+from lidarops.bench.accuracy.homogeneous import SIGMAS
 from lidarops.bench.accuracy.multiangle_cases import Array, Scan, ScanEstimates, ScanSolver, Scene
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import MonteCarloFigure
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleFlags, MultiAngleResult
 
@@ -218,41 +220,30 @@ class MultiAngle:
     safety: tuple[SafetyScore, ...]
 
 
-def measure_multiangle(
-    *,
-    quick: bool = False,
-    date: str = "",
-    size: StudySize | None = None,
-    progress: Callable[[int], object] = lambda _: None,
-) -> MultiAngle:
+def measure_multiangle(effort: Effort, *, size: StudySize | None = None) -> MultiAngle:
     """Score optical depth and extinction of simulated scans for every method and the peers.
 
     Parameters
     ----------
-    quick : bool
-        Fewer profiles.
-    date : str
-        Date of the run, for the report.
+    effort : Effort
     size : StudySize, optional
         Numbers of blocks, profiles and scenes.
-    progress : callable
-        Called with 1 after each of 8 parts.
     """
-    size = size or (QUICK if quick else FULL)
+    size = size or (QUICK if effort.quick else FULL)
     compared = []
     for number, scene in enumerate(cases.scan_scenes()):
         compared.append(_compare(scene, size, number))
-        progress(1)
+        effort.progress(1)
     published = tuple(_published(size))
-    progress(1)
+    effort.progress(1)
     priors, correlations = tuple(_priors(size)), tuple(_correlations(size))
-    progress(1)
+    effort.progress(1)
     outliers = tuple(score for share in OUTLIERS for score in _outliers(share, size))
-    progress(1)
+    effort.progress(1)
     safety = tuple(_safety(size))
-    progress(1)
+    effort.progress(1)
     return MultiAngle(
-        date, machine(), tuple(compared), published, priors, correlations, outliers, safety
+        effort.date, machine(), tuple(compared), published, priors, correlations, outliers, safety
     )
 
 

@@ -36,6 +36,7 @@ from lidarops.bench.accuracy.network_scores import (
     score,
     share_by_block,
 )
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import READ, machine
 from lidarops.retrieve.air import visibility as sight
 from lidarops.retrieve.network.extinction_field import NetworkResult
@@ -66,35 +67,22 @@ class _Chunks:
 
 
 def measure_network(
-    *,
-    quick: bool = False,
-    date: str = "",
-    profiles: int | None = None,
-    repeats: int | None = None,
-    peer_profiles: int | None = None,
-    progress: Callable[[int], object] = lambda _: None,
+    effort: Effort, *, profiles: int | None = None, peer_profiles: int | None = None
 ) -> NetworkAccuracy:
     """Retrieve extinction in every network, air and noise, with every solver.
 
     Parameters
     ----------
-    quick : bool
-        Use fewer profiles.
-    date : str
-        Date of the run, for the report.
+    effort : Effort
     profiles : int, optional
         Number of profiles of each case, rounded up to whole blocks.
-    repeats : int, optional
-        Number of timed repeats of the cycles.
     peer_profiles : int, optional
         Number of profiles of each comparison with a plain fit.
-    progress : callable
-        Called with 1 after each case.
     """
-    profile_count = profiles or (QUICK_PROFILES if quick else PROFILES)
+    profile_count = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
     blocks = -(-profile_count // network_cases.BLOCK)
     chunks = _Chunks(-(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * network_cases.BLOCK)
-    peer_profiles = peer_profiles or (_QUICK_PEER_PROFILES if quick else _PEER_PROFILES)
+    peer_profiles = peer_profiles or (_QUICK_PEER_PROFILES if effort.quick else _PEER_PROFILES)
     cases, visibility_scores = [], []
     for lidars in network_cases.LIDAR_LINES:
         net = lidars.network()
@@ -104,15 +92,15 @@ def measure_network(
             cases.append(scenario)
             if lidars is network_cases.THREE_BY_TWO and air is network_cases.VISIBILITY_AIR:
                 visibility_scores += _visibility_scores(results, signals[air.name], noise)
-            progress(1)
+            effort.progress(1)
     return NetworkAccuracy(
-        date=date,
+        date=effort.date,
         machine=machine(),
         cases=tuple(cases),
         figure=figure_points(),
         sights=tuple(visibility_scores),
         comparisons=tuple(_comparisons(peer_profiles)),
-        cycles=tuple(cycle_rates(quick=True, repeats=repeats or _QUICK_REPEATS)),
+        cycles=tuple(cycle_rates(quick=True, repeats=effort.repeats or _QUICK_REPEATS)),
     )
 
 

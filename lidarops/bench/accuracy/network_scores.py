@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.accuracy.homogeneous import SIGMAS, MonteCarloFigure
+from lidarops.bench.accuracy.homogeneous import SIGMAS
 from lidarops.bench.accuracy.network_cases import BLOCK, Array, FigurePoint
+from lidarops.bench.harness.rows import MonteCarloFigure
 from lidarops.bench.harness.timing import Machine
 from lidarops.retrieve.network.extinction_field import NetworkResult
 

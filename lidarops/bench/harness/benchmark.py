@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol
 
 from lidarops.bench.harness.timing import Machine
-from lidarops.reports import benchmark_page
+from lidarops.reports.benchmark_page import BenchmarkReport, Part
 
 RESULT: Final = "result.json"
 """Name of the JSON file with the results, beside the page."""
@@ -29,7 +29,7 @@ class BenchmarkOutput:
 
     result: object
     """A frozen dataclass, or a list of them."""
-    report: benchmark_page.BenchmarkReport
+    report: BenchmarkReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,23 @@ class Effort:
     """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
+
+
+class Study(Protocol):
+    """Result of a study, which states when and on which machine it was made."""
+
+    @property
+    def date(self) -> str:
+        """Date of the run."""
+
+    @property
+    def machine(self) -> Machine:
+        """Machine and software of the run."""
+
+
+def study_page(title: str, study: Study, *parts: Part) -> BenchmarkReport:
+    """Return the page of a study, with these chapters."""
+    return BenchmarkReport(title, facts(study.date, study.machine), parts, RESULT)
 
 
 def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
+from lidarops.bench.harness.rows import MonteCarloFigure
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.flags import FlagBit, Quality, rejecting
 

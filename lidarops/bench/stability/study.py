@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, Effort
+from lidarops.bench.harness.benchmark import BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.stability import (
     random_elastic,
@@ -103,7 +103,7 @@ def run_stability(effort: Effort) -> BenchmarkOutput:
         A `Stability` and its page.
     """
     stability = measure_stability(effort)
-    return BenchmarkOutput(stability, stability_report.stability_report(stability, RESULT))
+    return BenchmarkOutput(stability, stability_report.stability_report(stability))
 
 
 def _outcomes(progress: Callable[[int], object]) -> Iterator[CaseOutcome]:

@@ -15,14 +15,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from lidarops.bench.harness.benchmark import (
-    CAMPAIGN_FILE,
-    RESULT,
-    BenchmarkKind,
-    BenchmarkOutput,
-    Effort,
-    facts,
-)
+from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort, study_page
+from lidarops.bench.harness.rows import Row, Unit, chart, panel, table
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import stand_in_archives
 from lidarops.bench.throughput.campaigns import CampaignSize, simulate_campaign
@@ -31,13 +25,11 @@ from lidarops.campaign.model import load_campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
 from lidarops.figures import wording
-from lidarops.figures.charts import Chart, Panel, Series
-from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part
 from lidarops.run import archive
 from lidarops.run.staleness import Judge
 
-_NOTHING: Final = "-"
-_MICRO: Final = 1e6
+_PER_FILE: Final = "CPU time per file"
 _FILES_PER_SCENE: Final = 480
 _BINS: Final = 200
 _STATUS: Final = Path("/proc/self/status")
@@ -106,58 +98,37 @@ _QUICK_STAND_INS: Final = StandIns(instruments=4, days=10)
 _TO_WARM: Final = CampaignSize(1, 30, _BINS, retrieved=False)
 
 
-def run_archives(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
-    """Run the benchmark of archives.
-
-    Raises
-    ------
-    CampaignError
-        If its accuracy is requested.
-    """
-    if kind is not BenchmarkKind.THROUGHPUT:
-        raise CampaignError("an archive has no accuracy benchmark", remedy="choose throughput")
-    archives_result = measure_archives(
-        _QUICK if effort.quick else SIZES,
-        _QUICK_STAND_INS if effort.quick else STAND_INS,
-        date=effort.date,
-        progress=effort.progress,
-    )
-    return BenchmarkOutput(archives_result, archives_report(archives_result, RESULT))
-
-
 def measure_archives(
-    sizes: Sequence[CampaignSize],
-    stand_ins: StandIns,
+    effort: Effort,
     *,
-    date: str = "",
-    progress: Callable[[int], object] = lambda _: None,
+    sizes: Sequence[CampaignSize] | None = None,
+    stand_ins: StandIns | None = None,
 ) -> Archives:
     """Simulate archives in temporary folders, and time the operations on them.
 
     Parameters
     ----------
-    sizes : sequence of CampaignSize
+    effort : Effort
+    sizes : sequence of CampaignSize, optional
         Archives with real files.
-    stand_ins : StandIns
+    stand_ins : StandIns, optional
         Archive of stand-ins, which exists only in catalog and ledger.
-    date : str
-        Date stated in the result.
-    progress : callable
-        Called with 1 after each archive.
     """
+    sizes = sizes or (_QUICK if effort.quick else SIZES)
+    stand_ins = stand_ins or (_QUICK_STAND_INS if effort.quick else STAND_INS)
     measured = []
     for size in sizes:
         with _folders() as (small, large):
             simulate_campaign(_TO_WARM, small)
             simulate_campaign(size, large)
             measured.append(_measure(size.files, _OF_FILES, (small, large), read=True))
-        progress(1)
+        effort.progress(1)
     with _folders() as (small, large):
         stand_in_archives.write_stand_ins(StandIns(instruments=1, days=1), small / CAMPAIGN_FILE)
         stand_in_archives.write_stand_ins(stand_ins, large / CAMPAIGN_FILE)
         measured.append(_measure(stand_ins.files, _OF_ROWS, (small, large), read=False))
-    progress(1)
-    return Archives(date, machine(), tuple(measured))
+    effort.progress(1)
+    return Archives(effort.date, machine(), tuple(measured))
 
 
 @contextmanager
@@ -242,63 +213,55 @@ def growth(first: ArchiveCost, last: ArchiveCost, operation: Pass) -> float:
     return (last.spent[operation].cpu / last.files) / (first.spent[operation].cpu / first.files)
 
 
-def archives_report(archives: Archives, data: str = "") -> BenchmarkReport:
+def archives_report(archives: Archives) -> BenchmarkReport:
     """Return the report page."""
-    real_archives = [cost for cost in archives.measured if cost.read]
-    chapter = Part(
-        title="Cost per file, and its growth with the archive",
-        text="Simulated archives of one lidar on a local disk, in one process. The process has "
-        "done the same with a small archive before, so imports and compilation are not counted. "
-        "TMPDIR selects the disk.",
-        charts=(_chart(real_archives),),
-        tables=tuple(_table(archives.measured, operation) for operation in Pass),
-    )
-    return BenchmarkReport(
-        title="Archives: cost per file",
-        facts=facts(archives.date, archives.machine),
-        parts=(chapter,),
-        data=data,
-    )
-
-
-def _chart(costs: Sequence[ArchiveCost]) -> Chart:
-    series = tuple(
-        Series(
-            operation.value,
-            tuple(float(cost.files) for cost in costs),
-            tuple(_MICRO * cost.spent[operation].cpu / cost.files for cost in costs),
-            joined=True,
-        )
+    rows = {
+        operation: [
+            row
+            for cost in archives.measured
+            if operation in cost.spent
+            for row in _rows(archives.measured, cost, operation)
+        ]
         for operation in Pass
-        if all(operation in cost.spent for cost in costs)
-    )
-    return Chart(
-        name="archive",
-        title="CPU time per file",
-        caption="A horizontal line is a cost that does not grow with the archive.",
-        panels=(Panel("", "files", "CPU time per file (\N{MICRO SIGN}s)", series),),
+    }
+    drawn = [row for group in rows.values() for row in group if row.case.isdecimal()]
+    return study_page(
+        "Archives: cost per file",
+        archives,
+        Part(
+            title="Cost per file, and its growth with the archive",
+            text="Simulated archives of one lidar on a local disk, in one process. The process has "
+            "done the same with a small archive before, so imports and compilation are not "
+            "counted. TMPDIR selects the disk.",
+            charts=(
+                chart(
+                    "archive",
+                    "CPU time per file",
+                    "A horizontal line is a cost that does not grow with the archive.",
+                    (panel("", drawn, _PER_FILE, x="files", joined=True),),
+                ),
+            ),
+            tables=tuple(
+                table(
+                    f"{operation.value}: {_ABOUT[operation]}",
+                    group,
+                    "Rows: empty files stand in for those of the catalog, and are not read.",
+                    case="files",
+                )
+                for operation, group in rows.items()
+            ),
+        ),
     )
 
 
-def _table(measured: Sequence[ArchiveCost], operation: Pass) -> Table:
-    costs = [cost for cost in measured if operation in cost.spent]
-    rows = []
-    for cost in costs:
-        spent = cost.spent[operation]
-        first = next(other for other in costs if other.read is cost.read)
-        rows.append(
-            (
-                f"{cost.files:,}" + ("" if cost.read else " rows"),
-                f"{spent.cpu:.3g}",
-                f"{spent.wall:.3g}",
-                f"{_MICRO * spent.cpu / cost.files:.3g}",
-                _NOTHING if cost is first else f"{growth(first, cost, operation):.2f}",
-                wording.size(spent.peak),
-            )
-        )
-    return Table(
-        title=f"{operation.value}: {_ABOUT[operation]}",
-        columns=("files", "CPU s", "wall s", "us per file", "times the first", "peak memory"),
-        rows=tuple(rows),
-        note="Rows: empty files stand in for those of the catalog, and are not read.",
-    )
+def _rows(measured: Sequence[ArchiveCost], cost: ArchiveCost, operation: Pass) -> list[Row]:
+    case, spent = f"{cost.files}" + ("" if cost.read else " rows"), cost.spent[operation]
+    first = next(c for c in measured if operation in c.spent and c.read is cost.read)
+    larger = None if cost is first else growth(first, cost, operation)
+    return [
+        Row(case, operation, "CPU s", spent.cpu),
+        Row(case, operation, "wall s", spent.wall),
+        Row(case, operation, _PER_FILE, spent.cpu / cost.files * 1e9, unit=Unit.TIME),
+        Row(case, operation, "times the first", larger),
+        Row(case, operation, "peak memory", wording.size(spent.peak)),
+    ]

@@ -16,20 +16,12 @@ import numpy as np
 import yaml
 from scipy import stats
 
-from lidarops.bench.harness.benchmark import (
-    CAMPAIGN_FILE,
-    RESULT,
-    BenchmarkKind,
-    BenchmarkOutput,
-    Effort,
-    facts,
-)
+from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort, study_page
+from lidarops.bench.harness.rows import Row, Unit, chart, panel, table
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import orchestration
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
-from lidarops.figures.charts import Chart, Panel, Series
-from lidarops.figures.wording import percent
 from lidarops.netcdf.write import write_plain
 from lidarops.records import RunRecord
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
@@ -39,7 +31,7 @@ from lidarops.simulate.campaign import plan_simulation, write_simulation
 _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = 60
 """s; duration of a file."""
-_NOTHING: Final = "-"
+_CPU: Final = "CPU time (s)"
 _MILLI: Final = 1e3
 _SHORTEST: Final = 1e-4
 """s; least time, because a coarse clock may not advance during a fast call."""
@@ -132,43 +124,24 @@ _WORKER_SIZE: Final = CampaignSize(scenes=16, profiles=60)
 COMMAND_SIZES: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
 
 
-def run_campaigns(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
-    """Run the throughput benchmark of whole campaigns.
-
-    Raises
-    ------
-    CampaignError
-        If its accuracy is requested.
-    """
-    if kind is not BenchmarkKind.THROUGHPUT:
-        raise CampaignError("the case 'campaigns' has no accuracy", remedy="choose throughput")
-    result = measure_campaigns(quick=effort.quick, date=effort.date, progress=effort.progress)
-    return BenchmarkOutput(result, campaigns_report(result, RESULT))
-
-
 def measure_campaigns(
+    effort: Effort,
     *,
-    quick: bool = False,
-    date: str = "",
     along: Mapping[str, Sequence[CampaignSize]] | None = None,
     workers: Sequence[int] | None = None,
-    progress: Callable[[int], object] = lambda _: None,
 ) -> CampaignStudy:
     """Simulate campaigns of several sizes in temporary folders, and time their processing.
 
     Parameters
     ----------
-    quick : bool
-        Fewer and smaller campaigns, one worker.
-    date : str
-        Date stated in the result.
+    effort : Effort
+        A quick run has fewer and smaller campaigns, and one worker.
     along : mapping of str to sequence of CampaignSize, optional
         Sizes for each varied property, at least 2.
     workers : sequence of int, optional
         Numbers of processes to compare.
-    progress : callable
-        Called with 1 after each campaign.
     """
+    quick, progress = effort.quick, effort.progress
     growths = []
     # The first campaign of a process includes imports and compilation; it is not counted.
     _cost(CampaignSize(scenes=1, profiles=15), progress)
@@ -178,7 +151,7 @@ def measure_campaigns(
     counts = workers if workers is not None else (() if quick else (1, 2))
     times = {count: _wall(count, progress) for count in counts}
     commands = _time_commands(progress) if workers is None and not quick else ()
-    return CampaignStudy(date, machine(), tuple(growths), times, commands)
+    return CampaignStudy(effort.date, machine(), tuple(growths), times, commands)
 
 
 def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
@@ -346,22 +319,15 @@ def _slopes(
 # Page -----------------------------------------------------------------------------------------
 
 
-def campaigns_report(study: CampaignStudy, data: str = "") -> BenchmarkReport:
+def campaigns_report(study: CampaignStudy) -> BenchmarkReport:
     """Return the report page."""
-    return BenchmarkReport(
-        title="Campaigns: CPU time by stage",
-        facts=facts(study.date, study.machine),
-        parts=tuple(_parts_of_page(study)),
-        data=data,
-    )
-
-
-def _parts_of_page(study: CampaignStudy) -> Iterator[Part]:
-    yield _stages(study)
+    parts = [_stages(study)]
     if study.workers:
-        yield _workers(study)
+        parts.append(_workers(study))
     if study.modes:
-        yield orchestration.orchestration_part(study.modes, [size.scenes for size in COMMAND_SIZES])
+        scenes = [size.scenes for size in COMMAND_SIZES]
+        parts.append(orchestration.orchestration_part(study.modes, scenes))
+    return study_page("Campaigns: CPU time by stage", study, *parts)
 
 
 def _stages(study: CampaignStudy) -> Part:
@@ -372,62 +338,68 @@ def _stages(study: CampaignStudy) -> Part:
         "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
         "interval; 1 is linear.",
         charts=(
-            Chart(
-                name="growth",
-                title="CPU time of a campaign",
-                caption="One line per stage; a slope of 1 means a constant cost per item.",
-                panels=tuple(_panel(growth) for growth in study.growths),
+            chart(
+                "growth",
+                "CPU time of a campaign",
+                "One line per stage; a slope of 1 means a constant cost per item.",
+                tuple(
+                    panel(
+                        growth.along,
+                        [
+                            Row(f"{getattr(cost.size, growth.along)}", stage, _CPU, seconds)
+                            for cost in growth.costs
+                            for stage, seconds in cost.seconds.items()
+                        ],
+                        _CPU,
+                        x=f"number of {growth.along}",
+                        joined=True,
+                    )
+                    for growth in study.growths
+                ),
             ),
         ),
         tables=tuple(_table(growth) for growth in study.growths),
     )
 
 
-def _panel(growth: Growth) -> Panel:
-    sizes = tuple(float(getattr(cost.size, growth.along)) for cost in growth.costs)
-    return Panel(
-        title=growth.along,
-        x_label=f"number of {growth.along}",
-        y_label="CPU time (s)",
-        series=tuple(
-            Series(stage, sizes, tuple(cost.seconds[stage] for cost in growth.costs), joined=True)
-            for stage in Stage
-        ),
-    )
-
-
 def _table(growth: Growth) -> Table:
-    largest = growth.costs[-1]
-    total = sum(largest.seconds[stage] for stage in Stage if stage is not Stage.UNCHANGED)
+    size, spent = growth.costs[-1].size, growth.costs[-1].seconds
+    total = sum(seconds for stage, seconds in spent.items() if stage is not Stage.UNCHANGED)
     rows = []
-    for stage in Stage:
+    for stage, seconds in spent.items():
         slope, half = growth.slopes[stage]
-        seconds = largest.seconds[stage]
-        share = _NOTHING if stage is Stage.UNCHANGED else percent(seconds / total)
-        per_file = f"{_MILLI * seconds / largest.size.files:.3g}"
-        slope_text = f"{slope:.2f} ± {half:.2f}"
-        rows.append((stage.value, _ABOUT[stage], f"{seconds:.3g}", share, per_file, slope_text))
-    size = largest.size
-    return Table(
-        title=f"By number of {growth.along}; times at {getattr(size, growth.along)}",
-        columns=("stage", "work", "CPU s", "share", "ms per file", "slope"),
-        rows=tuple(rows),
-        note=f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
+        share = None if stage is Stage.UNCHANGED else seconds / total
+        rows += [
+            Row("", stage, "work", _ABOUT[stage]),
+            Row("", stage, _CPU, seconds),
+            Row("", stage, "share", share, unit=Unit.SHARE),
+            Row("", stage, "ms per file", _MILLI * seconds / size.files),
+            Row("", stage, "slope", f"{slope:.2f} ± {half:.2f}"),
+        ]
+    return table(
+        f"By number of {growth.along}; times at {getattr(size, growth.along)}",
+        rows,
+        f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
         + (f", {size.angles} directions." if size.angles else "."),
+        method="stage",
     )
 
 
 def _workers(study: CampaignStudy) -> Part:
     single = study.workers.get(1)
-    rows = tuple(
-        (f"{count}", f"{seconds:.1f}", f"{single / seconds:.2f}" if single else _NOTHING)
+    rows = [
+        row
         for count, seconds in study.workers.items()
-    )
+        for row in (
+            Row("", f"{count}", "s", seconds),
+            Row("", f"{count}", "speedup", single / seconds if single else None),
+        )
+    ]
     size = _WORKER_SIZE
-    table = Table(
-        title="Wall time by number of processes",
-        columns=("processes", "s", "speedup"),
-        rows=rows,
-        note=f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
+    wall = table(
+        "Wall time by number of processes",
+        rows,
+        f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
+        method="processes",
     )
-    return Part(title="Processes", text="The same campaign on one machine.", tables=(table,))
+    return Part(title="Processes", text="The same campaign on one machine.", tables=(wall,))

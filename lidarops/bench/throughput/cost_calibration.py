@@ -24,14 +24,8 @@ import numpy as np
 import yaml
 from scipy.optimize import nnls
 
-from lidarops.bench.harness.benchmark import (
-    CAMPAIGN_FILE,
-    RESULT,
-    BenchmarkKind,
-    BenchmarkOutput,
-    Effort,
-    facts,
-)
+from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort, study_page
+from lidarops.bench.harness.rows import Row, table
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
@@ -42,7 +36,7 @@ from lidarops.plan.cost_estimate import Costs, Term
 from lidarops.process.job import Job
 from lidarops.process.scene import process_scene
 from lidarops.records import RunRecord
-from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part
 from lidarops.run import archive
 from lidarops.simulate.campaign import plan_simulation, write_simulation
 from lidarops.steps import dependence
@@ -106,65 +100,45 @@ def accuracy_warning(calibration: Calibration) -> str:
     )
 
 
-def run_cost_calibration(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
-    """Calibrate this machine, and save the costs for ``lidarops plan``.
-
-    Raises
-    ------
-    CampaignError
-        If accuracy is requested.
-    CatalogError
-        If the calibration cannot be saved.
-    """
-    if kind is not BenchmarkKind.THROUGHPUT:
-        raise CampaignError("costs have no accuracy benchmark", remedy="choose throughput")
-    rounds = effort.repeats or (1 if effort.quick else _ROUNDS)
-    calibration = calibrate(date=effort.date, rounds=rounds, progress=effort.progress)
-    if warning := accuracy_warning(calibration):
-        _LOG.warning(warning)
-    return BenchmarkOutput(calibration, calibration_report(calibration, RESULT))
-
-
 def calibrate(
-    *,
-    date: str = "",
-    rounds: int = _ROUNDS,
-    path: Path | None = None,
-    progress: Callable[[int], object] = lambda _: None,
+    effort: Effort, *, rounds: int | None = None, path: Path | None = None
 ) -> Calibration:
-    """Measure the costs of this machine, in about a minute after compilation.
+    """Measure the costs of this machine, in about a minute after compilation, and save them.
 
     Parameters
     ----------
-    date : str
-        Date stated in the result.
-    rounds : int
+    effort : Effort
+    rounds : int, optional
         The median of these counts.
     path : Path, optional
         File for the costs, instead of the user's cache.
-    progress : callable
-        Called with 1 after each round, and after the report.
+
+    Raises
+    ------
+    CatalogError
+        If the calibration cannot be saved.
     """
+    rounds = rounds or effort.repeats or (1 if effort.quick else _ROUNDS)
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         campaign = _simulated(Path(folder))
         # The first run includes compilation and loading; it is not counted.
         record = archive.reprocess(campaign)
         if record is None or any(scene.error for scene in record.scenes):
             raise CampaignError("the simulated campaign cannot be processed", field="simulation")
-        progress(1)
-        observations = _scenes(campaign, rounds, progress)
+        effort.progress(1)
+        observations = _scenes(campaign, rounds, effort.progress)
         seconds = fit_costs(observations)
         seconds |= _report(campaign, record) | _load_times(campaign)
-        progress(1)
+        effort.progress(1)
         seconds[Term.RUN] = _run_cost(campaign, Costs(seconds | {Term.RUN: 0.0}))
-        progress(1)
+        effort.progress(1)
     this_machine = machine()
     saved = cost_estimate.save_calibration(
-        Costs(seconds, processor=this_machine.processor, date=date), path
+        Costs(seconds, processor=this_machine.processor, date=effort.date), path
     )
     model = Costs(seconds)
     return Calibration(
-        date=date,
+        date=effort.date,
         machine=this_machine,
         seconds={term: seconds[term] for term in cost_estimate.default_costs()},
         observations=tuple(
@@ -509,41 +483,48 @@ def _simulation(lidar: _Lidar) -> dict[str, Any]:
 # Page -----------------------------------------------------------------------------------------
 
 
-def calibration_report(calibration: Calibration, data: str = "") -> BenchmarkReport:
+def calibration_report(calibration: Calibration) -> BenchmarkReport:
     """Return the page of a calibration."""
-    terms = Table(
-        title="Costs by term",
-        columns=("term", "CPU s per unit", "default"),
-        rows=tuple(
-            (term, f"{calibration.seconds[term]:.3g}", f"{default:.3g}")
-            for term, default in cost_estimate.default_costs().items()
-        ),
-        note=f"Saved in {calibration.path}; lidarops plan estimates run times with them.",
-    )
-    scenes = Table(
-        title="Calibration scenes",
-        columns=("instrument", "products", "CPU s", "estimated", "ratio"),
-        rows=tuple(
-            (
-                observation.scene,
-                ", ".join(observation.products),
-                f"{observation.seconds:.3f}",
-                f"{observation.estimated:.3f}",
-                f"{observation.estimated / observation.seconds:.2f}",
-            )
-            for observation in calibration.observations
-        ),
-    )
+    defaults = cost_estimate.default_costs()
+    terms = [
+        row
+        for term, default in defaults.items()
+        for row in (
+            Row("", term, "CPU s per unit", calibration.seconds[term]),
+            Row("", term, "default", default),
+        )
+    ]
+    scenes = [
+        row
+        for scene in calibration.observations
+        for row in (
+            Row(scene.scene, ", ".join(scene.products), "CPU s", scene.seconds),
+            Row(scene.scene, ", ".join(scene.products), "estimated", scene.estimated),
+            Row(scene.scene, ", ".join(scene.products), "ratio", scene.estimated / scene.seconds),
+        )
+    ]
     text = (
         "CPU time of simulated scenes of many kinds and sizes, whole and single products, as a sum"
         " over their contents. The worst estimate is off by a factor of"
         f" {calibration.largest_ratio:.2f}."
     )
     if warning := accuracy_warning(calibration):
+        _LOG.warning(warning)
         text += f" Do not trust them: {warning}."
-    return BenchmarkReport(
-        title="Costs: calibration of the estimates of run times",
-        facts=facts(calibration.date, calibration.machine),
-        parts=(Part(title="Costs of this machine", text=text, tables=(terms, scenes)),),
-        data=data,
+    return study_page(
+        "Costs: calibration of the estimates of run times",
+        calibration,
+        Part(
+            title="Costs of this machine",
+            text=text,
+            tables=(
+                table(
+                    "Costs by term",
+                    terms,
+                    f"Saved in {calibration.path}; lidarops plan estimates run times with them.",
+                    method="term",
+                ),
+                table("Calibration scenes", scenes, case="instrument", method="products"),
+            ),
+        ),
     )

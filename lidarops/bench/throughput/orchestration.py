@@ -7,14 +7,14 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from lidarops.bench.harness.rows import Row, Unit, table
 from lidarops.errors import SceneError
-from lidarops.figures.wording import percent
-from lidarops.reports.benchmark_page import Part, Table
+from lidarops.reports.benchmark_page import Part
 
 SERIAL: Final = "plain loop"
 _CLI: Final = ("-c", "from lidarops.cli import app; app()", "reprocess")
@@ -27,6 +27,8 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 JOB: Final = 300.0
 """s; CPU time of the plain loop for the job to which the table extrapolates."""
+_EXTRA: Final = f"extra CPU of a job of {JOB:.0f} s"
+_SHARE: Final = Unit.SHARE
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,29 +113,26 @@ def overhead(mode: RunMode, serial: RunMode) -> Overhead:
 def orchestration_part(modes: Sequence[RunMode], scenes: Sequence[int]) -> Part:
     """Return the chapter on workers and flows."""
     serial = next(mode for mode in modes if mode.name == SERIAL)
-    cells: list[Callable[[RunMode], str]] = [
-        lambda mode: f"{mode.cpu[-1]:.1f}",
-        lambda mode: f"{mode.wall[-1]:.1f}",
-        lambda mode: f"{overhead(mode, serial).fixed:.1f}",
-        lambda mode: percent(overhead(mode, serial).share),
-        lambda mode: percent(overhead(mode, serial).of(JOB)),
+    rows = [
+        row
+        for mode in modes
+        for row in (
+            Row("", mode.name, "CPU s", mode.cpu[-1]),
+            Row("", mode.name, "wall s", mode.wall[-1]),
+            Row("", mode.name, "fixed extra CPU s", overhead(mode, serial).fixed),
+            Row("", mode.name, "extra CPU of the rest", overhead(mode, serial).share, unit=_SHARE),
+            Row("", mode.name, _EXTRA, overhead(mode, serial).of(JOB), unit=_SHARE),
+        )
     ]
-    table = Table(
-        title=f"Whole commands, including the start of all processes, for {scenes[-1]} scenes",
-        columns=(
-            "command",
-            "CPU s",
-            "wall s",
-            "fixed extra CPU s",
-            "extra CPU of the rest",
-            f"extra CPU of a job of {JOB:.0f} s",
-        ),
-        rows=tuple((mode.name, *(cell(mode) for cell in cells)) for mode in modes),
-        note=f"Lines through campaigns of {scenes[0]} and {scenes[-1]} scenes. The flow starts its "
+    commands = table(
+        f"Whole commands, including the start of all processes, for {scenes[-1]} scenes",
+        rows,
+        f"Lines through campaigns of {scenes[0]} and {scenes[-1]} scenes. The flow starts its "
         "own Prefect server, which a deployment already has.",
+        method="command",
     )
     return Part(
         title="Workers and flows",
         text="The same campaign by the command line and as a flow. CPU time of all processes.",
-        tables=(table,),
+        tables=(commands,),
     )

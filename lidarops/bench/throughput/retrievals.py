@@ -17,6 +17,7 @@ from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.accuracy.elastic_costs import ELASTIC_LEVEL, elastic_costs
 from lidarops.bench.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
 from lidarops.bench.accuracy.peers import iterative_peers
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import (
     READ,
     Machine,
@@ -88,39 +89,27 @@ class SolverThroughput:
     threads: tuple[Threads, ...]
 
 
-def measure_solvers(
-    *,
-    quick: bool = False,
-    date: str = "",
-    profiles: int | None = None,
-    repeats: int | None = None,
-    progress: Callable[[int], object] = lambda _: None,
-) -> SolverThroughput:
+def measure_solvers(effort: Effort, *, profiles: int | None = None) -> SolverThroughput:
     """Time every method of `fit_homogeneous_path`, and the iterative peers, on one path with noise.
 
     Parameters
     ----------
-    quick : bool
-        Fewer profiles and repeats.
-    date : str
-        Date to state.
-    profiles, repeats : int, optional
-        Most profiles per call; timed rounds, of which the least counts.
-    progress : callable
-        Called with 1 after each setting.
+    effort : Effort
+    profiles : int, optional
+        Most profiles per call.
     """
-    count = profiles or (_QUICK_PROFILES if quick else _PROFILES)
-    rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
+    count = profiles or (_QUICK_PROFILES if effort.quick else _PROFILES)
+    rounds = effort.repeats or (_QUICK_REPEATS if effort.quick else _REPEATS)
     speeds: list[Speed] = []
     for setting in settings():
         speeds += _speeds(setting, count, rounds)
-        progress(1)
+        effort.progress(1)
     threads = [
         _threads(method, dtype, count, rounds)
         for method, dtype in product(THREADED, ("float32", "float64"))
         if method in set(HomogeneousMethod)
     ]
-    return SolverThroughput(date, machine(), PATH, tuple(speeds), tuple(threads))
+    return SolverThroughput(effort.date, machine(), PATH, tuple(speeds), tuple(threads))
 
 
 def settings() -> list[Setting]:
@@ -216,33 +205,21 @@ class ElasticThroughput:
     costs: tuple[StepCost, ...]
 
 
-def measure_elastic(
-    *,
-    quick: bool = False,
-    date: str = "",
-    batches: Sequence[int] | None = None,
-    repeats: int | None = None,
-    progress: Callable[[int], object] = lambda _: None,
-) -> ElasticThroughput:
+def measure_elastic(effort: Effort, *, batches: Sequence[int] | None = None) -> ElasticThroughput:
     """Time every step from counts to backscatter, and simple peers, on the simulated set.
 
     Parameters
     ----------
-    quick : bool
-        Fewer profiles and repeats.
-    date : str
-        Date to state.
+    effort : Effort
     batches : sequence of int, optional
         Profiles per call.
-    repeats : int, optional
-        Timed rounds, of which the least counts.
-    progress : callable
-        Called with 1 after each batch.
     """
-    sizes = batches or (_QUICK_BATCHES if quick else _BATCHES)
-    rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
+    sizes = batches or (_QUICK_BATCHES if effort.quick else _BATCHES)
+    rounds = effort.repeats or (_QUICK_REPEATS if effort.quick else _REPEATS)
     costs: list[StepCost] = []
     for size in sizes:
         costs += elastic_costs(size, rounds)
-        progress(1)
-    return ElasticThroughput(date, machine(), elastic_cases.RANGE.size, ELASTIC_LEVEL, tuple(costs))
+        effort.progress(1)
+    return ElasticThroughput(
+        effort.date, machine(), elastic_cases.RANGE.size, ELASTIC_LEVEL, tuple(costs)
+    )

@@ -11,6 +11,7 @@ import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.bench.accuracy.multiangle_cases import Scan
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import READ, Machine, StepCost, least_times, machine
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
@@ -42,36 +43,24 @@ class MultiAngleThroughput:
 
 
 def measure_scan_kernels(
-    *,
-    quick: bool = False,
-    date: str = "",
-    batches: Sequence[int] | None = None,
-    repeats: int | None = None,
-    progress: Callable[[int], object] = lambda _: None,
+    effort: Effort, *, batches: Sequence[int] | None = None
 ) -> MultiAngleThroughput:
     """Time kernels, methods and peers on clear air, beside reading the inputs.
 
     Parameters
     ----------
-    quick : bool
-        Fewer profiles and repeats.
-    date : str
-        Date of the run, for the report.
+    effort : Effort
     batches : sequence of int, optional
-        Profiles of one call.
-    repeats : int, optional
-        Timed rounds, of which the least time is taken.
-    progress : callable
-        Called with 1 after each batch.
+        Profiles per call.
     """
     scene = cases.clear(3000.0)
     costs: list[StepCost] = []
-    for batch in batches or (_QUICK_BATCHES if quick else _BATCHES):
-        rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
+    for batch in batches or (_QUICK_BATCHES if effort.quick else _BATCHES):
+        rounds = effort.repeats or (_QUICK_REPEATS if effort.quick else _REPEATS)
         costs += _costs(scene.draw(batch, batch, 8), rounds)
-        progress(1)
+        effort.progress(1)
     angles, altitudes = scene.path.size, scene.altitude.size
-    return MultiAngleThroughput(date, machine(), angles, altitudes, tuple(costs))
+    return MultiAngleThroughput(effort.date, machine(), angles, altitudes, tuple(costs))
 
 
 def _costs(scan: Scan, repeats: int) -> Iterator[StepCost]:

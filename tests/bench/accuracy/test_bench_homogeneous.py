@@ -38,12 +38,12 @@ PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e
 
 @pytest.fixture(scope="module")
 def accuracy() -> homogeneous.Accuracy:
-    return homogeneous.measure_homogeneous(quick=True, date="2024-01-01", profiles=200)
+    return homogeneous.measure_homogeneous(Effort(quick=True, date="2024-01-01"), profiles=200)
 
 
 @pytest.fixture(scope="module")
 def timed() -> retrievals.SolverThroughput:
-    return retrievals.measure_solvers(profiles=40, repeats=1, date="2024-01-01")
+    return retrievals.measure_solvers(Effort(repeats=1, date="2024-01-01"), profiles=40)
 
 
 def _bound_by_mpmath(path: Scenario) -> dict[str, float]:
@@ -239,8 +239,8 @@ def test_results_survive_json(accuracy, timed, tmp_path):
 
 def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
     reports = {
-        "accuracy": homogeneous_report.homogeneous_accuracy_report(accuracy, "result.json"),
-        "throughput": retrieval_reports.homogeneous_throughput_report(timed, "result.json"),
+        "accuracy": homogeneous_report.homogeneous_accuracy_report(accuracy),
+        "throughput": retrieval_reports.homogeneous_throughput_report(timed),
     }
     for name, report in reports.items():
         folder = tmp_path / name
@@ -285,18 +285,18 @@ def test_wrong_use_is_refused(quantity, case, files, error, message):
 
 
 def test_the_command_prints_writes_and_dates(monkeypatch, accuracy, tmp_path):
-    passed = {}
+    passed = []
 
-    def measure(**arguments):
-        passed.update(arguments)
+    def measure(effort):
+        passed.append(effort)
         return accuracy
 
     monkeypatch.setattr(homogeneous, "measure_homogeneous", measure)
     words = ["bench", "accuracy", "--case", "homogeneous", "--quick", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
-    assert passed["quick"]
-    assert len(passed["date"]) == len("2024-01-01")
+    assert passed[0].quick
+    assert len(passed[0].date) == len("2024-01-01")
     assert "compressed" in result.stdout
     assert "index.html" in result.stdout.replace("\n", "")
     printed = CliRunner().invoke(app, [*words, "--json"])

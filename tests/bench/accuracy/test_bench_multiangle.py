@@ -11,12 +11,12 @@ from scipy.integrate import quad
 
 from lidarops.bench import registry
 from lidarops.bench.accuracy import multiangle_cases, multiangle_report, multiangle_scores
-from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.multiangle_scores import StudySize
 from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import RESULT, Effort
+from lidarops.bench.harness.rows import MonteCarloFigure
 from lidarops.bench.harness.timing import READ
-from lidarops.bench.throughput import scan_kernels, scan_report
+from lidarops.bench.throughput import retrieval_reports, scan_kernels
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleFlags,
@@ -36,7 +36,7 @@ def study():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
         result = multiangle_scores.measure_multiangle(
-            date="2024-01-01", size=SMALL, progress=steps.append
+            Effort(date="2024-01-01", progress=steps.append), size=SMALL
         )
     assert steps == [1] * (len(scenes) + 4)
     return result
@@ -44,7 +44,7 @@ def study():
 
 @pytest.fixture(scope="module")
 def timed():
-    return scan_kernels.measure_scan_kernels(date="2024-01-01", batches=(1, 2), repeats=1)
+    return scan_kernels.measure_scan_kernels(Effort(date="2024-01-01", repeats=1), batches=(1, 2))
 
 
 def without_noise(scene):
@@ -346,8 +346,8 @@ def test_times_are_multiples_of_the_read(timed):
 
 def test_pages_have_tables_and_figures(study, timed, tmp_path):
     reports = {
-        "accuracy": multiangle_report.multiangle_accuracy_report(study, RESULT),
-        "throughput": scan_report.multiangle_throughput_report(timed, RESULT),
+        "accuracy": multiangle_report.multiangle_accuracy_report(study),
+        "throughput": retrieval_reports.multiangle_throughput_report(timed),
     }
     for name, report in reports.items():
         folder = tmp_path / name
@@ -362,8 +362,8 @@ def test_pages_have_tables_and_figures(study, timed, tmp_path):
                 assert all(len(row) == len(table.columns) for row in table.rows)
     published = reports["accuracy"].parts[1]
     assert "this is not so" in published.text
-    # 2 angles, 2 numbers of beams, 3 shares; priors and correlations.
-    assert len(published.tables) + len(published.details) == 12 + 2
+    # 2 numbers of beams, 3 shares; priors and correlations.
+    assert len(published.tables) + len(published.details) == 6 + 2
 
 
 def test_results_survive_json(study, timed, tmp_path):
@@ -375,12 +375,12 @@ def test_results_survive_json(study, timed, tmp_path):
 def test_both_kinds_run(monkeypatch, study, timed):
     calls = []
 
-    def accuracy(**arguments):
-        calls.append(arguments)
+    def accuracy(effort):
+        calls.append(effort)
         return study
 
-    def throughput(**arguments):
-        calls.append(arguments)
+    def throughput(effort):
+        calls.append(effort)
         return timed
 
     monkeypatch.setattr(multiangle_scores, "measure_multiangle", accuracy)
@@ -388,18 +388,4 @@ def test_both_kinds_run(monkeypatch, study, timed):
     effort = Effort(quick=True, repeats=2, date="2024-01-01")
     assert registry.run_benchmark("accuracy", "multiangle", [], effort).result is study
     assert registry.run_benchmark("throughput", "multiangle", [], effort).result is timed
-    assert [call["quick"] for call in calls] == [True, True]
-    assert calls[1]["repeats"] == 2
-
-
-@pytest.mark.parametrize(
-    ("value", "error", "sign", "text"),
-    [
-        (2.0817, 0.019, False, "2.08(2)"),
-        (-0.0126, 0.0009, True, "-0.0126(9)"),
-        (51.2, 12.0, True, "+51(12)"),
-        (2.737, 0.0, False, "2.74"),
-    ],
-)
-def test_errors_are_given_in_units_of_the_last_digit(value, error, sign, text):
-    assert multiangle_report.with_error(MonteCarloFigure(value, error), sign=sign) == text
+    assert calls == [effort, effort]

@@ -13,15 +13,11 @@ from lidarops.bench import registry
 from lidarops.bench.accuracy import network as network_benchmark
 from lidarops.bench.accuracy import network_cases
 from lidarops.bench.accuracy import network_scores as scores
-from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
-from lidarops.bench.accuracy.network_report import (
-    bracketed,
-    network_accuracy_report,
-)
+from lidarops.bench.accuracy.network_report import network_accuracy_report
 from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import READ
-from lidarops.bench.throughput import networks
+from lidarops.bench.throughput import networks, retrieval_reports
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import solve_cycle, systematic_error
@@ -32,13 +28,13 @@ PROFILES = 3 * network_cases.BLOCK
 @pytest.fixture(scope="module")
 def accuracy():
     return network_benchmark.measure_network(
-        date="2024-01-01", profiles=PROFILES, repeats=1, peer_profiles=10
+        Effort(date="2024-01-01", repeats=1), profiles=PROFILES, peer_profiles=10
     )
 
 
 @pytest.fixture(scope="module")
 def throughput_result():
-    return networks.measure_network_throughput(quick=True, date="2024-01-01", repeats=1)
+    return networks.measure_network_throughput(Effort(quick=True, date="2024-01-01", repeats=1))
 
 
 @pytest.fixture(scope="module")
@@ -376,8 +372,8 @@ def test_times_are_multiples_of_the_read(accuracy, throughput_result):
 
 def test_pages_hold_tables_and_figures(accuracy, throughput_result, tmp_path):
     for name, report in (
-        ("accuracy", network_accuracy_report(accuracy, "result.json")),
-        ("throughput", networks.network_throughput_report(throughput_result, "result.json")),
+        ("accuracy", network_accuracy_report(accuracy)),
+        ("throughput", retrieval_reports.network_throughput_report(throughput_result)),
     ):
         folder = tmp_path / name
         text = build_benchmark_page(report, folder).read_text()
@@ -398,27 +394,18 @@ def test_results_survive_json(accuracy, throughput_result, tmp_path):
         assert results.load(type(result), path) == result
 
 
-@pytest.mark.parametrize(
-    ("value", "error", "text"),
-    [(4.17487, 0.00021, "4.1749(2)"), (-22.4, 1.6, "-22(2)"), (-40.0, 0.0, "-40")],
-)
-def test_errors_are_given_in_the_last_digits(value, error, text):
-    assert bracketed(MonteCarloFigure(value, error)) == text
-
-
 def test_the_command_runs_the_requested_benchmark(monkeypatch, accuracy, throughput_result):
-    received = {}
+    received = []
 
-    def measure(**arguments):
-        received.update(arguments)
+    def measure(effort):
+        received.append(effort)
         return accuracy
 
     monkeypatch.setattr(network_benchmark, "measure_network", measure)
-    monkeypatch.setattr(networks, "measure_network_throughput", lambda **_: throughput_result)
-    output = registry.run_benchmark(
-        "accuracy", "network", [], Effort(quick=True, date="2024-01-01")
-    )
-    assert (received["quick"], received["date"]) == (True, "2024-01-01")
+    monkeypatch.setattr(networks, "measure_network_throughput", lambda _: throughput_result)
+    effort = Effort(quick=True, date="2024-01-01")
+    output = registry.run_benchmark("accuracy", "network", [], effort)
+    assert received == [effort]
     assert output.result is accuracy
     assert output.report.data == "result.json"
     throughput = registry.run_benchmark("throughput", "network", [], Effort())

@@ -84,7 +84,7 @@ def test_false_values_of_few_clusters_leave_the_target_undecided():
     assert rate.false_random.value == pytest.approx(0.1)
     assert (rate.verdict, rate.needless_verdict) == (Verdict.UNDECIDED, Verdict.MET)
     assert stability_report._targets([rate]) == "Undecided: none (x)."
-    assert stability_report._row(rate)[13] == "0.1 % undecided; needless 5 % met"
+    assert stability_report.goal(rate) == "0.1 % undecided; needless 5 % met"
 
 
 def test_rejected_values_are_not_false_and_may_be_needless():
@@ -227,9 +227,7 @@ def stability():
 
 
 def test_page_names_cases_and_undetectable_violations(stability, tmp_path):
-    page = build_benchmark_page(
-        stability_report.stability_report(stability, "result.json"), tmp_path
-    ).read_text()
+    page = build_benchmark_page(stability_report.stability_report(stability), tmp_path).read_text()
     assert "visibility of extinction" in page
     assert "no: an exponential of range has the shape of extinction itself" in page
     assert "False values: homogeneous" in page

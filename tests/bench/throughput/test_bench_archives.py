@@ -7,7 +7,7 @@ import json
 import pytest
 
 from lidarops.bench import registry
-from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
+from lidarops.bench.harness.benchmark import BenchmarkOutput, Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import archives, stand_in_archives
 from lidarops.bench.throughput.archives import ArchiveCost, Pass, ProcessCost
@@ -50,10 +50,9 @@ def measured_archives():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(archives, "_cost_in_process", archives._cost)
         result = archives.measure_archives(
-            [CampaignSize(scenes=n, profiles=15, bins=100, retrieved=False) for n in (1, 2)],
-            SMALL,
-            date="2024-01-01",
-            progress=steps.append,
+            Effort(date="2024-01-01", progress=steps.append),
+            sizes=[CampaignSize(scenes=n, profiles=15, bins=100, retrieved=False) for n in (1, 2)],
+            stand_ins=SMALL,
         )
     assert steps == [1, 1, 1]
     return result
@@ -91,18 +90,13 @@ def test_growth_is_that_of_the_cost_per_file(tmp_path):
     assert archives.growth(small, large, Pass.AGAIN) == pytest.approx(1.1)
     rows = measured(1_000_000, 10.0, read=False)
     result_of_archives = archives.Archives("2024-01-01", machine(), (small, large, rows))
-    report = archives.archives_report(result_of_archives, "result.json")
+    report = archives.archives_report(result_of_archives)
     assert report.parts[0].tables[3].rows == (
-        ("1,000", "0.02", "0.04", "20", "-", "300 MB"),
-        ("100,000", "2.2", "4.4", "22", "1.10", "300 MB"),
-        ("1,000,000 rows", "10", "20", "10", "-", "300 MB"),
+        ("1000", "0.02", "0.04", "20 µs", "-", "300 MB"),
+        ("100000", "2.2", "4.4", "22 µs", "1.1", "300 MB"),
+        ("1000000 rows", "10", "20", "10 µs", "-", "300 MB"),
     )
-    page = registry.write_benchmark(registry.BenchmarkOutput(result_of_archives, report), tmp_path)
+    page = registry.write_benchmark(BenchmarkOutput(result_of_archives, report), tmp_path)
     assert "archive.png" in page.read_text(encoding="utf-8")
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["measured"][2]["spent"]["scan, all known"]["cpu"] == 10.0
-
-
-def test_archives_have_no_accuracy():
-    with pytest.raises(CampaignError, match="no accuracy"):
-        archives.run_archives(BenchmarkKind.ACCURACY, effort=Effort())

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from support.archives import mixed_campaign
 
-from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
+from lidarops.bench import registry
+from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import cost_calibration as calibration
 from lidarops.bench.throughput.cost_calibration import Observation, fit_costs
@@ -76,15 +77,16 @@ def test_poor_estimates_of_the_calibration_scenes_give_a_warning(
 ):
     scenes = tuple(Observation("", (), {}, 2.0, 2.0 * factor) for factor in (1.0, ratio))
     result = calibration.Calibration("", machine(), DEFAULTS, scenes, "")
-    monkeypatch.setattr(calibration, "calibrate", lambda **_: result)
-    page = calibration.run_cost_calibration(BenchmarkKind.THROUGHPUT, effort=Effort()).report
+    monkeypatch.setattr(calibration, "calibrate", lambda _: result)
+    page = registry.run_benchmark("throughput", "costs", [], Effort()).report
     assert ("calibrate again" in caplog.text) == warned
     assert ("calibrate again" in page.parts[0].text) == warned
 
 
-def test_costs_have_no_accuracy():
-    with pytest.raises(CampaignError, match="throughput"):
-        calibration.run_cost_calibration(BenchmarkKind.ACCURACY, effort=Effort())
+@pytest.mark.parametrize("case", ["archive", "campaigns", "costs"])
+def test_throughputs_have_no_accuracy(case: str):
+    with pytest.raises(CampaignError, match=f"'{case}' has no accuracy"):
+        registry.run_benchmark("accuracy", case, [], Effort())
 
 
 @pytest.mark.slow
@@ -97,7 +99,7 @@ def test_the_next_run_uses_the_calibration(tmp_path: Path, monkeypatch: pytest.M
     first = archive.reprocess(campaign)
     assert first is not None
     assert first.costs.startswith("not calibrated")
-    calibration.calibrate(date="today", rounds=1)
+    calibration.calibrate(Effort(date="today"), rounds=1)
     assert cost_estimate.load_calibration().words == "calibrated on this machine on today"
     record = archive.reprocess(campaign, options=archive.Options(force=True))
     assert isinstance(record, RunRecord)
