@@ -1,1 +1,1 @@
-"""Shared by all benchmarks: `benchmark` (arguments and output), `timing`, `results` (JSON)."""
+"""Shared by all benchmarks: `benchmark` (effort, page), `rows` (tables, charts), `timing`, JSON."""
