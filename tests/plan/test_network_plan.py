@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lidarops.plan.network_plan import angle_between
-from lidarops.plan.rule_table import RULES
 from pydantic import ValidationError
 from support.archives.network_plans import MEMBERS, campaign, granules
 from support.factories import ANALOG, DAY, PHOTON
