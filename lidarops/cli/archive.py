@@ -238,7 +238,7 @@ def reprocess(
         str | None,
         typer.Option(
             "--memory-limit",
-            help="Memory limit of each process, such as 2GiB: larger scenes are read in smaller chunks.",
+            help="Memory limit of each process, such as 2GiB; scenes are read in chunks that fit.",
             callback=_size,
         ),
     ] = None,

@@ -8,7 +8,6 @@ from datetime import timedelta
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lidarops.plan.network_plan import angle_between
 from pydantic import ValidationError
 from support.archives.network_plans import MEMBERS, campaign, granules
 from support.factories import ANALOG, DAY, PHOTON
