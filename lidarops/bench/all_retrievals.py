@@ -21,6 +21,9 @@ from lidarops.bench.accuracy import (
     network,
     network_report,
 )
+from lidarops.bench.accuracy.elastic import Elastic
+from lidarops.bench.accuracy.homogeneous import Accuracy
+from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.network_scores import NetworkAccuracy
 from lidarops.bench.harness.benchmark import Effort, study_page
 from lidarops.bench.harness.timing import Machine, least_times, machine
@@ -41,9 +44,9 @@ class AllRetrievals:
     machine: Machine
     baselines: tuple[Baseline, ...]
     works: tuple[WorkPrecision, ...]
-    homogeneous: homogeneous.Accuracy
-    elastic: elastic.Elastic
-    multiangle: multiangle_scores.MultiAngle
+    homogeneous: Accuracy
+    elastic: Elastic
+    multiangle: MultiAngle
     network: NetworkAccuracy
 
 
