@@ -34,7 +34,7 @@ from lidarops.records import (
     SceneOutcome,
 )
 from lidarops.steps.channels import channel_ranges, file_channels, member_channel
-from lidarops.steps.data import Chunk, ProductStream, RowProduct, Source, WholeProduct
+from lidarops.steps.data import Chunk, ProductStream, RowProduct, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
 from lidarops.steps.reading import NO_PRODUCT, read_windows
@@ -230,10 +230,13 @@ class _Work:
             yield writer
         self._clock.lap("write")
 
-    def _written(self, context: Context, data: xr.Dataset) -> ProductRecord:
-        """Write a whole product."""
-        with self._writer(data, context) as writer:
-            writer.add(data)
+    def _written(self, context: Context, results: Iterator[xr.Dataset]) -> ProductRecord:
+        """Write a product from its frame and the rows that follow."""
+        with self._writer(next(results), context) as writer:
+            for rows in results:
+                self._clock.lap("retrieve")
+                writer.add(rows)
+                self._clock.lap("write")
         return _record(context, writer)
 
 
@@ -285,9 +288,7 @@ class _Instrument(_Work):
         yield from (_record(contexts[kind], writer) for kind, writer in writers.items())
         for kind, stream in streams.items():
             if isinstance(stream, WholeProduct):
-                made = stream.result()
-                self._clock.lap("retrieve")
-                yield self._written(contexts[kind], made)
+                yield self._written(contexts[kind], stream.results())
 
     def _take(
         self,
@@ -333,7 +334,7 @@ class _Network(_Work):
                 typed_settings(step).wavelength,
                 self.inputs,
             )
-            yield self._written(context, made)
+            yield self._written(context, in_one_batch(made))
 
     def _members(self, product: PlannedStep) -> Iterator[Member]:
         """Yield the instruments that take part, with the data of the channel of a product."""

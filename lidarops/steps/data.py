@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
 
@@ -119,8 +119,14 @@ class WholeProduct(ABC):
         """Take the next profiles."""
 
     @abstractmethod
-    def result(self) -> xr.Dataset:
-        """Return the variables of the product, in memory."""
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield the frame of the product, as `RowProduct.frame`, then its rows in batches."""
+
+
+def in_one_batch(product: xr.Dataset) -> Iterator[xr.Dataset]:
+    """Yield a whole product as its frame, and as its rows."""
+    yield product
+    yield product
 
 
 class RowProduct(ABC):

@@ -151,9 +151,15 @@ def carry_out(
             else:
                 stream.add(chunk)
     return {
-        kind: joined(stream.frame(), rows[kind]) if kind in rows else stream.result()
+        kind: joined(stream.frame(), rows[kind]) if kind in rows else retrieved(stream)
         for kind, stream in streams.items()
     }
+
+
+def retrieved(stream):
+    """Return a product that is retrieved when all profiles are known."""
+    frame, *batches = stream.results()
+    return batches[0] if len(batches) == 1 else joined(frame, batches)
 
 
 def joined(frame, rows):
@@ -547,7 +553,7 @@ class _Ends(WholeProduct):
     def add(self, chunk: Chunk) -> None:
         """Take nothing."""
 
-    def result(self) -> xr.Dataset:
+    def results(self) -> xr.Dataset:
         return xr.Dataset()
 
 

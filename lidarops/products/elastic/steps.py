@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -171,6 +172,8 @@ class Elastic(ProductStep[InversionSettings]):
         return _BYTES_OF_A_BIN * self.values(settings, scene, plan)
 
 
+_AT_ONCE: Final = 16
+"""Averages that are inverted together."""
 _BYTES_OF_A_BIN: Final = 260.0
 """Bytes per bin of an average at the peak of the inversion: measured as 799 MB more for 195 more
 averages of 16,000 bins."""
@@ -190,20 +193,26 @@ class _Inversion(WholeProduct):
         """Add the next profiles to their averages."""
         self._averages.add(chunk)
 
-    def result(self) -> xr.Dataset:
-        """Return the inverted averages."""
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield the frame of the product, then the inverted averages, some at a time."""
+        averages = self._averages.result()
+        for first in range(0, averages.sizes["time"], _AT_ONCE):
+            rows = self._inverted(averages.isel(time=slice(first, first + _AT_ONCE)))
+            if first == 0:
+                times = {name: averages[name].variable for name in ("time", "time_bnds")}
+                yield rows.drop_dims("time").assign_coords(times)
+            yield rows
+
+    def _inverted(self, averages: xr.Dataset) -> xr.Dataset:
         data, settings = self._data, self._settings
-        geometry = data.source.geometry
-        averages = self._averages.result().assign_coords(
-            {
-                name: float(geometry[name][0])
-                for name in ("zenith_angle", "azimuth")
-                if name in geometry
-            }
-        )
-        overlap = data.get(OVERLAP)
+        geometry, overlap = data.source.geometry, data.get(OVERLAP)
+        pointing = {
+            name: float(geometry[name][0])
+            for name in ("zenith_angle", "azimuth")
+            if name in geometry
+        }
         inverted = labeled.invert_elastic(
-            averages,
+            averages.assign_coords(pointing),
             molecules=data[MOLECULES],
             wavelength=data[WAVELENGTH],
             station_altitude=data.source.station_altitude,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final, Literal
 
@@ -28,7 +29,7 @@ from lidarops.settings import SettingsModel, VisibilitySettings
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
-from lidarops.steps.data import Chunk, Data, WholeProduct
+from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
 from lidarops.steps.products import FEWEST_BINS
 from lidarops.steps.reading import ANALOG_NOISE, BINS, WAVELENGTH, RangeWindow, WindowSettings
 from lidarops.steps.reading import bins_with_noise as bins_with_their_noise
@@ -341,15 +342,13 @@ class _Sections(WholeProduct):
         )
         return joined
 
-    def result(self) -> xr.Dataset:
-        """Return all profiles, with visibility along the sections where it is requested."""
-        joined = self._joined()
-        definition = self._settings.visibility
-        if definition is None:
-            return joined
-        return _with_visibility(
-            joined, Definition(wavelength=self._data[WAVELENGTH], **dict(definition))
-        )
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield all profiles, with visibility along the sections where it is requested."""
+        sections, requested = self._joined(), self._settings.visibility
+        if requested is not None:
+            definition = Definition(wavelength=self._data[WAVELENGTH], **dict(requested))
+            sections = _with_visibility(sections, definition)
+        return in_one_batch(sections)
 
 
 def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:

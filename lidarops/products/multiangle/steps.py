@@ -7,6 +7,7 @@ A step that the retrieval decides from the data is planned where the beams permi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, Final
@@ -25,7 +26,7 @@ from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
-from lidarops.steps.data import Chunk, Data, Indices, WholeProduct
+from lidarops.steps.data import Chunk, Data, Indices, WholeProduct, in_one_batch
 from lidarops.steps.pointing import no_scan
 from lidarops.steps.products import MOLECULES
 from lidarops.steps.reading import WAVELENGTH
@@ -314,16 +315,17 @@ class _Scans(WholeProduct):
         """Interpolate the cycles of the next profiles to common altitudes."""
         self._cycles.add(chunk.profiles(self._profiles), chunk.rows.start)
 
-    def result(self) -> xr.Dataset:
-        """Return the optical depth of all cycles."""
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield the optical depth of all cycles."""
         settings = self._settings
-        return labeled.retrieve_optical_depth(
+        optical_depth = labeled.retrieve_optical_depth(
             self._cycles.result(),
             station_altitude=self._station,
             method=settings.method,
             largest_gradient=settings.largest_gradient,
             layers=[(low + self._station, high + self._station) for low, high in settings.layers],
         )
+        return in_one_batch(optical_depth)
 
 
 STEPS: Final = (
