@@ -148,9 +148,9 @@ def show_plan(
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.plan import cost_estimate
-    from lidarops.plan.memory_estimate import scene_memory
     from lidarops.run.archive import assess
     from lidarops.run.selection import selects_no_scene
+    from lidarops.steps.memory import scene_memory
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     selection = _selection(instrument, station, product, since, until)

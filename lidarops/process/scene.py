@@ -24,6 +24,7 @@ from lidarops.process.context import product_context
 from lidarops.process.input_files import check_files, local_files, open_granules
 from lidarops.process.job import Job
 from lidarops.raw.archive import count_bytes_read
+from lidarops.raw.header import Stretches
 from lidarops.records import (
     Granule,
     InputRecord,
@@ -34,10 +35,11 @@ from lidarops.records import (
     SceneOutcome,
 )
 from lidarops.steps.channels import channel_ranges, file_channels, member_channel
+from lidarops.steps.conditioning import Dark
 from lidarops.steps.data import Chunk, ProductStream, RowProduct, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
-from lidarops.steps.reading import NO_PRODUCT, read_windows
+from lidarops.steps.reading import NO_PRODUCT, Read, read_windows
 from lidarops.steps.registry import product_step, typed_settings
 from lidarops.steps.step import NOT_REQUESTED
 from lidarops.system.stores import without_keys
@@ -182,14 +184,19 @@ class _Work:
         self.job, self.inputs = job, inputs
         self._scene, self._root, self._clock = scene, root, clock
 
-    def _source(self, scene: Scene, steps: Sequence[PlannedStep], *, whole: bool = False) -> Source:
-        """Open the data that steps work on: only the channels and bins that they read.
+    def _source(
+        self,
+        scene: Scene,
+        steps: Sequence[PlannedStep],
+        stretches: Mapping[str, Stretches] | None = None,
+    ) -> Source:
+        """Open the data that steps work on: only the channels that they read.
 
-        All bins with `whole`, whatever the windows of the plan.
+        All bins, but those of `stretches` for the channels that it names.
         """
         job = self.job
-        read = dict.fromkeys(step.channel for step in steps if step.name == "read")
-        subtracted = [step.channel for step in steps if step.name == "dark"]
+        read = dict.fromkeys(step.channel for step in steps if step.name == Read.name)
+        subtracted = [step.channel for step in steps if step.name == Dark.name]
         bins = {channel.name: channel.bins for channel in scene.layout if channel.name in read}
         profiles = execution.chunk_profiles(max(bins.values()), job.profiles_per_chunk)
         open_files = (job.campaign, scene)
@@ -200,7 +207,7 @@ class _Work:
                 self._root,
                 list(bins),
                 profiles_per_chunk=max(1, profiles // execution.READ_TOGETHER),
-                stretches=None if whole else read_windows(steps),
+                stretches=stretches,
             ),
             dark=(
                 open_granules(*open_files, scene.dark, self._root, subtracted)
@@ -249,7 +256,7 @@ class _Instrument(_Work):
         channels = dict.fromkeys(
             step.channel for step in steps if is_product(step) and self.job.concerns(step)
         )
-        source = self._source(self._scene, steps)
+        source = self._source(self._scene, steps, read_windows(steps))
         plan = execution.refined_plan(self.job.plan, self._scene, self._sample)
         self.job = replace(self.job, plan=plan)
         self._clock.lap("look")
@@ -258,10 +265,11 @@ class _Instrument(_Work):
 
     def _sample(self, channel: str, granules: Sequence[Granule]) -> xr.Dataset:
         """Return power, variance and quality of a channel in some granules."""
-        steps = [step for step in self.job.plan.steps if step.channel == channel]
+        channels = (channel, *file_channels(channel))
+        steps = [step for step in self.job.plan.steps if step.channel in channels]
         few = replace(self._scene, granules=tuple(granules))
         # The signal is compared with bins beyond the sections.
-        return execution.profiles_of(self._source(few, steps, whole=True), steps, channel)
+        return execution.profiles_of(self._source(few, steps), steps, channel)
 
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
         steps = self.job.plan.steps
@@ -269,7 +277,7 @@ class _Instrument(_Work):
         wavelength = next(
             typed_settings(step).wavelength
             for step in steps
-            if (step.name, step.channel) == ("read", channel)
+            if (step.name, step.channel) == (Read.name, channel)
         )
         layout = member_channel(self._scene.layout, channel)
         contexts = {
@@ -345,7 +353,10 @@ class _Network(_Work):
                 continue
             data = None
             if usable.granules:
-                source = self._source(usable, steps)
+                # Products of the whole network may need more bins than a member states.
+                concerned = ("", planned.instrument)
+                of_member = [s for s in job.plan.steps if s.instrument in concerned]
+                source = self._source(usable, steps, read_windows(of_member))
                 data = execution.member_data(source, steps, product)
             layout = member_channel(planned.layout, product.channel)
             yield Member(

@@ -249,6 +249,8 @@ def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:
     except SceneError as error:
         # With a larger limit it may be processed.
         return failed_outcome(job, str(error)), False, True
+    except Exception as error:  # noqa: BLE001 - a bug in one scene must not stop the others
+        return internal_error(job, error), True, False
     return *attempt(job), False
 
 

@@ -13,7 +13,7 @@ from lidarops.retrieve.signal import labeled_gluing
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import glued_parts
-from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.conditioning import PROFILES
 from lidarops.steps.data import Data, Profiles
 from lidarops.steps.profiles import GluedProfiles
 from lidarops.steps.reading import ARCHIVE
@@ -103,7 +103,3 @@ def _first_profiles(part: Data) -> npt.NDArray[np.float64]:
 def _power(profiles: Profiles, counts: xr.Dataset) -> npt.NDArray[np.float64]:
     power: npt.NDArray[np.float64] = profiles.of(counts)["power"].to_numpy()
     return power
-
-
-CONDITIONED: Final = (ARCHIVE, PROFILES, OVERLAP)
-"""What the products of a channel take from its conditioning."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from lidarops.records import LeftOut, PlannedStep, Scene
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.data import Chunk, Data
-from lidarops.steps.step import Decisions, Step, UnitCosts
+from lidarops.steps.step import Decisions, MakingStep
 
 Decided = list[PlannedStep | LeftOut]
 
@@ -45,12 +45,8 @@ class NetworkStream(ABC):
         """Return the variables of the product, in memory."""
 
 
-class NetworkProductStep(Step[Any]):
-    """The step that makes a product of a network; it has the name of its kind."""
-
-    costs: ClassVar[UnitCosts]
-    drawn_whole: ClassVar[bool] = False
-    """As for `ProductStep`."""
+class NetworkProductStep(MakingStep[Any]):
+    """The step that makes a product of a network."""
 
     def decide(self, case: ChannelCase) -> Decisions:  # noqa: ARG002
         """Decide nothing for one channel: `plan` sees all instruments."""

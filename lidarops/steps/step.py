@@ -97,16 +97,12 @@ class UnitCosts:
     """s to load the compiled code of the kind, once a process."""
 
 
-class ProductStep(Step[S]):
+class MakingStep(Step[S]):
     """The step that makes a product; it has the name of its kind, and is the last of its steps."""
 
     costs: ClassVar[UnitCosts]
     drawn_whole: ClassVar[bool] = False
     """Whether figures show every value, so that their cost grows with the number of values."""
-
-    @abstractmethod
-    def stream(self, settings: S, data: Data) -> ProductStream:
-        """Return the product in the making, which takes the profiles of the scene in chunks."""
 
     @abstractmethod
     def values(self, settings: S, scene: Scene, plan: Plan) -> float:
@@ -115,6 +111,14 @@ class ProductStep(Step[S]):
     def held(self, settings: S, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
         """Return the number of bytes that the product holds for the whole scene."""
         return 0.0
+
+
+class ProductStep(MakingStep[S]):
+    """The step that makes a product of one channel."""
+
+    @abstractmethod
+    def stream(self, settings: S, data: Data) -> ProductStream:
+        """Return the product in the making, which takes the profiles of the scene in chunks."""
 
     def carry_out(self, settings: S, data: Data) -> None:
         """Put the stream into the data of the product."""

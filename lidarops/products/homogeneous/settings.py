@@ -21,6 +21,8 @@ class HomogeneousSettings(ChannelProduct):
 
     @model_validator(mode="after")
     def _rising(self) -> Self:
+        if len(set(self.sections)) < len(self.sections):
+            raise ValueError("sections lists a section twice")
         for near, far in self.sections:
             if far <= near:
                 raise ValueError(f"section [{near}, {far}] must end farther than it starts")

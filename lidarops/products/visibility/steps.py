@@ -70,10 +70,6 @@ _SAME_WAVELENGTH: Final = 1e-9
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 
 
-class MemberBackground(Background):
-    """State the far range of the channel of an instrument."""
-
-
 class MemberWindow(RangeWindow):
     """Read only the bins that the crossings of an instrument and its background need."""
 
@@ -277,7 +273,7 @@ class _NetworkPlan:
         if is_glued(name):
             for step in GLUE_STEPS:
                 yield from case.decisions(step)
-        yield from self._of_product(case).decisions(MemberBackground())
+        yield from self._of_product(case).decisions(Background())
 
     def _of_product(self, case: ChannelCase) -> ChannelCase:
         return case.of_product(KIND, self._settings)
@@ -511,4 +507,4 @@ def _no_averages(distance: npt.NDArray[np.float64]) -> xr.Dataset:
     )
 
 
-STEPS: Final = (MemberBackground(), MemberWindow(), _AVERAGE, Prior(), Visibility())
+STEPS: Final = (Background(), MemberWindow(), _AVERAGE, Prior(), Visibility())
