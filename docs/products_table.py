@@ -56,7 +56,7 @@ def _bits() -> Iterator[str]:
             carriers.setdefault(row, []).append(kind)
     for (value, word, severity, description), names in sorted(carriers.items()):
         yield f"| `{word}` | {value} | {severity} | {description} | {', '.join(names)} |"
-    own = {kind: sum(bit >= 1 << FIRST_OWN for bit in flags_of(kind)) for kind in kinds()}
+    own = {kind: sum(bit >= 1 << FIRST_OWN for bit in flags_of(kind)) for kind in _own_kinds()}
     left = [f"{PLACES - FIRST_OWN - count} in `{kind}`" for kind, count in own.items()]
     yield f"\nPlaces left for new bits: {FIRST_OWN - len(Quality)} in all kinds, {', '.join(left)}."
 

@@ -36,7 +36,7 @@ from prefect.client.schemas.objects import State, TaskRun
 from prefect.states import Completed
 from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from flows import WITH_FAILURES
 from flows.usage import plain_errors
@@ -44,6 +44,7 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
+from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import run_page
 from lidarops.run import clusters
@@ -57,6 +58,17 @@ _T = TypeVar("_T")
 
 Workers = Annotated[int, Field(ge=1, le=10_000)]
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
+
+
+def _known_kind(name: str) -> str:
+    if name not in kinds():
+        raise ValueError(f"{name!r} is no kind of product; the kinds are {', '.join(kinds())}")
+    return name
+
+
+KindName = Annotated[
+    str, AfterValidator(_known_kind), Field(json_schema_extra={"enum": list(kinds())})
+]
 
 _PROGRESS_INTERVAL = 15.0
 """s between reports of progress; each is a request to the server."""
@@ -195,7 +207,7 @@ def reprocess(
     publish: str | None = None,
     catalog: str | None = None,
     stations: list[str] | None = None,
-    products: list[str] | None = None,
+    products: list[KindName] | None = None,
     memory_limit: clusters.Memory | None = None,
     *,
     full: bool = False,

@@ -22,6 +22,7 @@ from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
+from lidarops.steps.dependence import ancillary_files
 
 ALTITUDE = np.linspace(0.0, 20_000.0, 41)
 PRESSURE, TEMPERATURE = us_standard(ALTITUDE)
@@ -227,7 +228,7 @@ def test_files_of_a_plan_are_read_once_and_recorded(tmp_path: Path) -> None:
         products={"elastic": {"channels": ["analog_532o", "photon_532o"]}},
     )
     scene = cut_scenes(campaign, (factories.granule(0),)).scenes[0]
-    files = Ancillaries.read(tmp_path, plan_scene(scene, campaign))
+    files = Ancillaries.read(tmp_path, ancillary_files(plan_scene(scene, campaign).steps))
     assert list(files.profiles) == ["air.csv"]
     assert list(files.overlaps) == ["o.csv"]
     assert [(file.path, file.role) for file in files.inputs] == [
@@ -237,4 +238,5 @@ def test_files_of_a_plan_are_read_once_and_recorded(tmp_path: Path) -> None:
     for file in files.inputs:
         assert file.sha256 == hashlib.sha256((tmp_path / file.path).read_bytes()).hexdigest()
     bare = factories.campaign()
-    assert Ancillaries.read(tmp_path, plan_scene(scene, bare)) == Ancillaries({}, {}, ())
+    none = ancillary_files(plan_scene(scene, bare).steps)
+    assert Ancillaries.read(tmp_path, none) == Ancillaries({}, {}, ())

@@ -189,7 +189,7 @@ def test_the_command_line_reprocesses_and_reports(
         (
             ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "multiangle"],
             2,
-            "requested: signal",
+            "requested: homogeneous",
         ),
         (["inspect", "/nowhere"], 2, "/nowhere"),
         (["inspect", "/"], 2, "directory"),
