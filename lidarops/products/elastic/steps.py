@@ -174,9 +174,9 @@ class Elastic(ProductStep[InversionSettings]):
 
 _AT_ONCE: Final = 16
 """Averages that are inverted together."""
-_BYTES_OF_A_BIN: Final = 260.0
-"""Bytes per bin of an average at the peak of the inversion: measured as 799 MB more for 195 more
-averages of 16,000 bins."""
+_BYTES_OF_A_BIN: Final = 60.0
+"""Bytes per bin of an average that are held: measured as 178 MB more for 195 more averages of
+16,000 bins."""
 
 
 class _Inversion(WholeProduct):
