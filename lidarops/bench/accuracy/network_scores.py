@@ -154,7 +154,7 @@ def crossing_errors(result: NetworkResult, truth: Array, near: Booleans) -> Cros
 
     Parameters
     ----------
-    result : MultiPositionResult
+    result : NetworkResult
     truth : (profile, crossing) float
         Extinction, m-1.
     near : (crossing,) bool

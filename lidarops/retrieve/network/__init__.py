@@ -3,8 +3,8 @@
 The order of the retrieval, and the modules that do it:
 
 1. `geometry`: stations and pointings give beams, and the crossings where beams meet.
-2. `_beam_signals`: the signals are validated; noise is estimated where no variance is given
-   (`noise`), and the median signals of blocks of profiles are taken.
+2. `_beam_signals`: the signals are validated; blocks of profiles are split by noise (`noise`),
+   and their median signals are taken.
 3. `_fit_layout`, `_condensed_signals`: outlying bins are bridged (`noise`). Each beam is condensed
    to its signal at the crossings and the integrals between them, with their covariance.
 4. `_empirical_prior`: each block chooses the prior of ln extinction over the crossings.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -33,30 +32,7 @@ NOISY_PROFILE: Final = 10.0
 """Ratio to the median variance beyond which a profile does not count for its block. Where its
 signal is stronger, and its noise therefore larger, up to this factor more is allowed."""
 _SMOOTHED_BINS: Final = 31
-"""Bins over which estimated noise is averaged."""
-_OUTLYING_SQUARE: Final = 60.0
-"""Ratio to the median square around it beyond which a bin is outlying: 6 standard errors, as for
-bridged bins (`lidarops.retrieve.network.noise.outlying_bins`)."""
-_MEDIAN_PROFILES: Final = 8
-"""Smallest number of profiles, if available, for the median around a bin."""
-_INDEPENDENT_BINS: Final = 3
-"""Bins to the next second difference that shares no bin. A third of all differences carries as
-much information as all of them."""
-_FEWEST_SQUARES: Final = 7
-"""Smallest number of second differences for the typical value of a profile and beam: most of
-fewer may be outlying."""
-_SUMMED_BINS: Final = 4
-"""Bins per sum. The variance of sums shows whether neighbouring bins are correlated."""
-_SAMPLED_SUMS: Final = 400
-"""Approximate number of sums of a beam that are sampled, if available."""
-_FEWEST_SUMS: Final = 300
-"""Smallest number of sums that can show a correlation."""
-_SAMPLING_FACTOR: Final = 4
-"""Factor by which more sums are sampled where too few of them are known."""
-_CORRELATED_RATIO: Final = 1.5
-"""Ratio to the variance of independent bins that sums may reach by chance."""
-_SCREENED_BIN_ERROR: Final = 0.045
-"""Relative standard error of a bin up to which the search for outlying bins always works."""
+"""Bins over which the energy of a profile is compared with that of its block."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +65,7 @@ def prepare_signals(
     range_: npt.ArrayLike,
     network: Network,
     *,
-    variance: npt.ArrayLike | None,
+    variance: npt.ArrayLike,
     overlap: npt.ArrayLike | None,
     full_overlap_range: npt.ArrayLike | None,
     exponent: npt.ArrayLike,
@@ -104,26 +80,19 @@ def prepare_signals(
         raise RetrievalInputError(f"is {bins}", field="bins", remedy="choose 3 to 99")
     exponents = _exponents(exponent, network.beams)
     layout = _fit_layout.lay_out_fits(network, ranges, overlap_function, nearest, int(bins))
-    block, count = _blocks(blocks, leading)
-    relative = variance is None
-    if variance is None:
-        members = [np.flatnonzero(block == number) for number in range(count)]
-        rows, row = _estimate_variances(signal, members, block)
-    else:
-        rows, row = _variances(variance, signal.shape, descending=descending)
-        windows = (layout.passages.beam, layout.window, layout.weights.shape[1])
-        block = noise_groups.split_by_noise(signal, rows, row, block, windows, LARGEST_BIN_ERROR)
-        count = int(block.max(initial=-1)) + 1
-        members = [np.flatnonzero(block == number) for number in range(count)]
+    block = _blocks(blocks, leading)
+    rows, row = _variances(variance, signal.shape, descending=descending)
+    windows = (layout.passages.beam, layout.window, layout.weights.shape[1])
+    block = noise_groups.split_by_noise(signal, rows, row, block, windows, LARGEST_BIN_ERROR)
+    count = int(block.max(initial=-1)) + 1
+    members = [np.flatnonzero(block == number) for number in range(count)]
     mean, mean_rows, single, averaged = _median_signals(signal, rows, row, members, layout)
-    data = _condensed_signals.condense(
-        signal, rows, row, exponents, layout, relative=relative, screened=True
-    )
+    data = _condensed_signals.condense(signal, rows, row, exponents, layout, screened=True)
     # A median is robust against single bins, and its variance is only an estimate.
     means = _condensed_signals.condense(
-        mean, mean_rows, np.arange(count), exponents, layout, relative=relative, screened=False
+        mean, mean_rows, np.arange(count), exponents, layout, screened=False
     )
-    bin_variance, negative = _relative_noise(mean, single, averaged, layout, relative=relative)
+    bin_variance, negative = _relative_noise(mean, single, averaged, layout)
     weak = ~(bin_variance <= LARGEST_BIN_ERROR**2) & (
         (means.usable == 1) | _faded(means, negative, layout)
     )
@@ -131,7 +100,7 @@ def prepare_signals(
         usable_variance = np.where(weak | (means.usable == 0), np.nan, bin_variance)
     means.usable[weak] = 0
     # Missing signals already have a reason.
-    too_noisy = _noisy_passages(signal, rows, row, single[block], layout, relative=relative)
+    too_noisy = _noisy_passages(signal, rows, row, single[block], layout)
     too_noisy &= data.usable == 1
     data.usable[(means.usable == 0)[block] | too_noisy] = 0
     return BeamSignals(
@@ -235,11 +204,11 @@ def _exponents(exponent: npt.ArrayLike, beams: int) -> Array:
     return np.broadcast_to(array, (beams,)).copy()
 
 
-def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Indices, int]:
-    """Return (profile,) block numbers and the number of blocks."""
+def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
+    """Return (profile,) block numbers."""
     count = int(np.prod(leading, dtype=np.int64))
     if blocks is None:
-        return np.zeros(count, dtype=np.intp), min(count, 1)
+        return np.zeros(count, dtype=np.intp)
     labels = np.asarray(blocks)
     if labels.shape != leading or labels.dtype.kind not in "iuUS":
         raise RetrievalInputError(
@@ -247,8 +216,8 @@ def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Ind
             field="blocks",
             remedy=f"give one whole number or name per profile, {leading}",
         )
-    names, inverse = np.unique(labels.reshape(count), return_inverse=True)
-    return inverse.reshape(count).astype(np.intp), int(names.size)
+    _, inverse = np.unique(labels.reshape(count), return_inverse=True)
+    return inverse.reshape(count).astype(np.intp)
 
 
 def _variances(
@@ -276,219 +245,6 @@ def _variances(
         ) from None
     row = np.zeros(shape[0], dtype=np.intp) if shared else np.arange(shape[0])
     return np.ascontiguousarray(rows), row
-
-
-def _estimate_variances(
-    signal: Array, members: list[Indices], block: Indices
-) -> tuple[Array, Indices]:
-    """Return relative variances from second differences along range, and the row of each profile.
-
-    Bins are assumed independent. Where neighbours are correlated, second differences give too
-    small a variance, and the variance of sums of bins is used; a few profiles cannot show this.
-    There is one row per block, and one per profile that is far noisier than its block or has
-    outlying bins that are not bridged: pooled with the block, its own error would be too small
-    and the errors of the others too large.
-
-    Returns
-    -------
-    rows : (row, beam, bin) float64
-    row : (profile,) intp
-    """
-    block_rows = np.full((len(members), *signal.shape[1:]), np.nan)
-    if signal.shape[-1] < 3:
-        return block_rows, block
-    with np.errstate(invalid="ignore", divide="ignore"):
-        logs = np.log(np.where(signal > 0, signal, np.nan))
-    squares = (logs[..., :-2] - 2.0 * logs[..., 1:-1] + logs[..., 2:]) ** 2 / 6.0
-    row, profile_rows = block.copy(), []
-    for number, profiles in enumerate(members):
-        block_squares = squares[profiles]
-        known = np.isfinite(block_squares)
-        level = _median_levels(block_squares, known)
-        noisy = _much_noisier(level)
-        not_noisy = known & ~noisy[..., np.newaxis] if noisy.any() else known
-        not_outlying = _not_outlying(
-            block_squares, known, _typical_squares(block_squares, not_noisy, level)
-        )
-        factor = _correlation_factor(logs[profiles, :, 1:-1], not_outlying, level)[:, np.newaxis]
-        block_rows[number] = _smoothed_mean(block_squares, not_outlying & not_noisy)
-        for n in np.flatnonzero(noisy.any(axis=1)):
-            believable = known[n] & (
-                block_squares[n]
-                <= _OUTLYING_SQUARE * _typical_squares(block_squares[[n]], known[[n]], level[[n]])
-            )
-            not_outlying[n, noisy[n]] = believable[noisy[n]]
-        single = np.flatnonzero((noisy | (known & ~not_outlying).any(axis=2)).any(axis=1))
-        # Outlying bins that are not searched for are noise of their own profile.
-        outlying = known[single] & ~not_outlying[single]
-        own_variance = np.broadcast_to(
-            block_rows[number], (single.size, *block_rows[number].shape)
-        ).copy()
-        for k in np.flatnonzero(noisy[single].any(axis=1)):
-            noisy_beams = noisy[single[k]]
-            own_variance[k, noisy_beams] = _smoothed_mean(
-                block_squares[single[[k]]], not_outlying[single[[k]]]
-            )[noisy_beams]
-        outlier_variance = _moving_mean(
-            np.where(outlying, block_squares[single], 0.0), known[single]
-        )
-        outlier_variance = np.where(
-            (own_variance > _SCREENED_BIN_ERROR**2) & (outlier_variance > 0.0),
-            outlier_variance,
-            0.0,
-        )
-        for k in np.flatnonzero(noisy[single].any(axis=1) | outlier_variance.any(axis=(1, 2))):
-            profile_rows.append((own_variance[k] + outlier_variance[k]) * factor)
-            row[profiles[single[k]]] = len(members) + len(profile_rows) - 1
-        block_rows[number] *= factor
-    return np.concatenate([block_rows, np.array(profile_rows)]) if profile_rows else block_rows, row
-
-
-def _correlation_factor(logs: Array, not_outlying: Booleans, level: Array) -> Array:
-    """Return (beam,) variance of sums of bins over the variance from second differences of bins.
-
-    It is taken from differences of successive profiles, because constant air would count as
-    correlated noise, in units of the noise of both profiles: otherwise medians of bins and of
-    sums would differ by chance where the noise varies. 1 where the ratio can be chance, or too
-    few sums are known.
-
-    Parameters
-    ----------
-    logs : (profile, beam, bin) float64
-    not_outlying : (profile, beam, bin) bool
-        Whether a bin is known and not outlying.
-    level : (profile, beam) float64
-        Proportional to the variance. Where it is not finite or 0, the median of the others.
-    """
-    factor = np.ones(logs.shape[1])
-    size = logs.shape[-1] // (3 * _SUMMED_BINS)
-    total = (len(logs) - 1) * size
-    if total < _FEWEST_SUMS:
-        return factor
-    level = np.where(np.isfinite(level) & (level > 0.0), level, np.nan)
-    typical_level = _beam_medians(level)
-    level = np.where(np.isnan(level), np.where(typical_level > 0.0, typical_level, 1.0), level)
-    # A sample of the profiles is enough, except for beams with too few known sums.
-    stride, beams = max(total // _SAMPLED_SUMS, 1), np.arange(factor.size)
-    while beams.size:
-        pairs = np.arange(0, len(logs) - 1, stride)
-        first, second = np.ix_(pairs, beams), np.ix_(pairs + 1, beams)
-        used = slice(0, size * 3 * _SUMMED_BINS)
-        steps = logs[..., used][second] - logs[..., used][first]
-        steps /= np.sqrt(level[first] + level[second])[..., np.newaxis]
-        steps[~(not_outlying[..., used][first] & not_outlying[..., used][second])] = np.nan
-        groups = steps.reshape(*steps.shape[:2], size, 3, _SUMMED_BINS)
-        sums = _second_squares(groups.sum(axis=4)) / _SUMMED_BINS
-        bins = _second_squares(groups[..., :3])
-        bin_variance, sum_variance = (
-            _beam_medians(bins, _FEWEST_SUMS),
-            _beam_medians(sums, _FEWEST_SUMS),
-        )
-        correlated = (bin_variance > 0.0) & (sum_variance > _CORRELATED_RATIO * bin_variance)
-        factor[beams[correlated]] = sum_variance[correlated] / bin_variance[correlated]
-        if stride == 1:
-            break
-        stride, beams = max(stride // _SAMPLING_FACTOR, 1), beams[sum_variance == 0.0]
-    return factor
-
-
-def _second_squares(values: Array) -> Array:
-    """Return squares of the second differences of three values."""
-    return np.asarray((values[..., 0] - 2.0 * values[..., 1] + values[..., 2]) ** 2)
-
-
-def _median_levels(squares: Array, known: Booleans) -> Array:
-    """Return (profile, beam) medians along range, robust against single outlying bins."""
-    # Unknown squares must not lower the median.
-    independent = np.where(
-        known[..., ::_INDEPENDENT_BINS], squares[..., ::_INDEPENDENT_BINS], np.inf
-    )
-    return np.asarray(np.median(independent, axis=2))
-
-
-def _much_noisier(level: Array) -> Booleans:
-    """Return (profile, beam) where noise is far above that of most profiles."""
-    typical = np.median(level, axis=0)
-    return np.asarray(np.isfinite(level) & (level > NOISY_PROFILE * typical) & (typical > 0.0))
-
-
-def _not_outlying(squares: Array, known: Booleans, typical: Array) -> Booleans:
-    """Return (profile, beam, bin) what is known, and not outlying by (beam, bin) typical squares.
-
-    Where many profiles are noisier than the rest, each is also compared with its own typical
-    noise before its bins count as outlying.
-    """
-    limit = _OUTLYING_SQUARE * typical
-    accepted = known & (squares <= limit)
-    profile, beam = np.nonzero((known & ~accepted).any(axis=2))
-    if profile.size:
-        sampled = known[profile, beam, ::_INDEPENDENT_BINS]
-        ratio = np.where(
-            sampled,
-            squares[profile, beam, ::_INDEPENDENT_BINS] / typical[beam, ::_INDEPENDENT_BINS],
-            np.inf,
-        )
-        number = sampled.sum(axis=1)
-        middle = np.maximum(number - 1, 0) // 2
-        excess = np.sort(ratio, axis=1)[np.arange(number.size), middle]
-        excess = np.where(number >= _FEWEST_SQUARES, np.maximum(excess, 1.0), 1.0)[:, np.newaxis]
-        accepted[profile, beam] = known[profile, beam] & (
-            squares[profile, beam] <= limit[beam] * excess
-        )
-    return accepted
-
-
-def _smoothed_mean(squares: Array, known: Booleans) -> Array:
-    """Return (beam, bin) means over profiles and neighbouring bins; two more bins than squares."""
-    return _moving_mean(np.where(known, squares, 0.0).sum(axis=0), known.sum(axis=0))
-
-
-def _moving_mean(total: Array, number: Indices | Booleans) -> Array:
-    """Return means over neighbouring bins from sums of `number` squares; two more bins."""
-    width = min(_SMOOTHED_BINS, total.shape[-1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = _moving_sum(total, width) / _moving_sum(number.astype(np.float64), width)
-    return np.concatenate([smooth[..., :1], smooth, smooth[..., -1:]], axis=-1)
-
-
-def _typical_squares(squares: Array, known: Booleans, level: Array) -> Array:
-    """Return (beam, bin) medians over profiles and some tens of bins; inf where they are 0.
-
-    These medians decide which bins are outlying, so that one bin of one profile is not taken for
-    noise of all. Some hundred squares are enough for a median, so only some profiles are used:
-    quiet and noisy ones alike, sorted by their (profile, beam) level.
-    """
-    stride = len(squares) // _MEDIAN_PROFILES
-    if stride > 1:
-        # Levels of photon counts may be equal.
-        total = np.where(known, squares, 0.0).sum(axis=2)
-        sampled = np.lexsort((total, level), axis=0)[stride // 2 :: stride]
-        beams = np.arange(squares.shape[1])
-        squares, known = squares[sampled, beams], known[sampled, beams]
-    out = np.full(squares.shape[1:], np.inf)
-    sections = max(squares.shape[-1] // _SMOOTHED_BINS, 1)
-    edges = np.linspace(0, squares.shape[-1], sections + 1).astype(int)
-    for low, high in pairwise(edges):
-        section = np.where(known[..., low:high], squares[..., low:high], np.nan)
-        median = _beam_medians(section)
-        out[:, low:high] = np.where(median > 0.0, median, np.inf)[:, np.newaxis]
-    return out
-
-
-def _beam_medians(values: Array, least: int = 1) -> Array:
-    """Return (beam,) medians of the known values; 0 where fewer than `least` are known.
-
-    Parameters
-    ----------
-    values : (profile, beam, ...) float64
-    least : int
-    """
-    rows = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
-    known = np.isfinite(rows)
-    if known.all() and rows.shape[1] >= least:
-        return np.asarray(np.median(rows, axis=1))
-    finite = [row[good] for row, good in zip(rows, known, strict=True)]
-    return np.array([np.median(row) if row.size >= least else 0.0 for row in finite])
 
 
 def _moving_sum(values: Array, width: int) -> Array:
@@ -556,7 +312,7 @@ def _typical_variance(variances: Array, signal: Array, median: Array) -> Array:
 
 
 def _noisy_passages(
-    signal: Array, rows: Array, row: Indices, single: Array, layout: FitLayout, *, relative: bool
+    signal: Array, rows: Array, row: Indices, single: Array, layout: FitLayout
 ) -> Booleans:
     """Return (profile, passage) where a profile far noisier than its block is too weak.
 
@@ -573,8 +329,7 @@ def _noisy_passages(
             typical = single[:, beam, window].sum(axis=1) / bins
             level = np.maximum(signal[:, beam, window].sum(axis=1) / bins, 0.0)
             noisier = (typical > 0.0) & ~(spread <= NOISY_PROFILE * typical)
-            scale = 1.0 if relative else level**2
-            out[:, c] = noisier & ~(spread <= LARGEST_BIN_ERROR**2 * scale)
+            out[:, c] = noisier & ~(spread <= LARGEST_BIN_ERROR**2 * level**2)
     return out
 
 
@@ -594,7 +349,7 @@ def _faded(
 
 
 def _relative_noise(
-    mean: Array, single: Array, averaged: Indices, layout: FitLayout, *, relative: bool
+    mean: Array, single: Array, averaged: Indices, layout: FitLayout
 ) -> tuple[Array, Booleans]:
     """Return (block, passage) relative variance of a bin of one profile around a crossing.
 
@@ -612,7 +367,6 @@ def _relative_noise(
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             level = mean[:, beam, window].sum(axis=1) / bins
             spread = single[:, beam, window].sum(axis=1) / bins
-            out[:, c] = spread if relative else np.where(level > 0, spread / level**2, np.inf)
-            if not relative:
-                negative[:, c] = ~(level >= -_NEGATIVE_SIGMAS * np.sqrt(spread / number))
+            out[:, c] = np.where(level > 0, spread / level**2, np.inf)
+            negative[:, c] = ~(level >= -_NEGATIVE_SIGMAS * np.sqrt(spread / number))
     return out, negative

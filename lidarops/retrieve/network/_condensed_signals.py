@@ -75,7 +75,6 @@ def condense(
     exponent: Array,
     layout: FitLayout,
     *,
-    relative: bool,
     screened: bool,
 ) -> CondensedSignals:
     """Condense power to values at crossings and integrals between them.
@@ -88,14 +87,12 @@ def condense(
     ----------
     power : (profile, beam, bin) float64
     variance : (row, beam, bin) float64
-        Variance of the power of each bin, absolute or relative; bins are independent.
+        Variance of the power of each bin; bins are independent.
     variance_row : (profile,) intp
         Row of `variance` of each profile.
     exponent : (beam,) float64
         m of backscatter ~ extinction^(1/m).
     layout : FitLayout
-    relative : bool
-        Whether variances are relative.
     screened : bool
         Whether to search for outlying bins and bridge them.
     """
@@ -111,7 +108,7 @@ def condense(
         np.zeros((profiles, total, 2)),
     )
     _condense(
-        power, variance, variance_row, relative, exponent, layout.log_factor, layout.range,
+        power, variance, variance_row, exponent, layout.log_factor, layout.range,
         layout.first_passage, layout.window, layout.weights, layout.cell, layout.fraction,
         layout.offset, screened, layout.limits, layout.neighbours,
         _curvature_errors.curvature_weights(layout),
@@ -294,7 +291,6 @@ def _take_outer_logarithms(
     variance: Array,
     log_factor: Array,
     exponent: float,
-    relative: bool,
     span: tuple[int, int],
     out: tuple[Array, Array, Codes],
 ) -> None:
@@ -305,8 +301,7 @@ def _take_outer_logarithms(
         if not abs(row[g]) < 1e300 or row[g] <= 0.0:
             continue
         logs[g] = exponent * (math.log(row[g]) + log_factor[g])
-        spread = variance[g]
-        noise[g] = exponent * exponent * (spread if relative else spread / row[g] ** 2)
+        noise[g] = exponent * exponent * (variance[g] / row[g] ** 2)
         if noise[g] < math.inf:
             codes[g] = outlying_bins.GOOD
 
@@ -315,7 +310,6 @@ def _take_outer_logarithms(
 def _bridge_outliers(
     signal: tuple[Array, Array, Array],
     exponent: float,
-    relative: bool,
     grid: Array,
     span: tuple[int, int, int, int],
     neighbour_plan: tuple[Indices, Array, Array],
@@ -338,14 +332,11 @@ def _bridge_outliers(
     scaled, scaled_variance, deviations, nodes, weights = work
     first, low, stop, last = span
     for outer_span in ((first, low), (stop, last)):
-        _take_outer_logarithms(
-            power, variance, log_factor, exponent, relative, outer_span, beam_row
-        )
+        _take_outer_logarithms(power, variance, log_factor, exponent, outer_span, beam_row)
     outlying_bins.scale_signal(logs, noise, exponent, codes, span, scaled, scaled_variance)
     number, end = outlying_bins.find_outliers(
         (logs, noise, scaled, scaled_variance),
         exponent,
-        relative,
         grid,
         span,
         neighbour_plan,
@@ -411,7 +402,6 @@ def _condense(
     power: Array,
     variance: Array,
     variance_row: Indices,
-    relative: bool,
     exponent: Array,
     log_factor: Array,
     range_: Array,
@@ -457,8 +447,7 @@ def _condense(
             stop, reason = _take_logarithms(power[n, beam], log_factor[beam], m, low, high, logs)
             spread_row = variance[variance_row[n], beam]
             for g in range(low, stop):
-                spread = spread_row[g]
-                noise[g] = m * m * (spread if relative else spread / power[n, beam, g] ** 2)
+                noise[g] = m * m * (spread_row[g] / power[n, beam, g] ** 2)
                 if not noise[g] < math.inf:
                     stop, reason = g, MISSING
                     break
@@ -469,7 +458,7 @@ def _condense(
             narrow = range_[beam, low + 1] - range_[beam, low] <= outlying_bins.WIDEST_BIN
             if screened and narrow and stop > low:
                 end_bin, outliers = _bridge_outliers(
-                    (power[n, beam], spread_row, log_factor[beam]), m, relative, range_[beam],
+                    (power[n, beam], spread_row, log_factor[beam]), m, range_[beam],
                     (start, low, stop, end),
                     (neighbours[0][beam], neighbours[1][beam], neighbours[2][beam]),
                     (logs, noise, codes), without_outliers, work,

@@ -185,8 +185,8 @@ def retrieve_network(
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     network: Network,
     *,
+    variance: npt.ArrayLike,
     method: str = "network",
-    variance: npt.ArrayLike | None = None,
     overlap: npt.ArrayLike | None = None,
     full_overlap_range: npt.ArrayLike | None = None,
     exponent: npt.ArrayLike = 1.0,
@@ -211,11 +211,10 @@ def retrieve_network(
         m.
     network : Network
         From `lidarops.retrieve.network.geometry`, with the same beams as `power`.
-    method : {"network", "cycle", "multiplier", "unbiased", "slope", "klett"}
-    variance : (..., beam, range) float, optional
+    variance : (..., beam, range) float
         Noise variance in the square of the power's unit, broadcast against `power`; bins are
-        independent. By default it is estimated block by block from second differences along
-        range. With enough profiles, the variance of sums of bins shows correlated noise.
+        independent.
+    method : {"network", "cycle", "multiplier", "unbiased", "slope", "klett"}
     overlap : (beam, range) or (range,) float, optional
         Overlap function; power is divided by it. Bins with an overlap below 0.5 are not used.
     full_overlap_range : float or (beam,) float, optional
@@ -242,7 +241,7 @@ def retrieve_network(
 
     Returns
     -------
-    MultiPositionResult
+    NetworkResult
 
     Raises
     ------

@@ -88,7 +88,7 @@ def test_the_noise_of_a_curvature_error_is_as_stated():
     layout = _fit_layout.lay_out_fits(net, np.tile(r, (6, 1)), None, np.full(6, 100.0), 7)
     data = _condensed_signals.condense(
         power, variance[np.newaxis], np.zeros(3000, dtype=np.intp), np.ones(6), layout,
-        relative=False, screened=False,
+        screened=False,
     )  # fmt: skip
     stated = np.median(data.curvature_error[..., 1], axis=0)
     np.testing.assert_allclose(np.var(data.curvature_error[..., 0], axis=0), stated, rtol=0.12)
@@ -121,7 +121,7 @@ def test_the_prior_of_a_solution_is_recovered(deviation, strength):
     power = signals(net, grid(net), gradient)[np.newaxis]
     data = _condensed_signals.condense(
         power, ((0.01 * power[0]) ** 2)[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.beams),
-        layout, relative=False, screened=False,
+        layout, screened=False,
     )  # fmt: skip
     crossing = layout.passages.crossing.astype(np.intp)
     problem = _empirical_prior._Problem(data, layout, crossing, np.ones(net.beams), net.crossing)
@@ -151,7 +151,7 @@ def test_errors_of_values_shift_solutions_as_a_new_solution_does(build, deviatio
     )
     data = _condensed_signals.condense(
         power, variance[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.beams), layout,
-        relative=False, screened=False,
+        screened=False,
     )  # fmt: skip
     shared = np.random.default_rng(6).normal(0.0, 1e-4, (layout.passages.beam.size, 2))
     shared[:, 1] = 1e-8

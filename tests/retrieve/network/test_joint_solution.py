@@ -61,7 +61,7 @@ def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
     data = _condensed_signals.condense(
         np.atleast_3d(power).reshape(-1, net.beams, r.size), variance[np.newaxis],
         np.zeros(power.size // (net.beams * r.size), dtype=np.intp),
-        np.full(net.beams, exponent), layout, relative=False, screened=False,
+        np.full(net.beams, exponent), layout, screened=False,
     )  # fmt: skip
     return layout, data
 

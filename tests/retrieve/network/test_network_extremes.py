@@ -19,7 +19,7 @@ from support.oracles.network import (
     without_noise,
 )
 
-from lidarops.retrieve.network import _beam_signals, geometry
+from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.extinction_field import retrieve_network
 
 # Flags --------------------------------------------------------------------------------------
@@ -179,55 +179,3 @@ def test_a_crossing_reached_against_strong_attenuation_is_flagged(method, relati
     assert result.flags.ill_conditioned[:, other].mean() > 0.6
     assert result.flags.flagged[:, other].all()
     assert not result.flags.flagged[:, start].any()
-
-
-@pytest.mark.parametrize("factor", [8.0, 20.0])
-def test_a_noisy_profile_does_not_change_the_estimated_noise_of_others(factor):
-    """Its noise was once assigned to its whole block, and only partly to itself."""
-    net = triangle()
-    r = grid(net)
-    clean = signals(net, r, homogeneous(2e-3))
-    calm, _ = noisy(net, r, clean, 0.01, 50, 4, 0.0)
-    power = calm.copy()
-    power[7] += (factor - 1.0) * (calm[7] - clean)
-    settings = {"full_overlap_range": 100.0, "prior": "none"}
-    quiet, result = (
-        retrieve_network(calm, r, net, **settings),
-        retrieve_network(power, r, net, **settings),
-    )
-    others = np.arange(50) != 7
-    near = result.near_crossing
-    np.testing.assert_allclose(
-        result.extinction_standard_error[others][:, near],
-        quiet.extinction_standard_error[others][:, near], rtol=0.05,
-    )  # fmt: skip
-    own = result.extinction_standard_error[7, near] / result.extinction[7, near]
-    typical = quiet.extinction_standard_error[7, near] / quiet.extinction[7, near]
-    stated = np.isfinite(own)
-    assert np.all(result.flags.flagged[7, near] | (own > 0.5 * factor * typical))
-    assert not (
-        stated
-        & ~result.flags.flagged[7, near]
-        & (
-            np.abs(result.extinction[7, near] - 2e-3)
-            > 4.0 * result.extinction_standard_error[7, near]
-        )
-    ).any()
-
-
-def test_noise_of_quiet_profiles_is_pooled_in_blocks():
-    power, _ = noisy(
-        triangle(),
-        grid(triangle()),
-        signals(triangle(), grid(triangle()), homogeneous(2e-3)),
-        0.02,
-        12,
-        5,
-        0.0,
-    )
-    block = np.repeat([0, 1], 6)
-    members = [np.flatnonzero(block == b) for b in range(2)]
-    rows, row = _beam_signals._estimate_variances(power, members, block)
-    np.testing.assert_array_equal(row, block)
-    assert rows.shape == (2, *power.shape[1:])
-    np.testing.assert_allclose(np.sqrt(np.median(rows, axis=2)), 0.02, rtol=0.1)

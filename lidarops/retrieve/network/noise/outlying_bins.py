@@ -14,7 +14,6 @@ is added to the covariance of the beam, with straight lines across long runs
 is wrong, and the beam is rejected.
 """
 
-# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
@@ -55,9 +54,6 @@ _REFERENCE_BINS: Final = 4
 _REFERENCE_DEGREE: Final = 3
 _NOISY_BIN: Final = 0.02
 """Relative standard error of a bin beyond which logarithms are not normal in their tails."""
-_NOISY_ESTIMATED_BIN: Final = 0.05
-"""The same for an estimated variance, which says nothing about a single bin: noisier bins are not
-tested."""
 WIDEST_BIN: Final = 10.0
 """m, largest width of a bin that is too narrow for a layer of air."""
 _SUSPECT_SIGMAS: Final = 4.5
@@ -244,7 +240,6 @@ def scale_signal(
 def _deviation(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
-    relative: bool,
     at: int,
     nodes: Indices,
     weights: Array,
@@ -260,15 +255,12 @@ def _deviation(
     for i in range(count):
         largest_noise = max(largest_noise, noise[nodes[i]])
     prediction = spread = 0.0
-    if largest_noise < ((_NOISY_ESTIMATED_BIN if relative else _NOISY_BIN) * exponent) ** 2:
+    if largest_noise < (_NOISY_BIN * exponent) ** 2:
         for i in range(count):
             prediction += weights[i] * logs[nodes[i]]
             spread += weights[i] * weights[i] * noise[nodes[i]]
         gap = abs(logs[at] - prediction) - air * exponent
         spread += noise[at]
-    elif relative:
-        # Estimated variances do not contain the noise of the bin itself.
-        return 0.0
     else:
         for i in range(count):
             prediction += weights[i] * scaled[nodes[i]]
@@ -282,7 +274,6 @@ def _deviation(
 def _measure_deviations(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
-    relative: bool,
     grid: Array,
     codes: Codes,
     span: tuple[int, int, int, int],
@@ -304,7 +295,6 @@ def _measure_deviations(
             deviations[g] = _deviation(
                 row,
                 exponent,
-                relative,
                 g,
                 neighbour_plan[0][g],
                 neighbour_plan[1][g],
@@ -314,14 +304,13 @@ def _measure_deviations(
         else:
             count, air = find_neighbours(grid, codes, g, first, stop, nodes, weights)
             if count > 0:
-                deviations[g] = _deviation(row, exponent, relative, g, nodes, weights, count, air)
+                deviations[g] = _deviation(row, exponent, g, nodes, weights, count, air)
 
 
 @_compiled
 def _worst_bin(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
-    relative: bool,
     grid: Array,
     codes: Codes,
     suspect: int,
@@ -341,7 +330,7 @@ def _worst_bin(
         if count < _SIDE:
             continue
         _fit_weights(grid, g, nodes, count, min(_REFERENCE_DEGREE, count - 2), weights)
-        deviation = _deviation(row, exponent, relative, g, nodes, weights, count, 0.0)
+        deviation = _deviation(row, exponent, g, nodes, weights, count, 0.0)
         if deviation > largest:
             worst, largest = g, deviation
     return worst
@@ -424,7 +413,6 @@ def _exceeds(
 def _no_outlier(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
-    relative: bool,
     codes: Codes,
     span: tuple[int, int, int, int],
     neighbour_plan: tuple[Indices, Array, Array],
@@ -436,14 +424,14 @@ def _no_outlier(
     lost = 0
     for g in range(first, last):
         lost |= codes[g]
-    if lost != 0 or relative:
+    if lost != 0:
         return False
     for g in range(low, stop):
         left, right = neighbour_plan[0][g, 0], neighbour_plan[0][g, NODES - 1]
         if left < first or right >= last:
             return False
         if right - left != NODES or right - g != _SIDE:
-            if _deviation(row, exponent, relative, g, neighbour_plan[0][g], neighbour_plan[1][g],
+            if _deviation(row, exponent, g, neighbour_plan[0][g], neighbour_plan[1][g],
                     NODES, neighbour_plan[2][g]) > OUTLYING_SIGMAS:  # fmt: skip
                 return False
             continue
@@ -467,7 +455,6 @@ def _no_outlier(
 def find_outliers(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
-    relative: bool,
     grid: Array,
     span: tuple[int, int, int, int],
     neighbour_plan: tuple[Indices, Array, Array],
@@ -483,8 +470,7 @@ def find_outliers(
     ----------
     row : four (bin,) float64
         Logarithms times the exponent, their variances, the signal in any unit, and its variances.
-    exponent, relative
-        As in `lidarops.retrieve.network._condensed_signals.condense`.
+    exponent : float
     grid : (bin,) float64
         m.
     span : four int
@@ -509,10 +495,10 @@ def find_outliers(
     first, _, _, stop = span
     largest_number = _EDGE_BINS + int(_OUTLYING_SHARE * (stop - first))
     number = 0
-    if stop <= first or _no_outlier(row, exponent, relative, codes, span, neighbour_plan):
+    if stop <= first or _no_outlier(row, exponent, codes, span, neighbour_plan):
         return number, stop
     _measure_deviations(
-        row, exponent, relative, grid, codes, (first, stop, first, stop), neighbour_plan, deviations
+        row, exponent, grid, codes, (first, stop, first, stop), neighbour_plan, deviations
     )
     outlying = int(np.sum(deviations[first:stop] > OUTLYING_SIGMAS))
     if outlying > largest_number:
@@ -522,14 +508,13 @@ def find_outliers(
         farthest = first + int(np.argmax(deviations[first:stop]))
         if number > largest_number or not deviations[farthest] > OUTLYING_SIGMAS:
             break
-        worst = _worst_bin(row, exponent, relative, grid, codes, farthest, first, stop)
+        worst = _worst_bin(row, exponent, grid, codes, farthest, first, stop)
         codes[worst] = BRIDGED
         number += 1
         affected = max(first, worst - REACH), min(stop, worst + REACH + 1)
         _measure_deviations(
             row,
             exponent,
-            relative,
             grid,
             codes,
             (first, stop, *affected),

@@ -43,13 +43,13 @@ def solved(net, r, power, variance, **settings):
     return retrieve_network(power, r, net, variance=variance, **settings)
 
 
-def condensed(net, r, power, variance, *, screened=True, relative=False, nearest=100.0):
+def condensed(net, r, power, variance, *, screened=True, nearest=100.0):
     ranges = np.tile(r, (net.beams, 1))
     layout = _fit_layout.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
     rows = np.broadcast_to(variance, (1, *power.shape[1:]))
     data = _condensed_signals.condense(
         power, np.ascontiguousarray(rows), np.zeros(len(power), dtype=np.intp),
-        np.ones(net.beams), layout, relative=relative, screened=screened,
+        np.ones(net.beams), layout, screened=screened,
     )  # fmt: skip
     return data, layout
 
@@ -108,7 +108,6 @@ def test_deviations_of_bins_are_normal(relative):
         outlying_bins._measure_deviations(
             row,
             1.0,
-            False,
             ranges,
             codes,
             (0, count, 0, count),
@@ -460,21 +459,11 @@ def test_noise_far_above_the_stated_one_is_flagged():
     assert (result.flags.outlying | result.flags.poor_fit | ~used).all()
 
 
-@pytest.mark.parametrize("variance", [0.0, None])
-def test_noise_that_is_not_stated_sets_no_flag(variance):
+def test_a_variance_of_zero_sets_no_flag_of_outlying_bins():
     net, r, power, _ = scene(ALL["plume"], relative=0.02)
-    result = solved(net, r, power, variance)
+    result = solved(net, r, power, 0.0)
     assert not result.flags.bridged.any()
     assert not result.flags.outlying.any()
-
-
-def test_spikes_are_detected_with_estimated_noise():
-    net, r, power, variance = scene(relative=0.01, additive=0.0)
-    at = bin_at(r, net.on_beam(0)[1][0])
-    clean = solved(net, r, power, None)
-    result = solved(net, r, hit(power, variance, 7, 0, at, 60.0), None)
-    assert result.flags.bridged[7, net.on_beam(0)[0]].all()
-    assert np.nanmax(apart(result, clean)[7]) < 1.0
 
 
 @pytest.mark.parametrize(("outlying", "left"), [((0, 1, -2, -1), True), ((0, 1), False)])
