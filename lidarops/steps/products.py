@@ -7,6 +7,7 @@ from typing import Final, Literal
 
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.data import Data
@@ -19,7 +20,7 @@ AVERAGE: Final = Datum[float]("average")
 """s, length of the clock intervals over which profiles are averaged."""
 MOLECULES: Final = Datum[MolecularProfile]("molecules")
 
-FEWEST_BINS: Final = 8
+FEWEST_BINS: Final = THRESHOLDS.fewest_bins
 """Fewest bins of a section, and of the range of a background."""
 
 
@@ -28,20 +29,20 @@ def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, 
 
     By default the last tenth of the bins.
     """
-    start, stop = limits or (0.9 * case.last, case.last)
+    start, stop = limits or ((1.0 - THRESHOLDS.tail_share) * case.last, case.last)
     return start, min(stop, case.last)
 
 
 class BackgroundSettings(SettingsModel):
     """Settings of the step ``background``."""
 
-    method: Literal["tail_mean", "cubic"]
+    method: Literal["tail_mean", "cubic", "known_shape"]
     range: tuple[float, float]
     """m."""
 
 
 class Background(Step[BackgroundSettings]):
-    """State how the background is estimated, from `background_range` of the request."""
+    """State how the background is estimated, from what the request says of it."""
 
     name = "background"
     settings = BackgroundSettings
@@ -49,7 +50,7 @@ class Background(Step[BackgroundSettings]):
 
     def decide(self, case: ChannelCase) -> Decisions:
         """Run always; the product is left out where the range holds too few bins."""
-        limits = case.request.background_range
+        limits = getattr(case.request, "background_range", None)
         start, stop = tail(case, limits)
         method = getattr(case.request, "background", "tail_mean")
         where = (
@@ -58,6 +59,11 @@ class Background(Step[BackgroundSettings]):
         reason = f"mean of {where}; signal there biases it"
         if method == "cubic":
             reason = f"cubic of the homogeneous section {where}; another course of signal biases it"
+        elif method == "known_shape":
+            reason = (
+                "fitted with the shape of clean air, which is assumed in the far range, and tested;"
+                f" mean of {where} where the fit fails"
+            )
         yield Run(
             reason,
             BackgroundSettings(method=method, range=(start, stop)),

@@ -26,8 +26,7 @@ from lidarops.process.scene import process_scene
 from lidarops.products.homogeneous.look import GAP
 from lidarops.raw.file import RawFile
 from lidarops.records import Plan, PlannedStep, Role, RunRecord
-from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
+from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.steps import dependence
@@ -220,9 +219,7 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         shots=np.ones(len(granules)),
         altitude_grid=np.arange(step, highest + 1e-6, step) + 20.0,
         station_altitude=20.0,
-        background=labeled_altitudes.Background(
-            (27_000.0, 30_000.0), MolecularProfile.us_standard(), 532e-9
-        ),
+        background_range=(27_000.0, 30_000.0),
     )
     scan = slant_paths.make_scan(
         on_levels["beam_zenith_angle"].to_numpy(),

@@ -36,7 +36,6 @@ from lidarops.netcdf.variables import layout_of
 from lidarops.records import DetectionMode
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
-from lidarops.retrieve.multiangle.labeled_altitudes import Background
 
 KINDS = list(MAKERS)
 
@@ -572,7 +571,7 @@ def test_a_scan_goes_from_profiles_to_a_product():
         shots=np.full(12, 600),
         altitude_grid=STATION.altitude + 60.0 * np.arange(1, 60),
         station_altitude=STATION.altitude,
-        background=Background((5400.0, 6000.0)),
+        background_range=(5400.0, 6000.0),
     )
     product = decoded(found, "multiangle")
     assert {"time": 3, "altitude": 59, "beam": 4}.items() <= product.sizes.items()

@@ -16,6 +16,7 @@ class MultiAngleSettings(ChannelProduct):
     highest: Metres = quantity(6000.0, unit="m", description="above the station")
     step: float = quantity(60.0, unit="m", ge=5, le=1000, description="between altitudes")
     method: Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"] = "auto"
+    background: Literal["known_shape", "tail_mean"] = "known_shape"
     layers: list[tuple[float, float]] = quantity(
         [],
         unit="m",

@@ -21,14 +21,18 @@ from lidarops.products.multiangle.settings import MultiAngleSettings
 from lidarops.records import Plan, Scene
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles
-from lidarops.retrieve.multiangle.labeled_altitudes import Background as TailBackground
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, Indices, WholeProduct, in_one_batch
 from lidarops.steps.pointing import no_scan
-from lidarops.steps.products import MOLECULES
+from lidarops.steps.products import (
+    BACKGROUND_METHOD,
+    BACKGROUND_RANGE,
+    MOLECULES,
+    Background,
+)
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.step import (
     REQUESTED,
@@ -240,8 +244,6 @@ class ScanSettings(SettingsModel):
     """m-1."""
     layers: tuple[tuple[float, float], ...]
     """m above the station."""
-    background_range: tuple[float, float]
-    """m along the beam."""
 
 
 class MultiAngle(ProductStep[ScanSettings]):
@@ -249,7 +251,15 @@ class MultiAngle(ProductStep[ScanSettings]):
 
     name = "multiangle"
     settings = ScanSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, DECIDED)
+    inputs = (
+        PROFILES,
+        WAVELENGTH,
+        OVERLAP,
+        MOLECULES,
+        BACKGROUND_RANGE,
+        BACKGROUND_METHOD,
+        DECIDED,
+    )
     costs = UnitCosts(product=0.1, value=6e-6, figure=1.9, load=0.1)
 
     def decide(self, case: ChannelCase) -> Decisions:
@@ -267,7 +277,6 @@ class MultiAngle(ProductStep[ScanSettings]):
                 method=settings.method,
                 largest_gradient=settings.largest_gradient,
                 layers=tuple(settings.layers),
-                background_range=(0.9 * case.last, case.last),
             ),
         )
 
@@ -303,7 +312,9 @@ class _Scans(WholeProduct):
             shots=profiles.shots(data.source.archive).to_numpy(),
             altitude_grid=self._station + altitude_steps(settings.step, settings.highest),
             station_altitude=self._station,
-            background=TailBackground(settings.background_range, data[MOLECULES], data[WAVELENGTH]),
+            background_range=data[BACKGROUND_RANGE],
+            molecules=data[MOLECULES] if data[BACKGROUND_METHOD] == "known_shape" else None,
+            wavelength=data[WAVELENGTH],
             overlap=None if overlap is None else overlap(profiles.range),
         )
 
@@ -329,6 +340,7 @@ class _Scans(WholeProduct):
 
 
 STEPS: Final = (
+    Background(),
     Gradient(),
     GradientRegressor(),
     Robust(),

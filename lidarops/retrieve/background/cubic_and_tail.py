@@ -12,18 +12,12 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import _cubic_kernel, photon_counts
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-FEWEST_BINS: Final = 8
-_LAG_SHARE: Final = 0.4
-LOWEST_CONTRAST: Final = 10.0
-"""Least curvature of the quartic at its minimum over the contribution of the noise. Below, it may
-be the wrong minimum, and the standard error is too small by a factor of 2 (simulations)."""
-LARGEST_SHIFT: Final = 1.0
-"""Standard errors by which signal curvature, mistaken for noise, may shift the background."""
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid, over the last range: rounding of float32 ranges."""
 
@@ -54,7 +48,7 @@ class BackgroundResult:
 
 def default_lag(bins: int) -> int:
     """Return the lag with the least scatter of the cubic, 0.4 of the bins."""
-    return max(min(round(_LAG_SHARE * bins), (bins - 1) // 2), 1)
+    return max(min(round(THRESHOLDS.lag_share * bins), (bins - 1) // 2), 1)
 
 
 def cubic(
@@ -192,11 +186,11 @@ def solve_cubic(
     quality = np.zeros(count, dtype=np.int32)
     for code, bit in _QUALITY_OF_STATUS.items():
         quality[status == code] |= np.int32(bit)
-    moved = (out[:, _cubic_kernel.CONTRAST] < LOWEST_CONTRAST) | (
-        out[:, _cubic_kernel.CURVATURE_SHIFT] > LARGEST_SHIFT
+    moved = (out[:, _cubic_kernel.CONTRAST] < THRESHOLDS.lowest_contrast) | (
+        out[:, _cubic_kernel.CURVATURE_SHIFT] > THRESHOLDS.largest_shift
     )
     quality[moved] |= np.int32(Quality.LOW_SIGNAL)
-    if bins < FEWEST_BINS:
+    if bins < THRESHOLDS.fewest_bins:
         quality[status != _cubic_kernel.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
     unsolved = status == _cubic_kernel.UNSOLVED
     background = np.where(unsolved, np.nan, out[:, _cubic_kernel.BACKGROUND])
@@ -241,7 +235,7 @@ def tail_mean(
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
     noise = inputs.variance_rows(variance, grid, leading)
-    first = _first_of_tail(grid.values, start, "start")
+    first = first_of_tail(grid.values, start)
     values = np.ascontiguousarray(rows[:, first:], dtype=np.float64)
     noise = np.broadcast_to(noise[:, first:], values.shape)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -282,7 +276,7 @@ def solve_tail(
     gradients : (profile, bin) float
         Derivatives of the backgrounds with respect to the power.
     """
-    first = _first_of_tail(range_, start, "tail_start")
+    first = first_of_tail(range_, start, "tail_start")
     gradients = np.zeros(power.shape)
     usable = np.isfinite(power) & np.isfinite(noise) & (noise > 0)
     bins = usable[:, first:].sum(axis=-1)
@@ -297,13 +291,14 @@ def solve_tail(
 def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:
     quality = np.zeros(bins.shape, dtype=np.int32)
     quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
-    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    quality[(bins > 0) & (bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
     return quality
 
 
-def _first_of_tail(range_: Array, start: float | None, field: str) -> int:
+def first_of_tail(range_: Array, start: float | None = None, field: str = "start") -> int:
+    """Return the first bin of the tail, by default of the last tenth of the bins."""
     if start is None:
-        return int(range_.size - max(range_.size // 10, 1))
+        return int(range_.size - max(int(THRESHOLDS.tail_share * range_.size), 1))
     if not np.isfinite(start) or start > range_[-1]:
         raise RetrievalInputError(
             f"is {start} m, but the range ends at {range_[-1]:g} m", field=field

@@ -6,18 +6,13 @@ The plan skips what this test excludes. It never yields a result.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-
-_TAIL: Final = 0.1
-"""Share of the bins, the farthest, whose power is the background."""
-_FEWEST: Final = 8
-"""Fewest bins of the stretch for a profile to be tested. No study is recorded that set it."""
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,18 +84,18 @@ def detect_light(
             field="power",
             remedy="give profiles over range, and one range per bin",
         )
-    tail = (np.arange(r.size) >= (1.0 - _TAIL) * r.size) & (r > 0.0)
+    tail = (np.arange(r.size) >= (1.0 - THRESHOLDS.tail_share) * r.size) & (r > 0.0)
     used = np.flatnonzero(tail | ((r >= near) & (r <= far) & (r > 0.0)))
     power, variance, flags, r = power[:, used], variance[:, used], flags[:, used], r[used]
     inside, tail = (r >= near) & (r <= far), tail[used]
     measured = np.isfinite(power) & np.isfinite(variance) & (variance > 0.0)
     measured &= (flags & int(Quality.INPUT_MISSING)) == 0
     saturated = (flags & int(Quality.SATURATED)) != 0
-    seen = ((measured | saturated) & inside).sum(axis=1) >= _FEWEST
+    seen = ((measured | saturated) & inside).sum(axis=1) >= THRESHOLDS.fewest_bins
     fitted = measured & (inside | tail)
     significance = _significance(power, variance, fitted, r)
     clipped = np.any(saturated & inside, axis=1)
-    testable = (measured & inside).sum(axis=1) >= _FEWEST
+    testable = (measured & inside).sum(axis=1) >= THRESHOLDS.fewest_bins
     significances = significance[testable & np.isfinite(significance)]
     return LightDetection(
         profiles=int(seen.sum()),

@@ -18,7 +18,8 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, known_shape
 from lidarops.retrieve.background._section_fit import fit_section, groups
-from lidarops.retrieve.background.left_signal import THRESHOLDS, LeftSignal, left_in_tail, shifts
+from lidarops.retrieve.background.left_signal import LeftSignal, left_in_tail, shifts
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 
 Array = npt.NDArray[np.float64]
@@ -173,7 +174,7 @@ def from_cubic(
         np.int32(Quality.INPUT_MISSING),
         np.int32(Quality.NO_REAL_SOLUTION),
     )
-    calm = fit.waves <= special.chdtri(groups(grid.size) - 3.0, known_shape.FALSE_ALARM)
+    calm = fit.waves <= special.chdtri(groups(grid.size) - 3.0, THRESHOLDS.false_alarm)
     unjudged = np.isnan(left.most) | ~calm | ((root.quality & doubts) != 0)
     return _judged(
         value.reshape(leading),
@@ -200,7 +201,7 @@ def _bits(uncertain: Booleans, absent: Flags) -> Flags:
 
 def _bins(range_: Array, span: tuple[float, float] | None) -> slice:
     if span is None:
-        return slice(range_.size - max(range_.size // 10, 1), range_.size)
+        return slice(cubic_and_tail.first_of_tail(range_), range_.size)
     start, stop = span
     first, past = np.searchsorted(range_, (start, np.nextafter(stop, np.inf)))
     if first == past:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,31 +11,13 @@ from scipy import special
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import _shape_fit
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 Booleans = npt.NDArray[np.bool_]
-
-START_SHARES: Final = (0.3, 0.4, 0.5, 0.6, 0.7)
-"""Starts of the windows that are tried where none is given, over the farthest usable range."""
-FEWEST_BINS: Final = 8
-FALSE_ALARM: Final = 1e-4
-"""Probability that either test of the residuals raises `poor_fit` where the shape is right;
-lower with fewer than 100 bins of unknown variance."""
-REJECTION: Final = 1e-2
-"""Probability that the tests reject a window where the shape is right."""
-NEGATIVE: Final = 3.0
-"""Standard errors below zero beyond which an amplitude is flagged negative."""
-LARGEST_CONDITION: Final = 30.0
-"""Standard error of the background over that of the mean of the same bins."""
-FAR: Final = 4.0
-"""Standard errors beyond which a value lies no more often than with a known variance."""
-_LEAST_FREEDOM: Final = (54.0, 18.0)
-"""Least degrees of freedom of the noise in the tests of waves and curvature. In short windows the
-estimated noise contains part of the tested misfit, which bounds the ratio: these are the largest
-quantiles at 8 to 60 bins, from 1 percent to 1e-4 false alarms (simulations)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +52,8 @@ class KnownShapeResult:
     """The residuals vary systematically along range: the window is not free of aerosol, the
     shape is not that of the air, or the noise is not white along range."""
     singular: Booleans
-    """The window is too short for the shape to differ from a constant (`LARGEST_CONDITION`);
-    use another method."""
+    """The window is too short for the shape to differ from a constant
+    (`Thresholds.largest_condition`); use another method."""
     quality: Flags
     """INPUT_MISSING, TOO_FEW_BINS, NO_SIGNAL (all bins of a window equal, which noise never gives;
     not for counts), NEGATIVE_AMPLITUDE, NOT_HOMOGENEOUS (where `poor_fit`)."""
@@ -161,10 +142,11 @@ def fit_known_shape(
         For Poisson counts: counts per unit of power. That is the number of shots where power is
         a mean count per shot, and shots times bin time in microseconds where it is in MHz.
     start, stop : (...) float, optional
-        m, ends of the window. Where `start` is not given, windows from each of `START_SHARES`
-        of the farthest usable range are tried. The result is that of the longest window whose
-        residuals show neither curvature nor waves and whose background agrees with those of all
-        shorter windows (each at 1 % false alarms), else that of the shortest.
+        m, ends of the window. Where `start` is not given, windows from each of
+        `Thresholds.start_shares` of the farthest usable range are tried. The result is that of
+        the longest window whose residuals show neither curvature nor waves and whose background
+        agrees with those of all shorter windows (each at 1 % false alarms), else that of the
+        shortest.
     mask : (..., range) bool, optional
         True where a bin may be used; broadcast against `power`.
 
@@ -197,7 +179,7 @@ def fit_known_shape(
     pasts = _pasts(rows, allowed, stop, grid.values, leading)
     firsts = _firsts(start, pasts, grid.values, leading)
     out = np.full((len(rows), _shape_fit.COLUMNS), np.nan)
-    limits = _limits(REJECTION)
+    limits = _limits(THRESHOLDS.rejection)
     _shape_fit.fit_shape(
         rows, shapes, frozen(grid.values), allowed, noise, firsts, pasts, limits, out
     )
@@ -279,7 +261,7 @@ def _firsts(
             )
         return np.searchsorted(range_, starts, side="left").astype(np.intp)[:, np.newaxis]
     farthest = range_[np.maximum(pasts - 1, 0)]
-    earliest: Array = farthest[:, np.newaxis] * np.array(START_SHARES)
+    earliest: Array = farthest[:, np.newaxis] * np.array(THRESHOLDS.start_shares)
     return np.searchsorted(range_, earliest, side="left").astype(np.intp)
 
 
@@ -300,7 +282,8 @@ def _estimated_limits(false_alarm: float, bins: npt.NDArray[np.int64]) -> tuple[
     counts, kind = np.unique(bins, return_inverse=True)
     count = np.maximum(counts.astype(np.float64), 2.0)
     freedom = 2.0 * (count - 1.0) ** 2 / (3.0 * count - 4.0)
-    waves_freedom, curvature_freedom = (np.maximum(freedom, least) for least in _LEAST_FREEDOM)
+    waves_freedom = np.maximum(freedom, THRESHOLDS.least_freedom_of_waves)
+    curvature_freedom = np.maximum(freedom, THRESHOLDS.least_freedom_of_curvature)
     groups = _shape_fit.GROUPS - 2.0
     waves = groups * special.fdtri(groups, waves_freedom, 1.0 - rate)
     return waves[kind], -special.stdtrit(curvature_freedom, 0.5 * rate)[kind]
@@ -312,7 +295,9 @@ def _level(chi2: Array, freedom: npt.NDArray[np.int64]) -> Array:
     An error over its estimate follows Student's distribution.
     """
     counts, kind = np.unique(freedom, return_inverse=True)
-    widening = -special.stdtrit(counts.astype(np.float64), special.ndtr(-FAR)) / FAR
+    widening = (
+        -special.stdtrit(counts.astype(np.float64), special.ndtr(-THRESHOLDS.far)) / THRESHOLDS.far
+    )
     level: Array = chi2 / freedom * widening[kind] ** 2
     return level
 
@@ -333,16 +318,17 @@ def _result(
         curvature = out[:, _shape_fit.CURVATURE] / np.sqrt(rough)
         waves = out[:, _shape_fit.WAVES] / rough
         amplitude_error = np.sqrt(out[:, _shape_fit.AMPLITUDE_VARIANCE] * level)
-        limits = _limits(FALSE_ALARM) if known else _estimated_limits(FALSE_ALARM, bins)
+        rate = THRESHOLDS.false_alarm
+        limits = _limits(rate) if known else _estimated_limits(rate, bins)
         poor = (np.abs(curvature) > limits[1]) | (waves > limits[0])
-        negative = out[:, _shape_fit.AMPLITUDE] < -NEGATIVE * amplitude_error
+        negative = out[:, _shape_fit.AMPLITUDE] < -THRESHOLDS.negative * amplitude_error
     condition = out[:, _shape_fit.CONDITION]
     unsolved = (bins > 0) & ~np.isfinite(out[:, _shape_fit.BACKGROUND])
-    singular = (condition > LARGEST_CONDITION) | unsolved
+    singular = (condition > THRESHOLDS.largest_condition) | unsolved
     quality = np.zeros(len(out), dtype=np.int32)
     quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
-    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
-    constant = (bins >= FEWEST_BINS) & (out[:, _shape_fit.CONSTANT] > 0)
+    quality[(bins > 0) & (bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
+    constant = (bins >= THRESHOLDS.fewest_bins) & (out[:, _shape_fit.CONSTANT] > 0)
     quality[constant] |= np.int32(Quality.NO_SIGNAL)
     quality[negative] |= np.int32(Quality.NEGATIVE_AMPLITUDE)
     quality[poor] |= np.int32(Quality.NOT_HOMOGENEOUS)

@@ -8,34 +8,14 @@ least with the square of range; this bounds L.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.background.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class Thresholds:
-    """The numbers of the judgement. No study is recorded that set those without a source."""
-
-    nearest: float = 0.6
-    """Begin of the window before the tail, over the start of the tail (dimensionless)."""
-    farthest: float = 0.7
-    """End of the window before the tail, over the start of the tail (dimensionless)."""
-    detected: float = 3.0
-    """Standard errors by which signal before the tail is detected."""
-    share_of_error: float = 0.5
-    """Largest shift of a value by signal left in the tail that raises no flag, over the standard
-    error of the value (dimensionless)."""
-    shape_error: float = 0.2
-    """Relative error of the signal in the tail as computed from the shape of clean air, caused by
-    aerosol in the far range (haze of 12 percent of the air there, simulated; dimensionless)."""
-
-
-THRESHOLDS: Final = Thresholds()
 
 
 @dataclass(frozen=True, slots=True)

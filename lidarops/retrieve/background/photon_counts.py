@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 
 Array = npt.NDArray[np.float64]
-
-ENOUGH_COUNTS: Final = 1000.0
-"""Counts that give a variance to 3 percent."""
-WIDEST: Final = 7
-"""Most bins to either side over which a mean profile is averaged."""
 
 
 def checked_shots(
@@ -90,18 +84,18 @@ def mean_profile_variance(power: npt.ArrayLike, shots: npt.ArrayLike = 1.0) -> A
 
 
 def _averaged(counts: Array, shots: Array) -> Array:
-    """Average counts per shot along range until they hold `ENOUGH_COUNTS`."""
+    """Average counts per shot along range until they hold `Thresholds.enough_counts`."""
     mean = np.full(counts.size, np.nan)
     too_few = np.ones(counts.size, dtype=bool)
     total_counts = np.concatenate([[0.0], np.cumsum(counts)])
     total_shots = np.concatenate([[0.0], np.cumsum(shots)])
     bins = np.arange(counts.size)
-    for half in range(WIDEST + 1):
+    for half in range(THRESHOLDS.widest + 1):
         low, high = np.maximum(bins - half, 0), np.minimum(bins + half + 1, counts.size)
         held = total_counts[high] - total_counts[low]
         spread = total_shots[high] - total_shots[low]
         with np.errstate(invalid="ignore", divide="ignore"):
             # At least half a count: without any count, the variance is small, not zero.
             mean = np.where(too_few, np.maximum(held, 0.5) / spread, mean)
-        too_few &= held < ENOUGH_COUNTS
+        too_few &= held < THRESHOLDS.enough_counts
     return np.where(shots > 0, mean, np.nan)

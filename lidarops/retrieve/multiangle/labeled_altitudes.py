@@ -41,19 +41,6 @@ _BESIDE: Final = 4
 """Bins beside an altitude that an interpolation may need."""
 
 
-@dataclass(frozen=True, slots=True)
-class Background:
-    """How the background of a profile is estimated."""
-
-    range: tuple[float, float]
-    """m along the beam: the tail, whose mean is the background."""
-    molecules: MolecularProfile | None = None
-    """If given, the background is fitted in the far range together with the signal shape of clean
-    air (`lidarops.retrieve.background.known_shape`); the tail is used where that fit fails."""
-    wavelength: float = np.nan
-    """m, for the scattering of the molecules."""
-
-
 class AltitudeCycles:
     """Profiles of a scan on common altitudes, sorted by cycle and beam, from chunks of profiles.
 
@@ -76,7 +63,13 @@ class AltitudeCycles:
         m above mean sea level, ascending, above the station; uniform for the method "joint".
     station_altitude : float
         m above mean sea level.
-    background : Background
+    background_range : (float, float)
+        m along the beam: the tail, whose mean is the background.
+    molecules : MolecularProfile, optional
+        If given, the background is fitted in the far range together with the signal shape of clean
+        air (`lidarops.retrieve.background.known_shape`); the tail is used where that fit fails.
+    wavelength : float
+        m, for the scattering of the molecules.
     overlap : (range,) float, optional
         The signal is divided by it; NaN where it is not known.
 
@@ -96,7 +89,9 @@ class AltitudeCycles:
         shots: npt.ArrayLike,
         altitude_grid: npt.ArrayLike,
         station_altitude: float,
-        background: Background,
+        background_range: tuple[float, float],
+        molecules: MolecularProfile | None = None,
+        wavelength: float = np.nan,
         overlap: Array | None = None,
     ) -> None:
         directions = scan_cycles.directions(zenith_angle, azimuth)
@@ -108,8 +103,10 @@ class AltitudeCycles:
         self._settings = _Settings(
             distance=distance,
             overlap=overlap,
-            background=background,
-            shapes=_shapes(background, order.zenith_angle, distance, station_altitude),
+            background_range=background_range,
+            shapes=None
+            if molecules is None
+            else _shapes(molecules, wavelength, order.zenith_angle, distance, station_altitude),
             zenith_angle=order.zenith_angle,
             altitude=levels,
             station_altitude=station_altitude,
@@ -170,9 +167,9 @@ class AltitudeCycles:
         xr.Dataset
             ``signal`` (range-corrected) and ``variance`` over (time, beam, altitude), NaN where
             missing; ``quality`` (the bits of all bins at an altitude) over (time, altitude);
-            ``left`` (the most signal that may have been subtracted with the background) over
-            (time, beam); and ``shots`` over time. ``time`` is the middle of ``time_bnds``, which
-            span the profiles of a cycle.
+            ``left`` (the signal that may have been subtracted with the background, 0 where none is
+            detected) over (time, beam); and ``shots`` over time. ``time`` is the middle of
+            ``time_bnds``, which span the profiles of a cycle.
         """
         order = self._order
         arrays = [np.concatenate(pieces) for pieces in zip(*self._pieces, strict=True)]
@@ -221,7 +218,7 @@ class _Settings:
 
     distance: Array
     overlap: Array | None
-    background: Background
+    background_range: tuple[float, float]
     shapes: Array | None
     """(beam, range): signal of clean air."""
     zenith_angle: Array
@@ -252,7 +249,7 @@ class _NetProfiles:
     variance: Array
     """(profile, range), with that of the background."""
     left: Array
-    """(profile,): the most signal that may have been subtracted with the background."""
+    """(profile,): the signal that may have been subtracted with the background."""
     uncertain: npt.NDArray[np.bool_]
     """(profile,): the far range does not fit clean air, or `left` cannot be estimated."""
 
@@ -306,7 +303,7 @@ def _batch_on_altitudes(
 ) -> tuple[Array, Array, Flags, Array]:
     """Return signal and variance as (cycle, beam, altitude), quality as (cycle, altitude).
 
-    The fourth array is, as (cycle, beam), the most signal that may have been subtracted with the
+    The fourth array is, as (cycle, beam), the signal that may have been subtracted with the
     background.
     """
     pieces = [
@@ -375,42 +372,40 @@ def _without_background(
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
     distance = settings.distance
     front = settings.in_front
-    data = (values[:, front], distance[front], variance[:, front])
+    data, tail = (values[:, front], distance[front], variance[:, front]), settings.background_range
     sky = (
-        estimate.from_tail(*data, settings.background.range)
+        estimate.from_tail(*data, tail)
         if settings.shapes is None
-        else estimate.from_known_shape(
-            *data, settings.shapes[beam][:, front], settings.background.range
-        )
+        else estimate.from_known_shape(*data, settings.shapes[beam][:, front], tail)
     )
     values = values - sky.background[:, np.newaxis]
     noise = variance + sky.standard_error[:, np.newaxis] ** 2
     if settings.overlap is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             values, noise = values / settings.overlap, noise / settings.overlap**2
-    return _NetProfiles(values, noise, sky.left.most, sky.unjudged)
+    return _NetProfiles(values, noise, sky.left.detected, sky.unjudged)
 
 
 def _shapes(
-    background: Background, zenith_angle: Array, distance: Array, station_altitude: float
-) -> Array | None:
+    molecules: MolecularProfile,
+    wavelength: float,
+    zenith_angle: Array,
+    distance: Array,
+    station_altitude: float,
+) -> Array:
     """Return the shape of the signal of clean air along each beam; 0 behind the lidar."""
-    if background.molecules is None:
-        return None
-    if not background.wavelength > 0:
+    if not wavelength > 0:
         raise RetrievalInputError(
-            f"has the wavelength {background.wavelength}",
-            field="background",
-            remedy="give the wavelength in m, or leave the molecules out",
+            f"is {wavelength}", field="wavelength", remedy="give m, or leave the molecules out"
         )
     in_front = distance > 0
     climb = np.cos(np.radians(zenith_angle))[:, np.newaxis]
-    extinction = background.molecules.number_density(
+    extinction = molecules.number_density(
         station_altitude + climb * distance[in_front]
-    ) * rayleigh_cross_section(background.wavelength)
+    ) * rayleigh_cross_section(wavelength)
     shapes = np.zeros((zenith_angle.size, distance.size))
     shapes[:, in_front] = known_shape.molecular_shape(
-        extinction / molecular_lidar_ratio(background.wavelength), extinction, distance[in_front]
+        extinction / molecular_lidar_ratio(wavelength), extinction, distance[in_front]
     )
     return shapes
 

@@ -11,7 +11,8 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import molecular_shape
 from lidarops.retrieve.background.estimate import from_cubic, from_known_shape, from_tail
-from lidarops.retrieve.background.left_signal import THRESHOLDS, shifts, window_before
+from lidarops.retrieve.background.left_signal import shifts, window_before
+from lidarops.retrieve.background.thresholds import THRESHOLDS
 
 RANGE = 7.5 * (np.arange(2000) + 0.5)
 TAIL = (13_500.0, 15_000.0)

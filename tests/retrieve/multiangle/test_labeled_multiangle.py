@@ -16,7 +16,7 @@ from lidarops.kinds import flags_of
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles, Background
+from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod
 
 STATION = 120.0
@@ -28,7 +28,7 @@ MISSING, OVERLAP = np.int32(Quality.INPUT_MISSING), np.int32(Quality.INCOMPLETE_
 SETTINGS = {
     "altitude_grid": ALTITUDE,
     "station_altitude": STATION,
-    "background": Background((16200.0, 18000.0)),
+    "background_range": (16200.0, 18000.0),
 }
 
 
@@ -118,7 +118,7 @@ AIR = MolecularProfile(
     temperature=np.full(80, 273.0),
 )
 """With the scale height of the simulated molecules."""
-FAR = Background((16200.0, 18000.0), AIR, 532e-9)
+FAR = {"molecules": AIR, "wavelength": 532e-9}
 
 
 def errors(product: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +133,7 @@ def errors(product: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
-@pytest.mark.parametrize("background", [SETTINGS["background"], FAR], ids=["tail", "known_shape"])
+@pytest.mark.parametrize("background", [{}, FAR], ids=["tail", "known_shape"])
 @pytest.mark.parametrize(
     ("zenith", "noise"),
     [(TWO_SIDED, (0.5, 0.01)), (ONE_SIDE, (0.5, 0.01)), (TWO_SIDED, (0.02, 0.03))],
@@ -145,7 +145,7 @@ def test_unflagged_optical_depths_lie_within_three_standard_errors(
     off, plain = [], []
     for seed in range(1, 5):
         profiles = scan(32, zenith, seed, sigma=noise[0], scatter=noise[1])
-        product = solve(*profiles, method=method, background=background)
+        product = solve(*profiles, method=method, **background)
         assert_explained(product)
         for kept, part in zip((off, plain), errors(product), strict=True):
             kept.append(part)
@@ -158,9 +158,9 @@ def test_unflagged_optical_depths_lie_within_three_standard_errors(
 
 def test_single_altitudes_stay_valid_if_shot_energy_jitters():
     profiles = scan(32, sigma=0.05, scatter=0.002, jitter=0.02)
-    joint = solve(*profiles, method="joint", background=FAR)
+    joint = solve(*profiles, method="joint", **FAR)
     assert has(joint, MultiAngleQuality.HIGH_CORRELATION).all()
-    product = solve(*profiles, background=FAR)
+    product = solve(*profiles, **FAR)
     assert "left out joint" in product.attrs["steps"]
     off, _ = errors(product)
     stands = ~has(product, flags_of("multiangle").rejecting)
@@ -170,7 +170,7 @@ def test_single_altitudes_stay_valid_if_shot_energy_jitters():
 
 
 def test_extinction_is_that_of_the_layers():
-    product = solve(*scan(32), method="joint", background=FAR)
+    product = solve(*scan(32), method="joint", **FAR)
     tops = np.append(0.0, ALTITUDE - STATION)
     truth = np.diff(optical_depth(tops)) / np.diff(tops)
     off = ((product["extinction"] - truth) / product["extinction_standard_error"]).to_numpy()
@@ -184,7 +184,7 @@ def test_optical_depths_of_layers_lie_within_their_errors(method):
     layers = [(STATION, STATION + 600.0), (STATION + 610.0, STATION + 1500.0)]
     off = []
     for seed in range(4):
-        product = solve(*scan(32, seed=seed), method=method, background=FAR, layers=layers)
+        product = solve(*scan(32, seed=seed), method=method, **FAR, layers=layers)
         bounds = product["layer_bnds"].to_numpy()
         np.testing.assert_allclose(bounds, STATION + np.array([[0, 600], [600, 1500]]))
         np.testing.assert_allclose(product["layer_altitude"], STATION + np.array([300, 1050]))
@@ -209,7 +209,7 @@ def test_optical_depths_of_layers_lie_within_their_errors(method):
 
 
 def test_product_has_monotone_profiles_and_chi_square():
-    product = solve(*scan(16), background=FAR)
+    product = solve(*scan(16), **FAR)
     depth, risen = product["optical_depth"].to_numpy(), product["monotone_optical_depth"].to_numpy()
     np.testing.assert_array_equal(np.isnan(depth), np.isnan(risen))
     for rising_row, row in zip(risen, depth, strict=True):
@@ -411,10 +411,10 @@ def test_any_chunks_of_cycles_give_the_same_bits(step):
 
 def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypatch):
     conditioned, pointing = scan(12)
-    cut = solve(conditioned, pointing, background=FAR)
+    cut = solve(conditioned, pointing, **FAR)
     monkeypatch.setattr(labeled_altitudes, "_BESIDE", 10**6)
     monkeypatch.setattr(labeled_altitudes, "_AT_ONCE", 5)
-    xr.testing.assert_identical(cut, solve(conditioned, pointing, background=FAR))
+    xr.testing.assert_identical(cut, solve(conditioned, pointing, **FAR))
 
 
 # Refusals
@@ -423,8 +423,8 @@ def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypa
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"background": Background((20e3, 30e3))}, "background"),
-        ({"background": Background((16e3, 18e3), AIR)}, "background"),
+        ({"background_range": (20e3, 30e3)}, "background"),
+        ({"molecules": AIR}, "wavelength"),
         ({"altitude_grid": ALTITUDE - 1000.0}, "altitude"),
         ({"method": "none"}, "method"),
         ({"zenith_angle": np.full(30, 90.0)}, "zenith_angle"),

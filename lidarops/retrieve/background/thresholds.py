@@ -1,0 +1,72 @@
+"""Thresholds by which backgrounds are estimated and judged, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Numbers of the background stage, dimensionless unless stated.
+
+    The last words of each entry state what set the number; "assumed" where nothing is recorded.
+    """
+
+    tail_share: float = 0.1
+    """Share of the bins, the farthest, whose mean is the background by default; usual practice."""
+    fewest_bins: int = 8
+    """Bins below which a mean, a fit or a test is not trusted; assumed."""
+
+    lag_share: float = 0.4
+    """Lag of the cubic over the number of bins: least scatter; benchmark of accuracy."""
+    lowest_contrast: float = 10.0
+    """Least curvature of the quartic at its minimum over the contribution of the noise. Below, it
+    may be the wrong minimum, and the standard error is too small by a factor of 2; simulations."""
+    largest_shift: float = 1.0
+    """Standard errors by which signal curvature, mistaken for noise, may shift the cubic;
+    assumed."""
+
+    start_shares: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7)
+    """Starts of the windows of the known shape, over the farthest usable range; assumed."""
+    false_alarm: float = 1e-4
+    """Probability that the residuals of a fit are called systematic where its shape is right;
+    chosen."""
+    rejection: float = 1e-2
+    """Probability that a window is rejected where the shape is right; chosen."""
+    negative: float = 3.0
+    """Standard errors below zero beyond which an amplitude is flagged negative; assumed."""
+    largest_condition: float = 30.0
+    """Standard error of the background over that of the mean of the same bins, beyond which the
+    shape does not differ from a constant; assumed."""
+    far: float = 4.0
+    """Standard errors beyond which a value lies as often as with a known variance; values beyond
+    count as false in the benchmark of stability."""
+    least_freedom_of_waves: float = 54.0
+    """Least degrees of freedom of the estimated noise in the test of waves. In short windows it
+    contains part of the tested misfit, which bounds the ratio: largest quantile at 8 to 60 bins,
+    from 1 percent to 1e-4 false alarms; simulations."""
+    least_freedom_of_curvature: float = 18.0
+    """The same in the test of curvature; simulations."""
+
+    nearest: float = 0.6
+    """Begin of the window that is compared with the tail, over the start of the tail; assumed."""
+    farthest: float = 0.7
+    """End of that window, over the start of the tail; assumed."""
+    detected: float = 3.0
+    """Standard errors by which signal before the tail is detected; assumed."""
+    share_of_error: float = 0.5
+    """Largest shift of a value by signal left in the tail that raises no flag, over the standard
+    error of the value; assumed."""
+    shape_error: float = 0.2
+    """Relative error of the signal in the tail as computed from the shape of clean air, caused by
+    aerosol in the far range; simulations with haze of 12 percent of the air there."""
+
+    enough_counts: float = 1000.0
+    """Counts over which a mean profile is averaged: their variance is known to 3 percent, by
+    Poisson statistics."""
+    widest: int = 7
+    """Most bins to either side over which a mean profile is averaged; assumed."""
+
+
+THRESHOLDS: Final = Thresholds()
