@@ -141,6 +141,8 @@ Identifier = Annotated[
     ),
 ]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+LawName = Literal["none", "angstrom", "kruse"]
+"""Law by which extinction is converted from the wavelength of the lidar to 550 nm."""
 
 
 class SettingsModel(BaseModel):
@@ -210,7 +212,7 @@ class VisibilitySettings(SettingsModel):
         " or 'paper': exp(-3), the rounded constant of the multi-position"
         " papers",
     )
-    law: Literal["none", "angstrom", "kruse"] = Field(
+    law: LawName = Field(
         default="none",
         description="conversion of extinction from the wavelength of the lidar to 550 nm; none"
         " keeps the wavelength of the lidar",

@@ -26,7 +26,7 @@ from lidarops.records import Plan, PlannedStep, Scene
 from lidarops.steps.channels import file_channels, is_glued
 from lidarops.steps.dependence import is_product, plan_closure
 from lidarops.steps.reading import read_windows
-from lidarops.steps.registry import product_step, typed_settings
+from lidarops.steps.registry import making_step, typed_settings
 from lidarops.steps.step import UnitCosts
 
 _FORMAT: Final = "lidarops costs"
@@ -121,7 +121,7 @@ def default_costs() -> Mapping[str, float]:
     """Return the costs on a common server core, used without a calibration, by term in s."""
     costs: dict[str, float] = {term.value: seconds for term, seconds in _SHARED_COSTS.items()}
     for kind in kinds():
-        of_kind: UnitCosts = product_step(kind).costs
+        of_kind: UnitCosts = making_step(kind).costs
         costs |= {
             kind: of_kind.product,
             value_term(kind): of_kind.value,
@@ -150,7 +150,7 @@ class Tally:
         self.count += bool(made)
         self._figures |= made
         self._values += sum(
-            terms.get(value_term(kind), 0.0) for kind in kinds() if product_step(kind).drawn_whole
+            terms.get(value_term(kind), 0.0) for kind in kinds() if making_step(kind).drawn_whole
         )
         seconds = self.costs.of(terms)
         self.scenes += seconds
@@ -231,7 +231,7 @@ def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[str, float
     for step in products:
         closure = plan_closure(plan, [(step.name, step.channel)])
         terms[step.name] += 1
-        terms[value_term(step.name)] += product_step(step.name).values(
+        terms[value_term(step.name)] += making_step(step.name).values(
             typed_settings(step), scene, closure
         )
     return {term: float(amount) for term, amount in terms.items() if amount}

@@ -7,20 +7,20 @@ needs them. A reason is a sentence that a user can check against the campaign fi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 from lidarops.campaign.model import Campaign, channel_facts
-from lidarops.kinds import Scope, kinds
+from lidarops.kinds import Scope, kinds_of
 from lidarops.plan import availability
 from lidarops.records import LeftOut, Plan, PlannedStep, Scene
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import file_channels, joined_layout
+from lidarops.steps.reading import Read
 from lidarops.steps.registry import (
     SHARED,
     channel_steps,
     needed_steps,
+    network_step,
     product_step,
-    steps_of,
     with_needs,
 )
 from lidarops.steps.step import NOT_REQUESTED, Leave
@@ -53,8 +53,8 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
 
 
 def _network_entries(scene: Scene, campaign: Campaign) -> Entries:
-    for kind in campaign.networks[scene.instrument].requested():
-        yield from product_step(kind).plan(scene, campaign)
+    for kind, request in campaign.networks[scene.instrument].requested().items():
+        yield from network_step(kind).plan(scene, campaign, request)
 
 
 def _entries(scene: Scene, campaign: Campaign) -> Entries:
@@ -97,13 +97,13 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
 def _channel_entries(case: ChannelCase) -> Entries:
     """Yield the entries of a channel: its conditioning, then product by product."""
     read, *conditioning = channel_steps(case.channel.name)
-    reading = list(case.decisions(read))
+    reading = list(read.entries(case))
     yield from reading
     if not any(isinstance(entry, PlannedStep) for entry in reading):
         return
     for step in conditioning:
-        yield from case.decisions(step)
-    made = {kind: list(_product_entries(case, kind)) for kind in kinds() if _is_channel(kind)}
+        yield from step.entries(case)
+    made = {kind.name: list(_product_entries(case, kind.name)) for kind in kinds_of(Scope.CHANNEL)}
     needed = {
         name
         for kind, entries in made.items()
@@ -112,27 +112,22 @@ def _channel_entries(case: ChannelCase) -> Entries:
     }
     for step in SHARED:
         if step.name in needed:
-            yield from case.decisions(step)
+            yield from step.entries(case)
     for entries in made.values():
         yield from entries
 
 
-def _is_channel(kind: str) -> bool:
-    return kinds()[kind].scope is Scope.CHANNEL
-
-
 def _product_entries(case: ChannelCase, kind: str) -> Entries:
     """Yield the entries of a product; its other steps only where the product is made."""
-    request: Any = case.requests.get(kind)
-    case = case.of_product(kind, request)
-    *others, making = steps_of(kind)
-    if request is None:
-        yield case.entry(kind, Leave(NOT_REQUESTED))
+    of_product = case.of_product(kind, case.requests.get(kind))
+    if of_product.request is None:
+        yield of_product.entry(kind, Leave(NOT_REQUESTED))
         return
-    product = list(case.decisions(making))
+    making = product_step(kind)
+    product = list(making.entries(of_product))
     if any(isinstance(entry, PlannedStep) for entry in product):
-        for step in others:
-            yield from case.decisions(step)
+        for part in making.parts:
+            yield from part.entries(of_product)
     yield from product
 
 
@@ -156,7 +151,7 @@ def _drop_unused_channels(plan: Plan) -> Plan:
                 if omission.channel not in unused or omission.product
             ),
             *(
-                LeftOut("read", channel, reason, rule="channel")
+                LeftOut(Read.name, channel, reason, rule="channel")
                 for channel in dict.fromkeys(step.channel for step in plan.steps)
                 if channel in unused
             ),

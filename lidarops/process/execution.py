@@ -23,9 +23,9 @@ from lidarops.steps.data import (
     Source,
     WholeProduct,
 )
-from lidarops.steps.dependence import is_product
-from lidarops.steps.registry import definition, product_step, typed_settings
-from lidarops.steps.step import Look
+from lidarops.steps.dependence import is_product, plan_closure
+from lidarops.steps.registry import carry_out, product_step
+from lidarops.steps.step import Look, Sample
 
 IN_MEMORY: Final = 2_000_000
 """Bytes of counts up to which a scene is one chunk: below, chunks cost more than they save."""
@@ -62,15 +62,17 @@ def channel_data(
         data = shared[name] = Data(source, name, shared)
         for step in steps:
             if step.channel == name and not step.product:
-                definition(step).carry_out(typed_settings(step), data)
+                carry_out(step, data)
     products: dict[str, Data] = {}
     streams: dict[str, ProductStream] = {}
     for step in steps:
         if step.channel == channel and step.product:
             data = products.setdefault(step.product, shared[channel].of_product())
-            definition(step).carry_out(typed_settings(step), data)
-            if data.stream is not None:
-                streams[step.product] = data.stream
+            if is_product(step):
+                making = product_step(step.product)
+                streams[step.product] = making.stream(making.typed(step), data)
+            else:
+                carry_out(step, data)
     return shared[channel], streams
 
 
@@ -81,7 +83,7 @@ def profiles_of(source: Source, steps: Sequence[PlannedStep], channel: str) -> x
     return data[PROFILES].of(counts)
 
 
-def refined_plan(plan: Plan, scene: Scene, profiles: Any) -> Plan:
+def refined_plan(plan: Plan, scene: Scene, profiles: Sample) -> Plan:
     """Return a plan without the parts of products in which sampled profiles show nothing.
 
     Parameters
@@ -92,11 +94,11 @@ def refined_plan(plan: Plan, scene: Scene, profiles: Any) -> Plan:
     profiles : callable
         Returns power, variance and quality of a channel in some granules.
     """
-    look = Look(plan, scene, profiles)
     steps: list[PlannedStep] = []
     left_out: list[LeftOut] = list(plan.left_out)
     for step in plan.steps:
         if is_product(step):
+            look = Look(plan_closure(plan, [(step.name, step.channel)]), scene, profiles)
             refined, omissions = product_step(step.product).refined(step, look)
             steps.append(refined)
             left_out += omissions
@@ -170,7 +172,7 @@ def member_data(source: Source, steps: Sequence[PlannedStep], product: PlannedSt
     data = data.of_product()
     for step in steps:
         if step.product == product.product:
-            definition(step).carry_out(typed_settings(step), data)
+            carry_out(step, data)
     return data
 
 
@@ -181,5 +183,5 @@ def joint_data(plan: Plan) -> dict[str, Data]:
     for step in plan.steps:
         if not step.instrument:
             data = products.setdefault(step.product, Data(nothing, step.channel, {}))
-            definition(step).carry_out(typed_settings(step), data)
+            carry_out(step, data)
     return products

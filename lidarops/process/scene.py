@@ -35,12 +35,12 @@ from lidarops.records import (
     SceneOutcome,
 )
 from lidarops.steps.channels import channel_ranges, file_channels, member_channel
-from lidarops.steps.conditioning import Dark
+from lidarops.steps.conditioning import DARK
 from lidarops.steps.data import Chunk, ProductStream, RowProduct, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
-from lidarops.steps.reading import NO_PRODUCT, Read, read_windows
-from lidarops.steps.registry import product_step, typed_settings
+from lidarops.steps.reading import ARCHIVE, NO_PRODUCT, WAVELENGTH, read_windows
+from lidarops.steps.registry import gives, network_step
 from lidarops.steps.step import NOT_REQUESTED
 from lidarops.system.stores import without_keys
 
@@ -195,8 +195,8 @@ class _Work:
         All bins, but those of `stretches` for the channels that it names.
         """
         job = self.job
-        read = dict.fromkeys(step.channel for step in steps if step.name == Read.name)
-        subtracted = [step.channel for step in steps if step.name == Dark.name]
+        read = {step.channel for step in steps if gives(step, ARCHIVE)}
+        subtracted = [step.channel for step in steps if gives(step, DARK)]
         bins = {channel.name: channel.bins for channel in scene.layout if channel.name in read}
         profiles = execution.chunk_profiles(max(bins.values()), job.profiles_per_chunk)
         open_files = (job.campaign, scene)
@@ -273,15 +273,12 @@ class _Instrument(_Work):
 
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
         steps = self.job.plan.steps
-        _, streams = execution.channel_data(source, steps, channel)
-        wavelength = next(
-            typed_settings(step).wavelength
-            for step in steps
-            if (step.name, step.channel) == (Read.name, channel)
-        )
+        data, streams = execution.channel_data(source, steps, channel)
         layout = member_channel(self._scene.layout, channel)
         contexts = {
-            kind: product_context(self.job, self._scene, kind, layout, wavelength, self.inputs)
+            kind: product_context(
+                self.job, self._scene, kind, layout, data[WAVELENGTH], self.inputs
+            )
             for kind in streams
         }
         with ExitStack() as until_written:
@@ -324,7 +321,8 @@ class _Network(_Work):
         for step in [step for step in plan.steps if is_product(step)]:
             members = list(self._members(step))
             joint = execution.joint_data(plan)[step.product]
-            stream = product_step(step.product).network_stream(typed_settings(step), members, joint)
+            making = network_step(step.product)
+            stream = making.network_stream(making.typed(step), members, joint)
             for member in members:
                 if member.data is not None:
                     source = member.data.source
@@ -339,7 +337,7 @@ class _Network(_Work):
                 self._scene,
                 step.product,
                 member_channel(first.layout, step.channel),
-                typed_settings(step).wavelength,
+                stream.wavelength,
                 self.inputs,
             )
             yield self._written(context, in_one_batch(made))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Generic, TypeVar
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts
 from lidarops.records import ChannelLayout, LeftOut, PlannedStep, Scene
 from lidarops.settings import ChannelProduct
-from lidarops.steps.step import Leave, Run, Step
+from lidarops.steps.step import Leave, Run
+
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,28 +29,22 @@ class ChannelCase:
     """Instrument of a network; empty for a single instrument."""
     requests: Mapping[str, ChannelProduct] = field(default_factory=dict)
     """Requested kinds of product of the channel, with their settings."""
-    request: Any = None
-    """Settings of the kind of product whose steps are decided; None for shared steps."""
-    product: str = ""
-    """Name of that kind; empty for shared steps."""
     requesters: tuple[str, ...] = ()
     """Glued channels and networks for which the channel is read besides."""
     networks: tuple[str, ...] = ()
     """Networks that use the channel."""
+    product: str = ""
+    """Kind of product whose steps are decided; empty for shared steps."""
 
     @property
     def last(self) -> float:
         """Far end of the last bin, m, without range offset."""
         return self.channel.bins * self.channel.bin_width
 
-    def of_product(self, product: str, request: Any) -> ChannelCase:
+    def of_product(self, product: str, request: R) -> ProductCase[R]:
         """Return the case for the steps of a kind of product, with its settings."""
-        return replace(self, request=request, product=product)
-
-    def decisions(self, step: Step[Any]) -> Iterator[PlannedStep | LeftOut]:
-        """Yield what a step decides, as entries of a plan."""
-        for decision in step.decide(self):
-            yield self.entry(step.name, decision)
+        shared = {known.name: getattr(self, known.name) for known in fields(self)}
+        return ProductCase(**{**shared, "product": product}, request=request)
 
     def entry(self, name: str, decision: Run | Leave) -> PlannedStep | LeftOut:
         """Return a decision as an entry of a plan."""
@@ -65,3 +62,11 @@ class ChannelCase:
             return LeftOut(**common)
         settings = decision.settings.model_dump(mode="json", exclude_none=True)
         return PlannedStep(settings=settings, **common)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProductCase(ChannelCase, Generic[R_co]):
+    """One channel of a scene, as the steps of a kind of product see it."""
+
+    request: R_co
+    """Settings of the kind in the campaign file."""

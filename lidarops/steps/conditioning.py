@@ -47,7 +47,7 @@ class OverlapSettings(SettingsModel):
     """Ancillary file of the overlap function."""
 
 
-class Overlap(Step[OverlapSettings]):
+class Overlap(Step[ChannelCase, OverlapSettings]):
     """Flag bins before full overlap, and give the overlap function."""
 
     name = "overlap"
@@ -84,7 +84,7 @@ class RangeOffsetSettings(SettingsModel):
     """m."""
 
 
-class RangeOffset(Step[RangeOffsetSettings]):
+class RangeOffset(Step[ChannelCase, RangeOffsetSettings]):
     """Shift the ranges of the bins."""
 
     name = "range_offset"
@@ -116,7 +116,7 @@ class DarkSettings(SettingsModel):
     method: Literal["interpolated", "nearest"]
 
 
-class Dark(Step[DarkSettings]):
+class Dark(Step[ChannelCase, DarkSettings]):
     """Subtract the signal of dark files from an analog channel."""
 
     name = "dark"
@@ -186,7 +186,7 @@ class DeadTimeSettings(SettingsModel):
     """s."""
 
 
-class DeadTime(Step[DeadTimeSettings]):
+class DeadTime(Step[ChannelCase, DeadTimeSettings]):
     """Correct photon counts for the dead time."""
 
     name = "dead_time"
@@ -217,7 +217,7 @@ class NoiseSettings(SettingsModel):
     """mV2, with the method ``given``."""
 
 
-class Noise(Step[NoiseSettings]):
+class Noise(Step[ChannelCase, NoiseSettings]):
     """Turn counts into power, with variance and quality."""
 
     name = "noise"

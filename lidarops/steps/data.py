@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,8 @@ from lidarops.steps.step import Datum
 
 T = TypeVar("T")
 Indices = npt.NDArray[np.int64]
+BackgroundName = Literal["tail_mean", "cubic", "known_shape"]
+"""Method by which a background is estimated."""
 
 CHUNK_BYTES: Final = 4_000_000
 """Bytes of raw counts that are processed together."""
@@ -81,7 +83,10 @@ class Profiles(ABC):
 
     @abstractmethod
     def signals(
-        self, counts: xr.Dataset, background_range: tuple[float, float], background_method: str
+        self,
+        counts: xr.Dataset,
+        background_range: tuple[float, float],
+        background_method: BackgroundName,
     ) -> xr.Dataset:
         """Return background-subtracted, range-corrected signals of profiles."""
 
@@ -152,8 +157,6 @@ class Data:
     channel: str
     channels: Mapping[str, Data]
     """Data of the channels that were prepared before."""
-    stream: ProductStream | None = None
-    """The product in the making, once its step has been carried out."""
     _values: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, datum: Datum[T]) -> T:
@@ -171,4 +174,4 @@ class Data:
 
     def of_product(self) -> Data:
         """Return a copy for the steps of one product, which other products do not see."""
-        return Data(self.source, self.channel, self.channels, None, dict(self._values))
+        return Data(self.source, self.channel, self.channels, dict(self._values))

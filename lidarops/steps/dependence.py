@@ -15,10 +15,10 @@ from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
 from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
-from lidarops.steps.conditioning import Dark, Noise
-from lidarops.steps.reading import Read, required_by
-from lidarops.steps.registry import definition, typed_settings
-from lidarops.steps.step import Step
+from lidarops.steps.conditioning import DARK
+from lidarops.steps.reading import ARCHIVE, READ, required_by
+from lidarops.steps.registry import definition, gives, typed_settings
+from lidarops.steps.step import Definition
 
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
@@ -97,10 +97,11 @@ def _needed(
 
 def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> PlannedStep:
     """Return a step whose reason, if it reads a channel, names only what it is read for."""
-    if step.name != Read.name or step.instrument:
+    if step.instrument or not gives(step, ARCHIVE):
         return step
     products = sorted(s.name for s in steps if is_product(s) and s.channel == step.channel)
-    glued = sorted(s.channel for s in steps if f"{step.channel}/{Noise.name}" in s.needs)
+    of_part = f"{step.channel}/"
+    glued = sorted({s.channel for s in steps if any(n.startswith(of_part) for n in s.needs)})
     return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
 
 
@@ -117,7 +118,7 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
         return plan
     products = [product for product in planned_products(plan) if product[0] in selected]
     closure = plan_closure(plan, products)
-    names = {*selected, Read.name}
+    names = {*selected, READ.name}
     left_out = tuple(
         omission
         for omission in plan.left_out
@@ -214,7 +215,7 @@ def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
     return {
         path: role
         for step in steps
-        if type(definition(step)).files is not Step.files
+        if type(definition(step)).files is not Definition.files
         for path, role in definition(step).files(typed_settings(step)).items()
     }
 
@@ -229,7 +230,7 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     files : iterable of InputRecord
         Files of the scene.
     """
-    dark = any(step.name == Dark.name for step in plan.steps)
+    dark = any(gives(step, DARK) for step in plan.steps)
     named = ancillary_files(plan.steps)
     return tuple(
         file

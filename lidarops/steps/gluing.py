@@ -33,7 +33,7 @@ class LagSettings(SettingsModel):
     """Bins, with the method ``given``."""
 
 
-class Lag(Step[LagSettings]):
+class Lag(Step[ChannelCase, LagSettings]):
     """Find the lag of the analog record behind the photon-counting one."""
 
     name = "lag"
@@ -64,12 +64,13 @@ class GlueSettings(SettingsModel):
     photon: str
 
 
-class Glue(Step[GlueSettings]):
+class Glue(Step[ChannelCase, GlueSettings]):
     """Glue the profiles of both channels."""
 
     name = "glue"
     settings = GlueSettings
-    inputs = (ARCHIVE, LAG, PROFILES)
+    inputs = (ARCHIVE, LAG)
+    from_parts = (PROFILES,)
     outputs = (PROFILES,)
 
     def decide(self, case: ChannelCase) -> Decisions:

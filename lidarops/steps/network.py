@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +12,8 @@ import xarray as xr
 
 from lidarops.campaign.model import Campaign, Station
 from lidarops.records import LeftOut, PlannedStep, Scene
-from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
 from lidarops.steps.data import Chunk, Data
-from lidarops.steps.step import Decisions, MakingStep
+from lidarops.steps.step import MakingStep, R, S
 
 Decided = list[PlannedStep | LeftOut]
 
@@ -36,6 +33,9 @@ class Member:
 class NetworkStream(ABC):
     """A product of a network in the making."""
 
+    wavelength: float
+    """m."""
+
     @abstractmethod
     def add(self, member: Member, chunk: Chunk) -> None:
         """Take the next profiles of an instrument."""
@@ -45,22 +45,13 @@ class NetworkStream(ABC):
         """Return the variables of the product, in memory."""
 
 
-class NetworkProductStep(MakingStep[Any]):
+class NetworkProductStep(MakingStep[R, S]):
     """The step that makes a product of a network."""
 
-    def decide(self, case: ChannelCase) -> Decisions:  # noqa: ARG002
-        """Decide nothing for one channel: `plan` sees all instruments."""
-        return iter(())
-
-    def carry_out(self, settings: Any, data: Data) -> None:
-        """Do nothing for one channel: `network_stream` sees all instruments."""
-
     @abstractmethod
-    def plan(self, scene: Scene, campaign: Campaign) -> Decided:
+    def plan(self, scene: Scene, campaign: Campaign, request: R) -> Decided:
         """Return the entries of the plan of a scene, of all members and of the whole network."""
 
     @abstractmethod
-    def network_stream(
-        self, settings: SettingsModel, members: Sequence[Member], data: Data
-    ) -> NetworkStream:
+    def network_stream(self, settings: S, members: Sequence[Member], data: Data) -> NetworkStream:
         """Return the product in the making; `data` holds what steps of the whole network gave."""

@@ -11,7 +11,7 @@ import xarray as xr
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.labeled import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
-from lidarops.steps.data import Averages, Chunk, Indices, Profiles
+from lidarops.steps.data import Averages, BackgroundName, Chunk, Indices, Profiles
 
 _PARTS: Final = ("power", "variance", "quality")
 
@@ -59,7 +59,10 @@ class FileProfiles(Profiles):
         return labeled.condition(counts, self._channel, **self._settings)
 
     def signals(
-        self, counts: xr.Dataset, background_range: tuple[float, float], background_method: str
+        self,
+        counts: xr.Dataset,
+        background_range: tuple[float, float],
+        background_method: BackgroundName,
     ) -> xr.Dataset:
         """Return background-subtracted, range-corrected signals of profiles."""
         return labeled.range_corrected_signals(
@@ -128,7 +131,10 @@ class GluedProfiles(Profiles):
         return labeled_gluing.glue(self._analog.of(counts), self._photon.of(counts), lag=self._lag)
 
     def signals(
-        self, counts: xr.Dataset, background_range: tuple[float, float], background_method: str
+        self,
+        counts: xr.Dataset,
+        background_range: tuple[float, float],
+        background_method: BackgroundName,
     ) -> xr.Dataset:
         """Return background-subtracted, range-corrected signals of profiles."""
         joined = self.of(counts)

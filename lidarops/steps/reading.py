@@ -16,20 +16,16 @@ from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import file_channels, range_channel, range_offset, wavelength
 from lidarops.steps.data import Data
-from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
+from lidarops.steps.step import Datum, Decisions, Definition, Leave, Run, Step
 
 ARCHIVE: Final = Datum[xr.Dataset]("archive")
 """Raw counts of all profiles of the scene, lazy or in memory."""
 WAVELENGTH: Final = Datum[float]("wavelength")
 """m."""
-BINS: Final = Datum[None]("bins")
-"""That only some bins are read."""
 
 NO_PRODUCT: Final = "no product of the campaign uses this channel"
 NO_WAVELENGTH: Final = "the wavelength in the header is implausible, and no facts give one"
 ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its bins"
-RANGE_WINDOW: Final = "range_window"
-"""Name of the step by which a kind of product states the bins that it needs."""
 
 
 class ReadSettings(SettingsModel):
@@ -39,7 +35,7 @@ class ReadSettings(SettingsModel):
     """m."""
 
 
-class Read(Step[ReadSettings]):
+class Read(Step[ChannelCase, ReadSettings]):
     """Read the counts of a channel."""
 
     name = "read"
@@ -69,37 +65,38 @@ class Read(Step[ReadSettings]):
         data[WAVELENGTH] = settings.wavelength
 
 
+READ: Final = Read()
+
+
 def required_by(requesters: Iterable[str]) -> str:
     """Return the reason why a channel is read: the products and glued channels that need it."""
     return f"required by {' and '.join(requesters)}"
 
 
 class WindowSettings(SettingsModel):
-    """Settings of the step ``range_window``."""
+    """Settings of a `Window`."""
 
     bins: tuple[tuple[int, int], ...]
     """First bin and the one past the last, of each stretch that is read."""
 
 
-class RangeWindow(Step[WindowSettings]):
-    """Base of the steps by which a kind of product states the bins that it needs."""
+class Window(Definition[WindowSettings]):
+    """The bins that a product needs of a channel.
 
-    name = RANGE_WINDOW
+    They are an input of reading: `read_windows` joins those of all products of a scene.
+    """
+
+    name = "range_window"
     settings = WindowSettings
-    inputs = (ARCHIVE,)
-    outputs = (BINS,)
-
-    def carry_out(self, settings: WindowSettings, data: Data) -> None:
-        """Give nothing: the bins are left out when the files are opened."""
 
 
 def read_windows(steps: Collection[PlannedStep]) -> dict[str, Stretches]:
     """Return the channels of which only some bins are needed, with these bins."""
     windows: dict[str, list[tuple[int, int]]] = {}
     for step in steps:
-        if step.name == RANGE_WINDOW and not idle_window(step, steps):
-            stretches = WindowSettings.model_validate(step.settings).bins
-            windows.setdefault(step.channel, []).extend(stretches)
+        if step.name == Window.name and not idle_window(step, steps):
+            settings = WindowSettings.model_validate(step.settings)
+            windows.setdefault(step.channel, []).extend(settings.bins)
     return {channel: tuple(merged(stretches)) for channel, stretches in windows.items()}
 
 
@@ -126,12 +123,12 @@ def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
     steps : collection of PlannedStep
         All steps of the scene.
     """
-    if step.name != RANGE_WINDOW:
+    if step.name != Window.name:
         return ""
     windowed = {
         (other.channel, other.product)
         for other in steps
-        if other.name == RANGE_WINDOW and other.instrument == step.instrument
+        if other.name == Window.name and other.instrument == step.instrument
     }
     needing = list(
         dict.fromkeys(

@@ -10,84 +10,107 @@ from typing import Any, Final
 
 from lidarops.kinds import kind_of
 from lidarops.records import Granule, LeftOut, Plan, PlannedStep, Scene
+from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import file_channels, glued_parts, is_glued
-from lidarops.steps.conditioning import (
-    PROFILES,
-    Dark,
-    DeadTime,
-    Noise,
-    Overlap,
-    RangeOffset,
-)
+from lidarops.steps.conditioning import Dark, DeadTime, Noise, Overlap, RangeOffset
+from lidarops.steps.data import Data
 from lidarops.steps.gluing import Glue, Lag
-from lidarops.steps.products import Molecular
-from lidarops.steps.reading import Read
-from lidarops.steps.step import Step
+from lidarops.steps.network import NetworkProductStep
+from lidarops.steps.preparation import Molecular
+from lidarops.steps.reading import READ
+from lidarops.steps.step import Datum, Definition, MakingStep, ProductStep, Step
 
-FILE_STEPS: Final[tuple[Step[Any], ...]] = (
-    Read(), Overlap(), RangeOffset(), Dark(), DeadTime(), Noise(),
+SharedStep = Step[ChannelCase, Any]
+
+FILE_STEPS: Final[tuple[SharedStep, ...]] = (
+    READ, Overlap(), RangeOffset(), Dark(), DeadTime(), Noise(),
 )  # fmt: skip
 """From the counts of a channel of the files to its profiles, in the order in which they run."""
-GLUE_STEPS: Final[tuple[Step[Any], ...]] = (Read(), Overlap(), Lag(), Glue())
+GLUE_STEPS: Final[tuple[SharedStep, ...]] = (READ, Overlap(), Lag(), Glue())
 """From two channels of the files to the profiles of the glued one."""
-SHARED: Final[tuple[Step[Any], ...]] = (Molecular(),)
+SHARED: Final[tuple[SharedStep, ...]] = (Molecular(),)
 """Steps that are decided once a channel, if one of its products needs them."""
 
 
-@cache
-def steps_of(kind: str) -> tuple[Step[Any], ...]:
-    """Return the own steps of a kind of product, of which the last one makes it.
+def making_step(kind: str) -> MakingStep[Any, Any]:
+    """Return the step that makes a product of a kind.
 
     Raises
     ------
     LidarOpsError
         If there is no such kind, or its package is incomplete.
     """
-    steps: tuple[Step[Any], ...] = kind_of(kind).part("steps", "STEPS")
-    return steps
+    step: MakingStep[Any, Any] = kind_of(kind).part("steps", "STEP")
+    return step
 
 
-def product_step(kind: str) -> Any:
-    """Return the step that makes a product of a kind."""
-    return steps_of(kind)[-1]
+def product_step(kind: str) -> ProductStep[Any, Any]:
+    """Return the step that makes a product of a kind of one channel, as `making_step`."""
+    step: ProductStep[Any, Any] = kind_of(kind).part("steps", "STEP")
+    return step
+
+
+def network_step(kind: str) -> NetworkProductStep[Any, Any]:
+    """Return the step that makes a product of a kind of networks, as `making_step`."""
+    step: NetworkProductStep[Any, Any] = kind_of(kind).part("steps", "STEP")
+    return step
 
 
 @cache
-def _definitions(product: str) -> Mapping[str, Step[Any]]:
-    """Return the steps that a product may have, by name; the shared ones for an empty name."""
-    own = steps_of(product) if product else ()
-    return {step.name: step for step in (*FILE_STEPS, *GLUE_STEPS, *SHARED, *own)}
+def _definitions(product: str) -> Mapping[str, Definition[Any]]:
+    """Return what a plan of a product may hold, by name; the shared steps for an empty name."""
+    making = making_step(product) if product else None
+    own = (*making.parts, making) if making else ()
+    return {known.name: known for known in (*FILE_STEPS, *GLUE_STEPS, *SHARED, *own)}
 
 
-def definition(entry: PlannedStep | LeftOut) -> Step[Any]:
-    """Return the step that an entry of a plan is about."""
+def definition(entry: PlannedStep | LeftOut) -> Definition[Any]:
+    """Return what an entry of a plan is about."""
     return _definitions(entry.product)[entry.name]
+
+
+def gives(planned: PlannedStep, datum: Datum[Any]) -> bool:
+    """Return whether a planned step gives a datum."""
+    step = definition(planned)
+    return isinstance(step, Step) and datum in step.outputs
+
+
+def carry_out(planned: PlannedStep, data: Data) -> None:
+    """Carry out a planned step; what is chosen only has no data."""
+    step = definition(planned)
+    if isinstance(step, Step):
+        step.carry_out(step.typed(planned), data)
 
 
 def typed_settings(planned: PlannedStep) -> Any:
     """Return the settings of a planned step as the model of its step."""
-    return definition(planned).settings.model_validate(dict(planned.settings))
+    return definition(planned).typed(planned)
 
 
 def needed_steps(kind: str) -> frozenset[str]:
-    """Return the names of all steps whose outputs a product needs, directly or not."""
-    known = _definitions(kind)
-    needed, new = set(), {kind}
+    """Return the names of all that a product needs, directly or not."""
+    needed, new = set[str](), {kind}
     while new:
         needed |= new
-        wanted = {datum for name in new for datum in known[name].inputs}
-        new = {name for name, step in known.items() if wanted & set(step.outputs)} - needed
+        new = {name for taker in new for name in _suppliers(kind, taker)} - needed
     return frozenset(needed)
 
 
 @cache
 def _suppliers(product: str, name: str) -> tuple[str, ...]:
-    """Return the names of the steps whose outputs a step of a product takes."""
+    """Return the names of what a step of a product takes."""
     known = _definitions(product)
-    wanted = set(known[name].inputs)
+    taker = known[name]
     return tuple(
-        other for other, step in known.items() if other != name and wanted & set(step.outputs)
+        other.name for other in known.values() if other is not taker and _takes(taker, other)
     )
+
+
+def _takes(taker: Definition[Any], other: Definition[Any]) -> bool:
+    """Return whether a step takes outputs of another, or makes its product by a choice."""
+    if isinstance(taker, Step | MakingStep) and isinstance(other, Step):
+        return not {*taker.inputs}.isdisjoint(other.outputs)
+    return isinstance(taker, MakingStep)
 
 
 def with_needs(entries: Iterable[PlannedStep | LeftOut]) -> list[PlannedStep | LeftOut]:
@@ -102,41 +125,22 @@ def with_needs(entries: Iterable[PlannedStep | LeftOut]) -> list[PlannedStep | L
     ]
 
 
-def _needs(step: PlannedStep, places: Collection[tuple[str, str, str, str]]) -> tuple[str, ...]:
+def _needs(planned: PlannedStep, places: Collection[tuple[str, str, str, str]]) -> tuple[str, ...]:
     def present(channel: str, names: Iterable[str]) -> list[str]:
-        products = dict.fromkeys(("", step.product))
+        products = dict.fromkeys(("", planned.product))
         return [
             name
             for name in names
-            if any((channel, step.instrument, product, name) in places for product in products)
+            if any((channel, planned.instrument, product, name) in places for product in products)
         ]
 
-    needs = present(step.channel, _suppliers(step.product, step.name))
-    if step.name == Glue.name:
-        for part in glued_parts(step.channel):
-            needs += [f"{part}/{name}" for name in present(part, _PROFILE_STEPS)]
+    needs = present(planned.channel, _suppliers(planned.product, planned.name))
+    step = definition(planned)
+    if isinstance(step, Step) and step.from_parts:
+        names = [s.name for s in FILE_STEPS if not {*step.from_parts}.isdisjoint(s.outputs)]
+        for part in glued_parts(planned.channel):
+            needs += [f"{part}/{name}" for name in present(part, names)]
     return tuple(needs)
-
-
-_PROFILE_STEPS: Final = tuple(step.name for step in FILE_STEPS if PROFILES in step.outputs)
-"""Steps that give the profiles of a channel of the files."""
-
-
-def setting_of(plan: Plan, product: str, step: str, name: str) -> Any:
-    """Return a setting of a step of a product in a plan."""
-    return next(
-        planned.settings[name]
-        for planned in plan.steps
-        if planned.name == step and planned.product == product
-    )
-
-
-def settings_of(plan: Plan, product: str, step: str, channel: str) -> Mapping[str, Any] | None:
-    """Return the settings of a step of a product of a channel; None where it does not run."""
-    for planned in plan.steps:
-        if (planned.name, planned.product, planned.channel) == (step, product, channel):
-            return planned.settings
-    return None
 
 
 def bins_of(scene: Scene, product: str, plan: Plan) -> int:
@@ -152,6 +156,6 @@ def intervals(granules: Iterable[Granule], seconds: float) -> int:
     return len({math.floor(start.timestamp() / seconds) for start in starts if start})
 
 
-def channel_steps(channel: str) -> tuple[Step[Any], ...]:
+def channel_steps(channel: str) -> tuple[SharedStep, ...]:
     """Return the steps from raw counts to the profiles of a channel."""
     return GLUE_STEPS if is_glued(channel) else FILE_STEPS

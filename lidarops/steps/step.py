@@ -1,21 +1,29 @@
-"""What a step is: typed settings, inputs and outputs by name, a decision, and its execution."""
+"""What a plan is made of: choices, steps, and the steps that make products.
+
+A choice has settings and a decision. A step is a choice that is carried out: it takes data from
+other steps and gives data to them, by name. A making step takes such data and makes a product.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
-from lidarops.records import LeftOut, Plan, PlannedStep, Role, Scene
+from lidarops.records import Granule, LeftOut, Plan, PlannedStep, Role, Scene
 from lidarops.settings import SettingsModel
 
 if TYPE_CHECKING:
-    from lidarops.steps.case import ChannelCase
+    import xarray as xr
+
+    from lidarops.steps.case import ChannelCase, ProductCase
     from lidarops.steps.data import Data, ProductStream
 
 T = TypeVar("T")
+R = TypeVar("R")
 S = TypeVar("S", bound=SettingsModel)
+C_contra = TypeVar("C_contra", bound="ChannelCase", contravariant=True)
 
 ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"
 REQUESTED: Final = "requested by the campaign"
@@ -60,27 +68,51 @@ class Leave:
 Decisions = Iterator[Run | Leave]
 
 
-class Step(ABC, Generic[S]):
-    """One step of the processing of a channel."""
+class Definition(ABC, Generic[S]):
+    """What an entry of a plan is about."""
 
     name: ClassVar[str]
-    settings: ClassVar[type[SettingsModel]] = NoSettings
+    settings: type[S] = NoSettings  # type: ignore[assignment]  # of definitions without another
     """Model of the settings that a plan states."""
-    inputs: ClassVar[tuple[Datum[Any], ...]] = ()
-    """What the step takes from other steps, where they run."""
-    outputs: ClassVar[tuple[Datum[Any], ...]] = ()
 
-    @abstractmethod
-    def decide(self, case: ChannelCase) -> Decisions:
-        """Yield at most one `Run`, and a `Leave` for whatever is left out."""
+    def typed(self, planned: PlannedStep) -> S:
+        """Return the settings of an entry of a plan as the model."""
+        return self.settings.model_validate(dict(planned.settings))
 
-    @abstractmethod
-    def carry_out(self, settings: S, data: Data) -> None:
-        """Put the outputs into the data of the channel."""
+    def settings_in(self, plan: Plan) -> S | None:
+        """Return the settings in the plan of one product; None where it does not run."""
+        return next((self.typed(step) for step in plan.steps if step.name == self.name), None)
 
     def files(self, settings: S) -> Mapping[str, Role]:  # noqa: ARG002 - most steps read none
         """Return the ancillary files that the step reads, by path, with their roles."""
         return {}
+
+
+class Choice(Definition[S], Generic[C_contra, S]):
+    """Something about a channel or a product that is decided from headers and campaign alone."""
+
+    @abstractmethod
+    def decide(self, case: C_contra) -> Decisions:
+        """Yield at most one `Run`, and a `Leave` for whatever is left out."""
+
+    def entries(self, case: C_contra) -> Iterator[PlannedStep | LeftOut]:
+        """Yield what is decided, as entries of a plan."""
+        for decision in self.decide(case):
+            yield case.entry(self.name, decision)
+
+
+class Step(Choice[C_contra, S]):
+    """One step of the processing of a channel."""
+
+    inputs: ClassVar[tuple[Datum[Any], ...]] = ()
+    """What the step takes from other steps, where they run."""
+    from_parts: ClassVar[tuple[Datum[Any], ...]] = ()
+    """What the step takes from those of the two channels that are glued."""
+    outputs: ClassVar[tuple[Datum[Any], ...]] = ()
+
+    @abstractmethod
+    def carry_out(self, settings: S, data: Data) -> None:
+        """Put the outputs into the data of the channel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +129,13 @@ class UnitCosts:
     """s to load the compiled code of the kind, once a process."""
 
 
-class MakingStep(Step[S]):
-    """The step that makes a product; it has the name of its kind, and is the last of its steps."""
+class MakingStep(Definition[S], Generic[R, S]):
+    """The step that makes a product; it has the name of its kind."""
 
+    inputs: ClassVar[tuple[Datum[Any], ...]] = ()
+    """What it takes from steps, where they run."""
+    parts: tuple[Definition[Any], ...] = ()
+    """Other entries of the kind: steps, and choices by which the product is made."""
     costs: ClassVar[UnitCosts]
     drawn_whole: ClassVar[bool] = False
     """Whether figures show every value, so that their cost grows with the number of values."""
@@ -113,16 +149,15 @@ class MakingStep(Step[S]):
         return 0.0
 
 
-class ProductStep(MakingStep[S]):
+class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):
     """The step that makes a product of one channel."""
+
+    parts: tuple[Choice[ProductCase[R], Any], ...] = ()
+    """In the order in which they are decided."""
 
     @abstractmethod
     def stream(self, settings: S, data: Data) -> ProductStream:
         """Return the product in the making, which takes the profiles of the scene in chunks."""
-
-    def carry_out(self, settings: S, data: Data) -> None:
-        """Put the stream into the data of the product."""
-        data.stream = self.stream(settings, data)
 
     def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:  # noqa: ARG002
         """Return the planned step without the parts in which sampled profiles show nothing.
@@ -132,12 +167,16 @@ class ProductStep(MakingStep[S]):
         return planned, []
 
 
+Sample = Callable[[str, Sequence[Granule]], "xr.Dataset"]
+"""Channel and granules -> power, variance and quality of their profiles."""
+
+
 @dataclass(frozen=True, slots=True)
 class Look:
     """Some profiles of a scene, for a decision that needs data."""
 
     plan: Plan
+    """Of the product."""
     scene: Scene
     """With usable granules only."""
-    profiles: Any
-    """Callable (channel, granules) -> power, variance and quality of the channel."""
+    profiles: Sample

@@ -13,15 +13,15 @@ from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.records import Plan, Scene
 from lidarops.retrieve.elastic import labeled
 from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
+from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, WholeProduct
 from lidarops.steps.pointing import fixed_zenith
-from lidarops.steps.products import AVERAGE, MOLECULES, Average
+from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
 from lidarops.steps.profiles import gluing
 from lidarops.steps.reading import WAVELENGTH
-from lidarops.steps.registry import bins_of, intervals, setting_of
+from lidarops.steps.registry import bins_of, intervals
 from lidarops.steps.step import (
     REQUESTED,
     Datum,
@@ -33,6 +33,8 @@ from lidarops.steps.step import (
     Step,
     UnitCosts,
 )
+
+Case = ProductCase[ElasticSettings]
 
 KNOWN_SHAPE: Final = Datum[bool]("known_shape")
 """That the background is fitted with the shape of the signal of clean air."""
@@ -50,11 +52,10 @@ class _ReferenceLimits:
     """Why there can be no reference window; empty where there can."""
 
 
-def _reference_limits(case: ChannelCase) -> _ReferenceLimits:
-    settings: ElasticSettings = case.request
+def _reference_limits(case: Case) -> _ReferenceLimits:
     zenith, reason = fixed_zenith(case)
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
-    window = settings.reference
+    window = case.request.reference
     # A window is a set of bin centres.
     ranged = replace(case.channel, name=range_channel(case.channel.name))
     reach = case.last - 0.5 * case.channel.bin_width + range_offset(ranged, case.facts)
@@ -67,13 +68,13 @@ def _reference_limits(case: ChannelCase) -> _ReferenceLimits:
     return _ReferenceLimits(bottom, top, window.width * stretch, reason)
 
 
-class KnownShape(Step[NoSettings]):
+class KnownShape(Step[Case, NoSettings]):
     """Fit the background with the shape of the signal of aerosol-free air."""
 
     name = "known_shape"
     outputs = (KNOWN_SHAPE,)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where the campaign requests this background."""
         if case.request.background == "known_shape":
             yield Run("the far range is assumed to be aerosol-free, and tested")
@@ -98,14 +99,14 @@ class WindowSettings(SettingsModel):
     relative_error: float
 
 
-class ReferenceWindow(Step[WindowSettings]):
+class ReferenceWindow(Step[Case, WindowSettings]):
     """State where the reference window may lie."""
 
     name = "reference"
     settings = WindowSettings
     outputs = (REFERENCE,)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run always."""
         limits, window = _reference_limits(case), case.request.reference
         settings = WindowSettings(
@@ -133,19 +134,22 @@ class InversionSettings(SettingsModel):
     molecular_relative_error: float
 
 
-class Elastic(ProductStep[InversionSettings]):
+_AVERAGE: Final = Average("the noise of a single profile is too large for the inversion")
+
+
+class Elastic(ProductStep[ElasticSettings, InversionSettings]):
     """Invert the averaged elastic signals."""
 
     name = "elastic"
     settings = InversionSettings
     inputs = (PROFILES, WAVELENGTH, OVERLAP, AVERAGE, MOLECULES, KNOWN_SHAPE, REFERENCE)
+    parts = (_AVERAGE, KnownShape(), ReferenceWindow())
     costs = UnitCosts(product=0.1, value=5e-7, figure=1.5, load=0.1)
     drawn_whole = True
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where a fixed beam reaches aerosol-free air."""
-        settings: ElasticSettings = case.request
-        limits = _reference_limits(case)
+        settings, limits = case.request, _reference_limits(case)
         if limits.reason:
             yield Leave(limits.reason)
             return
@@ -164,8 +168,9 @@ class Elastic(ProductStep[InversionSettings]):
 
     def values(self, settings: InversionSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
         """Return the number of bins of all averages."""
-        seconds = setting_of(plan, self.name, Average.name, "seconds")
-        return float(intervals(scene.granules, seconds) * bins_of(scene, self.name, plan))
+        average = _AVERAGE.settings_in(plan)
+        count = intervals(scene.granules, average.seconds) if average else 0
+        return float(count * bins_of(scene, self.name, plan))
 
     def held(self, settings: InversionSettings, scene: Scene, plan: Plan) -> float:
         """Return the bytes of the averages and of what is retrieved from them."""
@@ -226,9 +231,4 @@ class _Inversion(WholeProduct):
         return inverted.assign(gluing(averages))
 
 
-STEPS: Final = (
-    Average("the noise of a single profile is too large for the inversion"),
-    KnownShape(),
-    ReferenceWindow(),
-    Elastic(),
-)
+STEP: Final = Elastic()

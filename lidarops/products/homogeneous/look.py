@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -37,9 +37,11 @@ DARK: Final = 3.0
 above 5. Noise alone lifts the largest of 16 above 3 in 2 % of scenes, above 1.7 in half."""
 STILL_DARK: Final = 3.5
 """The same for the second sample, which has more profiles and so larger noise maxima."""
-REFINEMENTS: Final[Mapping[str, Quality]] = {
-    "section_saturated": Quality.SATURATED,
-    "section_dark": Quality.LOW_SIGNAL,
+OmittedBit = Literal["SATURATED", "LOW_SIGNAL"]
+"""Name of the quality bit of a section that is left out."""
+REFINEMENTS: Final[Mapping[str, OmittedBit]] = {
+    "section_saturated": "SATURATED",
+    "section_dark": "LOW_SIGNAL",
 }
 """Rule that leaves a section out -> its quality bit."""
 

@@ -24,9 +24,7 @@ from lidarops.products.homogeneous.figure_data import (
     read_sections,
 )
 from lidarops.records import Role, SceneOutcome
-
-_DARK_STEP: Final = "dark"
-"""Name of the step of a plan that subtracts dark files."""
+from lidarops.steps.conditioning import Dark
 
 
 def _figures(group: Group, sources: Sources) -> Iterator[ReportFigure]:
@@ -66,7 +64,7 @@ def _figures(group: Group, sources: Sources) -> Iterator[ReportFigure]:
 
 def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
     steps = scene.plan.steps if scene.plan else ()
-    return any(step.name == _DARK_STEP and step.channel == channel for step in steps)
+    return any(step.name == Dark.name and step.channel == channel for step in steps)
 
 
 REPORT: Final = ReportFigures(_figures, compares=True)

@@ -15,6 +15,7 @@ from lidarops.flags import Quality
 from lidarops.products.homogeneous.look import (
     LOOKED_AT,
     REFINEMENTS,
+    OmittedBit,
     empty_sections,
     omitted_sections,
 )
@@ -25,33 +26,29 @@ from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.labeled import LEVEL
 from lidarops.retrieve.signal.labeled import channel_unit
-from lidarops.settings import SettingsModel, VisibilitySettings
-from lidarops.steps.case import ChannelCase
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
-from lidarops.steps.products import FEWEST_BINS
-from lidarops.steps.reading import ANALOG_NOISE, BINS, WAVELENGTH, RangeWindow, WindowSettings
+from lidarops.steps.definition_of_visibility import VisibilityDefinition
+from lidarops.steps.preparation import FEWEST_BINS
+from lidarops.steps.reading import ANALOG_NOISE, WAVELENGTH, Window, WindowSettings
 from lidarops.steps.reading import bins_with_noise as bins_with_their_noise
-from lidarops.steps.registry import settings_of
 from lidarops.steps.step import (
     ALL_STEPS,
     REQUESTED,
-    Datum,
+    Choice,
     Decisions,
     Leave,
     Look,
     NoSettings,
     ProductStep,
     Run,
-    Step,
     UnitCosts,
 )
 
-VISIBILITY: Final = Datum[bool]("along_path")
-"""That visibility along the sections is requested."""
-LOOKED: Final = Datum[bool]("look")
-"""That sampled profiles show which sections contain a signal."""
+Case = ProductCase[HomogeneousSettings]
 
 FULL_OVERLAP: Final = 0.99
 """Smallest overlap at which a homogeneous section may begin."""
@@ -61,7 +58,7 @@ _ROUNDING: Final = 1e-6
 Section = tuple[float, float]
 
 
-def _inside(case: ChannelCase) -> list[Section]:
+def _inside(case: Case) -> list[Section]:
     """Return the requested sections that lie within the bins."""
     width = case.channel.bin_width
     return [
@@ -71,7 +68,7 @@ def _inside(case: ChannelCase) -> list[Section]:
     ]
 
 
-def _climb(case: ChannelCase, near: float, far: float) -> float:
+def _climb(case: Case, near: float, far: float) -> float:
     """Return the climb of the most level beam of a scene along a section, m.
 
     Infinite where the zenith angle is unknown, so that the beam does not count as level.
@@ -84,7 +81,7 @@ def _climb(case: ChannelCase, near: float, far: float) -> float:
     )
 
 
-def _level(case: ChannelCase) -> list[Section]:
+def _level(case: Case) -> list[Section]:
     """Return the sections that are retrieved: within the bins, along a nearly level path."""
     return [
         (near, far)
@@ -93,10 +90,10 @@ def _level(case: ChannelCase) -> list[Section]:
     ]
 
 
-class SectionWindow(RangeWindow):
+class SectionWindow(Window, Choice[Case, WindowSettings]):
     """Read only the bins that the sections of a photon-counting channel need."""
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run for photon counting where the sections end before the last bin."""
         if case.channel.mode is not DetectionMode.PHOTON:
             yield Leave(ANALOG_NOISE)
@@ -120,14 +117,13 @@ class LookSettings(SettingsModel):
     """Number of profiles that are sampled first."""
 
 
-class LookForSignal(Step[LookSettings]):
+class LookForSignal(Choice[Case, LookSettings]):
     """Leave out the sections in which no sampled profile shows a signal."""
 
     name = "look"
     settings = LookSettings
-    outputs = (LOOKED,)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run unless all steps are requested."""
         if case.all_steps:
             yield Leave(ALL_STEPS)
@@ -135,17 +131,13 @@ class LookForSignal(Step[LookSettings]):
             reason = "sections in which no sampled profile shows a signal are not retrieved"
             yield Run(reason, LookSettings(profiles=LOOKED_AT), number=float(LOOKED_AT))
 
-    def carry_out(self, settings: LookSettings, data: Data) -> None:
-        """Give nothing: `Homogeneous.refined` looks before the steps are carried out."""
 
-
-class AlongPath(Step[NoSettings]):
+class AlongPath(Choice[Case, NoSettings]):
     """Add visibility along the sections."""
 
     name = "along_path"
-    outputs = (VISIBILITY,)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where the campaign requests it."""
         definition = case.request.visibility
         if definition is None:
@@ -153,28 +145,6 @@ class AlongPath(Step[NoSettings]):
         else:
             reason = "the campaign requests visibility along the sections"
             yield Run(reason, number=definition.threshold)
-
-    def carry_out(self, settings: NoSettings, data: Data) -> None:
-        """Give nothing: the definition is a setting of the retrieval."""
-
-
-class VisibilityDefinition(SettingsModel):
-    """Definition of visibility in a plan."""
-
-    contrast: float
-    law: str
-    angstrom_exponent: float | None = None
-    exponent_standard_error: float
-
-    @classmethod
-    def of(cls, settings: VisibilitySettings) -> VisibilityDefinition:
-        """Return the definition that a campaign requests."""
-        return cls(
-            contrast=settings.threshold,
-            law=settings.law,
-            angstrom_exponent=settings.angstrom_exponent,
-            exponent_standard_error=settings.exponent_standard_error,
-        )
 
 
 class PathSettings(SettingsModel):
@@ -184,7 +154,7 @@ class PathSettings(SettingsModel):
     sections: tuple[Section, ...]
     """m."""
     visibility: VisibilityDefinition | None = None
-    left_out: tuple[tuple[float, float, str], ...] = ()
+    left_out: tuple[tuple[float, float, OmittedBit], ...] = ()
     """Sections that are not retrieved, with the quality bit that says why."""
 
     @property
@@ -193,15 +163,19 @@ class PathSettings(SettingsModel):
         return {(near, far): Quality[bit] for near, far, bit in self.left_out}
 
 
-class Homogeneous(ProductStep[PathSettings]):
+_LOOK: Final = LookForSignal()
+
+
+class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
     """Retrieve background, amplitude and extinction of range sections."""
 
     name = "homogeneous"
     settings = PathSettings
-    inputs = (PROFILES, RELATIVE_VARIANCE, OVERLAP, WAVELENGTH, BINS, LOOKED, VISIBILITY)
+    inputs = (PROFILES, RELATIVE_VARIANCE, OVERLAP, WAVELENGTH)
+    parts = (SectionWindow(), _LOOK, AlongPath())
     costs = UnitCosts(product=0.08, value=1.2e-7, figure=0.4, load=0.1)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run for the sections that lie within the bins, along a nearly level path."""
         if is_glued(case.channel.name):
             reason = "not made of glued channels: each record is fitted with its own background"
@@ -215,7 +189,7 @@ class Homogeneous(ProductStep[PathSettings]):
             if (near, far) not in level:
                 yield _slanted(case, near, far)
         if level:
-            settings: HomogeneousSettings = case.request
+            settings = case.request
             definition = settings.visibility
             yield Run(
                 f"{REQUESTED}; background is retrieved together with extinction",
@@ -229,14 +203,14 @@ class Homogeneous(ProductStep[PathSettings]):
 
     def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:
         """Return the planned step without the sections in which sampled profiles show no signal."""
-        sample = settings_of(look.plan, self.name, LookForSignal.name, planned.channel)
+        sample = _LOOK.settings_in(look.plan)
         if sample is None or not look.scene.granules:
             return planned, []
-        settings = PathSettings.model_validate(planned.settings)
-        omitted = omitted_sections(planned, settings, look, LookSettings(**sample).profiles)
+        settings = self.typed(planned)
+        omitted = omitted_sections(planned, settings, look, sample.profiles)
         if not omitted:
             return planned, []
-        entries = [(*section, REFINEMENTS[why.rule].name) for section, why in omitted.items()]
+        entries = [(*section, REFINEMENTS[why.rule]) for section, why in omitted.items()]
         refined = settings.model_copy(update={"left_out": (*settings.left_out, *entries)})
         return _with_settings(planned, refined), list(omitted.values())
 
@@ -264,7 +238,7 @@ _PARTS: Final = 64
 """Number of chunks whose sections are joined: a Dataset takes more than the few values in it."""
 
 
-def _outside(case: ChannelCase, near: float, far: float) -> Leave:
+def _outside(case: Case, near: float, far: float) -> Leave:
     bins = (min(far, case.last) - near) / case.channel.bin_width
     reason = (
         f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
@@ -273,7 +247,7 @@ def _outside(case: ChannelCase, near: float, far: float) -> Leave:
     return Leave(reason, number=bins, rule="section_inside")
 
 
-def _slanted(case: ChannelCase, near: float, far: float) -> Leave:
+def _slanted(case: Case, near: float, far: float) -> Leave:
     climb = _climb(case, near, far)
     slope = (
         "neither headers nor campaign give the zenith angle"
@@ -346,8 +320,7 @@ class _Sections(WholeProduct):
         """Yield all profiles, with visibility along the sections where it is requested."""
         sections, requested = self._joined(), self._settings.visibility
         if requested is not None:
-            definition = Definition(wavelength=self._data[WAVELENGTH], **dict(requested))
-            sections = _with_visibility(sections, definition)
+            sections = _with_visibility(sections, requested.at(self._data[WAVELENGTH]))
         return in_one_batch(sections)
 
 
@@ -379,4 +352,4 @@ def _with_visibility(sections: xr.Dataset, definition: Definition) -> xr.Dataset
     return sections.assign(visibility.data_vars).assign_attrs(steps=definition.words)
 
 
-STEPS: Final = (SectionWindow(), LookForSignal(), AlongPath(), Homogeneous())
+STEP: Final = Homogeneous()

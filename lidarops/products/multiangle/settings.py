@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from lidarops.settings import ChannelProduct, Metres, quantity
+
+Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"]
 
 
 class MultiAngleSettings(ChannelProduct):
@@ -15,8 +17,9 @@ class MultiAngleSettings(ChannelProduct):
     channels: list[str] = Field(min_length=1)
     highest: Metres = quantity(6000.0, unit="m", description="above the station")
     step: float = quantity(60.0, unit="m", ge=5, le=1000, description="between altitudes")
-    method: Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"] = "auto"
+    method: Method = "auto"
     background: Literal["known_shape", "tail_mean"] = "known_shape"
+    background_range: ClassVar[None] = None
     layers: list[tuple[float, float]] = quantity(
         [],
         unit="m",

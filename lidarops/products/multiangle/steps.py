@@ -10,24 +10,24 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
-from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.records import Plan, Scene
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
+from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, Indices, WholeProduct, in_one_batch
 from lidarops.steps.pointing import no_scan
-from lidarops.steps.products import (
+from lidarops.steps.preparation import (
     BACKGROUND_METHOD,
     BACKGROUND_RANGE,
     MOLECULES,
@@ -36,20 +36,19 @@ from lidarops.steps.products import (
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.step import (
     REQUESTED,
-    Datum,
+    Choice,
     Decisions,
     Leave,
     NoSettings,
     ProductStep,
     Run,
-    Step,
     UnitCosts,
 )
 
 Array = npt.NDArray[np.float64]
-
-DECIDED: Final = Datum[None]("decided_by_the_retrieval")
-"""Steps that the retrieval carries out within itself."""
+Case = ProductCase[MultiAngleSettings]
+PartOfRetrieval = Choice[Case, NoSettings]
+"""A step that the retrieval carries out within itself."""
 
 _HALF_TURN: Final = 180.0
 _SIMPLE: Final = frozenset({"kano_hamilton", "two_angle"})
@@ -77,9 +76,9 @@ class Beams:
     """Whether no half turn is free of beams, so that a horizontal gradient can be estimated."""
 
 
-def beams(case: ChannelCase) -> Beams:
+def beams(case: Case) -> Beams:
     """Return the beam directions that the retrieval will use from the files of a scan."""
-    settings: MultiAngleSettings = case.request
+    settings = case.request
     side = case.facts.azimuth
     pointings = tuple(
         (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
@@ -112,21 +111,12 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
     return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(tilted))
 
 
-class _PartOfRetrieval(Step[NoSettings]):
-    """A step that the retrieval carries out within itself."""
-
-    outputs: ClassVar = (DECIDED,)
-
-    def carry_out(self, settings: NoSettings, data: Data) -> None:
-        """Give nothing."""
-
-
-class Gradient(_PartOfRetrieval):
+class Gradient(PartOfRetrieval):
     """Include a horizontal gradient of backscatter in the error."""
 
     name = "gradient"
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run unless the campaign excludes gradients."""
         largest = case.request.largest_gradient
         if largest > 0:
@@ -136,12 +126,12 @@ class Gradient(_PartOfRetrieval):
             yield Leave("largest_gradient of the campaign is 0", number=0.0)
 
 
-class GradientRegressor(_PartOfRetrieval):
+class GradientRegressor(PartOfRetrieval):
     """Fit a horizontal gradient."""
 
     name = "gradient_regressor"
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where beams point to all sides."""
         directions, method = beams(case), case.request.method
         if method in _BLIND:
@@ -159,12 +149,12 @@ class GradientRegressor(_PartOfRetrieval):
             yield Run(reason, number=directions.free)
 
 
-class Robust(_PartOfRetrieval):
+class Robust(PartOfRetrieval):
     """Give outlying beams less weight."""
 
     name = "robust"
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where there are enough beams to identify an outlier."""
         count = float(beams(case).count)
         if count < FEWEST_BEAMS:
@@ -175,15 +165,14 @@ class Robust(_PartOfRetrieval):
             yield Run(reason, number=count)
 
 
-class Vertical(_PartOfRetrieval):
+class Vertical(PartOfRetrieval):
     """Regularise the profile along altitude."""
 
     name = "vertical"
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where the method treats altitudes together."""
-        settings: MultiAngleSettings = case.request
-        count = beams(case).count
+        settings, count = case.request, beams(case).count
         if settings.method in _SIMPLE:
             yield Leave(f"method {settings.method} treats each altitude independently")
         elif settings.method == "auto" and count <= 2:
@@ -198,12 +187,12 @@ class Vertical(_PartOfRetrieval):
             yield Run(reason, number=float(round(settings.highest / settings.step)))
 
 
-class Correlation(_PartOfRetrieval):
+class Correlation(PartOfRetrieval):
     """Include the correlation of errors along altitude."""
 
     name = "correlation"
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where redundant beams can show a correlation."""
         spare, method = float(beams(case).count - 2), case.request.method
         if method not in _JOINT:
@@ -218,12 +207,12 @@ class Correlation(_PartOfRetrieval):
             yield Run(reason, number=spare)
 
 
-class Layers(_PartOfRetrieval):
+class Layers(PartOfRetrieval):
     """Give the optical depth of layers."""
 
     name = "layers"
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where the campaign requests layers."""
         number = float(len(case.request.layers))
         if number:
@@ -239,36 +228,31 @@ class ScanSettings(SettingsModel):
     """m above the station."""
     step: float
     """m."""
-    method: str
+    method: Method
     largest_gradient: float
     """m-1."""
     layers: tuple[tuple[float, float], ...]
     """m above the station."""
 
 
-class MultiAngle(ProductStep[ScanSettings]):
+class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
     """Retrieve optical depth and extinction from the beams of each scan cycle."""
 
     name = "multiangle"
     settings = ScanSettings
-    inputs = (
-        PROFILES,
-        WAVELENGTH,
-        OVERLAP,
-        MOLECULES,
-        BACKGROUND_RANGE,
-        BACKGROUND_METHOD,
-        DECIDED,
-    )
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, BACKGROUND_RANGE, BACKGROUND_METHOD)
+    parts = (
+        Background(), Gradient(), GradientRegressor(), Robust(), Vertical(), Correlation(), Layers()
+    )  # fmt: skip
     costs = UnitCosts(product=0.1, value=6e-6, figure=1.9, load=0.1)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run where the beam scans."""
         reason = no_scan(case)
         if reason:
             yield Leave(reason)
             return
-        settings: MultiAngleSettings = case.request
+        settings = case.request
         yield Run(
             f"{REQUESTED}, and the beam scans",
             ScanSettings(
@@ -339,13 +323,4 @@ class _Scans(WholeProduct):
         return in_one_batch(optical_depth)
 
 
-STEPS: Final = (
-    Background(),
-    Gradient(),
-    GradientRegressor(),
-    Robust(),
-    Vertical(),
-    Correlation(),
-    Layers(),
-    MultiAngle(),
-)
+STEP: Final = MultiAngle()

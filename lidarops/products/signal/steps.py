@@ -10,12 +10,13 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
+from lidarops.products.signal.settings import SignalSettings
 from lidarops.records import Plan, Scene
 from lidarops.retrieve.signal.labeled import background_words
-from lidarops.steps.case import ChannelCase
+from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct
-from lidarops.steps.products import (
+from lidarops.steps.preparation import (
     BACKGROUND_METHOD,
     BACKGROUND_RANGE,
     FEWEST_BINS,
@@ -34,15 +35,16 @@ from lidarops.steps.step import (
 )
 
 
-class Signal(ProductStep[NoSettings]):
+class Signal(ProductStep[SignalSettings, NoSettings]):
     """Subtract the background and correct for range."""
 
     name = "signal"
     inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
+    parts = (Background(),)
     costs = UnitCosts(product=0.05, value=2e-8, figure=0.8)
     drawn_whole = True
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: ProductCase[SignalSettings]) -> Decisions:
         """Run where the range of the background holds enough bins."""
         limits = case.request.background_range
         start, stop = tail(case, limits)
@@ -102,4 +104,4 @@ def _without_overlap(signals: xr.Dataset, overlap: npt.NDArray[np.float64]) -> x
     )
 
 
-STEPS: Final = (Background(), Signal())
+STEP: Final = Signal()

@@ -20,7 +20,6 @@ from lidarops.steps.channels import (
     range_channel,
     wavelength,
 )
-from lidarops.steps.products import tail
 from lidarops.steps.reading import NO_WAVELENGTH
 
 KIND: Final = "visibility"
@@ -62,11 +61,6 @@ class MemberCase:
     def channel(self) -> ChannelLayout:
         """The channel that the network uses."""
         return member_channel(self.scene.layout, self.settings.channel)
-
-    @property
-    def tail(self) -> tuple[float, float]:
-        """Limits in m of the range whose mean is the background."""
-        return tail(self.channel_case(self.channel), self.settings.background_range)
 
     def channel_case(self, channel: ChannelLayout) -> ChannelCase:
         """Return the case of a channel."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import timedelta
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,9 +18,14 @@ from lidarops.settings import (
     quantity,
 )
 
+Method = Literal["network", "cycle", "multiplier", "unbiased", "slope", "klett"]
+PriorName = Literal["block", "none"]
+
 
 class VisibilityProductSettings(NetworkProduct):
     """The ``visibility`` product: extinction and visibility where beams of lidars cross."""
+
+    background: ClassVar[Literal["tail_mean"]] = "tail_mean"
 
     average: PartOfDay = Field(
         default=timedelta(minutes=10), description="interval over which signals are averaged"
@@ -28,8 +33,8 @@ class VisibilityProductSettings(NetworkProduct):
     block: PartOfDay = Field(
         default=timedelta(hours=6), description="interval of averages that share one mean field"
     )
-    method: Literal["network", "cycle", "multiplier", "unbiased", "slope", "klett"] = "network"
-    prior: Literal["block", "none"] = "block"
+    method: Method = "network"
+    prior: PriorName = "block"
     visibility: VisibilitySettings = VisibilitySettings()
     tolerance: float = quantity(
         15.0, unit="m", gt=0, le=1000, description="largest distance of beams at a crossing"

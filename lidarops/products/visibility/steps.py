@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,93 +21,68 @@ from lidarops.products.visibility.network import (
     angle_between,
     crossings,
 )
-from lidarops.products.visibility.settings import VisibilityProductSettings
+from lidarops.products.visibility.settings import Method, PriorName, VisibilityProductSettings
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, PlannedStep, Scene
-from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
-from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
+from lidarops.steps.case import ChannelCase, ProductCase
 from lidarops.steps.channels import glued_parts, is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Averages, Chunk, Data, Indices
+from lidarops.steps.definition_of_visibility import VisibilityDefinition
 from lidarops.steps.network import Decided, Member, NetworkProductStep, NetworkStream
-from lidarops.steps.products import AVERAGE, BACKGROUND_RANGE, Average, Background
+from lidarops.steps.preparation import AVERAGE, BACKGROUND_RANGE, Average, Background, tail
 from lidarops.steps.reading import (
     ANALOG_NOISE,
-    BINS,
+    READ,
     WAVELENGTH,
-    RangeWindow,
-    Read,
+    Window,
     WindowSettings,
     bins_with_noise,
     bins_within,
     merged,
 )
-from lidarops.steps.registry import (
-    FILE_STEPS,
-    GLUE_STEPS,
-    intervals,
-    setting_of,
-    typed_settings,
-)
-from lidarops.steps.step import (
-    ALL_STEPS,
-    Datum,
-    Decisions,
-    Leave,
-    NoSettings,
-    Run,
-    Step,
-    UnitCosts,
-)
+from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, intervals
+from lidarops.steps.step import ALL_STEPS, Choice, Decisions, Leave, NoSettings, Run, UnitCosts
 
-PRIOR: Final = Datum[None]("prior")
+Case = ProductCase[VisibilityProductSettings]
 
 _SAME_WAVELENGTH: Final = 1e-9
 """m; largest difference between equal wavelengths of instruments."""
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 
 
-class MemberWindow(RangeWindow):
-    """Read only the bins that the crossings of an instrument and its background need."""
+def _window(case: Case, farthest: float) -> Run | Leave:
+    """Return the bins that the crossings of an instrument and its background need.
 
-    def __init__(self, farthest: float = 0.0, tail: tuple[float, float] = (0.0, 0.0)) -> None:
-        self._farthest, self._tail = farthest, tail
-
-    def decide(self, case: ChannelCase) -> Decisions:
-        """Run for photon counting where some bins are not needed."""
-        channel = case.channel
-        if is_glued(channel.name) or channel.mode is not DetectionMode.PHOTON:
-            yield Leave(ANALOG_NOISE, rule="member_window")
-            return
-        if case.all_steps:
-            yield Leave(ALL_STEPS, rule="member_window")
-            return
-        width, (start, stop) = channel.bin_width, self._tail
-        low, high = window_before(start + width)
-        near = bins_with_noise(0.0, self._farthest + BINS_BEYOND * width, case)
-        far = (bins_within(low - width, high, case), bins_within(start, stop, case))
-        kept = merged((first, min(past, channel.bins)) for first, past in (near, *far))
-        number = float(sum(past - first for first, past in kept))
-        if len(kept) == 1 and number == channel.bins:
-            reason = "crossings and background need all bins"
-            yield Leave(reason, number=number, rule="member_window")
-            return
-        reason = "bins between the farthest crossing and the background range are not needed"
-        yield Run(reason, WindowSettings(bins=tuple(kept)), number=number, rule="member_window")
+    Some bins are not needed in photon counting beyond the farthest crossing, given in m.
+    """
+    rule, channel = "member_window", case.channel
+    if is_glued(channel.name) or channel.mode is not DetectionMode.PHOTON:
+        return Leave(ANALOG_NOISE, rule=rule)
+    if case.all_steps:
+        return Leave(ALL_STEPS, rule=rule)
+    width, (start, stop) = channel.bin_width, tail(case, case.request.background_range)
+    low, high = window_before(start + width)
+    near = bins_with_noise(0.0, farthest + BINS_BEYOND * width, case)
+    far = (bins_within(low - width, high, case), bins_within(start, stop, case))
+    kept = merged((first, min(past, channel.bins)) for first, past in (near, *far))
+    number = float(sum(past - first for first, past in kept))
+    if len(kept) == 1 and number == channel.bins:
+        return Leave("crossings and background need all bins", number=number, rule=rule)
+    reason = "bins between the farthest crossing and the background range are not needed"
+    return Run(reason, WindowSettings(bins=tuple(kept)), number=number, rule=rule)
 
 
-class Prior(Step[NoSettings]):
+class Prior(Choice[Case, NoSettings]):
     """Use a prior about the mean field of a block."""
 
     name = "prior"
-    outputs = (PRIOR,)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: Case) -> Decisions:
         """Run for the method ``network`` unless the campaign requests no prior."""
-        settings: VisibilityProductSettings = case.request
+        settings = case.request
         if settings.method != "network":
             yield Leave(f"method {settings.method} uses no prior")
         elif settings.prior == "none":
@@ -119,19 +94,16 @@ class Prior(Step[NoSettings]):
             )
             yield Run(reason, number=settings.block / settings.average)
 
-    def carry_out(self, settings: NoSettings, data: Data) -> None:
-        """Give nothing: the retrieval has its own setting."""
 
-
-class NetworkSettings(SettingsModel):
+class NetworkSettings(VisibilityDefinition):
     """Settings of the step ``visibility``."""
 
     beams: tuple[BeamPlan, ...]
     wavelength: float
     """m."""
     block_seconds: float
-    method: str
-    prior: str
+    method: Method
+    prior: PriorName
     tolerance: float
     """m."""
     smallest_angle: float
@@ -139,52 +111,43 @@ class NetworkSettings(SettingsModel):
     exponent_relative_error: float
     lidar_ratio_relative_error: float
     overlap_relative_error: float
-    contrast: float
-    law: str
-    angstrom_exponent: float | None = None
-    exponent_standard_error: float
-
-    @property
-    def definition(self) -> Definition:
-        """Definition of visibility."""
-        return Definition(
-            wavelength=self.wavelength,
-            contrast=self.contrast,
-            law=self.law,
-            angstrom_exponent=self.angstrom_exponent,
-            exponent_standard_error=self.exponent_standard_error,
-        )
 
 
-class Visibility(NetworkProductStep):
+_AVERAGE: Final = Average(
+    "signals are averaged before the retrieval: noise biases means of retrieved values"
+)
+
+
+class Visibility(NetworkProductStep[VisibilityProductSettings, NetworkSettings]):
     """Retrieve extinction and visibility where the beams of a network cross."""
 
     name = KIND
     settings = NetworkSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, BINS, BACKGROUND_RANGE, AVERAGE, PRIOR)
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, BACKGROUND_RANGE, AVERAGE)
+    parts = (Background(), Window(), _AVERAGE, Prior())
     costs = UnitCosts(product=0.2, value=2.5e-3, figure=1.2, load=0.1)
 
-    def plan(self, scene: Scene, campaign: Campaign) -> Decided:
+    def plan(self, scene: Scene, campaign: Campaign, request: VisibilityProductSettings) -> Decided:
         """Return the entries of the plan of a scene of a network.
 
         Without steps where the beams do not cross; the omissions then state why.
         """
-        settings: Any = campaign.networks[scene.instrument].requested()[self.name]
-        return list(_NetworkPlan(scene, campaign, settings).entries())
+        return list(_NetworkPlan(scene, campaign, request).entries())
 
     def network_stream(
-        self, settings: SettingsModel, members: Sequence[Member], data: Data
+        self, settings: NetworkSettings, members: Sequence[Member], data: Data
     ) -> NetworkStream:
         """Return the product, which holds averages of the beams."""
-        assert isinstance(settings, NetworkSettings)  # noqa: S101
         return _NetworkStream(settings, members, data[AVERAGE])
 
     def values(self, settings: NetworkSettings, scene: Scene, plan: Plan) -> float:
         """Return the number of averages of all beams."""
-        seconds = setting_of(plan, self.name, Average.name, "seconds")
-        members = {member.instrument: member for member in scene.members}
+        average = _AVERAGE.settings_in(plan)
+        if average is None:
+            return 0.0
+        granules = {member.instrument: member.granules for member in scene.members}
         return float(
-            sum(intervals(members[beam.instrument].granules, seconds) for beam in settings.beams)
+            sum(intervals(granules[beam.instrument], average.seconds) for beam in settings.beams)
         )
 
     def held(self, settings: NetworkSettings, scene: Scene, plan: Plan) -> float:
@@ -196,10 +159,6 @@ class Visibility(NetworkProductStep):
 _BYTES_OF_A_BIN: Final = 60.0
 """Bytes per bin of an average of a beam: power, variance and quality, and copies; assumed, not
 measured."""
-
-_AVERAGE: Final = Average(
-    "signals are averaged before the retrieval: noise biases means of retrieved values"
-)
 
 
 class _NetworkPlan:
@@ -224,9 +183,9 @@ class _NetworkPlan:
         prepared = [entry for member in able for entry in self._prepared(member)]
         yield from (entry for entry in prepared if isinstance(entry, LeftOut))
         wavelengths = [
-            typed_settings(step).wavelength
+            READ.typed(step).wavelength
             for step in prepared
-            if isinstance(step, PlannedStep) and step.name == Read.name
+            if isinstance(step, PlannedStep) and step.name == READ.name
         ]
         beams = [beam for member in able for beam in member.pointings()]
         reason = self._why_none(beams, wavelengths)
@@ -268,18 +227,18 @@ class _NetworkPlan:
         for channel in glued_parts(name) if is_glued(name) else (name,):
             case = member.channel_case(present[channel])
             for step in FILE_STEPS:
-                yield from case.decisions(step)
+                yield from step.entries(case)
         case = member.channel_case(member.channel)
         if is_glued(name):
             for step in GLUE_STEPS:
-                yield from case.decisions(step)
-        yield from self._of_product(case).decisions(Background())
+                yield from step.entries(case)
+        yield from Background().entries(self._of_product(case))
 
-    def _of_product(self, case: ChannelCase) -> ChannelCase:
+    def _of_product(self, case: ChannelCase) -> Case:
         return case.of_product(KIND, self._settings)
 
     @property
-    def _joint_case(self) -> ChannelCase:
+    def _joint_case(self) -> Case:
         """The case of the steps of the whole network."""
         channel = ChannelLayout(
             self._settings.channel, DetectionMode.PHOTON, math.nan, 0, math.nan, 0
@@ -340,16 +299,15 @@ class _NetworkPlan:
             if numbers:
                 farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
                 case = self._of_product(member.channel_case(member.channel))
-                yield from case.decisions(MemberWindow(farthest, member.tail))
-        for step in (_AVERAGE, Prior()):
-            yield from self._joint_case.decisions(step)
+                yield case.entry(Window.name, _window(case, farthest))
+        yield from _AVERAGE.entries(self._joint_case)
+        yield from Prior().entries(self._joint_case)
         yield self._joint_case.entry(KIND, self._visibility(beams, network, wavelength))
 
     def _visibility(
         self, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
     ) -> Run:
         settings = self._settings
-        definition = settings.visibility
         return Run(
             f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
             f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones",
@@ -364,10 +322,7 @@ class _NetworkPlan:
                 exponent_relative_error=settings.exponent_relative_error,
                 lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
                 overlap_relative_error=settings.overlap_relative_error,
-                contrast=definition.threshold,
-                law=definition.law,
-                angstrom_exponent=definition.angstrom_exponent,
-                exponent_standard_error=definition.exponent_standard_error,
+                **dict(VisibilityDefinition.of(settings.visibility)),
             ),
             number=float(network.crossings),
         )
@@ -380,6 +335,7 @@ class _NetworkStream(NetworkStream):
         self, settings: NetworkSettings, members: Sequence[Member], seconds: float
     ) -> None:
         self._settings, self._seconds = settings, seconds
+        self.wavelength = settings.wavelength
         by_name = {member.instrument: member for member in members}
         self._beams = [_Beam(by_name[beam.instrument], beam, seconds) for beam in settings.beams]
 
@@ -398,7 +354,7 @@ class _NetworkStream(NetworkStream):
             self._network(signals),
             labeled.NetworkSettings(
                 block_intervals=round(settings.block_seconds / self._seconds),
-                visibility=settings.definition,
+                visibility=settings.at(settings.wavelength),
                 method=settings.method,
                 prior=settings.prior,
                 exponent_relative_error=settings.exponent_relative_error,
@@ -507,4 +463,4 @@ def _no_averages(distance: npt.NDArray[np.float64]) -> xr.Dataset:
     )
 
 
-STEPS: Final = (Background(), MemberWindow(), _AVERAGE, Prior(), Visibility())
+STEP: Final = Visibility()

@@ -8,14 +8,15 @@ import numpy as np
 import xarray as xr
 
 from lidar_extras.integrated.integral import Window
+from lidar_extras.integrated.settings import IntegratedSettings
 from lidarops.records import Plan, Scene
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
+from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import channel_ranges
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct
-from lidarops.steps.products import (
+from lidarops.steps.preparation import (
     BACKGROUND_METHOD,
     BACKGROUND_RANGE,
     FEWEST_BINS,
@@ -34,15 +35,16 @@ class WindowSettings(SettingsModel):
     """m."""
 
 
-class Integrated(ProductStep[WindowSettings]):
+class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
     """Integrate the range-corrected signal over windows of range."""
 
     name = "integrated"
     settings = WindowSettings
     inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
+    parts = (Background(),)
     costs = UnitCosts(product=0.05, value=1e-8, figure=0.4)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: ProductCase[IntegratedSettings]) -> Decisions:
         """Run for the windows that hold a bin, where the range of the background holds enough."""
         start, stop = tail(case, case.request.background_range)
         bins = (stop - start) / case.channel.bin_width
@@ -122,4 +124,4 @@ class _Integrals(RowProduct):
         return values.assign(gluing(conditioned)).assign_coords(chunk.geometry.variables)
 
 
-STEPS: Final = (Background(), Integrated())
+STEP: Final = Integrated()

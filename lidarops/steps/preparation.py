@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, Literal
+from datetime import timedelta
+from typing import Final, Protocol
 
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
-from lidarops.steps.data import Data
+from lidarops.steps.case import ChannelCase, ProductCase
+from lidarops.steps.data import BackgroundName, Data
 from lidarops.steps.step import Datum, Decisions, Run, Step
 
 BACKGROUND_RANGE: Final = Datum[tuple[float, float]]("background_range")
 """m, the range from which the background is estimated."""
-BACKGROUND_METHOD: Final = Datum[str]("background_method")
+BACKGROUND_METHOD: Final = Datum[BackgroundName]("background_method")
 AVERAGE: Final = Datum[float]("average")
 """s, length of the clock intervals over which profiles are averaged."""
 MOLECULES: Final = Datum[MolecularProfile]("molecules")
@@ -36,23 +37,34 @@ def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, 
 class BackgroundSettings(SettingsModel):
     """Settings of the step ``background``."""
 
-    method: Literal["tail_mean", "cubic", "known_shape"]
+    method: BackgroundName
     range: tuple[float, float]
     """m."""
 
 
-class Background(Step[BackgroundSettings]):
-    """State how the background is estimated, from what the request says of it."""
+class BackgroundRequest(Protocol):
+    """What `Background` takes of the settings of a kind of product."""
+
+    @property
+    def background(self) -> BackgroundName:
+        """How the background is estimated."""
+
+    @property
+    def background_range(self) -> tuple[float, float] | None:
+        """Where, m; None for the last tenth of the bins."""
+
+
+class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
+    """State how and from which range the background is estimated."""
 
     name = "background"
     settings = BackgroundSettings
     outputs = (BACKGROUND_RANGE, BACKGROUND_METHOD)
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: ProductCase[BackgroundRequest]) -> Decisions:
         """Run always; the product is left out where the range holds too few bins."""
-        limits = getattr(case.request, "background_range", None)
+        method, limits = case.request.background, case.request.background_range
         start, stop = tail(case, limits)
-        method = getattr(case.request, "background", "tail_mean")
         where = (
             "the last tenth of the bins" if limits is None else "background_range of the campaign"
         )
@@ -82,8 +94,16 @@ class AverageSettings(SettingsModel):
     seconds: float
 
 
-class Average(Step[AverageSettings]):
-    """Average profiles over clock intervals, by `average` of the request."""
+class AverageRequest(Protocol):
+    """What `Average` takes of the settings of a kind of product."""
+
+    @property
+    def average(self) -> timedelta:
+        """Length of the clock intervals."""
+
+
+class Average(Step[ProductCase[AverageRequest], AverageSettings]):
+    """Average profiles over clock intervals."""
 
     name = "average"
     settings = AverageSettings
@@ -92,7 +112,7 @@ class Average(Step[AverageSettings]):
     def __init__(self, reason: str) -> None:
         self._reason = reason
 
-    def decide(self, case: ChannelCase) -> Decisions:
+    def decide(self, case: ProductCase[AverageRequest]) -> Decisions:
         """Run always."""
         seconds = case.request.average.total_seconds()
         yield Run(self._reason, AverageSettings(seconds=seconds), number=seconds)
@@ -109,7 +129,7 @@ class MolecularSettings(SettingsModel):
     """Ancillary file of pressure and temperature; None for the US Standard Atmosphere 1976."""
 
 
-class Molecular(Step[MolecularSettings]):
+class Molecular(Step[ChannelCase, MolecularSettings]):
     """Give the density of the air."""
 
     name = "molecular"
