@@ -135,7 +135,7 @@ def _environment(root: Path, out: Path) -> dict[str, str]:
         for name, value in os.environ.items()
         if not name.startswith("LIDAROPS_") and name != "SOURCE_DATE_EPOCH"
     }
-    folders = (root, root / "tests")
+    folders = (root, root / "tests", root / "tests" / "plugin")
     return kept | {
         "PYTHONPATH": os.pathsep.join(map(str, folders)),
         "NUMBA_CACHE_DIR": str(out / "cache" / "numba"),
