@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from lidarops.errors import LidarOpsError
 from lidarops.flags import Flags
-from lidarops.registry import registered
+from lidarops.registry import by_name, registered
 from lidarops.settings import ChannelProduct, NetworkProduct
 
 GROUP: Final = "lidarops.product_kinds"
@@ -107,13 +107,7 @@ def kind_of(name: str) -> Kind:
     LidarOpsError
         If there is none of that name.
     """
-    known = kinds()
-    if name not in known:
-        raise LidarOpsError(
-            f"there is no kind of product {name!r}",
-            remedy=f"kinds are {', '.join(known)}; install the package of any other kind",
-        )
-    return known[name]
+    return by_name(kinds(), name, "kind of product")
 
 
 @cache

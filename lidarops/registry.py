@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Protocol, TypeVar
 
@@ -50,3 +51,15 @@ def registered(group: str, of: type[_Part], noun: str) -> dict[str, _Part]:
             )
         parts[part.name] = part
     return parts
+
+
+def by_name(
+    parts: Mapping[str, _Part], name: str, noun: str, error: type[LidarOpsError] = LidarOpsError
+) -> _Part:
+    """Return the one of `registered` objects that has a name; raise `error` if none has."""
+    if name not in parts:
+        raise error(
+            f"there is no {noun} {name!r}",
+            remedy=f"{', '.join(parts)} are installed; install the package that adds it",
+        )
+    return parts[name]

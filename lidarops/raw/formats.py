@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.header import RawHeader, Stretches
-from lidarops.registry import registered
+from lidarops.registry import by_name, registered
 
 GROUP: Final = "lidarops.raw_formats"
 """Group of entry points."""
@@ -72,13 +72,7 @@ def raw_format(name: str) -> RawFormat:
     RawFormatError
         If there is none of that name.
     """
-    known = raw_formats()
-    if name not in known:
-        raise RawFormatError(
-            f"there is no raw format {name!r}",
-            remedy=f"formats are {', '.join(known)}; install the package of any other format",
-        )
-    return known[name]
+    return by_name(raw_formats(), name, "raw format", RawFormatError)
 
 
 def parse_raw_header(head: bytes, *, file: str, size: int, known: str = "") -> RawHeader:

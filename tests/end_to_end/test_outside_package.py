@@ -387,7 +387,7 @@ def test_products_of_an_uninstalled_package_are_shown(copied: Campaign) -> None:
     assert "window_cut" in inspected
     assert "unknown kind: integrated" in " ".join(re.split(r"[\s│]+", aggregated))
     assert "no kind of product 'integrated'" in reproduced
-    assert "install the package of any other kind" in reproduced
+    assert "install the package that adds it" in reproduced
     assert "products.integrated: unknown key; keys here are" in planned
     assert not any("Traceback" in result[1] for result in results)
     pages = [page for page in (output / "site/product").rglob("*.html") if KIND in page.name]

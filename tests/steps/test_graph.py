@@ -12,11 +12,13 @@ from support import factories
 from support.archives.network_plans import campaign as network_campaign
 from support.archives.network_plans import granules as network_granules
 
+from lidarops.kinds import kinds
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, PlannedStep, Role
 from lidarops.steps import dependence
-from lidarops.steps.registry import definition, typed_settings
+from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, SHARED, definition, making_step
+from lidarops.steps.step import Step
 
 CHANNELS = ["photon_532o", "analog_532o", "glued_532o"]
 REQUESTS: dict[str, dict[str, Any]] = {
@@ -71,6 +73,15 @@ def test_the_scenes_give_products_of_all_kinds():
     assert ("elastic", "glued_532o") in dependence.planned_products(PLANS["up"])
 
 
+def test_what_a_step_gives_is_taken_and_what_it_takes_is_given():
+    making = [making_step(kind) for kind in kinds()]
+    parts = [part for product in making for part in product.parts]
+    steps = [s for s in (*FILE_STEPS, *GLUE_STEPS, *SHARED, *parts) if isinstance(s, Step)]
+    given = {datum for step in steps for datum in step.outputs}
+    taken = {datum for step in steps for datum in (*step.inputs, *step.from_parts)}
+    assert given == taken | {datum for product in making for datum in product.inputs}
+
+
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
 def test_steps_need_entries_of_the_plan_only(plan):
     entries = {(entry.channel, entry.name) for entry in (*plan.steps, *plan.left_out)}
@@ -100,7 +111,8 @@ def test_settings_survive_json(plan):
     ):
         again = PlannedStep(**fields)
         assert again.as_dict() == step.as_dict()
-        typed = typed_settings(again)
-        assert isinstance(typed, definition(step).settings)
-        assert typed == typed_settings(step)
+        known = definition(step)
+        typed = known.typed(again)
+        assert isinstance(typed, known.settings)
+        assert typed == known.typed(step)
         assert typed.model_dump(mode="json", exclude_none=True) == dict(step.settings)
