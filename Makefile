@@ -38,6 +38,7 @@ bench: .venv/.runtime
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(INSTALL) --require-hashes -r requirements.lock
 	$(INSTALL) --no-build-isolation -e .
+	$(BIN)/lidarops compile
 	touch $@
 
 .venv/.dev: .venv/.runtime requirements-dev.lock tests/plugin/pyproject.toml

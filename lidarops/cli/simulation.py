@@ -1,4 +1,4 @@
-"""The command that writes simulated campaigns."""
+"""Commands that simulate: raw files of a campaign, and a first use of all retrievals."""
 
 from __future__ import annotations
 
@@ -42,3 +42,15 @@ def simulate(
         simulated = write_simulation(planned, client=client, progress=advance)
     write_plain(simulated.truth, settings.truth_path)
     typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
+
+
+@app.command("compile")
+@with_plain_errors
+def compile_code() -> None:
+    """Compile the retrievals now, so that the first run need not: once after installation.
+
+    Example: lidarops compile
+    """
+    from lidarops.run.compilation import compile_retrievals
+
+    typer.echo(f"compiled code is kept in {compile_retrievals()}")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import shutil
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -25,18 +29,41 @@ def keep_apart(sources: Path = _SOURCES) -> str:
     Returns
     -------
     str
-        The cache folder: within ``NUMBA_CACHE_DIR``, else beside the sources. Where it is not
-        writable, numba chooses another.
+        The cache folder: within ``NUMBA_CACHE_DIR``; else beside the sources; where that is not
+        writable, in the user's folder for caches. A folder elsewhere begins as a copy of the one
+        beside the sources, so that users and workers share what was compiled at installation.
     """
     digest = hashlib.sha256()
     for path in sorted(sources.rglob("*.py")):
         content = path.read_bytes()
         if b"numba" in content:
             digest.update(content)
-    name = f"lidarops-{digest.hexdigest()[:16]}"
+    installed = sources / "__pycache__" / f"lidarops-{digest.hexdigest()[:16]}"
     settings = vars(config)
-    base = Path(settings["CACHE_DIR"] or sources / "__pycache__")
-    # A former call may have set the folder already.
-    folder = str((base.parent if base.name.startswith("lidarops-") else base) / name)
-    settings["CACHE_DIR"] = folder
-    return folder
+    folder = _base(settings["CACHE_DIR"], sources) / installed.name
+    if folder != installed and installed.is_dir() and not folder.exists():
+        _copy(installed, folder)
+    settings["CACHE_DIR"] = str(folder)
+    return str(folder)
+
+
+def _base(requested: str, sources: Path) -> Path:
+    """Return the folder of caches, for the requested one or none."""
+    if requested:
+        # A former call may have set the folder already.
+        base = Path(requested)
+        return base.parent if base.name.startswith("lidarops-") else base
+    if os.access(sources, os.W_OK):
+        return sources / "__pycache__"
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111 - never raises
+    return Path(home) / "lidarops"
+
+
+def _copy(installed: Path, folder: Path) -> None:
+    """Copy a cache; another process may do the same. Without the copy, numba compiles anew."""
+    with suppress(OSError):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as building:
+            copy = Path(building) / folder.name
+            shutil.copytree(installed, copy)
+            copy.rename(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pkgutil
 from collections.abc import Iterator
 from functools import cache
@@ -42,6 +43,31 @@ def test_a_cache_folder_set_by_the_user_is_respected(
 ):
     monkeypatch.setattr(config, "CACHE_DIR", str(sources / "cache"))
     assert Path(keep_apart(sources)).parent == sources / "cache"
+
+
+def test_code_compiled_at_installation_is_shared(
+    sources: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+):
+    installed = Path(keep_apart(sources))
+    installed.mkdir(parents=True)
+    (installed / "kernel.nbc").write_text("compiled")
+    of_user = tmp_path_factory.mktemp("user")
+    monkeypatch.setattr(config, "CACHE_DIR", str(of_user))
+    copied = Path(keep_apart(sources)) / "kernel.nbc"
+    assert copied.is_relative_to(of_user)
+    copied.write_text("compiled by the user")
+    keep_apart(sources)
+    assert copied.read_text() == "compiled by the user"
+    assert (installed / "kernel.nbc").read_text() == "compiled"
+
+
+def test_a_read_only_installation_uses_the_cache_of_the_user(
+    sources: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+):
+    home = tmp_path_factory.mktemp("home")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert Path(keep_apart(sources)).parent == home / "lidarops"
 
 
 def test_the_functions_of_the_package_use_that_folder():
