@@ -292,8 +292,6 @@ class SceneOutcome:
     """Bytes of raw files, without headers."""
     cpu_seconds: float = 0.0
     """CPU time of the thread that processed the scene; 0 where not measured."""
-    estimated_seconds: float = 0.0
-    """CPU time estimated before the run; 0 where not estimated."""
     left_out: tuple[LeftOut, ...] = ()
     """Requested steps that are not in `plan`, because their product or channel was not made."""
 
@@ -352,8 +350,6 @@ class RunRecord:
     """Granules that the catalog refused."""
     truth: str = ""
     """Path of the truth file of a simulated campaign, empty for real data."""
-    costs: str = ""
-    """Source of the costs behind the estimated times; empty where nothing was estimated."""
     unmet: tuple[Unmet, ...] = ()
     """Channels that are requested or have facts, but are missing in files; those that no file
     holds come first."""

@@ -25,7 +25,6 @@ from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import (
     archives,
     campaigns,
-    cost_calibration,
     memory,
     networks,
     readers,
@@ -49,7 +48,6 @@ class Benchmark(StrEnum):
     ALL = "all"
     ARCHIVE = "archive"
     CAMPAIGNS = "campaigns"
-    COSTS = "costs"
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
     MEMORY = "memory"
@@ -138,7 +136,6 @@ def _throughput() -> dict[Benchmark, _Study]:
     return {
         Benchmark.ARCHIVE: (archives.measure_archives, archives.archives_report),
         Benchmark.CAMPAIGNS: (campaigns.measure_campaigns, campaigns.campaigns_report),
-        Benchmark.COSTS: (cost_calibration.calibrate, cost_calibration.calibration_report),
         Benchmark.ELASTIC: (
             retrievals.measure_elastic,
             retrieval_reports.elastic_throughput_report,

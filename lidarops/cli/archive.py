@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lidarops.campaign.model import Campaign
-    from lidarops.plan.cost_estimate import Tally
+    from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import Granule, Plan, RunRecord
     from lidarops.run.archive import Result
     from lidarops.run.selection import Selection
@@ -147,7 +147,7 @@ def show_plan(
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops.plan import cost_estimate
+    from lidarops.plan.cost_estimate import RunTime
     from lidarops.run.archive import assess
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
@@ -155,8 +155,7 @@ def show_plan(
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     selection = _selection(instrument, station, product, since, until)
     judgements = assess(settings, selection=selection, everything=not stale, wait=wait)
-    machine = cost_estimate.load_calibration()
-    making, everything = cost_estimate.Tally(machine), cost_estimate.Tally(machine)
+    making, everything = RunTime(), RunTime()
     scenes = []
     no_scene = True
     for judged in judgements:
@@ -184,20 +183,18 @@ def show_plan(
         show(_stale_table(f"{title}, {needs['to_be_made']}", judged))
     no_scene = no_scene and selects_no_scene(settings, selection)
     # With --stale, fresh scenes were not judged.
-    tallies = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
+    runs = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
     if as_json:
-        total = {
-            name.partition(",")[0].replace(" ", "_"): tally.parts for name, tally in tallies.items()
+        estimate = {
+            name.partition(",")[0].replace(" ", "_"): run.parts for name, run in runs.items()
         }
-        estimate = {**total, "costs": machine.words, "calibrated": not machine.note}
         no_scene_found = {"no_scene_selected": no_scene}
         document = {"scenes": scenes, **no_scene_found, "estimated_cpu_seconds": estimate}
         typer.echo(json.dumps(document, indent=2))
         return
     if no_scene:
         typer.echo(_NO_SCENE)
-    show(_time_table(tallies))
-    typer.echo(f"estimated CPU time: {machine.words}")
+    show(_time_table(runs))
 
 
 @app.command()
@@ -418,13 +415,11 @@ def _plan_table(title: str, plan: Plan) -> Table:
     return table
 
 
-def _time_table(tallies: Mapping[str, Tally]) -> Table:
-    table = make_table(
-        "Estimated CPU time in s", "", "scenes", "processing", "start", "report", "all"
-    )
-    for name, tally in tallies.items():
-        times = (f"{seconds:.2g}" for seconds in tally.parts.values())
-        add_row(table, name, tally.count, *times)
+def _time_table(runs: Mapping[str, RunTime]) -> Table:
+    title = "Estimated CPU time in s on a common server core"
+    table = make_table(title, "", "scenes", "processing", "start", "report", "all")
+    for name, run in runs.items():
+        add_row(table, name, run.count, *(f"{seconds:.2g}" for seconds in run.parts.values()))
     return table
 
 

@@ -67,8 +67,6 @@ def bench(
 
     Example: lidarops bench throughput demo/raw/coast/h*.*0
 
-    Example: lidarops bench throughput --case costs
-
     Example: lidarops bench stability --quick --out bench
     """
     from lidarops.bench import registry

@@ -141,19 +141,9 @@ def internal_errors(record: RunRecord) -> list[SceneOutcome]:
 
 
 def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
-    """Return the measured and the estimated CPU time of scenes, if it was measured.
-
-    The estimate counts start-up (loading code with the first scenes) once, though every worker
-    pays it.
-    """
-    # Failed scenes have no measured time, so their estimates are left out too.
-    measured = [scene for scene in record.scenes if scene.cpu_seconds]
-    if not measured:
-        return []
-    took = sum(scene.cpu_seconds for scene in measured)
-    estimated = sum(scene.estimated_seconds for scene in measured)
-    estimate = f"; estimate {duration(estimated)}, with the start-up of one worker ({record.costs})"
-    return [("CPU time of scenes", f"{duration(took)}{estimate if estimated else ''}")]
+    """Return the CPU time of scenes, if it was measured."""
+    took = sum(scene.cpu_seconds for scene in record.scenes)
+    return [("CPU time of scenes", duration(took))] if took else []
 
 
 def verdict(record: RunRecord) -> str:

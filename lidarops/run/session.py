@@ -18,7 +18,6 @@ from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.netcdf.code_version import joint_code_version
-from lidarops.plan import cost_estimate
 from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps.dependence import ProductKey
@@ -61,7 +60,6 @@ class Session:
         self._named = 0
         self.settled: set[str] = set()
         """Scenes whose products are all fresh now."""
-        self._tally = cost_estimate.Tally(cost_estimate.load_calibration())
         self.started = datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
 
@@ -118,12 +116,7 @@ class Session:
         )
         self._store.record(entry, self.id, self._lock.token)
         self._settle(judged, outcome, new)
-        # After the entry, so that a failing estimate loses no scene.
-        outcome = replace(
-            outcome,
-            estimated_seconds=self._estimated(judged),
-            left_out=self._beyond(judged, outcome),
-        )
+        outcome = replace(outcome, left_out=self._beyond(judged, outcome))
         self._settle_versions(judged, outcome)
         self._log(outcome)
         self._named += outcome.granules
@@ -181,18 +174,10 @@ class Session:
             scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
             refused=refused,
             truth=_truth(self._campaign),
-            costs=self._tally.costs.words,
             unmet=unmet,
             empty_scenes=dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES)),
             more_empty_scenes=max(len(empty_scenes or {}) - MOST_EMPTY_SCENES, 0),
         )
-
-    def _estimated(self, judged: Judgement) -> float:
-        """Return the estimated CPU time of a scene (s), with the code that it loads first."""
-        before = self._tally.loading
-        whole = self._campaign.all_steps
-        own = self._tally.add(judged.scene, judged.needed(), whole=whole)
-        return own + self._tally.loading - before
 
     def _beyond(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:
         """Return the left-out steps of the request that are in no plan of a product."""

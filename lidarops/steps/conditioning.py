@@ -20,6 +20,7 @@ from lidarops.steps.data import Data, Profiles
 from lidarops.steps.profiles import FileProfiles
 from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
+from lidarops.steps.workload import Workload
 
 Array = npt.NDArray[np.float64]
 
@@ -154,6 +155,10 @@ class Dark(Step[ChannelCase, DarkSettings]):
         """Give the dark signals."""
         if data.source.dark is not None:
             data[DARK] = labeled.read_dark(data.source.dark, data.channel, method=settings.method)
+
+    def cpu_time(self, settings: DarkSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the CPU time, s."""
+        return 0.035
 
 
 def _sessions(dark: Iterable[Granule]) -> int:

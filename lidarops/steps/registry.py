@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any, Final
 
 from lidarops.kinds import kind_of
-from lidarops.records import Granule, LeftOut, Plan, PlannedStep, Scene
+from lidarops.records import LeftOut, PlannedStep
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import file_channels, glued_parts, is_glued
+from lidarops.steps.channels import glued_parts, is_glued
 from lidarops.steps.conditioning import Dark, DeadTime, Noise, Overlap, RangeOffset
 from lidarops.steps.data import Data
 from lidarops.steps.gluing import Glue, Lag
@@ -141,19 +140,6 @@ def _needs(planned: PlannedStep, places: Collection[tuple[str, str, str, str]]) 
         for part in glued_parts(planned.channel):
             needs += [f"{part}/{name}" for name in present(part, names)]
     return tuple(needs)
-
-
-def bins_of(scene: Scene, product: str, plan: Plan) -> int:
-    """Return the number of bins of the channel of a product; `plan` holds that product only."""
-    channel = next(step.channel for step in plan.steps if step.name == product)
-    bins = {layout.name: layout.bins for layout in scene.layout}
-    return min(bins[name] for name in file_channels(channel))
-
-
-def intervals(granules: Iterable[Granule], seconds: float) -> int:
-    """Return the number of clock intervals that hold profiles."""
-    starts = (granule.start for granule in granules)
-    return len({math.floor(start.timestamp() / seconds) for start in starts if start})
 
 
 def channel_steps(channel: str) -> tuple[SharedStep, ...]:

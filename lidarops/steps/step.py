@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from lidarops.steps.case import ChannelCase, ProductCase
     from lidarops.steps.data import Data, ProductStream
+    from lidarops.steps.workload import Workload
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -87,6 +88,10 @@ class Definition(ABC, Generic[S]):
         """Return the ancillary files that the step reads, by path, with their roles."""
         return {}
 
+    def cpu_time(self, settings: S, work: Workload) -> float:  # noqa: ARG002 - most cost little
+        """Return the estimated CPU time on a common server core, s."""
+        return 0.0
+
 
 class Choice(Definition[S], Generic[C_contra, S]):
     """Something about a channel or a product that is decided from headers and campaign alone."""
@@ -115,20 +120,6 @@ class Step(Choice[C_contra, S]):
         """Put the outputs into the data of the channel."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnitCosts:
-    """CPU time and memory of a kind of product on a common server core, without a calibration."""
-
-    product: float
-    """s for one product."""
-    value: float
-    """s for one value of `ProductStep.values`."""
-    figure: float
-    """s for the figures of one channel of an instrument, for all scenes together."""
-    load: float = 0.0
-    """s to load the compiled code of the kind, once a process."""
-
-
 class MakingStep(Definition[S], Generic[R, S]):
     """The step that makes a product; it has the name of its kind."""
 
@@ -136,15 +127,8 @@ class MakingStep(Definition[S], Generic[R, S]):
     """What it takes from steps, where they run."""
     parts: tuple[Definition[Any], ...] = ()
     """Other entries of the kind: steps, and choices by which the product is made."""
-    costs: ClassVar[UnitCosts]
-    drawn_whole: ClassVar[bool] = False
-    """Whether figures show every value, so that their cost grows with the number of values."""
 
-    @abstractmethod
-    def values(self, settings: S, scene: Scene, plan: Plan) -> float:
-        """Return the number of values that are computed, which the CPU time is proportional to."""
-
-    def held(self, settings: S, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+    def held(self, settings: S, work: Workload) -> float:  # noqa: ARG002
         """Return the number of bytes that the product holds for the whole scene."""
         return 0.0
 

@@ -27,7 +27,6 @@ from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
 from lidarops.netcdf import code_version as versions
 from lidarops.netcdf.code_version import sources_in
-from lidarops.plan import cost_estimate
 from lidarops.raw import licel
 from lidarops.run.archive import assess, reprocess
 from lidarops.simulate.campaign import simulate_campaign
@@ -295,25 +294,6 @@ def test_a_changed_source_makes_it_stale_and_no_other(
     reasons = stale(campaign)
     assert set(reasons) == {KIND}
     assert reasons[KIND].startswith("the code changed")
-
-
-def test_a_calibration_from_before_it_was_installed_is_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    defaults = cost_estimate.default_costs()
-    costs = cost_estimate.Costs(
-        {term: 2 * cost for term, cost in defaults.items()}, cost_estimate.processor(), "2026-01-02"
-    )
-    path = cost_estimate.save_calibration(costs)
-    document = json.loads(path.read_text())
-    for term in [term for term in document["seconds"] if term.startswith(KIND)]:
-        del document["seconds"][term]
-    path.write_text(json.dumps(document))
-    read = cost_estimate.load_calibration()
-    assert read.words == "calibrated on this machine on 2026-01-02"
-    for term, cost in read.seconds.items():
-        assert cost == defaults[term] * (1 if term.startswith(KIND) else 2)
 
 
 # With another package, and without --------------------------------------------------------------

@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Final
-
-from lidarops.plan.cost_estimate import processor
 
 READ: Final = "read (np.max)"
 """Name of the floor of all times: a vectorised read of the same array in the same run."""
@@ -51,7 +50,7 @@ class StepCost:
 def machine() -> Machine:
     """Return the machine and the packages of this process."""
     return Machine(
-        processor=processor(),
+        processor=_processor(),
         python=platform.python_version(),
         packages={name: number for name in _PACKAGES if (number := _version(name))},
     )
@@ -90,6 +89,16 @@ def in_threads(function: Callable[[int], object], threads: int) -> None:
     with ThreadPoolExecutor(threads) as pool:
         for future in [pool.submit(function, number) for number in range(threads)]:
             future.result()
+
+
+def _processor() -> str:
+    """Return the model of this machine's processor."""
+    facts = Path("/proc/cpuinfo")
+    if facts.is_file():
+        for line in facts.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def _version(package: str) -> str:

@@ -3,6 +3,5 @@
 `retrievals`, `scan_kernels`, `networks` and `readers` time single functions; their pages are in
 `retrieval_reports`. `archives` times runs over archives of many scenes, most of them stand-ins
 (`stand_in_archives`). `campaigns` times all stages of simulated campaigns, `memory` measures the
-peak of processes, and `orchestration` workers and flows. `cost_calibration` fits the cost model of
-``lidarops plan``.
+peak of processes, and `orchestration` workers and flows.
 """

@@ -10,7 +10,6 @@ from typing import Final
 import xarray as xr
 
 from lidarops.products.elastic.settings import ElasticSettings
-from lidarops.records import Plan, Scene
 from lidarops.retrieve.elastic import labeled
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
@@ -21,7 +20,6 @@ from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
 from lidarops.steps.profiles import gluing
 from lidarops.steps.reading import WAVELENGTH
-from lidarops.steps.registry import bins_of, intervals
 from lidarops.steps.step import (
     REQUESTED,
     Datum,
@@ -31,8 +29,8 @@ from lidarops.steps.step import (
     ProductStep,
     Run,
     Step,
-    UnitCosts,
 )
+from lidarops.steps.workload import Workload
 
 Case = ProductCase[ElasticSettings]
 
@@ -144,8 +142,6 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
     settings = InversionSettings
     inputs = (PROFILES, WAVELENGTH, OVERLAP, AVERAGE, MOLECULES, KNOWN_SHAPE, REFERENCE)
     parts = (_AVERAGE, KnownShape(), ReferenceWindow())
-    costs = UnitCosts(product=0.1, value=5e-7, figure=1.5, load=0.1)
-    drawn_whole = True
 
     def decide(self, case: Case) -> Decisions:
         """Run where a fixed beam reaches aerosol-free air."""
@@ -166,15 +162,18 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
         """Return the product, which holds averages only."""
         return _Inversion(settings, data)
 
-    def values(self, settings: InversionSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
-        """Return the number of bins of all averages."""
-        average = _AVERAGE.settings_in(plan)
-        count = intervals(scene.granules, average.seconds) if average else 0
-        return float(count * bins_of(scene, self.name, plan))
+    def cpu_time(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the CPU time by the number of bins of all averages, s."""
+        return 0.1 + 5e-7 * work.bins * _averages(work)
 
-    def held(self, settings: InversionSettings, scene: Scene, plan: Plan) -> float:
+    def held(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the averages and of what is retrieved from them."""
-        return _BYTES_OF_A_BIN * self.values(settings, scene, plan)
+        return _BYTES_OF_A_BIN * work.bins * _averages(work)
+
+
+def _averages(work: Workload) -> int:
+    average = _AVERAGE.settings_in(work.plan)
+    return work.intervals(average.seconds) if average else 0
 
 
 _AT_ONCE: Final = 16

@@ -20,7 +20,7 @@ from lidarops.products.homogeneous.look import (
     omitted_sections,
 )
 from lidarops.products.homogeneous.settings import HomogeneousSettings
-from lidarops.records import DetectionMode, LeftOut, Plan, PlannedStep, Scene
+from lidarops.records import DetectionMode, LeftOut, PlannedStep
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.homogeneous import labeled
@@ -45,8 +45,8 @@ from lidarops.steps.step import (
     NoSettings,
     ProductStep,
     Run,
-    UnitCosts,
 )
+from lidarops.steps.workload import Workload
 
 Case = ProductCase[HomogeneousSettings]
 
@@ -131,6 +131,10 @@ class LookForSignal(Choice[Case, LookSettings]):
             reason = "sections in which no sampled profile shows a signal are not retrieved"
             yield Run(reason, LookSettings(profiles=LOOKED_AT), number=float(LOOKED_AT))
 
+    def cpu_time(self, settings: LookSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the CPU time, which is mostly that of opening files, s."""
+        return 0.04
+
 
 class AlongPath(Choice[Case, NoSettings]):
     """Add visibility along the sections."""
@@ -173,7 +177,6 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
     settings = PathSettings
     inputs = (PROFILES, RELATIVE_VARIANCE, OVERLAP, WAVELENGTH)
     parts = (SectionWindow(), _LOOK, AlongPath())
-    costs = UnitCosts(product=0.08, value=1.2e-7, figure=0.4, load=0.1)
 
     def decide(self, case: Case) -> Decisions:
         """Run for the sections that lie within the bins, along a nearly level path."""
@@ -218,16 +221,15 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
         """Return the product, which holds the values of sections only."""
         return _Sections(settings, data)
 
-    def values(self, settings: PathSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
-        """Return the number of bins in the sections of all profiles."""
-        width = min(channel.bin_width for channel in scene.layout)
-        return float(
-            len(scene.granules) * sum((far - near) / width for near, far in settings.sections)
-        )
+    def cpu_time(self, settings: PathSettings, work: Workload) -> float:
+        """Return the CPU time by the number of bins in the sections of all profiles, s."""
+        width = min(channel.bin_width for channel in work.scene.layout)
+        bins = sum((far - near) / width for near, far in settings.sections)
+        return 0.08 + 1.2e-7 * work.profiles * bins
 
-    def held(self, settings: PathSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
+    def held(self, settings: PathSettings, work: Workload) -> float:
         """Return the bytes of the values of all sections."""
-        return _BYTES_OF_A_SECTION * len(scene.granules) * len(settings.sections)
+        return _BYTES_OF_A_SECTION * work.profiles * len(settings.sections)
 
 
 _BYTES_OF_A_SECTION: Final = 400.0

@@ -18,7 +18,6 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
-from lidarops.records import Plan, Scene
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
@@ -42,8 +41,8 @@ from lidarops.steps.step import (
     NoSettings,
     ProductStep,
     Run,
-    UnitCosts,
 )
+from lidarops.steps.workload import Workload
 
 Array = npt.NDArray[np.float64]
 Case = ProductCase[MultiAngleSettings]
@@ -244,7 +243,6 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
     parts = (
         Background(), Gradient(), GradientRegressor(), Robust(), Vertical(), Correlation(), Layers()
     )  # fmt: skip
-    costs = UnitCosts(product=0.1, value=6e-6, figure=1.9, load=0.1)
 
     def decide(self, case: Case) -> Decisions:
         """Run where the beam scans."""
@@ -268,13 +266,13 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         """Return the product, which holds cycles on common altitudes."""
         return _Scans(settings, data)
 
-    def values(self, settings: ScanSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
-        """Return the number of altitudes of all profiles."""
-        return float(len(scene.granules) * settings.highest / settings.step)
+    def cpu_time(self, settings: ScanSettings, work: Workload) -> float:
+        """Return the CPU time by the number of altitudes of all profiles, s."""
+        return 0.1 + 6e-6 * work.profiles * settings.highest / settings.step
 
-    def held(self, settings: ScanSettings, scene: Scene, plan: Plan) -> float:
+    def held(self, settings: ScanSettings, work: Workload) -> float:
         """Return the bytes of the cycles and of what is retrieved from them."""
-        return _BYTES_OF_AN_ALTITUDE * self.values(settings, scene, plan)
+        return _BYTES_OF_AN_ALTITUDE * work.profiles * settings.highest / settings.step
 
 
 _BYTES_OF_AN_ALTITUDE: Final = 400.0

@@ -11,7 +11,6 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.products.signal.settings import SignalSettings
-from lidarops.records import Plan, Scene
 from lidarops.retrieve.signal.labeled import background_words
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
@@ -23,7 +22,6 @@ from lidarops.steps.preparation import (
     Background,
     tail,
 )
-from lidarops.steps.registry import bins_of
 from lidarops.steps.step import (
     REQUESTED,
     Decisions,
@@ -31,8 +29,8 @@ from lidarops.steps.step import (
     NoSettings,
     ProductStep,
     Run,
-    UnitCosts,
 )
+from lidarops.steps.workload import Workload
 
 
 class Signal(ProductStep[SignalSettings, NoSettings]):
@@ -41,8 +39,6 @@ class Signal(ProductStep[SignalSettings, NoSettings]):
     name = "signal"
     inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
     parts = (Background(),)
-    costs = UnitCosts(product=0.05, value=2e-8, figure=0.8)
-    drawn_whole = True
 
     def decide(self, case: ProductCase[SignalSettings]) -> Decisions:
         """Run where the range of the background holds enough bins."""
@@ -63,9 +59,9 @@ class Signal(ProductStep[SignalSettings, NoSettings]):
         """Return the product, which is written as profiles come."""
         return _Signals(data)
 
-    def values(self, settings: NoSettings, scene: Scene, plan: Plan) -> float:  # noqa: ARG002
-        """Return the number of bins of all profiles."""
-        return float(len(scene.granules) * bins_of(scene, self.name, plan))
+    def cpu_time(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the CPU time by the number of bins of all profiles, s."""
+        return 0.05 + 2e-8 * work.profiles * work.bins
 
 
 class _Signals(RowProduct):

@@ -22,7 +22,7 @@ from lidarops.products.visibility.network import (
     crossings,
 )
 from lidarops.products.visibility.settings import Method, PriorName, VisibilityProductSettings
-from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, PlannedStep, Scene
+from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
@@ -43,8 +43,9 @@ from lidarops.steps.reading import (
     bins_within,
     merged,
 )
-from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, intervals
-from lidarops.steps.step import ALL_STEPS, Choice, Decisions, Leave, NoSettings, Run, UnitCosts
+from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS
+from lidarops.steps.step import ALL_STEPS, Choice, Decisions, Leave, NoSettings, Run
+from lidarops.steps.workload import Workload
 
 Case = ProductCase[VisibilityProductSettings]
 
@@ -125,7 +126,6 @@ class Visibility(NetworkProductStep[VisibilityProductSettings, NetworkSettings])
     settings = NetworkSettings
     inputs = (PROFILES, WAVELENGTH, OVERLAP, BACKGROUND_RANGE, AVERAGE)
     parts = (Background(), Window(), _AVERAGE, Prior())
-    costs = UnitCosts(product=0.2, value=2.5e-3, figure=1.2, load=0.1)
 
     def plan(self, scene: Scene, campaign: Campaign, request: VisibilityProductSettings) -> Decided:
         """Return the entries of the plan of a scene of a network.
@@ -140,20 +140,20 @@ class Visibility(NetworkProductStep[VisibilityProductSettings, NetworkSettings])
         """Return the product, which holds averages of the beams."""
         return _NetworkStream(settings, members, data[AVERAGE])
 
-    def values(self, settings: NetworkSettings, scene: Scene, plan: Plan) -> float:
-        """Return the number of averages of all beams."""
-        average = _AVERAGE.settings_in(plan)
-        if average is None:
-            return 0.0
-        granules = {member.instrument: member.granules for member in scene.members}
-        return float(
-            sum(intervals(granules[beam.instrument], average.seconds) for beam in settings.beams)
-        )
+    def cpu_time(self, settings: NetworkSettings, work: Workload) -> float:
+        """Return the CPU time by the number of averages of all beams, s."""
+        return 0.2 + 2.5e-3 * _averages(settings, work)
 
-    def held(self, settings: NetworkSettings, scene: Scene, plan: Plan) -> float:
+    def held(self, settings: NetworkSettings, work: Workload) -> float:
         """Return the bytes of the averages of all beams."""
-        bins = max(channel.bins for member in scene.members for channel in member.layout)
-        return _BYTES_OF_A_BIN * bins * self.values(settings, scene, plan)
+        bins = max(channel.bins for member in work.scene.members for channel in member.layout)
+        return _BYTES_OF_A_BIN * bins * _averages(settings, work)
+
+
+def _averages(settings: NetworkSettings, work: Workload) -> int:
+    average = _AVERAGE.settings_in(work.plan)
+    seconds = average.seconds if average else math.inf
+    return sum(work.intervals(seconds, beam.instrument) for beam in settings.beams)
 
 
 _BYTES_OF_A_BIN: Final = 60.0

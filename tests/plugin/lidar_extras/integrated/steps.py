@@ -9,7 +9,6 @@ import xarray as xr
 
 from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
-from lidarops.records import Plan, Scene
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
@@ -24,8 +23,8 @@ from lidarops.steps.preparation import (
     tail,
 )
 from lidarops.steps.profiles import gluing
-from lidarops.steps.registry import bins_of
-from lidarops.steps.step import REQUESTED, Decisions, Leave, ProductStep, Run, UnitCosts
+from lidarops.steps.step import REQUESTED, Decisions, Leave, ProductStep, Run
+from lidarops.steps.workload import Workload
 
 
 class WindowSettings(SettingsModel):
@@ -42,7 +41,6 @@ class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
     settings = WindowSettings
     inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
     parts = (Background(),)
-    costs = UnitCosts(product=0.05, value=1e-8, figure=0.4)
 
     def decide(self, case: ProductCase[IntegratedSettings]) -> Decisions:
         """Run for the windows that hold a bin, where the range of the background holds enough."""
@@ -67,10 +65,9 @@ class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
         """Return the product, which is written as profiles come."""
         return _Integrals(settings, data)
 
-    def values(self, settings: WindowSettings, scene: Scene, plan: Plan) -> float:
-        """Return the number of bins of all profiles, for each window."""
-        bins = bins_of(scene, self.name, plan)
-        return float(len(scene.granules) * bins * len(settings.windows))
+    def cpu_time(self, settings: WindowSettings, work: Workload) -> float:
+        """Return the CPU time by the number of bins of all profiles, for each window, s."""
+        return 0.05 + 1e-8 * work.profiles * work.bins * len(settings.windows)
 
 
 class _Integrals(RowProduct):
