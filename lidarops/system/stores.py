@@ -7,6 +7,7 @@ module stores none.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import re
 import secrets
@@ -16,6 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
+from urllib.parse import unquote
 
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
 
@@ -47,7 +49,7 @@ class Stored:
     """An object in the listing of a store."""
 
     path: str
-    """Path relative to the URL."""
+    """Path relative to the URL, as the store states it; see `is_confined`."""
     size: int
     """Size in bytes."""
     stamp: int
@@ -72,6 +74,18 @@ def is_url(location: str) -> bool:
 def without_keys(text: str) -> str:
     """Return a text without the credentials in its URLs (the part before the @)."""
     return _KEYS.sub("", text)
+
+
+def is_confined(path: str) -> bool:
+    """Return whether a path of a store stays below its root, also where it is percent-encoded."""
+    plain = unquote(path)
+    return not {"", ".", ".."} & set(plain.split("/")) and not {"\\", "\0"} & set(plain)
+
+
+def _confine(path: str) -> None:
+    # A listing is not to be trusted: a web server may name any path.
+    if not is_confined(path):
+        raise OSError(errno.EINVAL, "its path leads out of the archive")
 
 
 class RemoteStore:
@@ -116,12 +130,17 @@ class RemoteStore:
             self._fs.invalidate_cache()
             listing = self._find()
             # The index of a web server has no sizes.
-            unsized = [name for name, info in listing.items() if info.get("size") is None]
-            listing |= {name: self._fs.info(name) for name in unsized}
+            listing |= {
+                name: self._fs.info(name)
+                for name, info in listing.items()
+                if info.get("size") is None and is_confined(self._path(name))
+            }
         for name in sorted(listing):
             info = listing[name]
-            path = name.removeprefix(self._prefix).lstrip("/")
-            yield Stored(path, int(info["size"] or 0), _stamp(info))
+            yield Stored(self._path(name), int(info["size"] or 0), _stamp(info))
+
+    def _path(self, name: str) -> str:
+        return name.removeprefix(self._prefix).removeprefix("/")
 
     def _find(self) -> dict[str, Any]:
         # By default, drivers that walk through folders skip what they cannot list.
@@ -139,7 +158,10 @@ class RemoteStore:
         ------
         CatalogError
             If it cannot be read.
+        OSError
+            If its path leads out of the URL.
         """
+        _confine(path)
         with self._errors_as(CatalogError, f"{path} cannot be read"):
             data: bytes = self._fs.cat_file(self._name(path), start=0, end=size)
         return data
@@ -151,7 +173,10 @@ class RemoteStore:
         ------
         CatalogError
             If it cannot be read.
+        OSError
+            If its path leads out of the URL.
         """
+        _confine(path)
         with (
             self._errors_as(CatalogError, f"{path} cannot be read"),
             self._fs.open(self._name(path), "rb") as stream,
@@ -165,7 +190,11 @@ class RemoteStore:
         ------
         CatalogError
             If the store cannot be reached.
+        OSError
+            If a path leads out of the folder; no file is copied then.
         """
+        for path in paths:
+            _confine(path)
         pairs = [(self._name(path), str(folder / path)) for path in paths]
         with self._errors_as(CatalogError, "cannot be read"):
             for path in paths:

@@ -95,3 +95,37 @@ def test_a_denied_file_is_refused_but_a_lost_connection_ends_the_scan(
         # The next scan tries it again although it is unchanged.
         assert scan_archive(campaign, store).refused == 0
         assert len(store.granules(status=Status.GOOD)) == 2
+
+
+ESCAPES = ["../../x", "%2e%2e/x", "coast/../../x", "..%5Cx", "coast//x"]
+"""Links of an index that lead out of its folder, or to a file of another name in it."""
+
+
+def test_a_link_that_leads_out_of_the_archive_is_refused(
+    campaign: Campaign, tmp_path: Path
+) -> None:
+    index = tmp_path / "raw" / "index.html"
+    index.write_text("".join(f'<a href="{link}">x</a>' for link in [*ESCAPES, "coast/h0"]))
+    ((name, instrument),) = campaign.instruments.items()
+    everything = instrument.model_copy(update={"files": ["*", "**/*"]})
+    campaign = campaign.model_copy(update={"instruments": {name: everything}})
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        granules = {granule.path: granule for granule in store.granules()}
+    # What else the driver lists depends on its version.
+    assert {"../../x", "..%5Cx"} < granules.keys()
+    assert granules.pop("coast/h0").status is Status.GOOD
+    for granule in granules.values():
+        assert granule.status is Status.REFUSED
+        assert "leads out of the archive" in granule.reason
+
+
+@pytest.mark.parametrize("path", [*ESCAPES, "/x"])
+def test_nothing_is_copied_outside_the_folder(
+    campaign: Campaign, tmp_path: Path, path: str
+) -> None:
+    folder = tmp_path / "one" / "two"
+    with pytest.raises(OSError, match="leads out"):
+        RemoteStore(campaign.archive).fetch(["coast/h0", path], folder)
+    assert not folder.exists()
+    assert not list(tmp_path.rglob("x"))
