@@ -141,8 +141,6 @@ Identifier = Annotated[
     ),
 ]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-LawName = Literal["none", "angstrom", "kruse"]
-"""Law by which extinction is converted from the wavelength of the lidar to 550 nm."""
 
 
 class SettingsModel(BaseModel):
@@ -212,7 +210,7 @@ class VisibilitySettings(SettingsModel):
         " or 'paper': exp(-3), the rounded constant of the multi-position"
         " papers",
     )
-    law: LawName = Field(
+    law: Literal["none", "angstrom", "kruse"] = Field(
         default="none",
         description="conversion of extinction from the wavelength of the lidar to 550 nm; none"
         " keeps the wavelength of the lidar",
@@ -234,3 +232,8 @@ class VisibilitySettings(SettingsModel):
     def threshold(self) -> float:
         """The contrast as a number."""
         return math.exp(-3.0) if self.contrast == "paper" else self.contrast
+
+    @property
+    def resolved(self) -> Self:
+        """The same definition, with the contrast as a number."""
+        return self.model_copy(update={"contrast": self.threshold})

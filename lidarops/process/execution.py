@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -38,10 +39,8 @@ def chunk_profiles(bins: int, requested: int | None) -> int:
     return max(1, requested or CHUNK_BYTES // (4 * max(bins, 1)))
 
 
-def channel_data(
-    source: Source, steps: Sequence[PlannedStep], channel: str
-) -> tuple[Data, dict[str, ProductStream]]:
-    """Carry out the steps of a channel, up to the products in the making.
+def channel_data(source: Source, steps: Sequence[PlannedStep], channel: str) -> dict[str, Data]:
+    """Carry out the steps of a channel, up to those that make products.
 
     Parameters
     ----------
@@ -52,10 +51,9 @@ def channel_data(
 
     Returns
     -------
-    Data
-        What the shared steps gave.
-    dict of str to ProductStream
-        By kind of product.
+    defaultdict of str to Data
+        What the steps gave by kind of product, with what the shared steps gave; that alone for an
+        empty name.
     """
     shared: dict[str, Data] = {}
     for name in dict.fromkeys((*file_channels(channel), channel)):
@@ -63,22 +61,29 @@ def channel_data(
         for step in steps:
             if step.channel == name and not step.product:
                 carry_out(step, data)
-    products: dict[str, Data] = {}
-    streams: dict[str, ProductStream] = {}
+    products: defaultdict[str, Data] = defaultdict(shared[channel].of_product)
     for step in steps:
         if step.channel == channel and step.product:
-            data = products.setdefault(step.product, shared[channel].of_product())
-            if is_product(step):
-                making = product_step(step.product)
-                streams[step.product] = making.stream(making.typed(step), data)
-            else:
-                carry_out(step, data)
-    return shared[channel], streams
+            carry_out(step, products[step.product])
+    return products
+
+
+def streams_of(
+    steps: Iterable[PlannedStep], data: Mapping[str, Data], channel: str
+) -> dict[str, ProductStream]:
+    """Return the products of a channel in the making, by kind, from its `channel_data`."""
+    return {
+        step.product: (making := product_step(step.product)).stream(
+            making.typed(step), data[step.product]
+        )
+        for step in steps
+        if step.channel == channel and is_product(step)
+    }
 
 
 def profiles_of(source: Source, steps: Sequence[PlannedStep], channel: str) -> xr.Dataset:
     """Return power, variance and quality of all profiles of a source."""
-    data, _ = channel_data(source, [step for step in steps if not step.product], channel)
+    data = channel_data(source, [step for step in steps if not step.product], channel)[""]
     counts = loaded(source.archive, file_channels(channel), slice(None))
     return data[PROFILES].of(counts)
 
@@ -166,22 +171,11 @@ def _rows(count: int, ends: np.ndarray[Any, Any] | None, profiles: int | None) -
         first = past
 
 
-def member_data(source: Source, steps: Sequence[PlannedStep], product: PlannedStep) -> Data:
-    """Return what the steps of one member of a network give, for a product of the network."""
-    data = channel_data(source, [s for s in steps if not s.product], product.channel)[0]
-    data = data.of_product()
-    for step in steps:
-        if step.product == product.product:
-            carry_out(step, data)
-    return data
-
-
 def joint_data(plan: Plan) -> dict[str, Data]:
     """Return what the steps of a whole network give, by kind of product."""
     nothing = Source(xr.Dataset(), None, Ancillaries({}, {}, ()), math.nan)
     products: dict[str, Data] = {}
     for step in plan.steps:
         if not step.instrument:
-            data = products.setdefault(step.product, Data(nothing, step.channel, {}))
-            carry_out(step, data)
+            carry_out(step, products.setdefault(step.product, Data(nothing, step.channel, {})))
     return products

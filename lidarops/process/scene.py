@@ -273,11 +273,12 @@ class _Instrument(_Work):
 
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
         steps = self.job.plan.steps
-        data, streams = execution.channel_data(source, steps, channel)
+        data = execution.channel_data(source, steps, channel)
+        streams = execution.streams_of(steps, data, channel)
         layout = member_channel(self._scene.layout, channel)
         contexts = {
             kind: product_context(
-                self.job, self._scene, kind, layout, data[WAVELENGTH], self.inputs
+                self.job, self._scene, kind, layout, data[""][WAVELENGTH], self.inputs
             )
             for kind in streams
         }
@@ -355,7 +356,7 @@ class _Network(_Work):
                 concerned = ("", planned.instrument)
                 of_member = [s for s in job.plan.steps if s.instrument in concerned]
                 source = self._source(usable, steps, read_windows(of_member))
-                data = execution.member_data(source, steps, product)
+                data = execution.channel_data(source, steps, product.channel)[product.product]
             layout = member_channel(planned.layout, product.channel)
             yield Member(
                 planned.instrument,

@@ -12,12 +12,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.settings import SettingsModel
 from lidarops.steps.step import Datum
 
 T = TypeVar("T")
 Indices = npt.NDArray[np.int64]
-BackgroundName = Literal["tail_mean", "cubic", "known_shape"]
-"""Method by which a background is estimated."""
 
 CHUNK_BYTES: Final = 4_000_000
 """Bytes of raw counts that are processed together."""
@@ -65,6 +64,14 @@ class Chunk:
         return self._profiles[key]
 
 
+class BackgroundSettings(SettingsModel):
+    """How a background is estimated."""
+
+    method: Literal["tail_mean", "cubic", "known_shape"]
+    range: tuple[float, float]
+    """m."""
+
+
 class Profiles(ABC):
     """How the profiles of a channel follow from raw counts."""
 
@@ -82,12 +89,7 @@ class Profiles(ABC):
         """Return power, variance and quality of profiles, (time, range)."""
 
     @abstractmethod
-    def signals(
-        self,
-        counts: xr.Dataset,
-        background_range: tuple[float, float],
-        background_method: BackgroundName,
-    ) -> xr.Dataset:
+    def signals(self, counts: xr.Dataset, background: BackgroundSettings) -> xr.Dataset:
         """Return background-subtracted, range-corrected signals of profiles."""
 
     @abstractmethod

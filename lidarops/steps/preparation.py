@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import timedelta
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase, ProductCase
-from lidarops.steps.data import BackgroundName, Data
+from lidarops.steps.data import BackgroundSettings, Data
 from lidarops.steps.step import Datum, Decisions, Run, Step
 
-BACKGROUND_RANGE: Final = Datum[tuple[float, float]]("background_range")
-"""m, the range from which the background is estimated."""
-BACKGROUND_METHOD: Final = Datum[BackgroundName]("background_method")
+BACKGROUND: Final = Datum[BackgroundSettings]("background")
 AVERAGE: Final = Datum[float]("average")
 """s, length of the clock intervals over which profiles are averaged."""
 MOLECULES: Final = Datum[MolecularProfile]("molecules")
@@ -34,19 +32,11 @@ def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, 
     return start, min(stop, case.last)
 
 
-class BackgroundSettings(SettingsModel):
-    """Settings of the step ``background``."""
-
-    method: BackgroundName
-    range: tuple[float, float]
-    """m."""
-
-
 class BackgroundRequest(Protocol):
     """What `Background` takes of the settings of a kind of product."""
 
     @property
-    def background(self) -> BackgroundName:
+    def background(self) -> Literal["tail_mean", "cubic", "known_shape"]:
         """How the background is estimated."""
 
     @property
@@ -59,7 +49,7 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
 
     name = "background"
     settings = BackgroundSettings
-    outputs = (BACKGROUND_RANGE, BACKGROUND_METHOD)
+    outputs = (BACKGROUND,)
 
     def decide(self, case: ProductCase[BackgroundRequest]) -> Decisions:
         """Run always; the product is left out where the range holds too few bins."""
@@ -83,9 +73,8 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
         )
 
     def carry_out(self, settings: BackgroundSettings, data: Data) -> None:
-        """Give the range."""
-        data[BACKGROUND_RANGE] = settings.range
-        data[BACKGROUND_METHOD] = settings.method
+        """Give the range and the method."""
+        data[BACKGROUND] = settings
 
 
 class AverageSettings(SettingsModel):

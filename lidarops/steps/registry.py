@@ -87,12 +87,8 @@ def typed_settings(planned: PlannedStep) -> Any:
 
 
 def needed_steps(kind: str) -> frozenset[str]:
-    """Return the names of all that a product needs, directly or not."""
-    needed, new = set[str](), {kind}
-    while new:
-        needed |= new
-        new = {name for taker in new for name in _suppliers(kind, taker)} - needed
-    return frozenset(needed)
+    """Return the names of the steps from which those of a product take data."""
+    return frozenset(name for taker in _definitions(kind) for name in _suppliers(kind, taker))
 
 
 @cache

@@ -142,7 +142,8 @@ def carry_out(
     plan = planned(campaign(products, **facts), dark=dark is not None, bins=raw.sizes["range"])
     files = NONE if ancillaries is None else ancillaries
     source = Source(raw, dark, files, STATION)
-    _, streams = execution.channel_data(source, plan.steps, channel)
+    data = execution.channel_data(source, plan.steps, channel)
+    streams = execution.streams_of(plan.steps, data, channel)
     rows = {kind: [] for kind, stream in streams.items() if isinstance(stream, RowProduct)}
     for chunk in execution.chunks(source, channel, streams.values(), profiles):
         for kind, stream in streams.items():

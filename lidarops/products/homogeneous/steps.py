@@ -26,12 +26,11 @@ from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.labeled import LEVEL
 from lidarops.retrieve.signal.labeled import channel_unit
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, VisibilitySettings
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
-from lidarops.steps.definition_of_visibility import VisibilityDefinition
 from lidarops.steps.preparation import FEWEST_BINS
 from lidarops.steps.reading import ANALOG_NOISE, WAVELENGTH, Window, WindowSettings
 from lidarops.steps.reading import bins_with_noise as bins_with_their_noise
@@ -157,7 +156,7 @@ class PathSettings(SettingsModel):
     method: Literal["auto", "direct", "cubic"]
     sections: tuple[Section, ...]
     """m."""
-    visibility: VisibilityDefinition | None = None
+    visibility: VisibilitySettings | None = None
     left_out: tuple[tuple[float, float, OmittedBit], ...] = ()
     """Sections that are not retrieved, with the quality bit that says why."""
 
@@ -199,7 +198,7 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
                 PathSettings(
                     method=settings.method,
                     sections=tuple(level),
-                    visibility=None if definition is None else VisibilityDefinition.of(definition),
+                    visibility=definition and definition.resolved,
                 ),
                 number=float(len(level)),
             )
@@ -322,7 +321,8 @@ class _Sections(WholeProduct):
         """Yield all profiles, with visibility along the sections where it is requested."""
         sections, requested = self._joined(), self._settings.visibility
         if requested is not None:
-            sections = _with_visibility(sections, requested.at(self._data[WAVELENGTH]))
+            definition = Definition(self._data[WAVELENGTH], **dict(requested))
+            sections = _with_visibility(sections, definition)
         return in_one_batch(sections)
 
 

@@ -26,12 +26,7 @@ from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, Indices, WholeProduct, in_one_batch
 from lidarops.steps.pointing import no_scan
-from lidarops.steps.preparation import (
-    BACKGROUND_METHOD,
-    BACKGROUND_RANGE,
-    MOLECULES,
-    Background,
-)
+from lidarops.steps.preparation import BACKGROUND, MOLECULES, Background
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.step import (
     REQUESTED,
@@ -239,7 +234,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
 
     name = "multiangle"
     settings = ScanSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, BACKGROUND_RANGE, BACKGROUND_METHOD)
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, BACKGROUND)
     parts = (
         Background(), Gradient(), GradientRegressor(), Robust(), Vertical(), Correlation(), Layers()
     )  # fmt: skip
@@ -294,8 +289,8 @@ class _Scans(WholeProduct):
             shots=profiles.shots(data.source.archive).to_numpy(),
             altitude_grid=self._station + altitude_steps(settings.step, settings.highest),
             station_altitude=self._station,
-            background_range=data[BACKGROUND_RANGE],
-            molecules=data[MOLECULES] if data[BACKGROUND_METHOD] == "known_shape" else None,
+            background_range=data[BACKGROUND].range,
+            molecules=data[MOLECULES] if data[BACKGROUND].method == "known_shape" else None,
             wavelength=data[WAVELENGTH],
             overlap=None if overlap is None else overlap(profiles.range),
         )

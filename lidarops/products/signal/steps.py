@@ -15,13 +15,7 @@ from lidarops.retrieve.signal.labeled import background_words
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct
-from lidarops.steps.preparation import (
-    BACKGROUND_METHOD,
-    BACKGROUND_RANGE,
-    FEWEST_BINS,
-    Background,
-    tail,
-)
+from lidarops.steps.preparation import BACKGROUND, FEWEST_BINS, Background, tail
 from lidarops.steps.step import (
     REQUESTED,
     Decisions,
@@ -37,7 +31,7 @@ class Signal(ProductStep[SignalSettings, NoSettings]):
     """Subtract the background and correct for range."""
 
     name = "signal"
-    inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
+    inputs = (PROFILES, BACKGROUND, OVERLAP)
     parts = (Background(),)
 
     def decide(self, case: ProductCase[SignalSettings]) -> Decisions:
@@ -69,20 +63,20 @@ class _Signals(RowProduct):
 
     def __init__(self, data: Data) -> None:
         self._profiles = data[PROFILES]
-        self._background = data[BACKGROUND_RANGE], data[BACKGROUND_METHOD]
+        self._background = data[BACKGROUND]
         overlap: Callable[..., npt.NDArray[np.float64]] | None = data.get(OVERLAP)
         self._overlap = None if overlap is None else overlap(self._profiles.range)
         self._geometry = data.source.geometry
 
     def frame(self) -> xr.Dataset:
         """Return times, pointing and ranges of all profiles."""
-        background_range, method = self._background
+        words = background_words(self._background.method, self._background.range)
         frame = self._geometry.assign_coords(range=self._profiles.range)
-        return frame.assign_attrs(steps=background_words(method, background_range))
+        return frame.assign_attrs(steps=words)
 
     def rows(self, chunk: Chunk) -> xr.Dataset:
         """Return the signals of profiles."""
-        signals = self._profiles.signals(chunk.counts, *self._background)
+        signals = self._profiles.signals(chunk.counts, self._background)
         if self._overlap is not None:
             signals = _without_overlap(signals, self._overlap)
         shots = self._profiles.shots(chunk.counts)

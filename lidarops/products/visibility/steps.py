@@ -23,16 +23,17 @@ from lidarops.products.visibility.network import (
 )
 from lidarops.products.visibility.settings import Method, PriorName, VisibilityProductSettings
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene
+from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
+from lidarops.settings import VisibilitySettings
 from lidarops.steps.case import ChannelCase, ProductCase
 from lidarops.steps.channels import glued_parts, is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Averages, Chunk, Data, Indices
-from lidarops.steps.definition_of_visibility import VisibilityDefinition
 from lidarops.steps.network import Decided, Member, NetworkProductStep, NetworkStream
-from lidarops.steps.preparation import AVERAGE, BACKGROUND_RANGE, Average, Background, tail
+from lidarops.steps.preparation import AVERAGE, BACKGROUND, Average, Background, tail
 from lidarops.steps.reading import (
     ANALOG_NOISE,
     READ,
@@ -96,7 +97,7 @@ class Prior(Choice[Case, NoSettings]):
             yield Run(reason, number=settings.block / settings.average)
 
 
-class NetworkSettings(VisibilityDefinition):
+class NetworkSettings(VisibilitySettings):
     """Settings of the step ``visibility``."""
 
     beams: tuple[BeamPlan, ...]
@@ -113,6 +114,12 @@ class NetworkSettings(VisibilityDefinition):
     lidar_ratio_relative_error: float
     overlap_relative_error: float
 
+    @property
+    def definition(self) -> Definition:
+        """Definition of visibility."""
+        values = {name: getattr(self, name) for name in VisibilitySettings.model_fields}
+        return Definition(self.wavelength, **values)
+
 
 _AVERAGE: Final = Average(
     "signals are averaged before the retrieval: noise biases means of retrieved values"
@@ -124,7 +131,7 @@ class Visibility(NetworkProductStep[VisibilityProductSettings, NetworkSettings])
 
     name = KIND
     settings = NetworkSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, BACKGROUND_RANGE, AVERAGE)
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, BACKGROUND, AVERAGE)
     parts = (Background(), Window(), _AVERAGE, Prior())
 
     def plan(self, scene: Scene, campaign: Campaign, request: VisibilityProductSettings) -> Decided:
@@ -322,7 +329,7 @@ class _NetworkPlan:
                 exponent_relative_error=settings.exponent_relative_error,
                 lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
                 overlap_relative_error=settings.overlap_relative_error,
-                **dict(VisibilityDefinition.of(settings.visibility)),
+                **dict(settings.visibility.resolved),
             ),
             number=float(network.crossings),
         )
@@ -354,7 +361,7 @@ class _NetworkStream(NetworkStream):
             self._network(signals),
             labeled.NetworkSettings(
                 block_intervals=round(settings.block_seconds / self._seconds),
-                visibility=settings.at(settings.wavelength),
+                visibility=settings.definition,
                 method=settings.method,
                 prior=settings.prior,
                 exponent_relative_error=settings.exponent_relative_error,
@@ -416,7 +423,7 @@ class _Beam:
             interval=self._interval,
             instrument=member.instrument,
             station=(member.station.latitude, member.station.longitude, member.station.altitude),
-            background_range=(distance[0], np.inf) if data is None else data[BACKGROUND_RANGE],
+            background_range=(distance[0], np.inf) if data is None else data[BACKGROUND].range,
             nearest=planned.nearest,
             overlap=None if overlap is None else overlap(distance),
             exponent=planned.exponent,

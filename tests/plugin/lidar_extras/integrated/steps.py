@@ -15,13 +15,7 @@ from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import channel_ranges
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct
-from lidarops.steps.preparation import (
-    BACKGROUND_METHOD,
-    BACKGROUND_RANGE,
-    FEWEST_BINS,
-    Background,
-    tail,
-)
+from lidarops.steps.preparation import BACKGROUND, FEWEST_BINS, Background, tail
 from lidarops.steps.profiles import gluing
 from lidarops.steps.step import REQUESTED, Decisions, Leave, ProductStep, Run
 from lidarops.steps.workload import Workload
@@ -39,7 +33,7 @@ class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
 
     name = "integrated"
     settings = WindowSettings
-    inputs = (PROFILES, BACKGROUND_RANGE, BACKGROUND_METHOD, OVERLAP)
+    inputs = (PROFILES, BACKGROUND, OVERLAP)
     parts = (Background(),)
 
     def decide(self, case: ProductCase[IntegratedSettings]) -> Decisions:
@@ -75,7 +69,8 @@ class _Integrals(RowProduct):
 
     def __init__(self, settings: WindowSettings, data: Data) -> None:
         self._profiles = data[PROFILES]
-        self._background = data[BACKGROUND_RANGE], data[BACKGROUND_METHOD]
+        background = data[BACKGROUND]
+        self._background = background.range, background.method
         self._geometry = data.source.geometry
         self._limits = np.array(settings.windows)
         centres, overlap = self._profiles.range, data.get(OVERLAP)
