@@ -11,7 +11,7 @@ from typing import Final
 
 from lidarops.records import Plan, Scene
 from lidarops.steps.dependence import is_product, plan_closure, planned_products
-from lidarops.steps.registry import definition, typed_settings
+from lidarops.steps.registry import definition
 from lidarops.steps.workload import Workload
 
 _START: Final = 9.0
@@ -48,7 +48,8 @@ def scene_cpu_time(scene: Scene, plan: Plan, *, whole: bool = False) -> float:
     for step in plan.steps:
         own = plan_closure(plan, [(step.name, step.channel)]) if is_product(step) else plan
         work = Workload(members.get(step.instrument, scene), step.channel, own)
-        times.append(definition(step).cpu_time(typed_settings(step), work))
+        known = definition(step)
+        times.append(known.cpu_time(known.typed(step), work))
     files = (*scene.granules, *scene.dark)
     times += [_FILE + _BYTE * file.size * (whole or file.sha256 is None) for file in files]
     return math.fsum(times)

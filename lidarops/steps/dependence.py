@@ -17,7 +17,7 @@ from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
 from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.reading import ARCHIVE, READ, required_by
-from lidarops.steps.registry import definition, gives, typed_settings
+from lidarops.steps.registry import definition, gives
 from lidarops.steps.step import Definition
 
 ProductKey = tuple[str, str]
@@ -215,8 +215,8 @@ def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
     return {
         path: role
         for step in steps
-        if type(definition(step)).files is not Definition.files
-        for path, role in definition(step).files(typed_settings(step)).items()
+        if type(known := definition(step)).files is not Definition.files
+        for path, role in known.files(known.typed(step)).items()
     }
 
 

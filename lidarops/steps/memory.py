@@ -10,7 +10,7 @@ from lidarops.records import Plan, PlannedStep, Scene
 from lidarops.steps.channels import file_channels
 from lidarops.steps.data import CHUNK_BYTES
 from lidarops.steps.dependence import is_product, plan_closure
-from lidarops.steps.registry import making_step, typed_settings
+from lidarops.steps.registry import making_step
 from lidarops.steps.workload import Workload
 
 PROCESS: Final = 420_000_000
@@ -69,7 +69,8 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
             closure = plan_closure(plan, [(step.name, step.channel)])
             # Channels are processed one after the other.
             work = Workload(scene, step.channel, closure)
-            held[step.channel] += making_step(step.name).held(typed_settings(step), work)
+            making = making_step(step.name)
+            held[step.channel] += making.held(making.typed(step), work)
     files = len(scene.granules) + len(scene.dark)
     return SceneMemory(
         held=OF_A_FILE * files + max(held.values(), default=0.0),

@@ -81,11 +81,6 @@ def carry_out(planned: PlannedStep, data: Data) -> None:
         step.carry_out(step.typed(planned), data)
 
 
-def typed_settings(planned: PlannedStep) -> Any:
-    """Return the settings of a planned step as the model of its step."""
-    return definition(planned).typed(planned)
-
-
 def needed_steps(kind: str) -> frozenset[str]:
     """Return the names of the steps from which those of a product take data."""
     return frozenset(name for taker in _definitions(kind) for name in _suppliers(kind, taker))

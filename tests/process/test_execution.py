@@ -24,7 +24,8 @@ from lidarops.process import execution
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
 from lidarops.steps import dependence
-from lidarops.steps.data import Chunk, RowProduct, Source, WholeProduct
+from lidarops.steps.data import Chunk, Data, RowProduct, Source, WholeProduct
+from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, product_step
 
 AIR = MolecularProfile.us_standard()
 STATION = 20.0
@@ -198,6 +199,36 @@ def deviation(product, inside):
         "backscatter_standard_error"
     ]
     return score.where(product["quality_flag"] == 0).to_numpy()[:, inside]
+
+
+@pytest.mark.parametrize(
+    ("kind", "request_"),
+    [
+        ("signal", {"channels": ["glued_532o"]}),
+        ("elastic", {**ELASTIC, "average": "20min"}),
+        ("homogeneous", {"channels": ["photon_532o"], "sections": [[750, 4500]], "visibility": {}}),
+    ],
+)
+def test_steps_take_no_data_but_their_inputs(kind, request_, monkeypatch) -> None:
+    """Else a product could depend on what its plan does not state."""
+    at, taken = [kind], set()
+    originals = execution.carry_out, Data.__getitem__, Data.get
+
+    def carried_out(step, data):
+        at.append(step.name)
+        originals[0](step, data)
+        at.pop()
+
+    monkeypatch.setattr(execution, "carry_out", carried_out)
+    for name, original in zip(("__getitem__", "get"), originals[1:], strict=True):
+        monkeypatch.setattr(
+            Data, name, lambda d, datum, of=original: taken.add((at[-1], datum)) or of(d, datum)
+        )
+    carry_out({kind: request_}, channel=request_["channels"][-1])
+    steps = (*FILE_STEPS, *GLUE_STEPS, *product_step(kind).parts, product_step(kind))
+    named = [(s.name, getattr(s, of, ())) for s in steps for of in ("inputs", "from_parts")]
+    assert taken <= {(name, datum) for name, inputs in named for datum in inputs}
+    assert {name for name, _ in taken} >= {kind, "noise"}
 
 
 @pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
