@@ -14,9 +14,7 @@ from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
 from lidarops.records import ChannelLayout, Holding, LeftOut, Unmet
-from lidarops.steps.channels import glued_parts, is_glued, joined_layout
-from lidarops.steps.gluing import Lag
-from lidarops.steps.reading import Read
+from lidarops.steps.channels import LAG_STEP, READ_STEP, glued_parts, is_glued, joined_layout
 
 FACTS: Final = "facts"
 _ABSENT: Final = "channel_present"
@@ -56,10 +54,10 @@ def missing_channels(
         if name not in present:
             held = ", ".join(present)
             reason = f"the facts name a channel that the files lack; they hold {held}"
-            yield LeftOut(Read.name, name, reason, rule=_UNMATCHED)
+            yield LeftOut(READ_STEP, name, reason, rule=_UNMATCHED)
         elif facts_of_channel.lag is not None and not name.startswith("analog_"):
             reason = "a lag belongs to the facts of the analog channel"
-            yield LeftOut(Lag.name, name, reason, rule=_UNMATCHED)
+            yield LeftOut(LAG_STEP, name, reason, rule=_UNMATCHED)
 
 
 def _why_absent(name: str, present: Mapping[str, ChannelLayout]) -> str:
@@ -116,7 +114,7 @@ def _lacking(
 ) -> list[LeftOut]:
     """Return the channels that files lack, without misplaced facts about a lag."""
     missing = missing_channels(layout, instrument, facts)
-    return [omission for omission in missing if omission.name != Lag.name]
+    return [omission for omission in missing if omission.name != LAG_STEP]
 
 
 def unavailable_channels(

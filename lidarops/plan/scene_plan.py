@@ -13,8 +13,7 @@ from lidarops.kinds import Scope, kinds_of
 from lidarops.plan import availability
 from lidarops.records import LeftOut, Plan, PlannedStep, Scene
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import file_channels, joined_layout
-from lidarops.steps.reading import Read
+from lidarops.steps.channels import READ_STEP, file_channels, joined_layout
 from lidarops.steps.registry import (
     SHARED,
     channel_steps,
@@ -151,7 +150,7 @@ def _drop_unused_channels(plan: Plan) -> Plan:
                 if omission.channel not in unused or omission.product
             ),
             *(
-                LeftOut(Read.name, channel, reason, rule="channel")
+                LeftOut(READ_STEP, channel, reason, rule="channel")
                 for channel in dict.fromkeys(step.channel for step in plan.steps)
                 if channel in unused
             ),

@@ -15,6 +15,10 @@ from lidarops.records import ChannelLayout
 GLUED: Final = "glued_"
 """Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
 
+READ_STEP: Final = "read"
+LAG_STEP: Final = "lag"
+"""Names of steps, for commands that need no plan and should not load the steps."""
+
 
 def is_glued(channel: str) -> bool:
     """Return whether a channel is glued from two of the files."""

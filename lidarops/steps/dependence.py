@@ -15,8 +15,9 @@ from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
 from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
+from lidarops.steps.channels import READ_STEP
 from lidarops.steps.conditioning import DARK
-from lidarops.steps.reading import ARCHIVE, READ, required_by
+from lidarops.steps.reading import ARCHIVE, required_by
 from lidarops.steps.registry import definition, gives
 from lidarops.steps.step import Definition
 
@@ -118,7 +119,7 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
         return plan
     products = [product for product in planned_products(plan) if product[0] in selected]
     closure = plan_closure(plan, products)
-    names = {*selected, READ.name}
+    names = {*selected, READ_STEP}
     left_out = tuple(
         omission
         for omission in plan.left_out

@@ -12,7 +12,7 @@ from lidarops.campaign.model import channel_facts
 from lidarops.retrieve.signal import labeled_gluing
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import glued_parts
+from lidarops.steps.channels import LAG_STEP, glued_parts
 from lidarops.steps.conditioning import PROFILES
 from lidarops.steps.data import Data, Profiles
 from lidarops.steps.profiles import GluedProfiles
@@ -36,7 +36,7 @@ class LagSettings(SettingsModel):
 class Lag(Step[ChannelCase, LagSettings]):
     """Find the lag of the analog record behind the photon-counting one."""
 
-    name = "lag"
+    name = LAG_STEP
     settings = LagSettings
     outputs = (LAG,)
 

@@ -15,7 +15,13 @@ from lidarops.records import PlannedStep
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS, NOISE_WINDOW
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import file_channels, range_channel, range_offset, wavelength
+from lidarops.steps.channels import (
+    READ_STEP,
+    file_channels,
+    range_channel,
+    range_offset,
+    wavelength,
+)
 from lidarops.steps.data import Data
 from lidarops.steps.step import Datum, Decisions, Definition, Leave, Run, Step
 from lidarops.steps.workload import Workload
@@ -40,7 +46,7 @@ class ReadSettings(SettingsModel):
 class Read(Step[ChannelCase, ReadSettings]):
     """Read the counts of a channel."""
 
-    name = "read"
+    name = READ_STEP
     settings = ReadSettings
     outputs = (ARCHIVE, WAVELENGTH)
 

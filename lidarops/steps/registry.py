@@ -63,9 +63,9 @@ def _definitions(product: str) -> Mapping[str, Definition[Any]]:
     return {known.name: known for known in (*FILE_STEPS, *GLUE_STEPS, *SHARED, *own)}
 
 
-def definition(entry: PlannedStep | LeftOut) -> Definition[Any]:
-    """Return what an entry of a plan is about."""
-    return _definitions(entry.product)[entry.name]
+def definition(planned: PlannedStep) -> Definition[Any]:
+    """Return what a planned step is."""
+    return _definitions(planned.product)[planned.name]
 
 
 def gives(planned: PlannedStep, datum: Datum[Any]) -> bool:
