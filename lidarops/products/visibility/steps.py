@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -29,7 +30,7 @@ from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
 from lidarops.settings import VisibilitySettings
 from lidarops.steps.case import ChannelCase, ProductCase
-from lidarops.steps.channels import glued_parts, is_glued
+from lidarops.steps.channels import file_channels, is_glued, member_channel
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Averages, Chunk, Data, Indices
 from lidarops.steps.network import Decided, Member, NetworkProductStep, NetworkStream
@@ -44,7 +45,7 @@ from lidarops.steps.reading import (
     bins_within,
     merged,
 )
-from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS
+from lidarops.steps.registry import channel_steps
 from lidarops.steps.step import ALL_STEPS, Choice, Decisions, Leave, NoSettings, Run
 from lidarops.steps.workload import Workload
 
@@ -210,34 +211,24 @@ class _NetworkPlan:
         )
         yield from self._joint(kept, min(wavelengths))
 
-    def _absent(self) -> Iterator[LeftOut]:
+    def _absent(self) -> Iterator[PlannedStep | LeftOut]:
         present = {member.instrument for member in self._scene.members}
         for name in self._campaign.networks[self._scene.instrument].instruments:
             if name not in present:
                 yield self._left(name, "no granule in the window", 0.0, "member_present")
 
-    def _left(self, member: str, reason: str, number: float | None, rule: str) -> LeftOut:
-        return LeftOut(
-            KIND,
-            self._settings.channel,
-            f"{member}: {reason}",
-            member,
-            rule=rule,
-            number=number,
-            product=KIND,
-        )
+    def _left(
+        self, member: str, reason: str, number: float | None, rule: str
+    ) -> PlannedStep | LeftOut:
+        case = replace(self._joint_case, member=member)
+        return case.entry(KIND, Leave(reason, number, rule))
 
     def _prepared(self, member: MemberCase) -> Iterator[PlannedStep | LeftOut]:
         """Yield the steps from the counts of an instrument to its signal."""
         name = self._settings.channel
-        present = {channel.name: channel for channel in member.scene.layout}
-        for channel in glued_parts(name) if is_glued(name) else (name,):
-            case = member.channel_case(present[channel])
-            for step in FILE_STEPS:
-                yield from step.entries(case)
-        case = member.channel_case(member.channel)
-        if is_glued(name):
-            for step in GLUE_STEPS:
+        for channel in dict.fromkeys((*file_channels(name), name)):
+            case = member.channel_case(member_channel(member.scene.layout, channel))
+            for step in channel_steps(channel):
                 yield from step.entries(case)
         yield from Background().entries(self._of_product(case))
 
@@ -268,7 +259,7 @@ class _NetworkPlan:
     def _crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
         return crossings(beams, self._scene, self._campaign, self._settings)
 
-    def _without_lonely_beams(self, beams: list[BeamPlan]) -> Iterator[LeftOut]:
+    def _without_lonely_beams(self, beams: list[BeamPlan]) -> Iterator[PlannedStep | LeftOut]:
         """Take out beams with fewer than two crossings, until all remaining beams have two."""
         while beams:
             network = self._crossings(beams)
