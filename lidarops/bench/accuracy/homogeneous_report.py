@@ -76,7 +76,7 @@ def _overview(result: Accuracy) -> Part:
     summary, paths = list(_summary(result)), list(_paths(result))
     complete = {row.method for row in summary if row.quantity == "solved" and row.value == "all"}
     hollow = {row.method for row in summary if row.method not in complete} | _HELPED
-    drawn = [row for row in paths if row.method in {"compressed", "fast", "direct", "cubic"}]
+    drawn = [row for row in paths if row.method in {"compressed", "direct", "cubic"}]
     first = result.cases[0].outcomes
     return Part(
         title="Error against time",
@@ -103,7 +103,7 @@ def _overview(result: Accuracy) -> Part:
                         drawn,
                         quantity.name,
                         x=_DIFFICULTY,
-                        hollow={HomogeneousMethod.FAST, HomogeneousMethod.DIRECT},
+                        hollow={HomogeneousMethod.DIRECT},
                         level=1.0,
                     )
                     for quantity in _OF_PATH

@@ -14,6 +14,7 @@ from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, Score
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Random = np.random.Generator
 
@@ -234,7 +235,7 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValue
     paths, rng = random_paths(cluster, profiles)
     with np.errstate(under="ignore", over="ignore", invalid="ignore", divide="ignore"):
         least = least_relative_error(paths)
-    highest = path_fit.HIGHEST_OPTICAL_DEPTH / float(paths.depth[0, -1])
+    highest = THRESHOLDS.highest_optical_depth / float(paths.depth[0, -1])
     within = paths.extinction[:, 0] < 0.9 * highest
     within &= 2.0 * paths.extinction[:, 0] * paths.range[0] < _DEEPEST
     for failure, violate in FAILURES:

@@ -30,7 +30,7 @@ from lidarops.bench.harness.timing import (
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)
-THREADED: Final = ("compressed", "fast")
+THREADED: Final = ("compressed",)
 
 _PROFILES: Final = 40_000
 _QUICK_PROFILES: Final = 8_000

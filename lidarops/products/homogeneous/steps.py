@@ -24,7 +24,7 @@ from lidarops.records import DetectionMode, LeftOut, PlannedStep
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.homogeneous import labeled
-from lidarops.retrieve.homogeneous.labeled import LEVEL
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import channel_unit
 from lidarops.settings import SettingsModel, VisibilitySettings
 from lidarops.steps.case import ProductCase
@@ -85,7 +85,7 @@ def _level(case: Case) -> list[Section]:
     return [
         (near, far)
         for near, far in _inside(case)
-        if case.all_steps or _climb(case, near, far) <= LEVEL * (1.0 + _ROUNDING)
+        if case.all_steps or _climb(case, near, far) <= THRESHOLDS.level * (1.0 + _ROUNDING)
     ]
 
 
@@ -253,7 +253,7 @@ def _slanted(case: Case, near: float, far: float) -> Leave:
     slope = (
         "neither headers nor campaign give the zenith angle"
         if math.isinf(climb)
-        else f"the beam climbs {climb:.0f} m (limit {LEVEL:g} m)"
+        else f"the beam climbs {climb:.0f} m (limit {THRESHOLDS.level:g} m)"
     )
     reason = f"section {near:g}-{far:g} m: {slope}; a vertical gradient would mimic extinction"
     return Leave(reason, number=None if math.isinf(climb) else climb, rule="section_level")

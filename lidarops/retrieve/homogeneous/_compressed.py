@@ -31,18 +31,27 @@ from lidarops.retrieve.homogeneous._vector_loops import (
     project_1_8,
     project_1_12,
     project_4_12,
-    project_6_8,
     residuals,
 )
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 BLOCK: Final = 48
-"""Profiles in a block: whole tiles of 4 and of 6, and whole vectors of any processor."""
+"""Profiles in a block: whole tiles of `_TILE`, and whole vectors of any processor."""
+_TILE: Final = 4
+"""Profiles that are projected together."""
 _LONGEST_LEAP: Final = 20.0
 """Most cells that the first step may cross."""
+_STEPS: Final = 3
+"""Newton steps on the polynomial of a cell."""
+_FIRST_STEP: Final = 1.5
+"""Half widths of a cell that the Gauss-Newton step before them may reach from its centre."""
+_FARTHEST: Final = 3.0
+"""Half widths that they may reach."""
+_LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
 _EDGE: Final = 1.02
 """Half widths from the centre of a cell beyond which the polynomial of the next cell is used."""
 _MOVES: Final = 40
@@ -96,11 +105,9 @@ _summing = numba.njit(
 
 
 class Mode(NamedTuple):
-    """Options of a call: noise and tests."""
+    """What is known of the noise of a call."""
 
     known_variance: bool
-    with_residuals: bool
-    """False skips chi-square and outliers; for a known variance only."""
     rounding: float
     """Relative rounding error of the power."""
 
@@ -148,12 +155,12 @@ _FIT_ROWS: Final = 14
 
 
 @_compiled
-def _scratch(power: Any, root: Any, envelope: Any, lanes: int) -> _Scratch:
+def _scratch(power: Any, root: Any, envelope: Any) -> _Scratch:
     bins = power.shape[1]
     return _Scratch(
-        np.zeros((6, bins)),
+        np.zeros((_TILE, bins)),
         np.zeros(BLOCK),
-        np.zeros((BLOCK, lanes)),
+        np.zeros((BLOCK, _functional_tables.COLUMNS)),
         np.ones(BLOCK),
         np.zeros(BLOCK, np.int64),
         np.zeros((8, BLOCK)),
@@ -178,23 +185,19 @@ def _scratch(power: Any, root: Any, envelope: Any, lanes: int) -> _Scratch:
 def _project(block: Any, tables: Tables, s: _Scratch) -> None:
     """Fill y: the projections of the profiles less their last bins, and their means."""
     bins, lanes = block.shape[1], s.y.shape[1]
-    rows = 6 if lanes == 8 else 4
     stride, width = 8 * bins, block.itemsize
     values, columns = s.tile.ctypes.data, tables.columns.ctypes.data
     out, after = s.y.ctypes.data, block.ctypes.data
-    for k in range(0, BLOCK, rows):
-        for j in range(rows):
+    for k in range(0, BLOCK, _TILE):
+        for j in range(_TILE):
             profile, tile = block[k + j], s.tile[j]
             reference = np.float64(profile[bins - 1])
             s.reference[k + j] = reference
             # A loop over the size of the array itself needs no bounds checks.
             for i in range(profile.size):
                 tile[i] = np.float64(profile[i]) - reference
-        ahead, target = after + (k + rows) * bins * width, out + 8 * lanes * k
-        if lanes == 8:
-            project_6_8(values, stride, columns, bins, target, ahead, rows * width)
-        else:
-            project_4_12(values, stride, columns, bins, target, ahead, rows * width)
+        ahead, target = after + (k + _TILE) * bins * width, out + 8 * lanes * k
+        project_4_12(values, stride, columns, bins, target, ahead, _TILE * width)
 
 
 @_compiled
@@ -275,19 +278,19 @@ def _newton(tables: Tables, s: _Scratch) -> None:
     for p in range(BLOCK):
         gauss = -f[0, p] * tables.steepness[s.cell[p]]
         t = -f[1, p] / gauss
-        t = t if t < 1.5 else 1.5
-        t = t if t > -1.5 else -1.5
-        for _ in range(3):
+        t = t if t < _FIRST_STEP else _FIRST_STEP
+        t = t if t > -_FIRST_STEP else -_FIRST_STEP
+        for _ in range(_STEPS):
             rise = f[6, p] + t * f[7, p]
             rise = f[3, p] + t * (f[4, p] + t * (f[5, p] + t * rise))
             rise = f[1, p] + t * (f[2, p] + t * rise)
             bend = 5.0 * f[6, p] + t * 6.0 * f[7, p]
             bend = 2.0 * f[3, p] + t * (3.0 * f[4, p] + t * (4.0 * f[5, p] + t * bend))
             bend = f[2, p] + t * bend
-            bend = bend if bend <= 0.3 * gauss else gauss
+            bend = bend if bend <= _LEAST_CURVATURE * gauss else gauss
             t -= rise / bend
-            t = t if t < 3.0 else 3.0
-            t = t if t > -3.0 else -3.0
+            t = t if t < _FARTHEST else _FARTHEST
+            t = t if t > -_FARTHEST else -_FARTHEST
         s.t[p] = t
 
 
@@ -375,10 +378,7 @@ def _measure_misfit(tables: Tables, s: _Scratch) -> None:
         powers[4], powers[5] = square * square, square * square * t
         powers[6], powers[7] = square**3, square**3 * t
         matrix = tables.directions.ctypes.data + 8 * terms * lanes * s.cell[p]
-        if lanes == 8:
-            project_1_8(powers.ctypes.data, 8, matrix, terms, out, out, 0)
-        else:
-            project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
+        project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         energy = 0.0
         for j in range(tables.size):
             s.remainder[j] = s.y[p, j] - size * row[j]
@@ -386,10 +386,7 @@ def _measure_misfit(tables: Tables, s: _Scratch) -> None:
             energy += s.remainder[j] * s.remainder[j]
         s.fit[_CURVATURE, p] = energy - _INTERPOLATED * size * size
         matrix = tables.squares.ctypes.data + 8 * terms * lanes * s.cell[p]
-        if lanes == 8:
-            project_1_8(powers.ctypes.data, 8, matrix, terms, out, out, 0)
-        else:
-            project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
+        project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         along = 0.0
         for j in range(tables.size):
             along += s.remainder[j] * row[j]
@@ -489,7 +486,7 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
 
 
 @_compiled
-def _judge(tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> None:
+def _judge(tables: Tables, s: _Scratch, limits: CommonLimits) -> None:
     """Fill the quality bits. Tests are for a pass, so that NaN fails."""
     fit, results = s.fit, s.results
     steepest = 1.0 / tables.mean_range
@@ -497,8 +494,6 @@ def _judge(tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> Non
         relative = results[5, p] / (results[4, p] + steepest)
         determined = (relative >= 0.0) & (relative < limits.largest_relative_error)
         determined &= results[3, p] < HUGE * HUGE
-        misfit = results[7, p]
-        fits = (limits.least_misfit <= misfit) & (misfit <= limits.most_misfit)
         largest = limits.outlier * math.sqrt(fit[_NOISE, p])
         bits = 0 if abs(results[6, p]) > limits.lowest_signal else _LOW_SIGNAL
         bits |= 0 if determined else _POORLY_DETERMINED
@@ -507,16 +502,14 @@ def _judge(tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> Non
         straight = results[8, p] <= limits.curvature
         straight &= fit[_SQUARE, p] * math.sqrt(tables.unit / fit[_NOISE, p]) <= limits.square
         bits |= 0 if straight else _NOT_HOMOGENEOUS
-        tested = 0 if fits else _POOR_FIT
-        tested |= 0 if fit[_LARGEST, p] <= largest else _OUTLIER
-        s.bits[p] = bits | (tested if mode.with_residuals else 0)
+        bits |= 0 if results[7, p] <= limits.misfit else _POOR_FIT
+        bits |= 0 if fit[_LARGEST, p] <= largest else _OUTLIER
+        s.bits[p] = bits
 
 
 @_compiled
-def _settle_exceptions(tables: Tables, s: _Scratch, mode: Mode) -> None:
-    """Overwrite the results of constant profiles, and residual results that were not computed."""
-    if not mode.with_residuals:
-        s.results[7, :] = math.nan
+def _settle_constant(tables: Tables, s: _Scratch, mode: Mode) -> None:
+    """Overwrite the results of constant profiles."""
     for p in range(BLOCK):
         if s.state[p] == _CONSTANT:
             s.results[:, p] = math.nan
@@ -538,13 +531,12 @@ def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: Co
     _estimate(tables, s)
     _measure_misfit(tables, s)
     _place_background(tables, s)
-    if mode.with_residuals:
-        _take_residuals(block, s, not mode.known_variance)
+    _take_residuals(block, s, not mode.known_variance)
     bins = block.shape[1]
     _set_noise(tables, s, bins, mode)
     _convert(tables, s, bins, limits.widening)
-    _judge(tables, s, mode, limits)
-    _settle_exceptions(tables, s, mode)
+    _judge(tables, s, limits)
+    _settle_constant(tables, s, mode)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -578,7 +570,7 @@ def solve_compressed(
         `ROUTED` where the profile is left to another solver; its results mean nothing.
     """
     count = power.shape[0]
-    s = _scratch(power, root, envelope, tables.columns.shape[1])
+    s = _scratch(power, root, envelope)
     for first in range(0, count, BLOCK):
         profiles = min(BLOCK, count - first)
         if profiles == BLOCK:

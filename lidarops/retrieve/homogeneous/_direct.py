@@ -59,6 +59,7 @@ from lidarops.retrieve.homogeneous._projection import (
     summing,
     total_of,
 )
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
@@ -66,14 +67,16 @@ STEPS: Final = 7
 """Newton steps from a start that is off by some hundredths of the spacing of nodes."""
 HUGE: Final = 1e300
 TINY: Final = 1e-280
+_FLAT: Final = 1e-13
+"""Squared share of a shape besides its mean, below which it is flat within rounding."""
+_LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
+_FEWEST_BINS: Final = THRESHOLDS.fewest_solved_bins
 
 # Treatment of the extinction.
 FREE: Final = 0
 GIVEN: Final = 1
 STEP: Final = 2
 """One linear step from a prior, expanded about the centroid of information."""
-STEP_ABOUT_ZERO: Final = 3
-"""The same, expanded about range zero."""
 
 
 @compiled
@@ -118,7 +121,7 @@ def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float
         sz += weighted * z[i]
     norm = s2 - free * s1 * s1 / w0
     # A shape that is flat over the valid bins, or gone before the first, holds no information.
-    if not (norm > 1e-13 * s2 and s2 > TINY):
+    if not (norm > _FLAT * s2 and s2 > TINY):
         return 0.0
     return float((sz - free * s1 * wz / w0) / math.sqrt(norm))
 
@@ -154,7 +157,9 @@ def _start(
 @compiled
 def _newton(tau: float, point: Point, low: float, high: float) -> float:
     gauss = point.b * point.b * point.slope_norm
-    step = point.gradient / (point.curvature if point.curvature > 0.3 * gauss else gauss)
+    step = point.gradient / (
+        point.curvature if point.curvature > _LEAST_CURVATURE * gauss else gauss
+    )
     moved = tau + step
     if not math.isfinite(moved):
         return tau
@@ -188,25 +193,20 @@ def _describe_given(p: Point, w0: float, free: float, row: Array) -> None:
 
 
 @compiled
-def _step(g: Grid, p: Point, kind: int, tau: float, row: Array) -> None:
-    """Write the linear step from a prior, with errors to first order in the two coefficients."""
+def _step(g: Grid, p: Point, tau: float, row: Array) -> None:
+    """Write the linear step from a prior, with errors to first order in the two coefficients.
+
+    About the centroid, the coefficients of shape and slope are independent.
+    """
     slope = p.gradient / (p.b * p.slope_norm)
-    centroid = g.start / g.length + p.centroid
-    origin = centroid if kind == STEP else 0.0
-    # Shape and slope about the origin; about the centroid, their coefficients are independent.
-    shift = 2.0 * (centroid - origin)
-    b = p.b + shift * slope
-    step = slope / b
-    slope_variance, b_variance = 1.0 / p.slope_norm, 1.0 / p.norm
-    by_slope, by_b = p.b / (b * b), -slope / (b * b)
-    row[EXTINCTION_VARIANCE] = by_slope * by_slope * slope_variance + by_b * by_b * b_variance
-    by_slope, by_b = shift / b + 2.0 * origin * by_slope, 1.0 / b + 2.0 * origin * by_b
-    row[AMPLITUDE_RELATIVE_VARIANCE] = (
-        by_slope * by_slope * slope_variance + by_b * by_b * b_variance
-    )
+    step, lever = slope / p.b, 2.0 * (g.start / g.length + p.centroid)
+    by_slope, by_shape = 1.0 / p.b, -step / p.b
+    row[EXTINCTION_VARIANCE] = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
+    by_slope, by_shape = lever * by_slope, 1.0 / p.b + lever * by_shape
+    row[AMPLITUDE_RELATIVE_VARIANCE] = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
     row[BACKGROUND] -= slope * p.mean_t
     row[EXTINCTION] = tau + step
-    row[AMPLITUDE] = b * math.exp(2.0 * step * (origin - g.start / g.length))
+    row[AMPLITUDE] = p.b * math.exp(2.0 * step * p.centroid)
 
 
 @compiled
@@ -238,7 +238,7 @@ def _fit(g: Grid, s: ProjectionScratch, free: float, kind: int, tau: float, row:
     if kind == GIVEN:
         _describe_given(p, w0, free, row)
     elif kind != FREE:
-        _step(g, p, kind, tau, row)
+        _step(g, p, tau, row)
         tau = row[EXTINCTION]
         p = _moved(evaluate(tau, g, s, w0, wz, free), row)
     describe_bend(g, s, p, w0, free, row)
@@ -286,7 +286,7 @@ def _solve_profile(
     fixed = not math.isnan(background)
     reference = background if fixed else np.float64(power[last])
     row[BINS] = 0 if last < 0 else _load(power, noise, is_variance, reference, s)
-    if row[BINS] < 4:
+    if row[BINS] < _FEWEST_BINS:
         row[STATUS] = EMPTY if last < 0 else TOO_SHORT
         return
     unit, largest = power_of_two(largest_of(s.w)), largest_of(s.z)
@@ -327,7 +327,7 @@ def solve_direct(
     background : (profile or 1,) float64
         Given backgrounds; NaN where the background is fitted.
     kind : int
-        `FREE`, `GIVEN`, `STEP` or `STEP_ABOUT_ZERO`.
+        `FREE`, `GIVEN` or `STEP`.
     extinction : (profile or 1,) float64
         m-1; not used where it is free.
     rounding : float

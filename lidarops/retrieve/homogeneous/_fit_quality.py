@@ -1,8 +1,8 @@
 """Judge the fit of a homogeneous path: noise level, misfit, quality bits.
 
-Every test of residuals has a false-alarm rate of `FALSE_ALARM` at any number of bins. Where the
-noise variance is not known, it is estimated from second differences of the residuals, which
-smooth misfit hardly affects; the tests allow for the scatter of that estimate.
+Every test of residuals has the rate `Thresholds.false_alarm` at any number of bins. Where the noise
+variance is not known, it is estimated from second differences of the residuals, which smooth misfit
+hardly affects; the tests allow for the scatter of that estimate.
 """
 
 from __future__ import annotations
@@ -18,26 +18,21 @@ from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _estimate
 from lidarops.retrieve.homogeneous._estimate import PathEstimate
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-FALSE_ALARM: Final = 4e-4
-"""Rate at which one test flags a profile that obeys the model."""
-LOWEST_SIGNAL: Final = 5.0
-"""Amplitude over its standard error at known extinction."""
-LARGEST_RELATIVE_ERROR: Final = 0.15
-"""Standard error of extinction over extinction plus 1 / mean range."""
-OUTLIER: Final = 5.0
-"""Least deviation, in standard deviations of the noise, that makes an outlier."""
-FEWEST_BINS: Final = 8
-FEWEST_DIFFERENCES: Final = 5
-"""With fewer second differences, the noise is estimated from the residuals themselves."""
-
-FAR: Final = 4.0
-"""Standard errors at which widened intervals have the coverage of a known variance."""
+_FALSE_ALARM: Final = THRESHOLDS.false_alarm
+_SECOND_DIFFERENCE: Final = 6.0
+"""Variance of a second difference of white noise over that of the noise."""
 _DIFFERENCE_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
+_RATIO: Final = 4.611
+"""Quantile of the logarithm of the ratio of two estimates of one variance from the same residuals,
+3.353 sqrt(17 / 9), times the root of the number of bins."""
+_RATIO_SHORT: Final = 7.3
+"""The same times the number of bins, for short sections; fitted to simulations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +50,8 @@ class Verdict:
 class _Limits:
     """Limits beyond which the tests fail."""
 
-    least_misfit: Array
-    """Lower limit of the reduced chi-square."""
-    most_misfit: Array
+    misfit: Array
+    """Of the reduced chi-square."""
     trend: Array
     outlier: Array
     widening: Array
@@ -68,8 +62,7 @@ class CommonLimits(NamedTuple):
 
     lowest_signal: float
     largest_relative_error: float
-    least_misfit: float
-    most_misfit: float
+    misfit: float
     curvature: float
     square: float
     """Limit of the residuals along the square of the shape, in standard deviations."""
@@ -91,16 +84,22 @@ def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimi
     limits_of = _known_limits if known_variance else _estimated_limits
     counts = [np.array([float(count)]) for count in (bins, bins - 2, shapes)]
     limits = limits_of(counts[0], counts[1], counts[2], 3)
-    least, most, _, outlier, widening = (float(limit[0]) for limit in limits)
+    misfit, _, outlier, widening = (float(limit[0]) for limit in limits)
     curvature, square = _shape_limits(bins, shapes, known_variance=known_variance)
     return CommonLimits(
-        LOWEST_SIGNAL, LARGEST_RELATIVE_ERROR, least, most, curvature, square, outlier, widening
+        THRESHOLDS.least_signal,
+        THRESHOLDS.largest_relative_error,
+        misfit,
+        curvature,
+        square,
+        outlier,
+        widening,
     )
 
 
 def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[float, float]:
     """Return the limits of the tests of curvature and square, each at half the rate."""
-    rate = 0.5 * FALSE_ALARM
+    rate = 0.5 * _FALSE_ALARM
     if known_variance:
         return float(special.chdtri(shapes, rate)), -float(special.ndtri(0.5 * rate))
     dof = _DIFFERENCE_DOF * (bins - 2)
@@ -124,12 +123,11 @@ def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> 
         reduced = fit.misfit / _residual_dof(fit.bins, unknowns) / noise
         limits = _limits(fit, unknowns, known_variance=known_variance)
         tests = (
-            (Quality.LOW_SIGNAL, fit.signal_energy / noise > LOWEST_SIGNAL**2),
+            (Quality.LOW_SIGNAL, fit.signal_energy / noise > THRESHOLDS.least_signal**2),
             (HomogeneousQuality.POORLY_DETERMINED, _determined(fit, noise, limits.widening)),
             (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
             (HomogeneousQuality.AT_BOUND, fit.bounded == 0),
-            (HomogeneousQuality.POOR_FIT, reduced >= limits.least_misfit),
-            (HomogeneousQuality.POOR_FIT, reduced <= limits.most_misfit),
+            (HomogeneousQuality.POOR_FIT, reduced <= limits.misfit),
             (Quality.NOT_HOMOGENEOUS, fit.trend / noise <= limits.trend),
             (Quality.OUTLIER, fit.largest / np.sqrt(noise) <= limits.outlier),
         )
@@ -140,7 +138,7 @@ def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> 
             quality[fitted & ~passed] |= np.int32(bit)
     quality[fit.status == _estimate.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
     quality[fit.status == _estimate.EMPTY] |= np.int32(Quality.INPUT_MISSING)
-    quality[(fit.bins > 0) & (fit.bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    quality[(fit.bins > 0) & (fit.bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
     return Verdict(noise, limits.widening, reduced, quality)
 
 
@@ -149,18 +147,18 @@ def _residual_dof(bins: Array, unknowns: int) -> Array:
 
 
 def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
-    from_differences = fit.second_differences / (6.0 * fit.difference_count)
+    from_differences = fit.second_differences / (_SECOND_DIFFERENCE * fit.difference_count)
     from_residuals = fit.misfit / _residual_dof(fit.bins, unknowns)
-    enough = fit.difference_count >= FEWEST_DIFFERENCES
+    enough = fit.difference_count >= THRESHOLDS.fewest_differences
     variance = np.where(enough, from_differences, from_residuals)
     return np.maximum(variance, fit.rounding)
 
 
 def _determined(fit: PathEstimate, noise: Array, widening: Array) -> npt.NDArray[np.bool_]:
     error = np.sqrt(fit.extinction_variance * noise) * widening
-    scale = fit.extinction + 1.0 / fit.mean_range
+    largest = THRESHOLDS.largest_relative_error * (fit.extinction + 1.0 / fit.mean_range)
     finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
-    determined: npt.NDArray[np.bool_] = finite & (error < LARGEST_RELATIVE_ERROR * scale)
+    determined: npt.NDArray[np.bool_] = finite & (error < largest)
     return determined
 
 
@@ -177,13 +175,16 @@ def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limit
     return _Limits(*(limit[kind] for limit in limits))
 
 
+def _outlier_limit(quantile: Array) -> Array:
+    return np.maximum(THRESHOLDS.outlier, quantile)
+
+
 def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:
     dof = _residual_dof(bins, unknowns)
     return (
-        special.chdtri(dof, 1.0 - 0.5 * FALSE_ALARM) / dof,
-        special.chdtri(dof, 0.5 * FALSE_ALARM) / dof,
-        np.where(shapes > 0, special.chdtri(shapes, FALSE_ALARM), np.inf),
-        np.maximum(OUTLIER, -special.ndtri(0.5 * FALSE_ALARM / np.maximum(bins, 1.0))),
+        special.chdtri(dof, 0.5 * _FALSE_ALARM) / dof,
+        np.where(shapes > 0, special.chdtri(shapes, _FALSE_ALARM), np.inf),
+        _outlier_limit(-special.ndtri(0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
         np.ones_like(bins),
     )
 
@@ -191,17 +192,14 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
 def _estimated_limits(
     bins: Array, differences: Array, shapes: Array, unknowns: int
 ) -> tuple[Array, ...]:
-    independent = differences >= FEWEST_DIFFERENCES
+    independent = differences >= THRESHOLDS.fewest_differences
     dof = np.where(independent, _DIFFERENCE_DOF * differences, _residual_dof(bins, unknowns))
-    # Quantile of the ratio of two estimates of one variance from the same residuals; its logarithm
-    # has 4.611 = 3.353 sqrt(17 / 9) and a term for short sections, fitted to simulations.
     neighbours = differences + 2.0
-    ratio = np.exp(4.611 / np.sqrt(neighbours) + 7.3 / neighbours)
+    ratio = np.exp(_RATIO / np.sqrt(neighbours) + _RATIO_SHORT / neighbours)
     return (
-        np.zeros_like(bins),
         np.where(independent, ratio, np.inf),
-        np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - FALSE_ALARM), np.inf),
-        np.maximum(OUTLIER, -special.stdtrit(dof, 0.5 * FALSE_ALARM / np.maximum(bins, 1.0))),
+        np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - _FALSE_ALARM), np.inf),
+        _outlier_limit(-special.stdtrit(dof, 0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
         # An error over its estimate follows Student's distribution.
-        -special.stdtrit(dof, special.ndtr(-FAR)) / FAR,
+        -special.stdtrit(dof, special.ndtr(-THRESHOLDS.covered)) / THRESHOLDS.covered,
     )

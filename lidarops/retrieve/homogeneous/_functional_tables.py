@@ -7,8 +7,8 @@ of a profile on the extinction. The best extinction is the maximum of
 within a cell of extinctions is a polynomial with coefficients linear in y.
 
 The projection is linear, and the tables project the shapes with the same numbers that multiply
-the profiles. A smaller basis therefore loses information (`Tables.size`) but never biases a
-result. The tables are computed in the longest float type.
+the profiles. What the basis lacks therefore costs information, but never biases a result. The
+tables are computed in the longest float type.
 
 Variables are scaled as in `lidarops.retrieve.homogeneous._projection`: x = (R - R_0) / L and
 tau = extinction * L.
@@ -31,6 +31,10 @@ CELLS: Final = 128
 DEGREE: Final = 6
 """Degree of the polynomials within a cell; the interpolation error of an extinction is 1e-11."""
 START_BINS: Final = 2048
+SIZE: Final = 11
+"""Dimensions of the basis: they lose a millionth of the information on extinction."""
+COLUMNS: Final = 12
+"""Basis and mean."""
 _WIDEST_SCALE: Final = 0.3
 
 _TRAINING: Final = 400
@@ -55,18 +59,17 @@ class Tables(NamedTuple):
     """Tables for all profiles of one range grid, one set of weights and one pair of bounds."""
 
     size: int
-    """Dimensions K of the basis: 7 lose up to 0.7 percent of the information on extinction, 11
-    up to 1e-6."""
+    """Dimensions K of the basis."""
     columns: Array
-    """(bin, lanes): K weighted basis vectors, then the weights of the mean, then zeros."""
+    """(bin, K + 1): weighted basis vectors, then the weights of the mean."""
     starts: Array
     """(cell, K, 4): q and h dq/dtau at the centre of the cell, h its half width, zeros."""
     slopes: Array
     """(cell, K, 8): q at the centre, then the polynomial of h dq/dtau."""
     directions: Array
-    """(cell, power, lanes): polynomials of q."""
+    """(cell, power, K + 1): polynomials of q."""
     squares: Array
-    """(cell, power, lanes): polynomials of the unit vector along the part of ``phi^2`` that is
+    """(cell, power, K + 1): polynomials of the unit vector along the part of ``phi^2`` that is
     orthogonal to the model."""
     scalars: Array
     """(cell, power, SCALARS): polynomials of the scalars that the results need beside y."""
@@ -90,11 +93,11 @@ class Tables(NamedTuple):
     mean_range: float
     """Weighted, m."""
     monotonic: bool
-    """Whether the direction of (y_0, y_1) determines the extinction. If not, as with bounds that
-    allow extinctions near -1 / range, the tables cannot be used."""
+    """Whether the direction of (y_0, y_1) determines the extinction. If not, the tables cannot be
+    used."""
 
 
-def make_tables(range_: Array, weights: Array, bounds: tuple[float, float], size: int) -> Tables:
+def make_tables(range_: Array, weights: Array, bounds: tuple[float, float]) -> Tables:
     """Return the tables of a range grid, from a cache if they were made before.
 
     Parameters
@@ -105,17 +108,13 @@ def make_tables(range_: Array, weights: Array, bounds: tuple[float, float], size
         Positive and finite.
     bounds : (float, float)
         Lowest and highest extinction, m-1.
-    size : int
-        Dimensions of the basis.
     """
-    return _cached(range_.tobytes(), weights.tobytes(), bounds, size)
+    return _cached(range_.tobytes(), weights.tobytes(), bounds)
 
 
 @lru_cache(maxsize=64)
-def _cached(
-    range_bytes: bytes, weight_bytes: bytes, bounds: tuple[float, float], size: int
-) -> Tables:
-    return _make(np.frombuffer(range_bytes), np.frombuffer(weight_bytes), bounds, size)
+def _cached(range_bytes: bytes, weight_bytes: bytes, bounds: tuple[float, float]) -> Tables:
+    return _make(np.frombuffer(range_bytes), np.frombuffer(weight_bytes), bounds)
 
 
 class _Family:
@@ -145,8 +144,8 @@ class _Family:
         mean = (shapes * self.weights).sum(axis=1) / self.total
         return np.asarray(self.root * (shapes - mean[:, np.newaxis]), np.longdouble)
 
-    def basis(self, tau: _Long, size: int) -> Array:
-        """Return the basis, (bin, size), orthonormal and free of the mean."""
+    def basis(self, tau: _Long) -> Array:
+        """Return the basis, (bin, `SIZE`), orthonormal and free of the mean."""
         both = np.empty((2, tau.size, self.x.size))
         for rows in self.blocks(tau.size):
             shape, slope = (self.centred(family) for family in self.shapes(tau[rows]))
@@ -154,7 +153,7 @@ class _Family:
             slope = slope - (slope * shape).sum(axis=1)[:, np.newaxis] * shape
             both[0, rows], both[1, rows] = shape, slope / _norm(slope)[:, np.newaxis]
         both = both.reshape(2 * tau.size, self.x.size)
-        basis = np.linalg.svd(both.T, full_matrices=False)[0][:, :size]
+        basis = np.linalg.svd(both.T, full_matrices=False)[0][:, :SIZE]
         level = (self.root / np.sqrt(self.total)).astype(np.float64)
         # Vectors of small singular values keep traces of the mean; two passes remove them.
         for _ in range(2):
@@ -178,19 +177,19 @@ def _norm(rows: _Long) -> _Long:
     return np.asarray(np.sqrt((rows * rows).sum(axis=1)), np.longdouble)
 
 
-def _project(family: _Family, columns: Array, tau: _Long, size: int) -> _Projected:
-    blocks = [_project_block(family, columns, tau[rows], size) for rows in family.blocks(tau.size)]
+def _project(family: _Family, columns: Array, tau: _Long) -> _Projected:
+    blocks = [_project_block(family, columns, tau[rows]) for rows in family.blocks(tau.size)]
     return _Projected(*(np.concatenate(arrays) for arrays in zip(*blocks, strict=True)))
 
 
-def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _Projected:
+def _project_block(family: _Family, columns: Array, tau: _Long) -> _Projected:
     shapes, slopes = family.shapes(tau)
     exact = columns.astype(np.longdouble)
     # Shapes are relative to their last bin, like profiles.
     shape = (shapes - shapes[:, -1:]) @ exact
     slope = (slopes - slopes[:, -1:]) @ exact
-    mean, mean_slope = shape[:, size] + shapes[:, -1], slope[:, size] + slopes[:, -1]
-    shape, slope = shape[:, :size], slope[:, :size]
+    mean, mean_slope = shape[:, SIZE] + shapes[:, -1], slope[:, SIZE] + slopes[:, -1]
+    shape, slope = shape[:, :SIZE], slope[:, :SIZE]
     norm = _norm(shape)
     direction = shape / norm[:, np.newaxis]
     along = (slope * direction).sum(axis=1)
@@ -210,7 +209,7 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
     ]
     scalars += [np.zeros_like(norm)] * (SCALARS - len(scalars))
     square = shapes * shapes
-    square = (square - square[:, -1:]) @ exact[:, :size]
+    square = (square - square[:, -1:]) @ exact[:, :SIZE]
     turned = turning / turn[:, np.newaxis]
     # Twice, since the remainder is small.
     for _ in range(2):
@@ -255,7 +254,7 @@ def _interpolation(nodes: _Long) -> _Long:
     return matrix
 
 
-def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int) -> Tables:
+def _make(range_: Array, weights: Array, bounds: tuple[float, float]) -> Tables:
     unit = math.ldexp(1.0, math.frexp(float(weights.max()))[1])
     family = _Family(range_, weights / unit)
     lowest, highest = (bound * float(family.length) for bound in bounds)
@@ -270,10 +269,10 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
         tau[0], tau[-1] = lowest, highest
         return tau
 
-    columns = np.zeros((range_.size, -(-(size + 1) // 4) * 4))
-    basis = family.basis(spread(_TRAINING), size)
-    columns[:, :size] = family.root.astype(np.float64)[:, np.newaxis] * basis
-    columns[:, size] = (family.weights / family.total).astype(np.float64)
+    columns = np.zeros((range_.size, COLUMNS))
+    basis = family.basis(spread(_TRAINING))
+    columns[:, :SIZE] = family.root.astype(np.float64)[:, np.newaxis] * basis
+    columns[:, SIZE] = (family.weights / family.total).astype(np.float64)
 
     edges = spread(CELLS + 1)
     centres = np.asarray((edges[1:] + edges[:-1]) / 2, np.longdouble)
@@ -282,22 +281,22 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     nodes = np.cos((2 * np.arange(order) + 1) * np.pi / (2 * order)).astype(np.longdouble)
     inside = (centres[:, np.newaxis] + halves[:, np.newaxis] * nodes).ravel()
     matrix = _interpolation(nodes)
-    inner = _project(family, columns, inside, size)
-    middle = _project(family, columns, centres, size)
-    turning = (np.repeat(halves, order)[:, np.newaxis] * inner.slope).reshape(CELLS, order, size)
+    inner = _project(family, columns, inside)
+    middle = _project(family, columns, centres)
+    turning = (np.repeat(halves, order)[:, np.newaxis] * inner.slope).reshape(CELLS, order, SIZE)
 
-    slopes = np.empty((CELLS, size, order + 1))
+    slopes = np.empty((CELLS, SIZE, order + 1))
     slopes[:, :, 0] = middle.direction
     slopes[:, :, 1:] = np.einsum("ij,cjk->cki", matrix, turning)
     # F is q . y: the integral of the slopes is the direction itself.
     directions = np.zeros((CELLS, order + 1, columns.shape[1]))
-    directions[:, :, :size] = np.swapaxes(slopes, 1, 2)
+    directions[:, :, :SIZE] = np.swapaxes(slopes, 1, 2)
     directions[:, 1:] /= np.arange(1, order + 1)[:, np.newaxis]
     squares = np.zeros_like(directions)
-    squares[:, :order, :size] = np.einsum(
-        "ij,cjk->cik", matrix, inner.square.reshape(CELLS, order, size)
+    squares[:, :order, :SIZE] = np.einsum(
+        "ij,cjk->cik", matrix, inner.square.reshape(CELLS, order, SIZE)
     )
-    starts = np.zeros((CELLS, size, 4))
+    starts = np.zeros((CELLS, SIZE, 4))
     starts[:, :, :2] = slopes[:, :, :2]
     scalars = np.einsum("ij,cjk->cik", matrix, inner.scalars.reshape(CELLS, order, -1))
     steepness = (halves * _norm(middle.slope)) ** 2
@@ -305,7 +304,7 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     padded = np.zeros(-(-range_.size // 16) * 16)
     padded[: range_.size] = family.envelope
     return Tables(
-        size=size,
+        size=SIZE,
         columns=columns,
         starts=starts,
         slopes=slopes,

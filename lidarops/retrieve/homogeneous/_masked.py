@@ -44,7 +44,7 @@ from lidarops.retrieve.homogeneous._estimate import (
     TREND,
     TREND_COUNT,
 )
-from lidarops.retrieve.homogeneous._misfit import DEPENDENT
+from lidarops.retrieve.homogeneous._misfit import INDEPENDENT
 from lidarops.retrieve.homogeneous._vector_loops import (
     LANES,
     STRIDE,
@@ -54,11 +54,11 @@ from lidarops.retrieve.homogeneous._vector_loops import (
     residuals,
     step_sums,
 )
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
 MOST_PASSES: Final = 8
-FEWEST_BINS: Final = 16
 NODES: Final = 16
 _SCALE: Final = 0.3
 _HUGE: Final = 1e140
@@ -66,10 +66,12 @@ _LEAST: Final = 1e-3
 """Least share of the weight per bin that a shape keeps without its mean, to be tried as a start:
 a shape that has decayed before the first valid bin would fit anything."""
 
-_LATEST: Final = 0.2
-"""Largest share of the section that may be missing at its start."""
-_DEEPEST: Final = 0.5
-"""Largest optical depth that may be missing there."""
+_FEWEST_BINS: Final = THRESHOLDS.fewest_masked_bins
+_LATEST: Final = THRESHOLDS.latest
+_DEEPEST: Final = THRESHOLDS.deepest
+_LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
+_STRAYED: Final = 0.1
+"""Relative change of the centre by a step, above which the step says nothing on convergence."""
 CONVERGED: Final = 1e-7
 """Step over extinction whose square is negligible: the iteration ends."""
 CLOSE: Final = 1e-3
@@ -327,7 +329,7 @@ def _step(
     linear = (rd - d * r / total_weight) / shape
     amplitude = fit.amplitude + linear
     curved = norm - rgx / amplitude
-    slope = right / (curved if curved > 0.3 * norm else norm)
+    slope = right / (curved if curved > _LEAST_CURVATURE * norm else norm)
     tau = min(max(fit.tau - 0.5 * slope / amplitude, bounds[0]), bounds[1])
     moved = tau - fit.tau
     slope = -2.0 * amplitude * moved
@@ -431,12 +433,12 @@ def _trend(
     pulled = _remainder(bent[9], p, r, total_weight)
     energy = count = shared = 0.0
     norm = _remainder(bent[6], p, p, total_weight)
-    if norm > DEPENDENT * bent[6]:
+    if norm > INDEPENDENT * bent[6]:
         energy += pulled * pulled / norm
         count += 1.0
         shared = _remainder(bent[7], p, q, total_weight) / norm
     rest = _remainder(bent[8], q, q, total_weight) - shared * shared * norm
-    if rest > DEPENDENT * bent[8]:
+    if rest > INDEPENDENT * bent[8]:
         along = _remainder(bent[10], q, r, total_weight) - shared * pulled
         energy += along * along / rest
         count += 1.0
@@ -502,7 +504,7 @@ def _fit(g: MaskedTables, s: _Scratch, count: float, want_differences: bool, row
         moved = abs(after.tau - before.tau)
         size = abs(after.tau) + g.scale
         # A step about a stray centre is small at any distance from the solution.
-        strayed = abs(after.centre - before.centre) > 0.1 * (1.0 + abs(after.centre))
+        strayed = abs(after.centre - before.centre) > _STRAYED * (1.0 + abs(after.centre))
         settled = moved < CONVERGED * size and last < CLOSE * size and not strayed
     _describe(g, before, after, sums, total_weight, row)
     e1, e4 = _decays(g, before.tau)
@@ -560,7 +562,7 @@ def _solve_profile(
 ) -> bool:
     count, reference, unit = _load(power, weights, s)
     row[BINS] = count
-    if count < FEWEST_BINS:
+    if count < _FEWEST_BINS:
         return False
     _shift(s.z[: weights.size], s.used[: weights.size], reference)
     _multiply(s.w, 1.0 / unit)
@@ -590,7 +592,7 @@ def solve_masked(
     power : (profile, bin) float32 or float64
     weights : (profile or 1, bin) float64
         A bin is left out where its weight is not positive and finite.
-    want_bends : bool
+    want_differences : bool
         Whether the second differences of the residuals are computed; 0 otherwise.
     rounding : float
         Relative rounding error of the power.

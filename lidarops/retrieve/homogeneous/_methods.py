@@ -8,21 +8,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.background.cubic_and_tail import solve_cubic, solve_tail
+from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic, solve_tail
 from lidarops.retrieve.homogeneous import _direct, _linearized, _masked, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
 from lidarops.retrieve.homogeneous._fit_quality import judge_fit
-from lidarops.retrieve.homogeneous._problem import (
-    Array,
-    Centre,
-    Flags,
-    PathProblem,
-    PathSolution,
-)
+from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
 from lidarops.retrieve.homogeneous._projection import make_grid
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
-_KINDS: Final = {Centre.CENTROID: _direct.STEP, Centre.ZERO: _direct.STEP_ABOUT_ZERO}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +43,7 @@ def solve_by_masked_fit(problem: PathProblem) -> PathSolution:
         problem.power,
         weights,
         not problem.known_variance,
-        _rounding(problem),
+        problem.rounding,
         tables,
         table,
         solved,
@@ -65,21 +58,10 @@ def solve_by_masked_fit(problem: PathProblem) -> PathSolution:
 def solve_by_linearization(problem: PathProblem) -> PathSolution:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
-    fit = _estimate(problem, kind=_KINDS[problem.centre], extinction=prior)
-    shifts = np.empty((fit.status.size, 3))
-    _linearized.neglected(
-        problem.power,
-        problem.noise,
-        problem.known_variance,
-        problem.range,
-        prior,
-        problem.centre is Centre.ZERO,
-        np.ascontiguousarray(fit.extinction),
-        np.ascontiguousarray(fit.amplitude),
-        shifts,
-    )
+    fit = _estimate(problem, kind=_direct.STEP, extinction=prior)
+    shifts = _linearized.neglected_shifts(problem, prior, fit.extinction, fit.amplitude)
     with np.errstate(over="ignore", invalid="ignore"):
-        added = _AddedVariances(*(shifts**2).T)
+        added = _AddedVariances(*(shift**2 for shift in shifts))
     return _solution(fit, problem, added=added)
 
 
@@ -109,35 +91,27 @@ def solve_by_cubic(problem: PathProblem) -> PathSolution:
     estimate, gradients = solve_cubic(
         problem.power,
         problem.range,
-        problem.lag,
+        None,
         variance,
         known_variance=problem.known_variance,
-        shots=problem.shots,
         want_gradients=True,
     )
-    fit = _fit_above_background(problem, estimate.background, gradients)
-    fit = replace(fit, status=np.where(np.isnan(estimate.background), np.nan, fit.status))
-    return _solution(fit, problem, quality=estimate.quality)
+    return _fit_above(problem, estimate, gradients)
 
 
 def solve_by_tail_mean(problem: PathProblem) -> PathSolution:
     """Take the background from the tail mean and propagate its noise into the other parameters."""
-    estimate, gradients = solve_tail(
-        problem.power, problem.range, problem.tail_start, problem.noise
-    )
-    fit = _fit_above_background(problem, estimate.background, gradients)
-    fit = replace(fit, status=np.where(np.isnan(estimate.background), np.nan, fit.status))
-    return _solution(fit, problem, quality=estimate.quality)
+    return _fit_above(problem, *solve_tail(problem.power, problem.range, None, problem.noise))
 
 
-def _fit_above_background(
-    problem: PathProblem, background: Array, gradients: Array
-) -> PathEstimate:
+def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Array) -> PathSolution:
     """Fit amplitude and extinction above a background that depends on the same power."""
+    background = estimate.background
     fit = _estimate(problem, background=background)
     spread = _propagated(problem, fit, gradients)
-    return replace(
+    fit = replace(
         fit,
+        status=np.where(np.isnan(background), np.nan, fit.status),
         background=background,
         background_variance=spread[:, 0],
         amplitude_relative_variance=spread[:, 1],
@@ -145,6 +119,7 @@ def _fit_above_background(
         background_bend=spread[:, 5],
         extinction_bend=fit.extinction_bend + spread[:, 4] * spread[:, 5],
     )
+    return _solution(fit, problem, quality=estimate.quality)
 
 
 def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Array:
@@ -189,16 +164,11 @@ def _table(problem: PathProblem, background: Array, kind: int, extinction: Array
         background,
         kind,
         extinction,
-        _rounding(problem),
+        problem.rounding,
         make_grid(problem.range, problem.bounds),
         table,
     )
     return table
-
-
-def _rounding(problem: PathProblem) -> float:
-    """Return the relative rounding error of the power and the kernels, as a standard deviation."""
-    return 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
 
 def _solution(

@@ -29,11 +29,11 @@ from lidarops.retrieve.homogeneous._projection import (
     product,
     summing,
 )
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-DEPENDENT: Final = 1e-9
-"""Least squared share of a shape outside the span of others, for it to count as independent."""
+INDEPENDENT: Final = THRESHOLDS.independent
 
 
 @compiled
@@ -104,7 +104,7 @@ def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, f
     square_norm = product(bent, weighted_bent)
     norm = _remainder(square_norm, bent_products, bent_products, p, w0)
     pulled = _remainder(product(bent, s.pull), bent_products, residual_products, p, w0)
-    if norm > DEPENDENT * square_norm:
+    if norm > INDEPENDENT * square_norm:
         energy += pulled * pulled / norm
         count += 1.0
         shared = (
@@ -112,7 +112,7 @@ def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, f
         )
     square_norm = product(square, weighted_square)
     norm = _remainder(square_norm, square_products, square_products, p, w0) - shared * shared * norm
-    if norm > DEPENDENT * square_norm:
+    if norm > INDEPENDENT * square_norm:
         along = (
             _remainder(product(square, s.pull), square_products, residual_products, p, w0)
             - shared * pulled

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -14,16 +13,9 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 
-class Centre(StrEnum):
-    """The range about which the linearised method expands the exponential."""
-
-    CENTROID = "centroid"
-    ZERO = "zero"
-
-
 @dataclass(frozen=True, slots=True)
 class PathProblem:
-    """Profiles of one section, with all settings of the solvers.
+    """Profiles of one section, with what is known about them.
 
     "(profile or 1,)" stands for one value for each profile, or one for all.
     """
@@ -48,13 +40,11 @@ class PathProblem:
     """(profile or 1,): the known background."""
     background_variance: Array | None = None
     """(profile or 1,): variance of the known background."""
-    shots: Array | None = None
-    """(profile or 1,): shots of which the power is the mean count; None for Gaussian noise."""
-    lag: int | None = None
-    """Lag of the cubic, in bins."""
-    centre: Centre = Centre.CENTROID
-    tail_start: float | None = None
-    """m: start of the tail whose mean is the background."""
+
+    @property
+    def rounding(self) -> float:
+        """Relative rounding error of the power and the kernels, as a standard deviation."""
+        return 0.3 * float(np.finfo(self.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
     def select(self, rows: npt.NDArray[np.intp], power: Floats) -> PathProblem:
         """Return the problem of the selected profiles, with new power."""
@@ -69,24 +59,7 @@ class PathProblem:
             extinction=selected(self.extinction),
             background=selected(self.background),
             background_variance=selected(self.background_variance),
-            shots=selected(self.shots),
         )
-
-    def cut(self, bins: slice, bounds: tuple[float, float]) -> PathProblem:
-        """Return the problem of a slice of bins."""
-        return replace(
-            self,
-            power=_contiguous(self.power[:, bins]),
-            range=np.ascontiguousarray(self.range[bins]),
-            noise=np.ascontiguousarray(self.noise[:, bins]),
-            bounds=bounds,
-        )
-
-
-def _contiguous(power: Floats) -> Floats:
-    if power.dtype == np.float32:
-        return np.ascontiguousarray(power, dtype=np.float32)
-    return np.ascontiguousarray(power, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,33 +12,17 @@ from lidarops.retrieve.homogeneous import _compressed, _methods
 from lidarops.retrieve.homogeneous._fit_quality import common_limits
 from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
 from lidarops.retrieve.homogeneous._problem import Array, PathProblem, PathSolution
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
-FEWEST_BINS: Final = 32
-"""Below, the direct fit is as fast, and a basis of 11 shapes would span most of the profile."""
-MOST_BINS: Final = 4096
-"""Above, the tables would need more than 100 MB and longer than a fit takes."""
-DEFAULT_SIZE: Final = 11
-FAST_SIZE: Final = 7
-THINNEST: Final = 0.15
-"""Least length over first range. In thinner sections the shapes are nearly straight lines, for
-which the cells of the tables are too coarse."""
 _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
+"""Deviation from even spacing by rounding, over the last range."""
 
 
-def compressed(problem: PathProblem) -> PathSolution:
+def solve_by_compression(problem: PathProblem) -> PathSolution:
     """Solve by 11 functionals of each profile; profiles with gaps by Newton steps."""
-    return _solve(problem, DEFAULT_SIZE, with_residuals=True)
-
-
-def fast(problem: PathProblem) -> PathSolution:
-    """Solve by 7 functionals; residuals are not computed where the variance is known."""
-    return _solve(problem, FAST_SIZE, with_residuals=not problem.known_variance)
-
-
-def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> PathSolution:
     if not _is_regular(problem):
         return _methods.solve_by_direct_fit(problem)
-    tables = _tables(problem, size)
+    tables = _tables(problem)
     if tables is None:
         return _methods.solve_by_masked_fit(problem)
     count, bins = problem.power.shape
@@ -49,11 +33,7 @@ def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> PathSolu
         _compressed.weight_roots(tables, _weights(problem), problem.power),
         tables.envelope.astype(problem.power.dtype),
         tables,
-        _compressed.Mode(
-            problem.known_variance,
-            with_residuals,
-            0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * np.finfo(np.float64).eps,
-        ),
+        _compressed.Mode(problem.known_variance, problem.rounding),
         common_limits(bins, _compressed.CURVATURES - 2, known_variance=problem.known_variance),
         out,
         quality,
@@ -76,20 +56,22 @@ def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> PathSolu
 def _is_regular(problem: PathProblem) -> bool:
     """Return whether the range is uniform, and the section neither short nor thin."""
     range_ = problem.range
-    if range_.size < FEWEST_BINS or range_[-1] - range_[0] < THINNEST * range_[0]:
+    if range_.size < THRESHOLDS.fewest_compressed_bins:
+        return False
+    if range_[-1] - range_[0] < THRESHOLDS.thinnest * range_[0]:
         return False
     even = np.linspace(range_[0], range_[-1], range_.size)
     return bool(np.max(np.abs(range_ - even)) <= _UNIFORM * range_[-1])
 
 
-def _tables(problem: PathProblem, size: int) -> Tables | None:
+def _tables(problem: PathProblem) -> Tables | None:
     """Return the tables, or None where they do not apply."""
-    if not problem.common_noise or problem.range.size > MOST_BINS:
+    if not problem.common_noise or problem.range.size > THRESHOLDS.most_compressed_bins:
         return None
     weights = _weights(problem)
     if not np.all((weights > 0.0) & (weights < _compressed.HUGE)):
         return None
-    tables = make_tables(problem.range, weights, problem.bounds, size)
+    tables = make_tables(problem.range, weights, problem.bounds)
     return tables if tables.monotonic else None
 
 

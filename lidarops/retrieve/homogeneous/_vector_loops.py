@@ -168,11 +168,10 @@ def _projection(rows: int, vectors: int) -> Any:
     return project
 
 
-project_6_8 = _projection(rows=6, vectors=2)
-"""``project_6_8(values, stride, matrix, terms, out, ahead, ahead_step)``: write the (6, 8)
-products of 6 rows of float64 `values`, `stride` bytes apart, with the (terms, 8) `matrix`, each
-summed over the terms in order; prefetch memory from the address `ahead` meanwhile."""
 project_4_12 = _projection(rows=4, vectors=3)
+"""``project_4_12(values, stride, matrix, terms, out, ahead, ahead_step)``: write the (4, 12)
+products of 4 rows of float64 `values`, `stride` bytes apart, with the (terms, 12) `matrix`, each
+summed over the terms in order; prefetch memory from the address `ahead` meanwhile."""
 project_1_32 = _projection(rows=1, vectors=8)
 project_1_16 = _projection(rows=1, vectors=4)
 project_1_12 = _projection(rows=1, vectors=3)

@@ -1,9 +1,9 @@
-"""Homogeneous path and tail mean over xarray: checks units, cuts sections, merges quality."""
+"""Homogeneous path over xarray: checks units, cuts sections, merges quality."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, TypeGuard
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,23 +11,18 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.background import cubic_and_tail as _background
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
 """Bits that exclude a bin from a fit."""
 CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
 """Bits that a section takes over from its bins."""
-FEWEST_BINS: Final = 4
-LEVEL: Final = 100.0
-"""m; largest change of height along a section that counts as level. Aerosol decreases with a scale
-height of 1 to 2 km; a larger change mimics an extinction of more than some percent."""
-
 _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
-_TAIL: Final = {"background": "{}", "background_standard_error": "{}"}
-_SECTION: Final = {
-    **_TAIL,
+_VALUES: Final = {
+    "background": "{}",
+    "background_standard_error": "{}",
     "background_model_error": "{}",
     "amplitude": "{} m2",
     "amplitude_standard_error": "{} m2",
@@ -40,7 +35,6 @@ _SECTION: Final = {
 _COUNTS: Final = ("valid_bins", "quality_flag")
 
 _Block = npt.NDArray[Any]
-_Function = Callable[..., tuple[_Block, ...]]
 
 
 def fit_homogeneous_path(
@@ -87,26 +81,32 @@ def fit_homogeneous_path(
     RetrievalInputError
         Where units, dimensions or sections are invalid.
     """
-    distance = _distance(power)
-    edges = _edges(sections)
-    inputs = _Inputs.gather(power, variance, quality)
+    distance, edges = _distance(power), _edges(sections)
     bins = [_bins(distance, near, far) for near, far in edges]
     used = slice(min(section.start for section in bins), max(section.stop for section in bins))
-    outputs = inputs.isel(used).map(
+    inputs = {
+        name: array.isel(range=used, missing_dims="ignore")
+        for name, array in _checked_inputs(power, variance, quality).items()
+    }
+    outputs = xr.apply_ufunc(
         _solve,
-        len(_SECTION),
-        2,
-        {
+        *inputs.values(),
+        input_core_dims=[["range"] if "range" in a.dims else [] for a in inputs.values()],
+        output_core_dims=[["section"]] * (len(_VALUES) + len(_COUNTS)),
+        kwargs={
+            "ranged": {name: "range" in array.dims for name, array in inputs.items()},
             "range": distance[used],
             "sections": [slice(b.start - used.start, b.stop - used.start) for b in bins],
             "method": method,
             "relative": relative_variance,
         },
-        along=("section", len(bins)),
+        dask="parallelized",
+        output_dtypes=[np.float64] * len(_VALUES) + [np.int32] * len(_COUNTS),
+        dask_gufunc_kwargs={"output_sizes": {"section": len(bins)}},
+        keep_attrs=False,
     )
-    result = xr.Dataset(dict(zip((*_SECTION, *_COUNTS), outputs, strict=True)))
-    _set_units(result, _SECTION, power.attrs.get("units", "1"))
-    return result.assign_coords(_section_coordinates(edges))
+    result = xr.Dataset(dict(zip((*_VALUES, *_COUNTS), outputs, strict=True)))
+    return _described(result, edges, power.attrs.get("units", "1"))
 
 
 def empty_fit(
@@ -137,20 +137,22 @@ def empty_fit(
     dims = (*profiles.dims, "section")
     shape = (*profiles.shape, len(edges))
     result = xr.Dataset(
-        {name: (dims, np.full(shape, np.nan)) for name in _SECTION}
+        {name: (dims, np.full(shape, np.nan)) for name in _VALUES}
         | {name: (dims, np.zeros(shape, np.int32)) for name in _COUNTS},
         coords=profiles.coords,
     )
-    _set_units(result, _SECTION, unit)
-    return result.assign_coords(_section_coordinates(edges))
+    return _described(result, edges, unit)
 
 
-def _section_coordinates(edges: npt.NDArray[np.float64]) -> dict[str, tuple[Any, ...]]:
-    return {
-        "section": ("section", np.arange(len(edges), dtype=np.int32)),
-        "section_range": ("section", edges.mean(axis=1), {"units": "m"}),
-        "section_bounds": (("section", "nv"), edges, {"units": "m"}),
-    }
+def _described(result: xr.Dataset, edges: npt.NDArray[np.float64], power_unit: str) -> xr.Dataset:
+    """Return values of sections with their units and coordinates."""
+    for name, pattern in _VALUES.items():
+        result[name].attrs["units"] = pattern.format(power_unit).removeprefix("1 ")
+    return result.assign_coords(
+        section=("section", np.arange(len(edges), dtype=np.int32)),
+        section_range=("section", edges.mean(axis=1), {"units": "m"}),
+        section_bounds=(("section", "nv"), edges, {"units": "m"}),
+    )
 
 
 def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
@@ -174,158 +176,62 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
     length = result["section_bounds"].isel(nv=1) - result["section_bounds"].isel(nv=0)
     climb = length * np.abs(np.cos(np.deg2rad(zenith_angle)))
     # Negated, so that an unknown angle does not count as level.
-    sloping = ~(climb <= LEVEL)
+    sloping = ~(climb <= THRESHOLDS.level)
     bits: xr.DataArray = sloping.astype(np.int32) * np.int32(HomogeneousQuality.NOT_LEVEL)
     return bits.drop_vars(bits.coords)
 
 
-def tail_mean(
-    power: xr.DataArray,
-    *,
-    start: float | None = None,
-    variance: xr.DataArray | float | None = None,
-) -> xr.Dataset:
-    """Return the mean of the far bins as background.
-
-    See `lidarops.retrieve.background.cubic_and_tail.tail_mean`.
-
-    Parameters
-    ----------
-    power : xr.DataArray, (..., range)
-        Any unit; the coordinate of ``range`` in m.
-    start : float, optional
-        m; bins from here on are averaged, the last tenth of the bins where not given.
-    variance : xr.DataArray or float, optional
-        Noise variance in the square of the power's unit.
-
-    Returns
-    -------
-    xr.Dataset, (...)
-        ``background``, ``background_standard_error`` and ``quality_flag``.
-
-    Raises
-    ------
-    RetrievalInputError
-        Where units, dimensions or `start` are invalid.
-    """
-    distance = _distance(power)
-    inputs = _Inputs.gather(power, variance, None)
-    outputs = inputs.map(_tail_mean, len(_TAIL), 1, {"range": distance, "start": start})
-    result = xr.Dataset(dict(zip((*_TAIL, "quality_flag"), outputs, strict=True)))
-    _set_units(result, _TAIL, power.attrs.get("units", "1"))
-    return result
-
-
-class _Inputs:
-    """Power, variance and quality, aligned, each with its range in one chunk."""
-
-    def __init__(self, arrays: Mapping[str, xr.DataArray], variance: float | None) -> None:
-        self._arrays = arrays
-        self._variance = variance
-
-    @classmethod
-    def gather(
-        cls,
-        power: xr.DataArray,
-        variance: xr.DataArray | float | None,
-        quality: xr.DataArray | None,
-    ) -> _Inputs:
-        arrays = {"power": power}
-        number = None
-        if isinstance(variance, xr.DataArray):
-            arrays["variance"] = variance
-        else:
-            number = variance
-        if quality is not None:
-            arrays["quality"] = quality
-            if quality.dtype.kind not in "iu":
-                raise RetrievalInputError(
-                    f"holds {quality.dtype}", field="quality", remedy="give bits as integers"
-                )
-        for name, array in arrays.items():
-            _check_dimensions(array, power, name)
-        return cls({name: _one_chunk(array) for name, array in arrays.items()}, number)
-
-    def isel(self, bins: slice) -> _Inputs:
-        cut = {
-            name: array.isel(range=bins, missing_dims="ignore")
-            for name, array in self._arrays.items()
-        }
-        return _Inputs(cut, self._variance)
-
-    def map(
-        self,
-        function: _Function,
-        values: int,
-        counts: int,
-        settings: Mapping[str, Any],
-        *,
-        along: tuple[str, int] | None = None,
-    ) -> tuple[xr.DataArray, ...]:
-        """Map a function of blocks that returns `values` floats and `counts` integers per profile.
-
-        Each is an array along the dimension and of the length `along`, where given.
-        """
-        core = [] if along is None else [along[0]]
-        outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
-            _on_blocks,
-            *self._arrays.values(),
-            input_core_dims=[
-                ["range"] if "range" in array.dims else [] for array in self._arrays.values()
-            ],
-            output_core_dims=[core] * (values + counts),
-            kwargs={
-                "function": function,
-                "ranged": {name: "range" in array.dims for name, array in self._arrays.items()},
-                "settings": {"variance": self._variance} | dict(settings),
-            },
-            dask="parallelized",
-            output_dtypes=[np.float64] * values + [np.int32] * counts,
-            dask_gufunc_kwargs={} if along is None else {"output_sizes": dict([along])},
-            keep_attrs=False,
-        )
-        return outputs
-
-
-def _on_blocks(
-    *blocks: _Block, function: _Function, ranged: Mapping[str, bool], settings: Mapping[str, Any]
-) -> tuple[_Block, ...]:
-    # Values of whole profiles broadcast along range.
-    arguments = {
-        name: block if along else np.asarray(block)[..., np.newaxis]
-        for (name, along), block in zip(ranged.items(), blocks, strict=True)
+def _checked_inputs(
+    power: xr.DataArray, variance: xr.DataArray | float | None, quality: xr.DataArray | None
+) -> dict[str, xr.DataArray]:
+    """Return the arrays that are given, each with its range in one chunk."""
+    inputs = {"power": power}
+    if variance is not None:
+        inputs["variance"] = xr.DataArray(variance)
+    if quality is not None:
+        inputs["quality"] = quality
+        if quality.dtype.kind not in "iu":
+            raise RetrievalInputError(
+                f"holds {quality.dtype}", field="quality", remedy="give bits as integers"
+            )
+    for name, array in inputs.items():
+        _check_dimensions(array, power, name)
+    return {
+        name: array.chunk({"range": -1}) if array.chunks and "range" in array.dims else array
+        for name, array in inputs.items()
     }
-    return function(**(dict(settings) | arguments))
 
 
 def _bins(distance: npt.NDArray[np.float64], near: float, far: float) -> slice:
     inside = np.flatnonzero((distance >= near) & (distance < far))
-    if inside.size < FEWEST_BINS:
+    fewest = THRESHOLDS.fewest_solved_bins
+    if inside.size < fewest:
         raise RetrievalInputError(
             f"[{near:g}, {far:g}] m holds {inside.size} bins of the range grid, which reaches"
             f" from {distance.min():g} to {distance.max():g} m",
             field="sections",
-            remedy=f"choose sections that hold at least {FEWEST_BINS}, better 50, bins",
+            remedy=f"choose sections that hold at least {fewest}, better 50, bins",
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
 
 def _solve(
-    power: _Block,
-    variance: _Block | float | None,
-    quality: _Block | None = None,
-    *,
+    *blocks: _Block,
+    ranged: Mapping[str, bool],
     range: _Block,  # noqa: A002 - the field's word
     sections: Sequence[slice],
     method: str,
     relative: bool,
 ) -> tuple[_Block, ...]:
     """Return the values of all sections, stacked along a last axis."""
+    # Values of whole profiles broadcast along range.
+    arrays = {
+        name: block if along else np.asarray(block)[..., np.newaxis]
+        for (name, along), block in zip(ranged.items(), blocks, strict=True)
+    }
     solutions = [
         _solve_section(
-            power[..., bins],
-            variance[..., bins] if _along_range(variance) else variance,
-            None if quality is None else quality[..., bins] if _along_range(quality) else quality,
+            **{n: a[..., bins] if a.shape[-1] > 1 else a for n, a in arrays.items()},
             range=range[bins],
             method=method,
             relative=relative,
@@ -335,15 +241,10 @@ def _solve(
     return tuple(np.stack(values, axis=-1) for values in zip(*solutions, strict=True))
 
 
-def _along_range(block: Any) -> TypeGuard[_Block]:
-    # Values of whole profiles have one bin.
-    return isinstance(block, np.ndarray) and block.shape[-1] > 1
-
-
 def _solve_section(
     power: _Block,
-    variance: _Block | float | None,
-    quality: _Block | None,
+    variance: _Block | None = None,
+    quality: _Block | None = None,
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
@@ -356,23 +257,13 @@ def _solve_section(
     weights = None
     if relative and variance is not None:
         with np.errstate(divide="ignore"):
-            variance, weights = None, 1.0 / np.asarray(variance)
+            weights = 1.0 / variance
+        variance = None
     fit = _homogeneous.fit_homogeneous_path(
         power, range, variance=variance, weights=weights, method=method
     )
-    values = tuple(getattr(fit, name) for name in _SECTION)
+    values = tuple(getattr(fit, name) for name in _VALUES)
     return (*values, fit.valid_bins, fit.quality | carried)
-
-
-def _tail_mean(
-    power: _Block,
-    variance: _Block | float | None,
-    *,
-    range: _Block,  # noqa: A002 - the field's word
-    start: float | None,
-) -> tuple[_Block, ...]:
-    tail = _background.tail_mean(power, range, start=start, variance=variance)
-    return tail.background, tail.background_standard_error, tail.quality
 
 
 def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:
@@ -419,14 +310,3 @@ def _check_dimensions(array: xr.DataArray, power: xr.DataArray, name: str) -> No
         raise RetrievalInputError(
             f"has the dimensions {array.dims}, power has {power.dims}", field=name
         )
-
-
-def _one_chunk(array: xr.DataArray) -> xr.DataArray:
-    if array.chunks is not None and "range" in array.dims:
-        return array.chunk({"range": -1})
-    return array
-
-
-def _set_units(result: xr.Dataset, units: Mapping[str, str], power_unit: str) -> None:
-    for name, pattern in units.items():
-        result[name].attrs["units"] = pattern.format(power_unit).removeprefix("1 ")

@@ -36,7 +36,7 @@ from lidarops.cli import app
 from lidarops.flags import Quality
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.homogeneous import path_fit
-from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 HOLDS = Failure("none", satisfied=True)
 HIDDEN = Failure("hidden", unseen="it has the shape of the answer")
@@ -135,7 +135,7 @@ def test_visible_misfit_is_the_remainder_of_three_tangents():
 
 
 def test_our_test_misses_few_more_detectable_violations_than_the_best_one():
-    limit = stats.norm.isf(0.5 * FALSE_ALARM)
+    limit = stats.norm.isf(0.5 * THRESHOLDS.false_alarm)
     assert 0.05 < stats.norm.sf(VISIBLE - limit) < 0.08
     assert stats.norm.sf(3.5 - limit) == pytest.approx(0.5, abs=0.02)
     r = np.linspace(2000.0, 9000.0, 300)

@@ -8,10 +8,11 @@ from scipy import stats
 from support.oracles.homogeneous import section, signal
 
 from lidarops.flags import Quality
-from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 KM = 1e-3
+FALSE_ALARM = THRESHOLDS.false_alarm
 BIT = int(Quality.NOT_HOMOGENEOUS)
 ENERGY = stats.chi2.isf(0.5 * FALSE_ALARM, 5)
 SQUARE = stats.norm.isf(0.25 * FALSE_ALARM)

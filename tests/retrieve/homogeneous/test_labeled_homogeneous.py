@@ -11,7 +11,6 @@ from support.oracles.homogeneous import signal
 import lidarops
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import labeled, path_fit
 from lidarops.retrieve.signal import labeled as labeled_signal
 
@@ -211,27 +210,6 @@ def test_invalid_arguments_are_refused(power, change, arguments, field, words):
     with pytest.raises(RetrievalInputError, match=words) as caught:
         labeled.fit_homogeneous_path(change(power), **arguments)
     assert caught.value.field == field
-
-
-@pytest.mark.parametrize("chunked", [False, True])
-def test_tail_mean_is_that_of_numpy(power, chunked):
-    data = power.chunk({"time": 3, "range": 50}) if chunked else power
-    variance = xr.full_like(power, 2.0)
-    fit = labeled.tail_mean(data, start=9000.0, variance=variance)
-    expected = cubic_and_tail.tail_mean(power.to_numpy(), RANGE, start=9000.0, variance=2.0)
-    assert fit["background"].dims == ("channel", "time")
-    assert fit["background"].attrs["units"] == "mV"
-    np.testing.assert_array_equal(fit["background"], expected.background)
-    np.testing.assert_array_equal(
-        fit["background_standard_error"], expected.background_standard_error
-    )
-    np.testing.assert_array_equal(fit["quality_flag"], expected.quality)
-    np.testing.assert_array_equal(
-        labeled.tail_mean(data)["background"],
-        cubic_and_tail.tail_mean(power.to_numpy(), RANGE).background,
-    )
-    with pytest.raises(RetrievalInputError, match="12000 m"):
-        labeled.tail_mean(power, start=20_000.0)
 
 
 def test_real_vertical_profiles_are_flagged(data_root):

@@ -5,8 +5,6 @@ import pytest
 from support.oracles.homogeneous import GEOMETRIES, lowest_errors, section, signal
 
 from lidarops.flags import Quality
-from lidarops.retrieve.homogeneous import _masked
-from lidarops.retrieve.homogeneous._estimate import COLUMNS
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
@@ -115,11 +113,6 @@ def test_profiles_without_convergence_are_left_to_the_direct_fit():
     exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
     np.testing.assert_array_equal(fit.quality[:30], exact.quality[:30])
     np.testing.assert_array_equal(fit.background[10:30], exact.background[10:30])
-    plan = _masked.make_masked_tables(r, (-0.3 / r[-1], 60.0 / 8000.0))
-    solved, table = np.empty(40, bool), np.empty((40, len(COLUMNS)))
-    _masked.solve_masked(power, np.ones((1, 225)), False, 1e-16, plan, table, solved)
-    assert solved[:10].all()
-    assert not solved[10:30].any()
 
 
 def test_bits_do_not_depend_on_the_batch():

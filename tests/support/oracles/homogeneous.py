@@ -99,7 +99,7 @@ def real_roots(coefficients):
     return sorted(mp.re(root) for root in roots if abs(mp.im(root)) < tiny * size)
 
 
-def linear_step(r, power, weights, prior, centre):
+def linear_step(r, power, weights, prior):
     """Return background, amplitude and extinction after one linear step from a prior.
 
     By the weighted normal equations of potapova2021 and a general routine. The centroid is the
@@ -111,9 +111,7 @@ def linear_step(r, power, weights, prior, centre):
         return root * (column - np.sum(weights * column) / np.sum(weights))
 
     shape = signal_from(r, r[0], prior)
-    origin = 0.0
-    if centre == "centroid":
-        origin = cleared(shape * r) @ cleared(shape) / (cleared(shape) @ cleared(shape))
+    origin = cleared(shape * r) @ cleared(shape) / (cleared(shape) @ cleared(shape))
     length = r[-1] - r[0]
     design = np.stack([np.ones_like(r), shape, shape * (r - origin) / length], axis=1)
     (background, b, g), *_ = np.linalg.lstsq(design * root[:, None], power * root, rcond=None)

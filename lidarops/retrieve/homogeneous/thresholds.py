@@ -1,0 +1,74 @@
+"""Thresholds of the homogeneous path, each with what set it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Limits of the search, of the tests and of the choice of the solver."""
+
+    # The search
+    lowest_extinction: float = -0.3
+    """1 / last range. Where extinction approaches -1 / range, the shape stops falling and a second
+    minimum appears. Simulations: 7 % of the fits end there with -0.5 / length, none above this."""
+    highest_optical_depth: float = 60.0
+    """Over the section: the signal vanishes after two of 225 bins. Assumed."""
+    largest_optical_depth: float = 300.0
+    """Over the section, of a given extinction: beyond, the exponential leaves the range of floats.
+    """
+    least_curvature: float = 0.3
+    """Curvature over that of Gauss-Newton, below which a step is one of Gauss-Newton. Assumed."""
+
+    # The tests
+    least_signal: float = 5.0
+    """Amplitude over its standard error at known extinction. Simulations: with
+    `largest_relative_error`, none of 100,000 profiles of noise is accepted."""
+    largest_relative_error: float = 0.15
+    """Standard error of extinction over extinction + 1 / mean range. Simulations: above, coverage
+    of the accepted values falls below 0.93."""
+    false_alarm: float = 4e-4
+    """Rate at which one test of residuals flags a profile that obeys the model. Assumed: half of
+    the target of 1e-3 for needless flags."""
+    outlier: float = 5.0
+    """Least deviation of an outlier, standard deviations of the noise. Assumed; with many bins,
+    `false_alarm` sets a larger one."""
+    fewest_bins: int = 8
+    """With fewer, TOO_FEW_BINS. Assumed."""
+    fewest_solved_bins: int = 4
+    """With fewer, there are no more values than unknowns."""
+    fewest_differences: int = 5
+    """Second differences; with fewer, the noise is estimated from the residuals. Assumed."""
+    covered: float = 4.0
+    """Standard errors at which intervals from an estimated noise have the coverage of a known one:
+    the distance beyond which the stability benchmark counts a value as false."""
+    independent: float = 1e-9
+    """Squared share of a shape outside the span of others, above which it is tested. Rounding."""
+    model_error: float = 0.05
+    """Departure of the logarithmic slope from the model, as a share of 2 (extinction + 1 / mean
+    range). Simulations: reduces false values among accepted ones by a factor of 7."""
+
+    # The choice of the solver
+    fewest_compressed_bins: int = 32
+    """Below, the direct fit is as fast, and 11 shapes span most of a profile. Assumed."""
+    most_compressed_bins: int = 4096
+    """Above, tables need more than 100 MB and more time than a fit. Measured."""
+    thinnest: float = 0.15
+    """Length over first range. In thinner sections shapes are nearly straight lines, for which the
+    cells of the tables are too coarse. Assumed."""
+    fewest_masked_bins: int = 16
+    """Bins with data; fewer are left to the direct fit. Assumed."""
+    latest: float = 0.2
+    """Share of the section that may be missing at its start; else the direct fit. Assumed."""
+    deepest: float = 0.5
+    """Optical depth that may be missing at the start; else the direct fit. Assumed."""
+
+    # The product
+    level: float = 100.0
+    """m; largest change of height along a section. Aerosol decreases with a scale height of 1 to
+    2 km; a larger change mimics an extinction of more than some percent. Assumed."""
+
+
+THRESHOLDS: Final = Thresholds()
