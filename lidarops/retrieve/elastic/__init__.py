@@ -5,7 +5,7 @@
 3. `choose_reference` selects the window where a profile has the shape of particle-free air, among
    `candidate_windows`.
 4. `invert_elastic` solves the lidar equation from that window (Fernald, Sasano), with an error
-   budget. `monte_carlo` gives the same errors without linearisation.
+   budget.
 
 `labeled.invert_elastic` subtracts the background and runs these steps on `xarray` data; import
 it from its module, so that the numerics stay free of xarray.
@@ -14,9 +14,7 @@ it from its module, so that the numerics stay free of xarray.
 from lidarops.retrieve.elastic.inversion import (
     ElasticResult,
     ErrorBudget,
-    MonteCarlo,
     invert_elastic,
-    monte_carlo,
 )
 from lidarops.retrieve.elastic.layers import Layers, find_layers
 from lidarops.retrieve.elastic.outlying_bins import BridgedProfiles, bridge_outliers
@@ -32,7 +30,6 @@ __all__ = [
     "ElasticResult",
     "ErrorBudget",
     "Layers",
-    "MonteCarlo",
     "ReferenceWindow",
     "Rejection",
     "bridge_outliers",
@@ -40,5 +37,4 @@ __all__ = [
     "choose_reference",
     "find_layers",
     "invert_elastic",
-    "monte_carlo",
 ]

@@ -104,7 +104,7 @@ def _trace_path(
 
 
 @_compiled
-def _usable(power: float, variance: float) -> bool:
+def usable(power: float, variance: float) -> bool:
     return abs(power) < HUGE and 0.0 <= variance < HUGE
 
 
@@ -123,7 +123,7 @@ def _calibrate(power: Any, variance: Array, window: Any, path: Array, out: Array
     count, signal, shape, noise = 0, 0.0, 0.0, 0.0
     by_scattering_ratio = by_lidar_ratio = by_air = 0.0
     for i in range(path.shape[1]):
-        if not (window[i] and _usable(power[i], variance[i])):
+        if not (window[i] and usable(power[i], variance[i])):
             continue
         expected = path[SHAPE, i]
         count += 1
@@ -137,7 +137,7 @@ def _calibrate(power: Any, variance: Array, window: Any, path: Array, out: Array
         return -1
     passed, centre = 0, -1
     for i in range(path.shape[1]):
-        if window[i] and _usable(power[i], variance[i]):
+        if window[i] and usable(power[i], variance[i]):
             if passed == count // 2:
                 centre = i
                 break
@@ -179,7 +179,7 @@ def _integrate(
     last_distance = last_variance = last_slope = 0.0
     for i in range(range_.size):
         p, v = np.float64(power[i]), variance[i]
-        if not _usable(p, v):
+        if not usable(p, v):
             continue
         g, s, distance = path[GAIN, i], path[RATIO, i], range_[i]
         q = g * p
@@ -407,7 +407,7 @@ def _withhold(
         out[BACKSCATTER, k, i] = np.nan
         for field in (NOISE, BACKGROUND, REFERENCE, LIDAR_RATIO, MOLECULAR):
             out[field, k, i] = np.nan
-        if not (calibrated and _usable(power[i], variance[i])):
+        if not (calibrated and usable(power[i], variance[i])):
             out[ATTENUATED, k, i] = out[ATTENUATED_ERROR, k, i] = np.nan
 
 

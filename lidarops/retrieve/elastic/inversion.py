@@ -7,8 +7,8 @@ window towards the lidar and away from it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,29 +17,11 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.elastic import _fernald, outlying_bins
+from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-Reference = tuple[npt.ArrayLike, npt.ArrayLike] | npt.NDArray[np.bool_]
-
-LONGEST_GAP: Final = 150.0
-"""m; a longer gap without data ends the integration."""
-
-LEAST_DENOMINATOR: Final = 0.05
-"""Share of the denominator at the reference. Beyond the reference, errors grow as its inverse."""
-
-LEAST_CERTAINTY: Final = 5.0
-"""Standard errors by which the denominator must exceed zero for first-order errors to hold."""
-
-SKEWED: Final = 5.5
-"""Ratio s of the denominator to its noise error at which noise errors are twice those of first
-order. A reference that is too high by noise makes both the values and their errors too low. Noise
-errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1 (s below 20): less than 0.1
-percent of the values are then off by more than 4 errors. With first-order errors it is 1 to 3
-percent where s is 5 to 8 (simulations)."""
-
-LARGEST_BACKSCATTER: Final = 5e-4
-"""m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
+Reference = tuple[npt.ArrayLike, npt.ArrayLike]
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,21 +129,6 @@ class ElasticResult:
 
 
 @dataclass(frozen=True, slots=True)
-class MonteCarlo:
-    """Spread of perturbed solutions: the errors of `ElasticResult` without linearisation."""
-
-    budget: ErrorBudget
-    """m-1 sr-1, of particle backscatter, for each cause alone, with the sign of its effect."""
-    standard_error: Array
-    """m-1 sr-1, of particle backscatter, for all causes together."""
-    bias: Array
-    """m-1 sr-1, mean of the solutions with all causes minus the unperturbed solution."""
-    lidar_constant_standard_error: Array
-    solved: Array
-    """Share of the samples of all causes that have a solution."""
-
-
-@dataclass(frozen=True, slots=True)
 class _Problem:
     """Arguments in the layout of the kernel: rows of profiles, ascending in range."""
 
@@ -207,9 +174,9 @@ def invert_elastic(
     backscatter times the scattering ratio there. Integrals are trapezoidal, so signals of either
     sign have the same weight. The relative error of the trapezoids is below 1e-4 where scattering
     changes over 100 m or more and bins are 7.5 m apart. Errors are of first order; noise errors
-    are widened where the reference is noisy (`SKEWED`). Noise is taken as independent from bin
-    to bin, and its correlation through the integrals and the window is propagated. An isolated
-    bin that its variance does not explain is interpolated from its neighbours.
+    are widened where the reference is noisy (`Thresholds.skewed`). Noise is taken as independent
+    from bin to bin, and its correlation through the integrals and the window is propagated. An
+    isolated bin that its variance does not explain is interpolated from its neighbours.
 
     Parameters
     ----------
@@ -224,9 +191,8 @@ def invert_elastic(
         m-1, broadcast against `power`.
     lidar_ratio : float or (..., range) float
         Of particles, sr.
-    reference : (bottom, top) or (..., range) bool
-        Edges in m, one pair or one for each profile (NaN: none for that profile); or a mask of
-        the bins.
+    reference : (bottom, top)
+        Edges in m, one pair or one for each profile (NaN: none for that profile).
     reference_scattering_ratio : float or (...) float
         In the reference window; 1 is air free of particles.
     variance : (..., range) float, optional
@@ -249,12 +215,13 @@ def invert_elastic(
     -------
     ElasticResult
         There is no value where the reference window has no positive signal (`calibrated`),
-        beyond a gap of `LONGEST_GAP`, and where the denominator is below `LEAST_DENOMINATOR`
-        of its value at the reference or `LEAST_CERTAINTY` of its standard errors (`unstable`).
-        Beyond the reference, no bin farther than an unstable one has a value. The lidar constant
-        and quantities derived from it assume the particle extinction of the nearest solved bin
-        from there down to the lidar. The errors of the attenuated backscatter neglect that the
-        noise of a bin also enters the lidar constant.
+        beyond a gap of `Thresholds.longest_gap`, and where the denominator is below
+        `Thresholds.least_denominator` of its value at the reference or
+        `Thresholds.least_certainty` of its standard errors (`unstable`). Beyond the reference, no
+        bin farther than an unstable one has a value. The lidar constant and quantities derived
+        from it assume the particle extinction of the nearest solved bin from there down to the
+        lidar. The errors of the attenuated backscatter neglect that the noise of a bin also enters
+        the lidar constant.
 
     Raises
     ------
@@ -275,175 +242,17 @@ def invert_elastic(
         (lidar_ratio_standard_error, molecular_relative_error),
         (background_standard_error, reference_relative_error),
     )
-    out, scalars, state = _invert(problem, problem.power)
-    return _result(problem, out, scalars, state)
+    return _result(problem, *_invert(problem))
 
 
-def monte_carlo(
-    power: npt.ArrayLike,
-    range: npt.ArrayLike,  # noqa: A002 - the field's word
-    *,
-    molecular_backscatter: npt.ArrayLike,
-    molecular_extinction: npt.ArrayLike,
-    lidar_ratio: npt.ArrayLike,
-    reference: Reference,
-    reference_scattering_ratio: npt.ArrayLike = 1.0,
-    variance: npt.ArrayLike,
-    background_standard_error: npt.ArrayLike = 0.0,
-    lidar_ratio_standard_error: npt.ArrayLike = 0.0,
-    reference_relative_error: npt.ArrayLike = 0.0,
-    molecular_relative_error: npt.ArrayLike = 0.0,
-    samples: int = 200,
-    seed: int,
-) -> MonteCarlo:
-    """Return errors from perturbed solutions, where errors are too large for first order.
-
-    Normal deviates perturb the power, its background, the scattering ratio of the reference, the
-    lidar ratio and the air density, each alone and all together. All profiles get the same
-    deviates, so the result of a profile does not depend on the other profiles in the array.
-
-    Parameters
-    ----------
-    power, range, variance
-        As in `invert_elastic`, but the variance is required.
-    molecular_backscatter, molecular_extinction, lidar_ratio
-        As in `invert_elastic`.
-    reference, reference_scattering_ratio
-        As in `invert_elastic`.
-    background_standard_error, lidar_ratio_standard_error
-        As in `invert_elastic`.
-    reference_relative_error, molecular_relative_error
-        As in `invert_elastic`.
-    samples : int
-        At least 2; the relative error of a standard error from n samples is 1 / sqrt(2 n).
-    seed : int
-        The same seed gives the same result.
-
-    Returns
-    -------
-    MonteCarlo
-        NaN where `invert_elastic` has no value, or less than 95 percent of the samples have one.
-
-    Raises
-    ------
-    RetrievalInputError
-        As in `invert_elastic`, and for fewer than 2 samples.
-    """
-    problem = _prepare(
-        power,
-        range,
-        variance,
-        reference,
-        (molecular_backscatter, molecular_extinction, lidar_ratio),
-        reference_scattering_ratio,
-        (lidar_ratio_standard_error, molecular_relative_error),
-        (background_standard_error, reference_relative_error),
-    )
-    if samples < 2:
-        raise RetrievalInputError(f"is {samples}", field="samples", remedy="give 2 or more")
-    return _sample(problem, samples, np.random.default_rng(seed))
-
-
-def _sample(problem: _Problem, samples: int, rng: np.random.Generator) -> MonteCarlo:
-    solution, scalars, _ = _invert(problem, problem.power)
-    backscatter, constant = solution[_fernald.BACKSCATTER], scalars[:, _fernald.CONSTANT]
-    spreads = [_Spread.like(backscatter) for _ in _CAUSES]
-    total_spread, constant_spread = _Spread.like(backscatter), _Spread.like(constant)
-    for _ in range(samples):
-        noise, deviates = rng.standard_normal(problem.grid.size), rng.standard_normal(4)
-        for cause, spread in enumerate(spreads):
-            cause_deviate = np.where(np.arange(4) == cause - 1, deviates, 0.0)
-            sample, _ = _perturbed(problem, noise if cause == 0 else 0.0 * noise, cause_deviate)
-            spread.add(sample - backscatter, float(deviates[cause - 1]) if cause else 0.0)
-        sample, sample_constant = _perturbed(problem, noise, deviates)
-        total_spread.add(sample - backscatter, 0.0)
-        constant_spread.add(sample_constant - constant, 0.0)
-    shape = (*problem.leading, problem.grid.size)
-
-    def as_profiles(rows: Array) -> Array:
-        return np.asarray(problem.grid.turn(rows.reshape(shape)))
-
-    return MonteCarlo(
-        budget=ErrorBudget(*(as_profiles(spread.signed_error()) for spread in spreads)),
-        standard_error=as_profiles(total_spread.error()),
-        bias=as_profiles(total_spread.mean()),
-        lidar_constant_standard_error=constant_spread.error().reshape(problem.leading),
-        solved=as_profiles(total_spread.count / samples),
-    )
-
-
-_CAUSES: Final = ("noise", "background", "reference", "lidar_ratio", "molecular")
-_LEAST_SOLVED: Final = 0.95
-
-
-@dataclass(slots=True)
-class _Spread:
-    """Sums over the samples that have a solution."""
-
-    count: Array
-    total: Array
-    square: Array
-    product: Array
-    """Product of the deviations and the deviates that caused them; its sign is the effect's."""
-    samples: int = 0
-
-    @classmethod
-    def like(cls, values: Array) -> _Spread:
-        count, total, square, product = np.zeros((4, *values.shape))
-        return cls(count, total, square, product)
-
-    def add(self, deviation: Array, deviate: float) -> None:
-        solved = np.isfinite(deviation)
-        finite_deviation = np.where(solved, deviation, 0.0)
-        self.samples += 1
-        self.count += solved
-        self.total += finite_deviation
-        self.square += finite_deviation * finite_deviation
-        self.product += deviate * finite_deviation
-
-    def mean(self) -> Array:
-        enough = self.count >= max(_LEAST_SOLVED * self.samples, 2.0)
-        return np.where(enough, self.total, np.nan) / np.maximum(self.count, 1.0)
-
-    def error(self) -> Array:
-        square = self.square - self.count * self.mean() ** 2
-        return np.asarray(np.sqrt(np.maximum(square, 0.0) / np.maximum(self.count - 1.0, 1.0)))
-
-    def signed_error(self) -> Array:
-        return np.asarray(np.where(self.product < 0.0, -1.0, 1.0) * self.error())
-
-
-def _perturbed(problem: _Problem, noise: Array, deviates: Array) -> tuple[Array, Array]:
-    """Return backscatter and lidar constant with each cause off by its deviate times its error."""
-    background, reference, ratio, air = deviates
-    variance = problem.variance if problem.variance is not None else np.zeros((1, 1))
-    power = problem.power + noise * np.sqrt(variance) + background * problem.causes[:, :1]
-    scale = 1.0 + air * problem.errors[1]
-    perturbed = replace(
-        problem,
-        variance=None,
-        air=(
-            problem.air[0] * scale,
-            problem.air[1] * scale,
-            problem.air[2] + ratio * problem.errors[0],
-        ),
-        scattering_ratio=problem.scattering_ratio * (1.0 + reference * problem.causes[:, 1]),
-        errors=(np.zeros((1, problem.grid.size)), np.zeros((1, problem.grid.size))),
-        causes=np.zeros((1, 2)),
-    )
-    out, scalars, _ = _invert(perturbed, power)
-    return out[_fernald.BACKSCATTER], scalars[:, _fernald.CONSTANT]
-
-
-def _invert(problem: _Problem, power: inputs.Floats) -> tuple[Array, Array, _fernald.Codes]:
-    count, bins = power.shape
-    noise_known = problem.variance is not None
+def _invert(problem: _Problem) -> tuple[Array, Array, _fernald.Codes]:
+    count, bins = problem.power.shape
     out = np.empty((_fernald.FIELDS, count, bins))
     scalars = np.empty((count, _fernald.SCALARS))
     state = np.empty((count, bins), dtype=np.uint8)
     variance = problem.variance if problem.variance is not None else np.zeros((1, bins))
     _fernald.invert_fernald(
-        frozen(power),
+        frozen(problem.power),
         frozen(variance),
         frozen(problem.window),
         frozen(problem.grid.values),
@@ -451,12 +260,19 @@ def _invert(problem: _Problem, power: inputs.Floats) -> tuple[Array, Array, _fer
         frozen(problem.scattering_ratio),
         (frozen(problem.errors[0]), frozen(problem.errors[1])),
         frozen(problem.causes),
-        np.array([LONGEST_GAP, LEAST_DENOMINATOR, LEAST_CERTAINTY**2, SKEWED**2]),
+        np.array(
+            [
+                THRESHOLDS.longest_gap,
+                THRESHOLDS.least_denominator,
+                THRESHOLDS.least_certainty**2,
+                THRESHOLDS.skewed**2,
+            ]
+        ),
         out,
         scalars,
         state,
     )
-    if not noise_known:
+    if problem.variance is None:
         out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
         scalars[:, _fernald.CONSTANT_ERROR] = np.nan
     return out, scalars, state
@@ -503,8 +319,10 @@ def _prepare(
     backscatter = inputs.noise_rows(air[0], "molecular_backscatter", grid, leading)
     extinction = inputs.noise_rows(air[1], "molecular_extinction", grid, leading)
     lidar_ratio = inputs.noise_rows(air[2], "lidar_ratio", grid, leading)
-    _require_molecular(backscatter, "molecular_backscatter", LARGEST_BACKSCATTER)
-    _require_molecular(extinction, "molecular_extinction", 10.0 * LARGEST_BACKSCATTER)
+    largest = THRESHOLDS.largest_backscatter
+    _require_molecular(backscatter, "molecular_backscatter", largest)
+    # The lidar ratio of air is below 10 sr.
+    _require_molecular(extinction, "molecular_extinction", 10.0 * largest)
     _require(lidar_ratio > 0.0, lidar_ratio, "lidar_ratio", "give positive sr")
     ratio = _profile_values(scattering_ratio, "reference_scattering_ratio", leading)
     _require(
@@ -578,14 +396,9 @@ def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) 
 
 def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ...]) -> Mask:
     """Return the bins of the reference window as (profile or 1, bin)."""
-    if isinstance(reference, np.ndarray) and reference.dtype == np.bool_:
-        rows = inputs.noise_rows(reference.astype(np.float64), "reference", grid, leading)
-        return rows > 0.0
     if not isinstance(reference, tuple) or len(reference) != 2:
         raise RetrievalInputError(
-            "is neither a pair of ranges nor a boolean array",
-            field="reference",
-            remedy="give (bottom, top) in m",
+            "is not a pair of ranges", field="reference", remedy="give (bottom, top) in m"
         )
     bottom, top = (_profile_values(edge, "reference", leading) for edge in reference)
     if np.any(bottom >= top):

@@ -26,22 +26,13 @@ from lidarops.retrieve.elastic import layers as _layers
 from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic import reference_window as _reference
 from lidarops.retrieve.elastic.flags import ElasticQuality
+from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-CLOUD_MARGIN: Final = 300.0
-"""m beyond the last bin of a cloud; its thin edge extends beyond its apparent top."""
-LEAST_SHARE: Final = 0.1
-"""Least share of the bins that must lie beyond a cloud for a fit of the background there."""
-UNDETECTED_PARTICLES: Final = 1.5
-"""Standard errors of the window's mean by which undetected particles may raise it. They raise it
-by 3 in one of 20 profiles."""
-STEPS_PER_WINDOW: Final = 4
-"""Candidate windows that start within the width of one."""
-
 _CONTRAST_WAVELENGTH: Final = 532e-9
-"""m; wavelength of `lidarops.retrieve.elastic.layers.CLOUD_CONTRAST`."""
+"""m; wavelength of `Thresholds.cloud_contrast`."""
 
 _CARRIED: Final = int(
     Quality.INPUT_MISSING
@@ -113,7 +104,7 @@ def invert_elastic(
     averages : xr.Dataset
         ``power``, ``variance``, ``quality`` over (time, range) and ``shots``, ``profiles`` over
         time, with the scalar coordinate ``zenith_angle`` (degree), from
-        `lidarops.retrieve.signal.labeled_averaging.clock_average`; in memory.
+        `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory.
     molecules : MolecularProfile
     wavelength : float
         m.
@@ -257,11 +248,11 @@ def _signal_and_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _l
     # Only beyond the cloud does the signal have the shape of air: fit the background there.
     step = float(np.median(np.diff(means.distance)))
     hidden = np.zeros_like(clouds.mask)
-    margin = min(round(CLOUD_MARGIN / step), hidden.shape[1])
+    margin = min(round(THRESHOLDS.cloud_margin / step), hidden.shape[1])
     hidden[:, margin:] = clouds.mask[:, : hidden.shape[1] - margin]
     hidden |= clouds.mask
     beyond = ~np.logical_or.accumulate(hidden[:, ::-1], axis=-1)[:, ::-1]
-    enough = beyond.sum(axis=-1) >= LEAST_SHARE * means.distance.size
+    enough = beyond.sum(axis=-1) >= THRESHOLDS.least_share_beyond * means.distance.size
     refitted = clouds.cloudy & enough
     signal = _subtract_background(means, beyond | ~refitted[:, np.newaxis], known_shape=True)
     return signal, means.find_clouds(signal.power)
@@ -283,7 +274,7 @@ def _subtract_background(
 def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
     """Return the relative error of the scattering ratio: assumed, and by undetected particles."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        undetected = UNDETECTED_PARTICLES * window.scale_standard_error / window.scale
+        undetected = THRESHOLDS.undetected_particles * window.scale_standard_error / window.scale
     return np.hypot(reference.relative_error, np.nan_to_num(undetected, nan=0.0))
 
 
@@ -298,7 +289,7 @@ def _window(
     highest = min(reference.highest, float(distance[-1]))
     width = min(reference.width, highest - reference.lowest)
     candidates = _reference.candidate_windows(
-        reference.lowest, highest, width, reference.width / STEPS_PER_WINDOW
+        reference.lowest, highest, width, reference.width / THRESHOLDS.steps_per_window
     )
     return _reference.choose_reference(
         power,
@@ -313,7 +304,8 @@ def _window(
 def _cloud_contrast(wavelength: float) -> float:
     """Return the least contrast of a cloud; aerosol over air scales with lambda^3."""
     scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
-    return max(1.0 + (_layers.CLOUD_CONTRAST - 1.0) * scaled, 2.0)
+    contrast = 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
+    return max(contrast, THRESHOLDS.least_cloud_contrast)
 
 
 def _solution_flags(

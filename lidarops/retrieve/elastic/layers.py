@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
@@ -12,18 +14,20 @@ from scipy.special import ndtri
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.elastic import _layer_search
+from lidarops.retrieve.elastic._fernald import HUGE, usable
+from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-DEFAULT_SCALES: Final = (60.0, 120.0, 240.0, 480.0)
-"""m; lengths of the windows in which signals are averaged below and above a base."""
+_TOP: Final = THRESHOLDS.top
+_ROUNDING: Final = 1e-9
+"""Relative rise that the rounding of sums can cause."""
 
-CLOUD_CONTRAST: Final = 3.0
-"""Factor of the rise. At visible wavelengths the scattering ratio of aerosol rarely rises by this
-factor within 500 m; that of thin cirrus does. In the near infrared, where air scatters little,
-choose a larger one."""
+# Rows of the sums.
+POWER, SHAPE, VARIANCE, COUNT = 0, 1, 2, 3
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +36,11 @@ class Layers:
 
     cloud_base_range: Array
     """m, of the first bin of the lowest layer; NaN where there is none."""
-    cloud_top_range: Array
-    """m, apparent top: its last bin before the signal is back at its level below the base. In a
-    layer that attenuates strongly this is below the true top."""
-    contrast: Array
-    """Ratio of the power to the molecular shape above the base over that below, lowest layer."""
-    significance: Array
-    """Standard errors by which the rise exceeds the requested factor, of the lowest layer."""
     mask: Mask
-    """(..., range): bins from base to apparent top, of all layers."""
+    """(..., range): bins of all layers, from base to apparent top, the last bin before the signal
+    is back at its level below the base. In a layer that attenuates strongly this is below the true
+    top."""
     cloudy: Mask
-    opaque: Mask
-    """No signal of air above the highest layer: it is below 3 standard errors, or below 1 percent
-    of the level below the lowest layer, in the farthest window where noise would let a tenth of
-    that level be seen, or there is no such window."""
 
 
 def find_layers(
@@ -54,9 +49,7 @@ def find_layers(
     variance: npt.ArrayLike,
     *,
     molecular_attenuated: npt.ArrayLike,
-    contrast: float = CLOUD_CONTRAST,
-    scales: npt.ArrayLike = DEFAULT_SCALES,
-    false_alarm: float = 0.01,
+    contrast: float = THRESHOLDS.cloud_contrast,
 ) -> Layers:
     r"""Return layers at whose base the scattering ratio rises by more than a factor.
 
@@ -67,8 +60,9 @@ def find_layers(
 
     for at least one length of the windows. This tests the hypothesis that the ratio rises by no
     more than the factor :math:`c`. If that holds everywhere, whatever the aerosol, a profile is
-    flagged with a probability below `false_alarm`, because :math:`t` is the quantile of the
-    normal distribution for `false_alarm` over the number of bins and lengths (Bonferroni bound).
+    flagged with a probability below `Thresholds.cloud_false_alarm`, because :math:`t` is the
+    quantile of the normal distribution for that rate over the number of bins and lengths
+    (Bonferroni bound).
     The base is where the statistic peaks. The top is where the mean of the next window is again
     within 2 standard errors of the level below the base.
 
@@ -89,10 +83,6 @@ def find_layers(
         `power`.
     contrast : float
         The factor :math:`c`, at least 1.
-    scales : (scale,) float
-        m, lengths of the windows; a window has at least two bins.
-    false_alarm : float
-        Probability of a false detection in a whole profile.
 
     Returns
     -------
@@ -119,43 +109,161 @@ def find_layers(
         )
     if not 1.0 <= contrast < np.inf:
         raise RetrievalInputError(f"is {contrast}", field="contrast", remedy="give 1 or more")
-    if not 0.0 < false_alarm < 1.0:
-        raise RetrievalInputError(
-            f"is {false_alarm}", field="false_alarm", remedy="give a probability"
-        )
-    lengths = _lengths(scales, grid)
+    step = float(np.median(np.diff(grid.values))) if grid.size > 1 else 1.0
+    # A window has at least two bins.
+    lengths = np.unique(np.maximum(np.rint(np.array(THRESHOLDS.window_lengths) / step), 2.0))
+    rate = THRESHOLDS.cloud_false_alarm / (grid.size * lengths.size)
     mask = np.zeros(rows.shape, dtype=np.bool_)
-    opaque = np.zeros(rows.shape[0], dtype=np.bool_)
-    lowest_layer = np.full((rows.shape[0], _layer_search.FIELDS), np.nan)
-    threshold = -float(ndtri(false_alarm / (grid.size * lengths.size)))
-    _layer_search.detect_rises(
+    _mark_layers(
         frozen(rows),
         frozen(noise),
         frozen(shape),
-        lengths,
+        lengths.astype(np.int64),
         float(contrast),
-        threshold,
+        -float(ndtri(rate)),
         mask,
-        lowest_layer,
-        opaque,
     )
-    cloudy = np.isfinite(lowest_layer[:, _layer_search.BASE])
-    first = np.where(cloudy, lowest_layer[:, _layer_search.BASE], 0.0).astype(np.int64)
-    stop = np.where(cloudy, lowest_layer[:, _layer_search.TOP], 1.0).astype(np.int64)
+    cloudy = mask.any(axis=-1)
+    base = np.where(cloudy, grid.values[np.argmax(mask, axis=-1)], np.nan)
     return Layers(
-        cloud_base_range=np.where(cloudy, grid.values[first], np.nan).reshape(leading),
-        cloud_top_range=np.where(cloudy, grid.values[stop - 1], np.nan).reshape(leading),
-        contrast=lowest_layer[:, _layer_search.CONTRAST].reshape(leading),
-        significance=lowest_layer[:, _layer_search.SIGNAL].reshape(leading),
+        cloud_base_range=base.reshape(leading),
         mask=grid.turn(mask.reshape(*leading, grid.size)),
         cloudy=cloudy.reshape(leading),
-        opaque=opaque.reshape(leading),
     )
 
 
-def _lengths(scales: npt.ArrayLike, grid: inputs.RangeGrid) -> npt.NDArray[np.int64]:
-    lengths = np.atleast_1d(inputs.real_array(scales, "scales").astype(np.float64))
-    if lengths.ndim != 1 or lengths.size == 0 or not np.all((lengths > 0.0) & (lengths < np.inf)):
-        raise RetrievalInputError("holds no lengths", field="scales", remedy="give m")
-    step = float(np.median(np.diff(grid.values))) if grid.size > 1 else 1.0
-    return np.unique(np.maximum(np.rint(lengths / step), 2.0)).astype(np.int64)
+@_compiled
+def _accumulate(power: Any, variance: Array, shape: Array, sums: Array) -> None:
+    """Sum from the far end, so that sums over far bins keep their digits."""
+    signal = air = noise = count = 0.0
+    sums[:, power.size] = 0.0
+    for j in range(power.size):
+        i = power.size - 1 - j
+        if usable(power[i], variance[i]):
+            signal += np.float64(power[i])
+            air += shape[i]
+            noise += variance[i]
+            count += 1.0
+        sums[POWER, i], sums[SHAPE, i], sums[VARIANCE, i], sums[COUNT, i] = (
+            signal,
+            air,
+            noise,
+            count,
+        )
+
+
+@_compiled
+def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
+    """Return the mean ratio to air and its variance; NaN with data in less than half the bins."""
+    if first < 0 or stop >= sums.shape[1]:
+        return np.nan, np.nan
+    count = sums[COUNT, first] - sums[COUNT, stop]
+    shape = sums[SHAPE, first] - sums[SHAPE, stop]
+    if 2.0 * count < stop - first or not shape > 0.0:
+        return np.nan, np.nan
+    ratio = (sums[POWER, first] - sums[POWER, stop]) / shape
+    return ratio, (sums[VARIANCE, first] - sums[VARIANCE, stop]) / (shape * shape)
+
+
+@_compiled
+def _rise(sums: Array, i: int, length: int, contrast: float) -> float:
+    """Return by how many standard errors the rise of the ratio to air exceeds `contrast`."""
+    first, stop = i - length, i + length
+    if first < 0 or stop >= sums.shape[1]:
+        return 0.0
+    # Most bins end here, without a division.
+    below = (sums[POWER, first] - sums[POWER, i]) * (sums[SHAPE, i] - sums[SHAPE, stop])
+    above = (sums[POWER, i] - sums[POWER, stop]) * (sums[SHAPE, first] - sums[SHAPE, i])
+    if not above > contrast * below:
+        return 0.0
+    low, low_variance = _mean(sums, first, i)
+    high, high_variance = _mean(sums, i, stop)
+    excess = high - contrast * low
+    variance = high_variance + contrast * contrast * low_variance
+    if not excess > _ROUNDING * high:
+        return 0.0
+    return excess / math.sqrt(variance) if variance > 0.0 else HUGE
+
+
+@_compiled
+def _steepest(
+    sums: Array,
+    start: int,
+    reach: int,
+    lengths: npt.NDArray[np.int64],
+    contrast: float,
+    threshold: float,
+) -> tuple[int, int]:
+    """Return the bin of the steepest rise for the shortest window that shows it, and its length."""
+    stop = min(start + reach + 1, int(sums.shape[1]) - 1)
+    for length in lengths:
+        best, highest = start, 0.0
+        for i in range(start, stop):
+            rise = _rise(sums, i, length, contrast)
+            if rise > highest:
+                best, highest = i, rise
+        if highest >= threshold:
+            break
+    return best, length
+
+
+@_compiled
+def _next_base(
+    sums: Array, start: int, lengths: npt.NDArray[np.int64], contrast: float, threshold: float
+) -> tuple[int, int]:
+    """Return the bin where the next layer begins and the window length that shows it; or -1."""
+    for i in range(start, sums.shape[1] - 1):
+        for length in lengths:
+            if _rise(sums, i, length, contrast) >= threshold:
+                return _steepest(sums, i, length, lengths, contrast, threshold)
+    return -1, 0
+
+
+@_compiled
+def _end(sums: Array, base: int, length: int) -> int:
+    """Return the first bin from which the ratio to air is back at its level below the base."""
+    level, level_variance = _mean(sums, base - length, base)
+    bins = int(sums.shape[1]) - 1
+    for i in range(base + 1, bins):
+        ratio, variance = _mean(sums, i, min(i + length, bins))
+        if not ratio > level + _TOP * math.sqrt(variance + level_variance):
+            return i
+    return bins
+
+
+@_compiled
+def _mark_layers(
+    power: Any,
+    variance: Array,
+    shape: Array,
+    lengths: npt.NDArray[np.int64],
+    contrast: float,
+    threshold: float,
+    layers: Mask,
+) -> None:
+    """Mark the bins between base and top of all layers of each profile.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    variance, shape : (profile or 1, bin) float64
+    lengths : (scale,) int64
+        Bins that are averaged below and above a base, ascending.
+    contrast : float
+        Least factor by which the ratio to air rises.
+    threshold : float
+        Standard errors by which the rise exceeds that factor.
+    layers : (profile, bin) bool
+        Output, False before.
+    """
+    sums = np.empty((4, power.shape[1] + 1))
+    for k in range(power.shape[0]):
+        noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
+        _accumulate(power[k], noise, air, sums)
+        end = 0
+        while True:
+            base, length = _next_base(sums, end, lengths, contrast, threshold)
+            if base < 0:
+                break
+            end = _end(sums, base, length)
+            layers[k, base:end] = True

@@ -11,23 +11,18 @@ import numpy.typing as npt
 
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.elastic._fernald import HUGE, usable
+from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-OUTLYING: Final = 6.0
-"""Standard deviations of the noise by which an outlier lies beyond all neighbours."""
-LEAST_CONTRAST: Final = 6.0
-"""Least distance of an outlier from its neighbours, over their spread in excess of noise. Peaks
-with a full width at half maximum of 1.5 bins or more have less."""
-SPREAD_BY_NOISE: Final = 2.0
-"""Standard deviations of the noise that are subtracted from the spread of the neighbours."""
-MOST_EQUAL: Final = 4
-"""Most neighbours of equal power: more of them mean few counts, whose noise is not normal."""
-LARGEST_STEP: Final = 0.1
-"""Largest relative change of the signal across a bin: a cloud attenuates by more."""
-_STEP_BY_NOISE: Final = 4.0
-"""Standard deviations of the noise of a bin, or 5.7 of the difference of the means of 4."""
+OUTLYING: Final = THRESHOLDS.outlying
+LEAST_CONTRAST: Final = THRESHOLDS.least_contrast
+SPREAD_BY_NOISE: Final = THRESHOLDS.spread_by_noise
+MOST_EQUAL: Final = THRESHOLDS.most_equal
+LARGEST_STEP: Final = THRESHOLDS.largest_step
+STEP_BY_NOISE: Final = THRESHOLDS.step_by_noise
 _HALF: Final = 4
 """Neighbours on either side."""
 _FARTHEST: Final = 2 * _HALF
@@ -37,7 +32,6 @@ _WIDENED: Final = 1.25
 the sum of the three is then right: 9/4 of the sum of the two."""
 _ROUNDING: Final = 1e-12
 """Relative deviation that rounding can cause where the noise is stated as 0."""
-_HUGE: Final = 1e300
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -143,11 +137,6 @@ def bridge_rows(
 
 
 @_compiled
-def _is_usable(power: float, variance: float) -> bool:
-    return abs(power) < _HUGE and 0.0 <= variance < _HUGE
-
-
-@_compiled
 def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -> bool:
     """Return whether a bin is outlying, with one neighbour left out of the test (-1: none)."""
     left = right = left_range = right_range = largest_variance = 0.0
@@ -164,7 +153,7 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
     right, right_range = right / right_count, right_range / right_count
     step = abs(right - left)
     allowed = max(
-        _STEP_BY_NOISE * np.sqrt(largest_variance), LARGEST_STEP * max(abs(left), abs(right))
+        STEP_BY_NOISE * np.sqrt(largest_variance), LARGEST_STEP * max(abs(left), abs(right))
     )
     if not step <= allowed:
         return False
@@ -216,7 +205,7 @@ def _may_hold_outliers(
         below = value - factor_below[i] * np.float64(power[i - 1])
         above = value - factor_above[i] * np.float64(power[i + 1])
         peak = (below * above > 0.0) & (below * below > OUTLYING**2 * variance[i])
-        missing = not ((abs(value) < _HUGE) & (variance[i] >= 0.0) & (variance[i] < _HUGE))
+        missing = not ((abs(value) < HUGE) & (variance[i] >= 0.0) & (variance[i] < HUGE))
         suspects += 1 if peak | missing else 0
     return suspects > 0
 
@@ -237,7 +226,7 @@ def _mark_outliers(power: Any, variance: Array, range_: Array, work: Array, outl
         count = 0
         for i in range(bins):
             value, value_variance = np.float64(power[p, i]), row[i]
-            if _is_usable(value, value_variance):
+            if usable(value, value_variance):
                 square = range_[i] * range_[i]
                 q[count], noise[count] = value * square, value_variance * square * square
                 noise[count] = max(noise[count], (_ROUNDING * q[count]) ** 2)
@@ -264,15 +253,13 @@ def _fill(power: Any, variance: Array, range_: Array, outlying: Mask) -> None:
     for p in range(power.shape[0]):
         before = -1
         for i in range(range_.size):
-            if not _is_usable(np.float64(power[p, i]), variance[p, i]):
+            if not usable(np.float64(power[p, i]), variance[p, i]):
                 continue
             if not outlying[p, i]:
                 before = i
                 continue
             after = i + 1
-            while outlying[p, after] or not _is_usable(
-                np.float64(power[p, after]), variance[p, after]
-            ):
+            while outlying[p, after] or not usable(np.float64(power[p, after]), variance[p, after]):
                 after += 1
             near, far = (range_[before] / range_[i]) ** 2, (range_[after] / range_[i]) ** 2
             weight = (range_[i] - range_[before]) / (range_[after] - range_[before])

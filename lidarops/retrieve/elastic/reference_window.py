@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Final
+from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.elastic import _window_tests
+from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Codes = npt.NDArray[np.int32]
 
-FEWEST_BINS: Final = 8
-LEAST_SHARE: Final = 0.5
-"""Share of the bins of a window that must hold data."""
-_MOST_WINDOWS: Final = 10_000
+_HUGE: Final = 1e300
+_SHORTEST: Final = 1e-9
+"""m; half length of a window of one bin, to divide by."""
+_DEPENDENT: Final = 1e-12
+"""Squared share of a polynomial outside the span of lower ones, below which it is rounding."""
+
+# Values that `_compare_with_air` writes for each window.
+SCALE, SCALE_ERROR, SLOPE, SLOPE_ERROR = 0, 1, 2, 3
+CURVATURE, SCATTER, COUNT, EXCLUDED_BINS = 4, 5, 6, 7
+FIELDS: Final = 8
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Rejection(IntFlag):
@@ -47,7 +57,7 @@ class Rejection(IntFlag):
 class ReferenceWindow:
     """The chosen window of each profile, with the leading axes of the power.
 
-    Where no candidate passes, floats are NaN and `index` is -1.
+    Where no candidate passes, floats are NaN.
     """
 
     chosen: Mask
@@ -55,18 +65,9 @@ class ReferenceWindow:
     """m."""
     top: Array
     """m."""
-    index: npt.NDArray[np.int64]
-    """Index of the chosen candidate."""
     scale: Array
     """Power over the molecular shape, averaged over the window with inverse variances."""
     scale_standard_error: Array
-    slope: Array
-    """Slope of the logarithm of the power over the molecular shape, m-1."""
-    slope_standard_error: Array
-    curvature: Array
-    """Curvature of the ratio to the molecular shape, in standard errors."""
-    reduced_chi_square: Array
-    """Reduced chi-square of the power against the molecular shape alone."""
     rejections: Codes
     """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
 
@@ -105,7 +106,7 @@ def candidate_windows(lowest: float, highest: float, width: float, step: float) 
             remedy="give m, with the width and step positive",
         )
     count = np.floor((highest - lowest - width) / step + 1e-9) + 1
-    if count > _MOST_WINDOWS:
+    if count > THRESHOLDS.most_windows:
         raise RetrievalInputError(
             f"makes {count:.0f} windows", field="step", remedy="give a larger step in m"
         )
@@ -121,8 +122,6 @@ def choose_reference(
     molecular_attenuated: npt.ArrayLike,
     candidates: npt.ArrayLike,
     exclude: npt.NDArray[np.bool_] | None = None,
-    most_deviation: float = 3.0,
-    least_signal: float = 20.0,
 ) -> ReferenceWindow:
     r"""Return the cleanest window; of equally clean ones, the best determined.
 
@@ -131,14 +130,14 @@ def choose_reference(
     orthogonal under the noise, so the three tests are independent. A candidate passes where
 
     - at least 8 bins and half of the window hold data, and none is excluded;
-    - :math:`a_0` exceeds `least_signal` of its standard errors;
-    - :math:`a_1` and :math:`a_2` are below `most_deviation` of theirs;
-    - chi-square of the power against :math:`\phi a_0` is less than `most_deviation` standard
-      deviations above its mean (as Gaussian: :math:`\chi^2/\nu < 1 + k \sqrt{2/\nu}`).
+    - :math:`a_0` exceeds `Thresholds.least_signal` of its standard errors;
+    - :math:`a_1` and :math:`a_2` are below k = `Thresholds.most_deviation` of theirs;
+    - chi-square of the power against :math:`\phi a_0` is less than k standard deviations above its
+      mean (as Gaussian: :math:`\chi^2/\nu < 1 + k \sqrt{2/\nu}`).
 
-    The anchor is the passing window with the lowest upper bound of :math:`a_0`, at
-    `most_deviation` standard errors. Windows whose :math:`a_0` differs from it by less than
-    `most_deviation` standard errors of the difference count as equally clean. Of these, the one
+    The anchor is the passing window with the lowest upper bound of :math:`a_0`, at k standard
+    errors. Windows whose :math:`a_0` differs from it by less than k standard errors of the
+    difference count as equally clean. Of these, the one
     with the smallest standard error of :math:`a_0` is chosen, the nearest one in a tie. That
     error follows from the variances and not from the power, so the choice favours no
     fluctuation. The tests favour one slightly, because they keep windows whose noise looks flat.
@@ -162,10 +161,6 @@ def choose_reference(
         m, bottom and top of each window; see `candidate_windows`.
     exclude : (..., range) bool, optional
         Bins that no window may contain, such as the mask of `layers.find_layers`.
-    most_deviation : float
-        Largest deviation from the molecular shape, in standard errors.
-    least_signal : float
-        Least signal-to-noise ratio of the mean of a window.
 
     Returns
     -------
@@ -186,13 +181,9 @@ def choose_reference(
             field="molecular_attenuated",
             remedy="give a value for each bin",
         )
-    if not (most_deviation > 0.0 and least_signal > 0.0):
-        raise RetrievalInputError(
-            "must be positive", field="most_deviation" if least_signal > 0.0 else "least_signal"
-        )
     windows, edges = _edges(candidates, grid)
-    statistics = np.full((rows.shape[0], windows.shape[0], _window_tests.FIELDS), np.nan)
-    _window_tests.compare_with_air(
+    statistics = np.full((rows.shape[0], windows.shape[0], FIELDS), np.nan)
+    _compare_with_air(
         frozen(rows),
         frozen(inputs.variance_rows(variance, grid, leading)),
         frozen(shape),
@@ -201,8 +192,8 @@ def choose_reference(
         edges,
         statistics,
     )
-    rejections = _rejections(statistics, np.diff(edges)[:, 0], most_deviation, least_signal)
-    index = _pick(statistics, rejections, most_deviation)
+    rejections = _rejections(statistics, np.diff(edges)[:, 0])
+    index = _pick(statistics, rejections)
     return _result(statistics, rejections, index, windows, leading)
 
 
@@ -242,23 +233,19 @@ def _excluded(
     return inputs.noise_rows(mask.astype(np.float64), "exclude", grid, leading) > 0.0
 
 
-def _rejections(
-    statistics: Array, lengths: npt.NDArray[np.int64], most_deviation: float, least_signal: float
-) -> Codes:
+def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
     """Return the bits of `Rejection` of each window; 0 for those that pass all tests."""
-    f = np.moveaxis(statistics, -1, 0)
-    count = np.nan_to_num(f[_window_tests.COUNT])
+    f, most = np.moveaxis(statistics, -1, 0), THRESHOLDS.most_deviation
+    count = np.nan_to_num(f[COUNT])
     freedom = np.maximum(count - 1.0, 1.0)
-    fewest = np.maximum(FEWEST_BINS, LEAST_SHARE * lengths)
+    fewest = np.maximum(THRESHOLDS.fewest_bins, THRESHOLDS.least_share * lengths)
     passes = {
         Rejection.TOO_FEW_BINS: count >= fewest,
-        Rejection.EXCLUDED: ~(f[_window_tests.EXCLUDED_BINS] > 0.0),
-        Rejection.LOW_SIGNAL: f[_window_tests.SCALE] >= least_signal * f[_window_tests.SCALE_ERROR],
-        Rejection.SLOPE: np.abs(f[_window_tests.SLOPE])
-        <= most_deviation * f[_window_tests.SLOPE_ERROR],
-        Rejection.CURVATURE: np.abs(f[_window_tests.CURVATURE]) <= most_deviation,
-        Rejection.SCATTER: f[_window_tests.SCATTER]
-        <= 1.0 + most_deviation * np.sqrt(2.0 / freedom),
+        Rejection.EXCLUDED: ~(f[EXCLUDED_BINS] > 0.0),
+        Rejection.LOW_SIGNAL: f[SCALE] >= THRESHOLDS.least_signal * f[SCALE_ERROR],
+        Rejection.SLOPE: np.abs(f[SLOPE]) <= most * f[SLOPE_ERROR],
+        Rejection.CURVATURE: np.abs(f[CURVATURE]) <= most,
+        Rejection.SCATTER: f[SCATTER] <= 1.0 + most * np.sqrt(2.0 / freedom),
     }
     rejections = np.zeros(count.shape, dtype=np.int32)
     for reason, passed in passes.items():
@@ -269,15 +256,16 @@ def _rejections(
     return rejections
 
 
-def _pick(statistics: Array, rejections: Codes, most_deviation: float) -> npt.NDArray[np.int64]:
+def _pick(statistics: Array, rejections: Codes) -> npt.NDArray[np.int64]:
     """Return the index of the chosen window or -1; mark those with more particles as rejected."""
-    scale, error = statistics[..., _window_tests.SCALE], statistics[..., _window_tests.SCALE_ERROR]
+    scale, error = statistics[..., SCALE], statistics[..., SCALE_ERROR]
+    most = THRESHOLDS.most_deviation
     passed = rejections == 0
-    upper = np.where(passed, scale + most_deviation * error, np.inf)
+    upper = np.where(passed, scale + most * error, np.inf)
     anchor = np.argmin(upper, axis=-1)[:, np.newaxis]
     lowest = np.take_along_axis(scale, anchor, axis=-1)
     lowest_error = np.take_along_axis(error, anchor, axis=-1)
-    has_more_particles = passed & (scale - lowest > most_deviation * np.hypot(error, lowest_error))
+    has_more_particles = passed & (scale - lowest > most * np.hypot(error, lowest_error))
     rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
     precision = np.where(rejections == 0, error, np.inf)
     best = np.argmin(precision, axis=-1)
@@ -301,12 +289,99 @@ def _result(
         chosen=chosen.reshape(leading),
         bottom=np.where(chosen, windows[index, 0], np.nan).reshape(leading),
         top=np.where(chosen, windows[index, 1], np.nan).reshape(leading),
-        index=index.reshape(leading),
-        scale=chosen_value(_window_tests.SCALE),
-        scale_standard_error=chosen_value(_window_tests.SCALE_ERROR),
-        slope=chosen_value(_window_tests.SLOPE),
-        slope_standard_error=chosen_value(_window_tests.SLOPE_ERROR),
-        curvature=chosen_value(_window_tests.CURVATURE),
-        reduced_chi_square=chosen_value(_window_tests.SCATTER),
+        scale=chosen_value(SCALE),
+        scale_standard_error=chosen_value(SCALE_ERROR),
         rejections=rejections.reshape(*leading, windows.shape[0]),
     )
+
+
+@_compiled
+def _usable(power: float, variance: float) -> bool:
+    return abs(power) < _HUGE and 0.0 < variance < _HUGE
+
+
+@_compiled
+def _fit(
+    power: Any, variance: Array, shape: Array, range_: Array, excluded: Any, out: Array
+) -> None:
+    """Fit the molecular shape times polynomials in range that are orthogonal under the noise."""
+    middle = 0.5 * (range_[0] + range_[-1])
+    half = max(0.5 * (range_[-1] - range_[0]), _SHORTEST)
+    s0 = s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
+    count, out[EXCLUDED_BINS] = 0, 0.0
+    for i in range(range_.size):
+        if excluded[i]:
+            out[EXCLUDED_BINS] += 1.0
+        if excluded[i] or not _usable(power[i], variance[i]):
+            continue
+        t = (range_[i] - middle) / half
+        f = shape[i]
+        w = f * f / variance[i]
+        y = f * power[i] / variance[i]
+        count += 1
+        s0 += w
+        s1 += w * t
+        s2 += w * t * t
+        s3 += w * t**3
+        s4 += w * t**4
+        y0 += y
+        y1 += y * t
+        y2 += y * t * t
+    out[COUNT] = count
+    if not s0 > 0.0:
+        return
+    # 1, t - a and t^2 - b (t - a) - c are orthogonal.
+    scale, a, c = y0 / s0, s1 / s0, s2 / s0
+    norm1 = s2 - a * s1
+    out[SCALE], out[SCALE_ERROR] = scale, 1.0 / math.sqrt(s0)
+    residual = 0.0
+    for i in range(range_.size):
+        if not excluded[i] and _usable(power[i], variance[i]):
+            residual += (power[i] - scale * shape[i]) ** 2 / variance[i]
+    out[SCATTER] = residual / max(count - 1, 1)
+    if count < 3 or not norm1 > _DEPENDENT * s0:
+        return
+    slope = (y1 - a * y0) / norm1
+    out[SLOPE], out[SLOPE_ERROR] = slope / scale / half, 1.0 / math.sqrt(norm1) / abs(scale) / half
+    b = (s3 - a * s2) / norm1
+    norm2 = s4 - c * s2 - b * (s3 - a * s2)
+    if norm2 > _DEPENDENT * s0:
+        out[CURVATURE] = (y2 - c * y0 - b * (y1 - a * y0)) / math.sqrt(norm2)
+
+
+@_compiled
+def _compare_with_air(
+    power: Any,
+    variance: Array,
+    shape: Array,
+    range_: Array,
+    excluded: Any,
+    edges: npt.NDArray[np.int64],
+    out: Array,
+) -> None:
+    """Compare each profile with the molecular shape in each window.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    variance, shape : (profile or 1, bin) float64
+    range_ : (bin,) float64
+        m, ascending.
+    excluded : (profile or 1, bin) bool
+    edges : (window, 2) int64
+        First bin of the window, and first bin beyond it.
+    out : (profile, window, `FIELDS`) float64
+        Output, NaN before: scale of the shape with its error, slope of the logarithm of the
+        ratio to the shape in m-1 with its error, curvature over its error, chi-square over the
+        degrees of freedom, number of bins, number of excluded bins.
+    """
+    for k in range(power.shape[0]):
+        noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
+        masked = excluded[k % excluded.shape[0]]
+        for j in range(edges.shape[0]):
+            first, stop = edges[j, 0], edges[j, 1]
+            if stop > first:
+                _fit(
+                    power[k, first:stop], noise[first:stop], air[first:stop], range_[first:stop],
+                    masked[first:stop], out[k, j],
+                )  # fmt: skip

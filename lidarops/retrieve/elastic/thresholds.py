@@ -1,0 +1,83 @@
+"""Thresholds of the elastic retrieval, each with what set it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Limits of the four steps: outlying bins, clouds, reference window, inversion."""
+
+    # Isolated outlying bins
+    outlying: float = 6.0
+    """Standard deviations of the noise by which an outlier lies beyond all neighbours.
+    Simulations: none of 1e8 bins of normal noise."""
+    least_contrast: float = 6.0
+    """Distance of an outlier from its neighbours over their spread in excess of noise. Peaks with a
+    full width at half maximum of 1.5 bins or more have less."""
+    spread_by_noise: float = 2.0
+    """Standard deviations of the noise that are subtracted from that spread. Assumed."""
+    most_equal: int = 4
+    """Neighbours of equal power: more of them mean few counts, whose noise is not normal. Assumed.
+    """
+    largest_step: float = 0.1
+    """Relative change of the signal across a bin: a cloud attenuates by more. Assumed."""
+    step_by_noise: float = 4.0
+    """Standard deviations of the noise of a bin, or 5.7 of the difference of the means of 4, by
+    which the signal may change across a bin. Assumed."""
+
+    # Clouds
+    window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0)
+    """m; in which signals are averaged below and above a base. Assumed."""
+    cloud_contrast: float = 3.0
+    """Factor of the rise at 532 nm. The scattering ratio of aerosol rarely rises by this factor
+    within 500 m, that of thin cirrus does. Assumed."""
+    least_cloud_contrast: float = 2.0
+    """The same at short wavelengths, where air scatters more. Assumed."""
+    cloud_false_alarm: float = 0.01
+    """Probability of a false cloud in a profile. Assumed."""
+    top: float = 2.0
+    """Standard errors of the level below the base within which a layer has ended. Assumed."""
+    cloud_margin: float = 300.0
+    """m beyond the last bin of a cloud; its thin edge extends beyond its apparent top. Assumed."""
+    least_share_beyond: float = 0.1
+    """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
+
+    # Reference window
+    steps_per_window: int = 4
+    """Candidates that start within the width of one. Assumed."""
+    fewest_bins: int = 8
+    """Bins with data. Assumed."""
+    least_share: float = 0.5
+    """Share of the bins of a window that must hold data. Assumed."""
+    least_signal: float = 20.0
+    """Signal-to-noise ratio of the mean of a window. Assumed."""
+    most_deviation: float = 3.0
+    """Standard errors by which a window may depart from the shape of air. Assumed: 1 % of clean
+    windows fail."""
+    undetected_particles: float = 1.5
+    """Standard errors of the window's mean by which undetected particles may raise it. Simulations:
+    they raise it by 3 in one of 20 profiles."""
+    most_windows: int = 10_000
+    """Candidates; more are taken for a mistake of units. Assumed."""
+
+    # Inversion
+    longest_gap: float = 150.0
+    """m; a longer gap without data ends the integration. Assumed."""
+    least_denominator: float = 0.05
+    """Share of the denominator at the reference. Beyond, errors grow as its inverse. Assumed."""
+    least_certainty: float = 5.0
+    """Standard errors by which the denominator must exceed zero for first-order errors to hold.
+    Simulations, with `skewed`."""
+    skewed: float = 5.5
+    """Ratio s of the denominator to its noise error at which noise errors are twice those of first
+    order. A reference that is too high by noise makes both values and errors too low, so noise
+    errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1. Simulations: less than 0.1 %
+    of the values are then off by more than 4 errors, without it 1 to 3 % where s is 5 to 8."""
+    largest_backscatter: float = 5e-4
+    """m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
+
+
+THRESHOLDS: Final = Thresholds()
