@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lidarops.records import DetectionMode, Granule, Role
 from lidarops.retrieve.signal import labeled
-from lidarops.retrieve.signal.dark import SESSION_GAP
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import range_offset
@@ -162,14 +162,14 @@ class Dark(Step[ChannelCase, DarkSettings]):
 
 
 def _sessions(dark: Iterable[Granule]) -> int:
-    """Return the number of dark sessions, separated by `SESSION_GAP` as in the retrieval."""
+    """Return the number of dark sessions, separated as in the retrieval."""
     middles = sorted(
         granule.start + ((granule.stop or granule.start) - granule.start) / 2
         for granule in dark
         if granule.start
     )
     gaps = ((later - time).total_seconds() for time, later in itertools.pairwise(middles))
-    return 1 + sum(gap > SESSION_GAP for gap in gaps)
+    return 1 + sum(gap > THRESHOLDS.session_gap for gap in gaps)
 
 
 def _times_around(times: Sequence[datetime], first: datetime, last: datetime) -> str:

@@ -12,7 +12,8 @@ from lidarops.campaign.model import channel_facts
 from lidarops.raw.header import Stretches
 from lidarops.raw.model import count_bins
 from lidarops.records import PlannedStep
-from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS, NOISE_WINDOW
+from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import (
@@ -178,7 +179,7 @@ def bins_with_noise(nearest: float, farthest: float, case: ChannelCase) -> tuple
 
     def margin(distance: float) -> int:
         # Two for rounding.
-        return max(math.ceil(NOISE_WINDOW * distance / width), MIN_NOISE_BINS) + 2
+        return max(math.ceil(THRESHOLDS.noise_window * distance / width), MIN_NOISE_BINS) + 2
 
     first = math.floor((nearest - offset) / width) - margin(nearest)
     return max(first, 0), math.ceil((farthest - offset) / width) + margin(farthest)

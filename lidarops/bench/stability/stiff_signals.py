@@ -276,7 +276,6 @@ def _channels(strength: float, gain: float = 0.5, profiles: int = 30) -> dict[st
         "range": distance,
         "analog_variance": np.full(shape, 4e-4),
         "photon_variance": np.broadcast_to(counted, shape),
-        "block": np.zeros(profiles, dtype=np.int64),
     }
 
 

@@ -61,7 +61,7 @@ class BeamAverages:
 
     averages: xr.Dataset
     """``power``, ``variance`` and ``quality`` over (time, range), ``shots`` and ``time_bnds``, in
-    memory; from `lidarops.retrieve.signal.labeled_averaging.clock_average`."""
+    memory; from `lidarops.retrieve.signal.labeled_averaging.ClockAverage`."""
     interval: Integers
     """(time,) number of the clock interval of each average."""
     instrument: str

@@ -21,7 +21,6 @@ from lidarops.retrieve.signal.counts_to_signal import (
     difference_variance,
     photon_signal,
     range_corrected,
-    smooth_signal,
 )
 from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
 from lidarops.retrieve.signal.gluing import GluedSignal, glue
@@ -41,6 +40,5 @@ __all__ = [
     "photon_signal",
     "range_corrected",
     "shift_signal",
-    "smooth_signal",
     "time_mean",
 ]

@@ -388,23 +388,6 @@ def noise_profiles(power: Array, noise: NoiseModel, s: SignalScratch, out: Array
         _estimate(power[k], noise, s, out[k])
 
 
-@_compiled
-def smooth_profiles(values: Array, windows: Windows, s: SignalScratch, out: Array) -> None:
-    """Average each profile over windows.
-
-    Parameters
-    ----------
-    values : (profile, bin) float64
-    windows : Windows
-    s : SignalScratch
-    out : (profile, bin) float64
-        Output: the averages of finite values.
-    """
-    for k in range(values.shape[0]):
-        complete = _load(values[k], s.sums)
-        _averages(s.sums, windows, complete, out[k])
-
-
 class Counter(NamedTuple):
     """Dead time of a photon counter, and the limits of its flags."""
 

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.signal import _weighted_sums
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.int64]
+
+_HUGE: Final = 1e300
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +27,7 @@ class Averages:
     """Means with their variances by independent noise and by shared errors."""
 
     values: Array
-    """In the unit of the profiles; NaN where too few values were finite."""
+    """In the unit of the profiles; NaN where no value was finite."""
     variance: Array
     """Variance of the mean by noise that is independent from profile to profile."""
     shared_variance: Array
@@ -46,7 +51,6 @@ def time_mean(
     groups: npt.ArrayLike | None = None,
     weights: npt.ArrayLike | None = None,
     shared_variance: npt.ArrayLike | None = None,
-    least_count: int = 1,
     axis: int = -2,
 ) -> Averages:
     r"""Return weighted means of profiles over time, bin by bin.
@@ -73,8 +77,6 @@ def time_mean(
     shared_variance : (..., time, range) float, optional
         Variance of errors that the profiles have in common, such as that of a subtracted dark
         profile; broadcast. It does not average down.
-    least_count : int
-        Least number of finite values in a mean.
     axis : int
         The time axis.
 
@@ -94,10 +96,6 @@ def time_mean(
         raise RetrievalInputError(
             f"is {axis}, but profiles have the shape {values.shape}", field="axis"
         )
-    if least_count < 1:
-        raise RetrievalInputError(
-            f"is {least_count}", field="least_count", remedy="a mean needs at least 1 value"
-        )
     axis %= values.ndim
     group = _checked_groups(groups, values.shape[axis])
     before, after = values.shape[:axis], values.shape[axis + 1 :]
@@ -105,7 +103,7 @@ def time_mean(
     sums = np.zeros((4, math.prod(before), number, math.prod(after)))
     count = np.zeros(sums.shape[1:], dtype=np.int64)
     _add(sums, count, values, variance, shared_variance, weights, group, axis)
-    return _averages(sums, count, (*before, number, *after), least_count)
+    return _averages(sums, count, (*before, number, *after))
 
 
 def _add(
@@ -122,7 +120,7 @@ def _add(
     whole = values.shape
     shape = (math.prod(whole[:axis]), whole[axis], math.prod(whole[axis + 1 :]))
     shared, weights = 0.0 if shared is None else shared, 1.0 if weights is None else weights
-    _weighted_sums.add_profiles(
+    _add_profiles(
         frozen(values.reshape(shape)),
         _flat_term(variance, "variance", whole, shape, axis),
         _flat_term(shared, "shared_variance", whole, shape, axis),
@@ -133,7 +131,7 @@ def _add(
     )
 
 
-def _averages(sums: Array, count: Counts, shape: tuple[int, ...], least_count: int = 1) -> Averages:
+def _averages(sums: Array, count: Counts, shape: tuple[int, ...]) -> Averages:
     """Turn sums into means, in place."""
     total, value, noise, systematic = sums
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -142,7 +140,7 @@ def _averages(sums: Array, count: Counts, shape: tuple[int, ...], least_count: i
         systematic /= total
         systematic **= 2
     for means in (value, noise, systematic):
-        means[count < least_count] = np.nan
+        means[count == 0] = np.nan
     return Averages(
         value.reshape(shape),
         noise.reshape(shape),
@@ -231,3 +229,63 @@ def _checked_groups(groups: npt.ArrayLike | None, length: int) -> npt.NDArray[np
             remedy=f"give one whole number for each of the {length} profiles",
         )
     return np.ascontiguousarray(group, dtype=np.intp)
+
+
+@_compiled
+def _add_profile(
+    values: Any,
+    variance: Array,
+    shared: Array,
+    weight: float,
+    sums: tuple[Array, Array, Array, Array],
+    count: npt.NDArray[np.int64],
+) -> None:
+    total, value, noise, systematic = sums
+    for i in range(values.size):
+        x = np.float64(values[i])
+        valid = abs(x) < _HUGE
+        total[i] += weight if valid else 0.0
+        value[i] += weight * x if valid else 0.0
+        noise[i] += weight * weight * variance[i] if valid else 0.0
+        systematic[i] += weight * math.sqrt(shared[i]) if valid else 0.0
+        count[i] += 1 if valid else 0
+
+
+@_compiled
+def _add_profiles(
+    values: Any,
+    variance: Array,
+    shared: Array,
+    weights: Array,
+    group: npt.NDArray[np.intp],
+    sums: Array,
+    count: npt.NDArray[np.int64],
+) -> None:
+    """Add each profile to the sums of its group.
+
+    Parameters
+    ----------
+    values : (outer, time, inner) float32 or float64
+        Values that are not finite are skipped.
+    variance, shared : (outer or 1, time or 1, inner) float64
+    weights : (outer or 1, time or 1) float64
+        A profile is skipped where it is not positive.
+    group : (time,) int
+        A profile is skipped where it is negative.
+    sums : (4, outer, group, inner) float64
+        Input and output: sums of weights, of weighted values, of squared weights times variance,
+        and of weighted roots of the shared variance.
+    count : (outer, group, inner) int64
+        Input and output: number of finite values.
+    """
+    for k in range(values.shape[0]):
+        for t in range(values.shape[1]):
+            weight, g = weights[k % weights.shape[0], t % weights.shape[1]], group[t]
+            if g < 0 or not 0.0 < weight < _HUGE:
+                continue
+            group_sums = (sums[0, k, g], sums[1, k, g], sums[2, k, g], sums[3, k, g])
+            profile_variance = variance[k % variance.shape[0], t % variance.shape[1]]
+            profile_shared = shared[k % shared.shape[0], t % shared.shape[1]]
+            _add_profile(
+                values[k, t], profile_variance, profile_shared, weight, group_sums, count[k, g]
+            )

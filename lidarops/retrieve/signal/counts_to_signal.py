@@ -24,33 +24,13 @@ from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.common.inputs import Floats
 from lidarops.retrieve.signal import _signal_kernels as kernels
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-PILE_UP_CORRECTION = 0.1
-"""Relative dead-time correction above which `Quality.PILE_UP` is raised."""
-UNCORRECTED_PILE_UP = 0.01
-"""Relative correction above which PILE_UP is raised where the dead time is unknown, so that
-nothing is corrected."""
-NEAR_FULL_SCALE = 0.5
-"""Share of full scale above which a bin is tested for clipped shots."""
-CLIPPING = 3.5
-"""Standard deviations of a shot by which the mean must lie below full scale. Clipping shifts the
-mean by 6e-5 of that deviation there, and by more above."""
-PARALYSIS = 0.5
-"""Measured rate times dead time above which a rate cannot be corrected (`Quality.SATURATED`)."""
-NOISE_WINDOW = 0.1
-"""Half-width, relative to range, of the window in which noise is smoothed."""
-WEIGHT_WINDOW = 0.3
-"""Half-width, relative to range, of the window for the weights of the noise model."""
 MIN_NOISE_BINS = kernels.BLOCK
 """Smallest half-width of such a window in bins: 16."""
-_FINE = 0.5
-"""Variance of a shot in squared digitiser steps above which rounding is neglected. The error that
-does not average out is below 1e-4 steps there."""
-LEAK = 0.05
-"""Largest share of a squared third difference that may come from the fall of the signal."""
 
 _Number = TypeVar("_Number", bound=np.generic)
 _COUNT_LIMITS = np.iinfo(np.int32)
@@ -192,7 +172,7 @@ def _add_rounding(variance: Array, scale: _Scale) -> Array:
     rows[scale.shots <= 0] += np.inf
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         unit = (scale.step**2 * scale.shots)[:, np.newaxis]
-        coarse = np.flatnonzero((rows < _FINE * unit).any(axis=-1))
+        coarse = np.flatnonzero((rows < THRESHOLDS.fine * unit).any(axis=-1))
         unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
         measured = rows[coarse] / unit
         median = np.sort(measured, axis=-1)[:, (measured.shape[-1] - 1) // 2, np.newaxis]
@@ -200,7 +180,7 @@ def _add_rounding(variance: Array, scale: _Scale) -> Array:
         harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(noise - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
         common = np.maximum((0.25 - noise) / 3.0, harmonic)
         raised = unit * (np.maximum(measured, 1.0 / 12.0) + shots * common)
-    rows[coarse] = np.where(measured >= _FINE, rows[coarse], raised)
+    rows[coarse] = np.where(measured >= THRESHOLDS.fine, rows[coarse], raised)
     return raised_variance
 
 
@@ -216,10 +196,11 @@ def _flag_clipped(
     """
     rows, noise = _rows(scale.counts), _rows(variance)
     fired = (scale.shots > 0)[:, np.newaxis]
-    profile, bins = np.nonzero(fired & (rows > NEAR_FULL_SCALE * scale.top[:, np.newaxis]))
+    bright = rows > THRESHOLDS.near_full_scale * scale.top[:, np.newaxis]
+    profile, bins = np.nonzero(fired & bright)
     shot_deviation = np.sqrt(noise[profile, bins] * scale.shots[profile])
     margin = (scale.top[profile] - rows[profile, bins]) * scale.step[profile]
-    clipped = margin < CLIPPING * shot_deviation
+    clipped = margin < THRESHOLDS.clipping * shot_deviation
     indices = profile[clipped], bins[clipped]
     _rows(power)[indices] = np.nan
     _rows(quality)[indices] |= np.int32(Quality.SATURATED)
@@ -293,11 +274,11 @@ def photon_signal(
         kernels.Counter(
             dead_time=dead * 1e6,
             assumed_dead_time=(dead or DEFAULT_DEAD_TIME) * 1e6,
-            paralysis=PARALYSIS,
-            pile_up=UNCORRECTED_PILE_UP if dead_time is None else PILE_UP_CORRECTION,
+            paralysis=THRESHOLDS.paralysis,
+            pile_up=THRESHOLDS.uncorrected_pile_up if dead_time is None else THRESHOLDS.pile_up,
         ),
         _overlap_bits(grid, full_overlap_range),
-        _windows(grid, NOISE_WINDOW),
+        _windows(grid, THRESHOLDS.noise_window),
         kernels.scratch(grid.size),
         _rows(power),
         _rows(variance),
@@ -435,11 +416,11 @@ def _noise_model(grid: Array) -> kernels.NoiseModel:
     spacing = np.abs(np.gradient(grid)) if grid.size > 1 else np.ones(1)
     with np.errstate(divide="ignore"):
         # The third difference of R^-2 is 24 (h / R)^3 of the signal.
-        leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * LEAK)
+        leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * THRESHOLDS.leak)
     return kernels.NoiseModel(
-        narrow=_windows(grid, NOISE_WINDOW),
+        narrow=_windows(grid, THRESHOLDS.noise_window),
         # A third difference takes one bin before and two after.
-        wide=_windows(grid, WEIGHT_WINDOW, ends=(1, 2)),
+        wide=_windows(grid, THRESHOLDS.weight_window, ends=(1, 2)),
         leak=frozen(leak),
     )
 
@@ -450,45 +431,6 @@ def _estimated_variance(power: Array, grid: Array) -> Array:
         frozen(rows), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)
     )
     return variance
-
-
-def smooth_signal(
-    values: Array,
-    range: Array,  # noqa: A002 - the field's word
-    *,
-    window: float = NOISE_WINDOW,
-) -> Array:
-    """Return averages over a window that grows with range, of at least 33 bins, ignoring NaN.
-
-    Parameters
-    ----------
-    values : (..., range) float
-    range : (range,) float
-        m.
-    window : float
-        Half-width of the window, relative to range.
-
-    Returns
-    -------
-    (..., range) float
-        NaN where the window holds no finite value. The rounding error is about 20 units in the
-        last place of the mean of absolute values within the window, however large the signal of
-        the near range is.
-
-    Raises
-    ------
-    RetrievalInputError
-        For shapes that do not match, a range that is not finite or repeats a bin, a window that
-        is negative or not finite.
-    """
-    grid = _grid(range)
-    _require(0.0 <= window < np.inf, window, "window", "a share of range")
-    rows = _profiles(values, "values", grid.size)
-    averages = np.empty(rows.shape)
-    kernels.smooth_profiles(
-        frozen(_rows(rows)), _windows(grid, window), kernels.scratch(grid.size), _rows(averages)
-    )
-    return averages
 
 
 def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - the field's word

@@ -11,15 +11,10 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-SESSION_GAP: Final = 1800.0
-"""s; dark files farther apart belong to different sessions."""
-VARIANCE_WINDOW: Final = 65
-"""Bins over which the scatter of repeats is averaged: that of 3 repeats alone is off by 100 %."""
-FAR_SHARE: Final = 0.5
-"""Share of the bins, from the far end, that gives the noise of a file without repeats."""
 _SECOND_DIFFERENCE_VARIANCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
 
@@ -43,10 +38,6 @@ class DarkProfile:
     variance: Array
     """(..., time, range), noise variance, independent from bin to bin. Profiles with the same dark
     files share that noise: it does not average down over them."""
-    level_variance: Array
-    """(...), variance of the level of a single dark file, which drifts. This error is common to
-    all bins and does not average down, but subtracting a fitted background removes it. NaN for
-    fewer than two files."""
 
 
 def dark_profile(
@@ -58,8 +49,8 @@ def dark_profile(
 ) -> DarkProfile:
     r"""Return the dark signal of each profile from the dark files.
 
-    Consecutive dark files within `SESSION_GAP` form a session, with mean :math:`\bar D_s` at its
-    mean time. Between two sessions,
+    Consecutive dark files within `Thresholds.session_gap` form a session, with mean
+    :math:`\bar D_s` at its mean time. Between two sessions,
 
     .. math:: D(t) = (1 - u) \bar D_1 + u \bar D_2, \quad u = \frac{t - t_1}{t_2 - t_1}, \qquad
               v = (1 - u)^2 v_1 + u^2 v_2
@@ -99,11 +90,7 @@ def dark_profile(
     sessions = _sessions(dark_seconds)
     means, variances = _means(signals, sessions)
     shares = _shares(dark_seconds, sessions, seconds, chosen)
-    return DarkProfile(
-        _weighted_sum(shares, means),
-        _weighted_sum(shares**2, variances),
-        _level_variance(signals),
-    )
+    return DarkProfile(_weighted_sum(shares, means), _weighted_sum(shares**2, variances))
 
 
 def _signals(values: npt.ArrayLike) -> Array:
@@ -152,7 +139,7 @@ def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Ar
 def _sessions(dark_seconds: Array) -> list[npt.NDArray[np.intp]]:
     """Return the indices of the dark files of each session, in time order."""
     order = np.argsort(dark_seconds, kind="stable")
-    breaks = np.flatnonzero(np.diff(dark_seconds[order]) > SESSION_GAP) + 1
+    breaks = np.flatnonzero(np.diff(dark_seconds[order]) > THRESHOLDS.session_gap) + 1
     return [np.sort(files) for files in np.split(order, breaks)]
 
 
@@ -185,26 +172,11 @@ def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array,
 
 def _far_variance(signals: Array) -> Array:
     """Return the noise variance from second differences of the far bins, (..., 1, 1)."""
-    far = signals[..., int(signals.shape[-1] * (1.0 - FAR_SHARE)) :]
+    far = signals[..., int(signals.shape[-1] * (1.0 - THRESHOLDS.far_share)) :]
     second = np.diff(far, n=2, axis=-1) ** 2 / _SECOND_DIFFERENCE_VARIANCE
     finite = np.isfinite(second)
     total = np.where(finite, second, 0.0).sum(axis=(-2, -1), keepdims=True)
     return _ratio(total, finite.sum(axis=(-2, -1), keepdims=True))
-
-
-def _level_variance(signals: Array) -> Array:
-    """Return the variance of the levels of the files about their mean, (...)."""
-    finite = np.isfinite(signals)
-    mean = _ratio(
-        np.where(finite, signals, 0.0).sum(axis=-2, keepdims=True),
-        finite.sum(axis=-2, keepdims=True),
-    )
-    levels = _ratio(np.where(finite, signals - mean, 0.0).sum(axis=-1), finite.sum(axis=-1))
-    known = np.isfinite(levels)
-    count = known.sum(axis=-1)
-    levels = np.where(known, levels, 0.0)
-    levels -= _ratio(levels.sum(axis=-1), count)[..., np.newaxis]
-    return _ratio((np.where(known, levels, 0.0) ** 2).sum(axis=-1), count - 1)
 
 
 def _ratio(total: Array, count: npt.NDArray[np.int64] | Array) -> Array:
@@ -214,9 +186,9 @@ def _ratio(total: Array, count: npt.NDArray[np.int64] | Array) -> Array:
 
 
 def _window_sum(values: Array) -> Array:
-    """Return sums over symmetric windows of `VARIANCE_WINDOW` bins, fewer towards the ends."""
+    """Return sums over windows of `Thresholds.variance_window` bins, fewer towards the ends."""
     index = np.arange(values.shape[-1])
-    half = np.minimum(np.minimum(index, index[::-1]), VARIANCE_WINDOW // 2)
+    half = np.minimum(np.minimum(index, index[::-1]), THRESHOLDS.variance_window // 2)
     sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
     np.cumsum(values, axis=-1, out=sums[..., 1:])
     total: Array = sums[..., index + half + 1] - sums[..., index - half]

@@ -22,45 +22,6 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.intp]
 
 
-def clock_average(
-    conditioned: xr.Dataset,
-    *,
-    seconds: float,
-    shots: xr.DataArray,
-    shared_variance: Shared | None = None,
-) -> xr.Dataset:
-    """Return means of profiles over intervals of the clock (UTC), weighted by their shots.
-
-    Parameters
-    ----------
-    conditioned : xr.Dataset
-        ``power``, ``variance`` and ``quality`` over (time, range), from
-        `lidarops.retrieve.signal.labeled.condition`, with the coordinates ``time`` and
-        ``time_bnds``; ascending in time.
-    seconds, shots, shared_variance
-        As for `ClockAverage`.
-
-    Returns
-    -------
-    xr.Dataset
-        As from `ClockAverage.result`.
-
-    Raises
-    ------
-    RetrievalInputError
-        Where `seconds` does not divide a day.
-    """
-    average = ClockAverage(
-        conditioned[["time", "time_bnds"]],
-        conditioned["range"].to_numpy(),
-        seconds=seconds,
-        shots=shots,
-        shared_variance=shared_variance,
-    )
-    average.add(conditioned)
-    return average.result()
-
-
 class ClockAverage:
     """Means of profiles over intervals of the clock (UTC), weighted by their shots.
 

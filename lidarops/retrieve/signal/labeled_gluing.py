@@ -123,8 +123,6 @@ def _glue(
         analog_variance=np.nan_to_num(analog_variance[..., ahead]),
         photon_variance=np.nan_to_num(photon_variance[..., ahead]),
         photon_background=np.nan_to_num(sky),
-        # Their noise is correlated: a blend would have more noise than its variance states.
-        hand_over="switch",
     )
     power, variance = (np.full(photon.shape, np.nan) for _ in range(2))
     power[..., ahead] = glued.power + sky[..., np.newaxis]

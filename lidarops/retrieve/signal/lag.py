@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy import special
@@ -13,27 +14,13 @@ from scipy import special
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.signal import _cross_correlation
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 
-LARGEST_LAG: Final = 30
-"""Largest lag that is searched, bins."""
-CONFIDENCE: Final = 0.999
-"""Least probability that noise without a common cause has a lower peak."""
-FEWEST_BINS: Final = 200
-"""Fewest bins between the largest lags."""
-_HIGH_PASS: Final = 17
-"""Bins of the running mean that is subtracted to leave the noise."""
-_SCALE_WINDOW: Final = 65
-"""Bins over which the standard deviation of the noise is taken."""
-_CLIP: Final = 5.0
-"""Standard deviations at which the noise is clipped, against spikes."""
 _PARTS: Final = 16
 """Parts of the range in the jackknife estimate of the standard error."""
-_PEAK_WIDTH: Final = 4
-"""Bins on either side of a peak that belong to it."""
 _MARGIN: Final = 2
 """Additional lags on either side, for the neighbours of a peak."""
 
@@ -60,9 +47,6 @@ class LagEstimate:
 def estimate_lag(
     analog: npt.ArrayLike,
     photon_counting: npt.ArrayLike,
-    *,
-    largest_lag: int = LARGEST_LAG,
-    mask: npt.ArrayLike | None = None,
 ) -> LagEstimate:
     r"""Return the lag of analog behind photon counting from the correlation of their noise.
 
@@ -81,11 +65,6 @@ def estimate_lag(
     analog, photon_counting : (..., time, range) float
         Simultaneous, on bins of the same width, in any unit, with or without background; NaN is
         skipped. One profile is enough if its noise is large enough.
-    largest_lag : int
-        Bins, to both sides.
-    mask : (..., range) bool, optional
-        True where a bin of photon counting may be used; broadcast against the profiles without
-        time. Exclude the nearest bins where light is scattered in the system.
 
     Returns
     -------
@@ -99,21 +78,16 @@ def estimate_lag(
         For shapes that do not match, or fewer than 200 bins between the largest lags.
     """
     first, second = _pair(analog, photon_counting)
-    if largest_lag != int(largest_lag) or largest_lag < _PEAK_WIDTH:
-        raise RetrievalInputError(
-            f"is {largest_lag}", field="largest_lag", remedy=f"choose {_PEAK_WIDTH} bins or more"
-        )
     bins = first.shape[-1]
-    reach = int(largest_lag) + _MARGIN
-    if bins < FEWEST_BINS + 2 * reach:
+    reach = THRESHOLDS.largest_lag + _MARGIN
+    if bins < THRESHOLDS.fewest_lag_bins + 2 * reach:
         raise RetrievalInputError(
-            f"have {bins} bins for lags up to {largest_lag}",
+            f"have {bins} bins for lags up to {THRESHOLDS.largest_lag}",
             field="analog",
-            remedy="give all bins of the profiles, or a smaller largest_lag",
+            remedy="give all bins of the profiles",
         )
-    allowed = _allowed(mask, first.shape)
     lags = np.arange(-reach, reach + 1)
-    sums = _correlate(_noise(first), np.where(allowed, _noise(second), 0.0), reach)
+    sums = _correlate(_noise(first), _noise(second), reach)
     total = sums.sum(axis=-2)
     lag, systematic, at_end = _peak(total, lags)
     scatter = _jackknife(sums, lags)
@@ -123,7 +97,7 @@ def estimate_lag(
         lag=lag,
         standard_error=np.where(undefined, np.nan, np.hypot(scatter, systematic)),
         confidence=confidence,
-        significant=(confidence >= CONFIDENCE) & ~undefined & ~at_end,
+        significant=(confidence >= THRESHOLDS.confidence) & ~undefined & ~at_end,
         correlation=total[..., _MARGIN:-_MARGIN],
         lags=lags[_MARGIN:-_MARGIN],
     )
@@ -143,24 +117,6 @@ def _pair(analog: npt.ArrayLike, photon_counting: npt.ArrayLike) -> tuple[Array,
     return first, second
 
 
-def _allowed(mask: npt.ArrayLike | None, shape: tuple[int, ...]) -> Booleans:
-    if mask is None:
-        return np.ones((1, shape[-1]), dtype=bool)
-    allowed = np.asarray(mask)
-    if allowed.dtype != np.bool_:
-        raise RetrievalInputError(
-            f"holds {allowed.dtype}", field="mask", remedy="give True where a bin may be used"
-        )
-    try:
-        return np.broadcast_to(allowed, (*shape[:-2], shape[-1]))[..., np.newaxis, :]
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {allowed.shape}, which does not broadcast to"
-            f" {(*shape[:-2], shape[-1])}",
-            field="mask",
-        ) from None
-
-
 def _noise(profiles: Array) -> Array:
     """Return the noise of profiles over its standard deviation; 0 for gaps."""
     finite = np.isfinite(profiles)
@@ -172,14 +128,14 @@ def _noise(profiles: Array) -> Array:
         finite = finite & (count > 1)
     complete = bool(finite.all())
     present = np.ones((1, finite.shape[-1])) if complete else finite.astype(np.float64)
-    bins = np.maximum(_box(present, _HIGH_PASS), 1.0)
-    rough = np.where(finite, filled - _box(filled, _HIGH_PASS) / bins, 0.0)
-    square = _box((rough**2).sum(axis=-2, keepdims=True), _SCALE_WINDOW)
-    bins = _box(finite.sum(axis=-2, keepdims=True).astype(np.float64), _SCALE_WINDOW)
+    bins = np.maximum(_box(present, THRESHOLDS.high_pass), 1.0)
+    rough = np.where(finite, filled - _box(filled, THRESHOLDS.high_pass) / bins, 0.0)
+    square = _box((rough**2).sum(axis=-2, keepdims=True), THRESHOLDS.scale_window)
+    bins = _box(finite.sum(axis=-2, keepdims=True).astype(np.float64), THRESHOLDS.scale_window)
     deviation = np.sqrt(square / np.maximum(bins, 1.0))
     floor = 1e-12 * np.max(deviation, axis=-1, keepdims=True, initial=0.0)
     scaled = np.where(deviation > floor, rough / np.where(deviation > floor, deviation, 1.0), 0.0)
-    return np.clip(scaled, -_CLIP, _CLIP)
+    return np.clip(scaled, -THRESHOLDS.clip, THRESHOLDS.clip)
 
 
 def _box(values: Array, window: int) -> Array:
@@ -198,14 +154,57 @@ def _correlate(first: Array, second: Array, reach: int) -> Array:
     flat = (math.prod(leading), times, bins)
     edges = np.linspace(reach, bins - reach, _PARTS + 1).astype(np.intp)
     sums = np.zeros((flat[0], _PARTS, 2 * reach + 1))
-    _cross_correlation.add_products(
-        frozen(first.reshape(flat)), frozen(second.reshape(flat)), reach, edges, sums
-    )
+    _add_products(frozen(first.reshape(flat)), frozen(second.reshape(flat)), reach, edges, sums)
     inner = (..., slice(reach, bins - reach))
     energy = (first[inner] ** 2).sum(axis=(-2, -1)) * (second[inner] ** 2).sum(axis=(-2, -1))
     scale = np.sqrt(energy)[..., np.newaxis, np.newaxis]
     by_part: Array = sums.reshape(*leading, *sums.shape[1:]) / np.where(scale > 0, scale, np.inf)
     return by_part
+
+
+# Inlined by force: a reassociated sum as a symbol of its own has other bits fresh than cached.
+@numba.njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"reassoc", "contract", "nsz"},
+)
+def _product(first: Any, second: Any) -> float:
+    total = 0.0
+    for i in range(second.size):
+        total += first[i] * second[i]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_products(
+    first: Array,
+    second: Array,
+    reach: int,
+    edges: npt.NDArray[np.intp],
+    sums: Array,
+) -> None:
+    """Add the products of `second` and of `first` shifted by each lag, by parts of the range.
+
+    Parameters
+    ----------
+    first, second : (channel, time, bin) float64
+    reach : int
+        Largest lag to either side, in bins.
+    edges : (part + 1,) int
+        Bins of `second` where the parts begin and end, at least `reach` from both ends.
+    sums : (channel, part, lag) float64
+        The sums to which the products are added.
+    """
+    for c in range(first.shape[0]):
+        for t in range(first.shape[1]):
+            x, y = first[c, t], second[c, t]
+            for p in range(edges.size - 1):
+                segment = y[edges[p] : edges[p + 1]]
+                for j in range(2 * reach + 1):
+                    start = edges[p] + j - reach
+                    sums[c, p, j] += _product(x[start : start + segment.size], segment)
 
 
 def _peak(total: Array, lags: npt.NDArray[np.int64]) -> tuple[Array, Array, Booleans]:
@@ -219,7 +218,7 @@ def _peak(total: Array, lags: npt.NDArray[np.int64]) -> tuple[Array, Array, Bool
     peak, beside = _correct_for_high_pass(at(0), at(side))
     outside = at(-side), at(2 * side)
     sum_of_two = peak + beside
-    base = sum_of_two / _HIGH_PASS
+    base = sum_of_two / THRESHOLDS.high_pass
     sum_of_four = sum_of_two + outside[0] + outside[1] + 2.0 * base
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction = np.clip(beside / sum_of_two, 0.0, 1.0)
@@ -232,7 +231,10 @@ def _peak(total: Array, lags: npt.NDArray[np.int64]) -> tuple[Array, Array, Bool
 
 def _correct_for_high_pass(peak: Array, beside: Array) -> tuple[Array, Array]:
     """Return two neighbouring correlations corrected for the subtracted running mean."""
-    peak_response, side_response = 1.0 - 1.0 / _HIGH_PASS, -1.0 / _HIGH_PASS - 1.0 / _HIGH_PASS**2
+    peak_response, side_response = (
+        1.0 - 1.0 / THRESHOLDS.high_pass,
+        -1.0 / THRESHOLDS.high_pass - 1.0 / THRESHOLDS.high_pass**2,
+    )
     determinant = peak_response**2 - side_response**2
     return (
         (peak_response * peak - side_response * beside) / determinant,
@@ -251,7 +253,7 @@ def _jackknife(sums: Array, lags: npt.NDArray[np.int64]) -> Array:
 
 def _confidence(total: Array, lags: npt.NDArray[np.int64], lag: Array) -> Array:
     """Return the probability that the highest of as many random correlations is lower."""
-    far = np.abs(lags - lag[..., np.newaxis]) > _PEAK_WIDTH
+    far = np.abs(lags - lag[..., np.newaxis]) > THRESHOLDS.peak_width
     tried = lags.size - 2 * _MARGIN
     # The spread of the others is smaller because the highest of all is not among them.
     count = np.maximum(far.sum(axis=-1) + 1.0 - special.ndtri(0.5 / tried) ** 2, 1.0)
@@ -264,10 +266,7 @@ def _confidence(total: Array, lags: npt.NDArray[np.int64], lag: Array) -> Array:
 
 
 def shift_signal(
-    profile: npt.ArrayLike,
-    lag: npt.ArrayLike,
-    *,
-    variance: npt.ArrayLike | None = None,
+    profile: npt.ArrayLike, lag: float, *, variance: npt.ArrayLike = np.nan
 ) -> tuple[Array, Array]:
     r"""Return a signal shifted by `lag` bins towards the lidar, and its variance.
 
@@ -279,18 +278,18 @@ def shift_signal(
     Parameters
     ----------
     profile : (..., range) float
-    lag : (...) float
-        Bins; broadcast.
+    lag : float
+        Bins.
     variance : (..., range) float, optional
-        Variance of noise that is independent from bin to bin; broadcast.
+        Variance of noise that is independent from bin to bin; broadcast. NaN where not given.
 
     Returns
     -------
     shifted : (..., range) float
         NaN where the source lies beyond the ends or in a gap.
     variance : (..., range) float
-        NaN where not given. A shift by a fraction of a bin correlates the noise of neighbouring
-        bins and reduces that of a bin.
+        A shift by a fraction of a bin correlates the noise of neighbouring bins and reduces that
+        of a bin.
 
     Raises
     ------
@@ -300,45 +299,34 @@ def shift_signal(
     values = inputs.real_array(profile, "profile").astype(np.float64, copy=False)
     if values.ndim == 0:
         raise RetrievalInputError("is a single number", field="profile")
-    noise = np.asarray(np.nan) if variance is None else inputs.real_array(variance, "variance")
+    if not math.isfinite(lag):
+        raise RetrievalInputError("is not finite", field="lag")
+    noise = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
     try:
-        noise = np.broadcast_to(noise.astype(np.float64, copy=False), values.shape)
+        noise = np.broadcast_to(noise, values.shape)
     except ValueError:
         raise RetrievalInputError(
             f"has the shape {noise.shape}, which does not broadcast to {values.shape}",
             field="variance",
         ) from None
-    lags = inputs.profile_values(lag, "lag", values.shape[:-1])
-    rows, noises = values.reshape(-1, values.shape[-1]), noise.reshape(-1, values.shape[-1])
-    amount = np.broadcast_to(np.zeros(1) if lags is None else lags, len(rows))
-    shifted, variances = _shifted(rows, noises, amount)
-    return shifted.reshape(values.shape), variances.reshape(values.shape)
-
-
-def _shifted(rows: Array, noises: Array, amount: Array) -> tuple[Array, Array]:
-    shifted, variances = np.zeros(rows.shape), np.zeros(rows.shape)
-    for value in np.unique(amount):
-        selected = slice(None) if np.all(amount == value) else np.flatnonzero(amount == value)
-        profiles, variances_of_profiles = rows[selected], noises[selected]
-        total, spread = np.zeros(profiles.shape), np.zeros(profiles.shape)
-        whole_bins = math.floor(value)
-        fraction = float(value) - whole_bins
-        for offset, weight in enumerate((1.0 - fraction, fraction)):
-            # NaN times a weight of 0 must not reach the sum.
-            if weight != 0.0:
-                _add_shifted(profiles, whole_bins + offset, weight, total)
-                _add_shifted(variances_of_profiles, whole_bins + offset, weight**2, spread)
-        shifted[selected], variances[selected] = total, spread
+    shifted, variances = np.zeros((2, *values.shape))
+    whole_bins = math.floor(lag)
+    fraction = lag - whole_bins
+    for offset, weight in enumerate((1.0 - fraction, fraction)):
+        # NaN times a weight of 0 must not reach the sum.
+        if weight != 0.0:
+            _add_shifted(values, whole_bins + offset, weight, shifted)
+            _add_shifted(noise, whole_bins + offset, weight**2, variances)
     missing = ~np.isfinite(shifted)
     shifted[missing] = np.nan
     variances[missing] = np.nan
     return shifted, variances
 
 
-def _add_shifted(rows: Array, whole_bins: int, weight: float, total: Array) -> None:
-    bins = rows.shape[1]
+def _add_shifted(values: Array, whole_bins: int, weight: float, total: Array) -> None:
+    bins = values.shape[-1]
     first, past = min(max(-whole_bins, 0), bins), max(min(bins - whole_bins, bins), 0)
-    total[:, :first] = np.nan
-    total[:, past:] = np.nan
+    total[..., :first] = np.nan
+    total[..., past:] = np.nan
     if first < past:
-        total[:, first:past] += weight * rows[:, first + whole_bins : past + whole_bins]
+        total[..., first:past] += weight * values[..., first + whole_bins : past + whole_bins]

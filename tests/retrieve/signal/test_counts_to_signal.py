@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -207,13 +205,6 @@ def test_estimated_noise_serves_a_retrieval_as_well_as_known_noise(
     assert abs(score[accepted].mean()) < 0.1
 
 
-def test_smoothing_keeps_constants_and_skips_nan() -> None:
-    values = np.full((2, 400), 3.0)
-    values[0, 50:60] = np.nan
-    assert counts_to_signal.smooth_signal(values, RANGE) == pytest.approx(3.0)
-    assert np.isnan(counts_to_signal.smooth_signal(np.full((1, 400), np.nan), RANGE)).all()
-
-
 def _analog(counts, shots, range=RANGE, **settings):  # noqa: A002
     volts = np.full(np.shape(shots), 0.5)
     return counts_to_signal.analog_signal(
@@ -310,40 +301,11 @@ def test_photon_agrees_with_plain_numpy(bins: int, dead_time: float | None) -> N
     )
 
 
-@pytest.mark.parametrize("decades", [0, 6, 9])
-def test_the_near_range_does_not_degrade_sums_of_the_far_range(decades: int) -> None:
-    rng = np.random.default_rng(decades)
-    distance = (np.arange(4096) + 0.5) * 7.5
-    values = rng.normal(1.0, 1.0, 4096) * 10.0 ** np.linspace(decades, 0.0, 4096)
-    values[:30] *= 10.0**decades
-    first, past = oracle.windows(distance, 0.1)
-    inside = [values[a:b] for a, b in zip(first, past, strict=True)]
-    exact = np.array([math.fsum(window) / window.size for window in inside])
-    size = np.array([math.fsum(np.abs(window)) / window.size for window in inside])
-    error = np.abs(counts_to_signal.smooth_signal(values, distance) - exact)
-    whole = (4096 / kernels.BLOCK) ** 2 * 2.0**-106 * np.abs(values).sum() / (past - first)
-    assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
-    if decades > 0:
-        # Differences of one running sum, as in the oracle, lose these digits.
-        oracle_error = np.abs(oracle.smooth(values, distance) - exact)
-        assert oracle_error.max() > 1e-10 * size[np.argmax(oracle_error)]
-
-
 def test_a_constant_signal_has_no_noise_slope() -> None:
     # 18 bins: every window with a difference holds all of them, so one mean is fitted.
     power = np.random.default_rng(2).normal(5.0, 1.0, (20, 18))
     variance = counts_to_signal.difference_variance(power, RANGE[:18])
     assert (np.ptp(variance, axis=-1) == 0.0).all()
-
-
-def test_windows_never_leave_the_profile() -> None:
-    values = np.arange(400.0)
-    for window in (1e300, 1e308):
-        # Both ends as far from the bin as the nearer end of the profile, or 16 bins.
-        average = counts_to_signal.smooth_signal(values, RANGE * 1e-300, window=window)
-        np.testing.assert_allclose(average[16:-16], values[16:-16])
-        assert average[0] == np.mean(values[:17])
-        assert average[-1] == np.mean(values[-17:])
 
 
 def test_windows_do_not_reach_over_bins_that_were_left_on_disk() -> None:
@@ -390,17 +352,10 @@ def test_every_layout_of_the_input_gives_the_same_bits() -> None:
         plain = convert(counts, shots)
         for form in forms:
             _assert_same_bits(convert(form, shots.astype(">i2"), RANGE.astype(">f8")), plain)
-    power = _analog(counts, shots).power
-    for values in (power.astype(">f8"), np.asfortranarray(power), power[::-1][::-1]):
-        np.testing.assert_array_equal(
-            counts_to_signal.smooth_signal(values, RANGE),
-            counts_to_signal.smooth_signal(power, RANGE),
-        )
     # One signature each: otherwise users would wait for repeated compilation.
     assert len(kernels.voltage_profiles.signatures) == 1
     assert len(kernels.photon_profiles.signatures) == 1
     assert len(kernels.noise_profiles.signatures) == 1
-    assert len(kernels.smooth_profiles.signatures) == 1
 
 
 def test_leading_axes_are_kept() -> None:
@@ -491,9 +446,6 @@ _COUNTS = np.ones((1, 400), np.int32)
         ("dark", lambda: _analog(_COUNTS, SHOTS, dark=np.zeros(399))),
         ("dark_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=1.0, dark_variance=[1.0])),
         ("power", lambda: counts_to_signal.difference_variance(np.zeros(399), RANGE)),
-        ("values", lambda: counts_to_signal.smooth_signal(np.zeros(399), RANGE)),
-        ("window", lambda: counts_to_signal.smooth_signal(np.zeros(400), RANGE, window=np.nan)),
-        ("window", lambda: counts_to_signal.smooth_signal(np.zeros(400), RANGE, window=-1.0)),
         ("counts", lambda: _analog(_COUNTS > 0, SHOTS)),
         ("counts", lambda: _photon(_COUNTS > 0, SHOTS)),
         ("bin_width", lambda: counts_to_signal.photon_signal(_COUNTS, SHOTS, RANGE, bin_width=0.0)),

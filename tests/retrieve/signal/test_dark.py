@@ -56,15 +56,13 @@ def test_variance_is_that_of_the_mean(method):
 
 def test_a_drifting_level_is_separated_from_noise():
     rng = np.random.default_rng(4)
-    noise, levels = [], []
+    noise = []
     for _ in range(200):
         times = 60.0 * np.arange(6)
         signals = rng.normal(0.0, 0.1, (6, 300)) + rng.normal(0.0, 2.0, (6, 1))
         result = dark.dark_profile(signals, times, [0.0])
         noise.append(result.variance.mean())
-        levels.append(result.level_variance)
     assert np.mean(noise) == pytest.approx(0.1**2 / 6, rel=0.02)
-    assert np.mean(levels) == pytest.approx(2.0**2, rel=0.2)
 
 
 def test_the_noise_of_a_single_file_is_that_of_its_far_bins():
@@ -74,7 +72,6 @@ def test_the_noise_of_a_single_file_is_that_of_its_far_bins():
     result = dark.dark_profile(signal, [0.0], [10.0, 20.0])
     np.testing.assert_array_equal(result.dark, signal[[0, 0]])
     assert result.variance[0, 100] == pytest.approx(0.3**2, rel=0.1)
-    assert np.isnan(result.level_variance)
 
 
 def test_a_single_file_has_the_scatter_of_other_sessions():
@@ -97,7 +94,6 @@ def test_gaps_are_skipped_and_not_filled():
     empty = dark.dark_profile(np.full((3, 50), np.nan), [0.0, 1.0, 2.0], [0.0])
     assert np.isnan(empty.dark).all()
     assert np.isnan(empty.variance).all()
-    assert np.isnan(empty.level_variance)
 
 
 def test_leading_axes_order_and_cutting_change_nothing():
@@ -157,5 +153,5 @@ def test_the_far_range_of_a_real_station_holds_only_sky(data_root, wavelength):
     gain = (clean[near].mean() - clean[far].mean()) / (rate[near].mean() - rate[far].mean())
     residual = clean[far].mean() - gain * rate[far].mean()
     assert signals[:, far].mean() > 2.0
-    assert abs(residual) < 2.5 * np.sqrt(result.level_variance)
-    assert np.sqrt(result.level_variance) < 0.1
+    # The level of a dark file scatters by less than 0.1 mV.
+    assert abs(residual) < 0.25

@@ -14,11 +14,19 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.signal.dark import dark_profile
 from lidarops.retrieve.signal.labeled import DarkSignals
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage, clock_average
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 
 BINS = 16
 MIDNIGHT = np.datetime64("2026-03-01T00:00:00", "ns")
 SECOND = np.timedelta64(1_000_000_000, "ns")
+
+
+def clock_average(conditioned, **settings):
+    """Return the means of profiles that come in one chunk."""
+    distance = conditioned["range"].to_numpy()
+    average = ClockAverage(conditioned[["time", "time_bnds"]], distance, **settings)
+    average.add(conditioned)
+    return average.result()
 
 
 def made(minutes, *, seed=0, length=60):

@@ -54,7 +54,7 @@ def test_the_standard_error_covers_the_scatter():
 
 def test_one_profile_is_enough():
     rng = np.random.default_rng(3)
-    estimate = lag.estimate_lag(*recorded(rng, 6.4, profiles=1), mask=np.arange(BINS) > 200)
+    estimate = lag.estimate_lag(*recorded(rng, 6.4, profiles=1))
     assert estimate.significant
     assert abs(estimate.lag - 6.4) < 3.0 * estimate.standard_error
 
@@ -77,10 +77,7 @@ def test_profiles_of_different_times_have_no_lag():
 
 def test_a_lag_beyond_the_largest_is_not_significant():
     rng = np.random.default_rng(6)
-    analog, photon = recorded(rng, 12.0)
-    assert not lag.estimate_lag(analog, photon, largest_lag=6).significant
-    estimate = lag.estimate_lag(analog, photon, largest_lag=11)
-    assert not estimate.significant
+    assert not lag.estimate_lag(*recorded(rng, 34.0)).significant
 
 
 def test_gaps_dead_channels_and_spikes_do_not_mislead():
@@ -177,17 +174,6 @@ def test_gaps_stay_gaps_and_spread_only_where_they_are_used():
     assert np.isnan(far).all()
 
 
-def test_each_profile_may_have_its_own_lag():
-    rng = np.random.default_rng(10)
-    values = rng.normal(size=(2, 3, 50)).astype(np.float32)
-    lags = np.array([[0.0, 1.5, -2.0], [8.6, 3.0, 0.25]])
-    moved, noise = lag.shift_signal(values, lags)
-    assert np.isnan(noise).all()
-    for k in np.ndindex(2, 3):
-        np.testing.assert_array_equal(moved[k], lag.shift_signal(values[k], lags[k])[0])
-    np.testing.assert_array_equal(lag.shift_signal(values, 0.0)[0], values)
-
-
 def test_the_estimated_lag_aligns_the_signals():
     """Shifted by its lag, the analog signal has no lag."""
     rng = np.random.default_rng(11)
@@ -206,10 +192,6 @@ def test_the_estimated_lag_aligns_the_signals():
         ({"analog": np.ones(500)}, "analog"),
         ({"analog": np.ones((2, 200)), "photon_counting": np.ones((2, 200))}, "analog"),
         ({"photon_counting": np.ones((3, 500))}, "photon_counting"),
-        ({"largest_lag": 3}, "largest_lag"),
-        ({"largest_lag": 10.5}, "largest_lag"),
-        ({"mask": np.ones(500)}, "mask"),
-        ({"mask": np.ones(7, dtype=bool)}, "mask"),
     ],
 )
 def test_impossible_arguments_are_refused(change, field):
@@ -224,7 +206,6 @@ def test_impossible_arguments_are_refused(change, field):
     [
         ({"profile": 1.0}, "profile"),
         ({"lag": np.nan}, "lag"),
-        ({"lag": [1.0, 2.0, 3.0]}, "lag"),
         ({"variance": np.ones(3)}, "variance"),
     ],
 )

@@ -9,8 +9,8 @@ import numpy as np
 
 from lidarops.constants import DEFAULT_DEAD_TIME, LICEL_RANGE_PER_MICROSECOND
 from lidarops.flags import Quality
-from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.counts_to_signal import Signal
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 EXTREMES = (-(2**31), 1 - 2**31, 2**31 - 1)
 UNUSABLE = int(Quality.INPUT_MISSING | Quality.SATURATED)
@@ -42,9 +42,9 @@ def analog(
         variance = np.full(power.shape, noise_variance) + dark_variance
     top = fired * (2.0**adc_bits - 1.0)
     with np.errstate(invalid="ignore"):
-        clipped = (top - counts) * step < counts_to_signal.CLIPPING * np.sqrt(variance * fired)
+        clipped = (top - counts) * step < THRESHOLDS.clipping * np.sqrt(variance * fired)
         clipped &= fired > 0
-        clipped &= counts > counts_to_signal.NEAR_FULL_SCALE * top
+        clipped &= counts > THRESHOLDS.near_full_scale * top
     power[clipped] = np.nan
     quality[clipped] |= np.int32(Quality.SATURATED)
     if noise_variance is None:
@@ -80,13 +80,9 @@ def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_rang
         exposure = fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)
         rate = counts / exposure
         load = rate * ((dead_time or DEFAULT_DEAD_TIME) * 1e6)
-        correction = load / (1.0 - np.minimum(load, counts_to_signal.PARALYSIS))
-        quality[load > counts_to_signal.PARALYSIS] |= np.int32(Quality.SATURATED)
-        limit = (
-            counts_to_signal.UNCORRECTED_PILE_UP
-            if dead_time is None
-            else counts_to_signal.PILE_UP_CORRECTION
-        )
+        correction = load / (1.0 - np.minimum(load, THRESHOLDS.paralysis))
+        quality[load > THRESHOLDS.paralysis] |= np.int32(Quality.SATURATED)
+        limit = THRESHOLDS.uncorrected_pile_up if dead_time is None else THRESHOLDS.pile_up
         quality[correction > limit] |= np.int32(Quality.PILE_UP)
         rate[(quality & UNUSABLE) != 0] = np.nan
         live = 1.0 - rate * ((dead_time or 0.0) * 1e6)
@@ -138,7 +134,7 @@ def difference_variance(power, range):  # noqa: A002
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         leak = (24.0 * (spacing / range) ** 3 * mean) ** 2 / 20.0
         usable = np.isfinite(squares) & np.isfinite(mean) & (local > 0)
-        usable &= leak < counts_to_signal.LEAK * local
+        usable &= leak < THRESHOLDS.leak * local
         weight = np.where(usable, 1.0 / local**2, 0.0)
         weight /= np.max(weight, axis=-1, keepdims=True)
         weighty = usable & (weight > 0.0)

@@ -1,0 +1,87 @@
+"""Thresholds of the steps from counts to signals, each with what set it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Limits of conversion, noise model, dark signals, lag and gluing."""
+
+    # Photon counting
+    paralysis: float = 0.5
+    """Measured rate times dead time above which a rate cannot be corrected. Assumed."""
+    pile_up: float = 0.1
+    """Relative dead-time correction above which PILE_UP is raised. Assumed."""
+    uncorrected_pile_up: float = 0.01
+    """The same where the dead time is unknown, so that nothing is corrected. Assumed."""
+
+    # Analog
+    near_full_scale: float = 0.5
+    """Share of full scale above which a bin is tested for clipped shots. Assumed."""
+    clipping: float = 3.5
+    """Standard deviations of a shot by which the mean must lie below full scale: clipping shifts
+    the mean by 6e-5 of that deviation there, and by more above."""
+    fine: float = 0.5
+    """Variance of a shot in squared digitiser steps above which rounding is neglected. The error
+    that does not average out is below 1e-4 steps there."""
+
+    # Noise
+    noise_window: float = 0.1
+    """Half-width, relative to range, of the window in which noise is smoothed. Assumed."""
+    weight_window: float = 0.3
+    """The same for the weights of the noise model. Assumed."""
+    leak: float = 0.05
+    """Share of a squared third difference that may come from the fall of the signal. Assumed."""
+
+    # Dark signals
+    session_gap: float = 1800.0
+    """s; dark files farther apart belong to different sessions. Assumed."""
+    variance_window: int = 65
+    """Bins over which the scatter of repeats is averaged: that of 3 repeats alone is off by 100 %.
+    """
+    far_share: float = 0.5
+    """Share of the bins, from the far end, that gives the noise of a file without repeats.
+    Assumed."""
+
+    # Lag
+    largest_lag: int = 30
+    """Bins; largest lag that is searched. Assumed."""
+    confidence: float = 0.999
+    """Least probability that noise without a common cause has a lower peak. Assumed."""
+    fewest_lag_bins: int = 200
+    """Bins between the largest lags. Assumed."""
+    high_pass: int = 17
+    """Bins of the running mean that is subtracted to leave the noise. Assumed."""
+    scale_window: int = 65
+    """Bins over which the standard deviation of the noise is taken. Assumed."""
+    clip: float = 5.0
+    """Standard deviations at which the noise is clipped, against spikes. Assumed."""
+    peak_width: int = 4
+    """Bins on either side of a peak that belong to it. Assumed."""
+
+    # Gluing
+    count_rates: tuple[float, float] = (0.5, 20.0)
+    """MHz; between them photon counting, corrected for dead time, is linear and above its noise.
+    Specification of the elastic chain."""
+    least_snr: float = 10.0
+    """Signal-to-noise ratio of analog in the window. Specification of the elastic chain."""
+    fewest_glued_bins: int = 8
+    """Bins of a window. Assumed."""
+    least_fall: float = 1.5
+    """Factor by which the smoothed count rate must fall within a window: bins without a sufficient
+    fall give the slope of their noise. Assumed."""
+    smoothing: int = 31
+    """Bins over which signals are averaged before the window is chosen. Edges that follow the noise
+    of single bins would bias the slope. Assumed."""
+    least_slope: float = 5.0
+    """Standard errors by which the slope must exceed 0. Assumed."""
+    largest_misfit: float = 1.5
+    """Chi-square of the line over its degrees of freedom, for many bins. Assumed."""
+    misfit_false_alarm: float = 1e-4
+    """Probability with which noise exceeds the largest chi-square, for few bins. Assumed."""
+
+
+THRESHOLDS: Final = Thresholds()
