@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final, Self
 
 import numpy as np
@@ -209,20 +208,13 @@ def molecular_lidar_ratio(wavelength: ArrayLike) -> Array:
     return np.asarray(8.0 * np.pi / 3.0 * (1.0 + 2.0 * gamma) / (1.0 + gamma))
 
 
-class Extrapolation(StrEnum):
-    """Treatment of altitudes beyond the levels of a profile."""
-
-    SCALED_STANDARD = "scaled_standard"
-    """US Standard Atmosphere, scaled to the pressure and temperature of the last level."""
-    REFUSED = "refused"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MolecularProfile:
     """Pressure and temperature of the air over altitude, with its molecular scattering.
 
-    Between levels the logarithm of pressure and the temperature are linear in altitude. Above
-    84 km the number density is 0: less than 1e-5 of that at the ground remains.
+    Between levels the logarithm of pressure and the temperature are linear in altitude. Beyond the
+    levels they are those of the US Standard Atmosphere, scaled to the last level. Above 84 km the
+    number density is 0: less than 1e-5 of that at the ground remains.
 
     Raises
     ------
@@ -238,12 +230,10 @@ class MolecularProfile:
     """Pa."""
     temperature: Array
     """K."""
-    extrapolation: Extrapolation = Extrapolation.SCALED_STANDARD
 
     def __post_init__(self) -> None:
         for name in ("altitude", "pressure", "temperature"):
             object.__setattr__(self, name, _levels(name, getattr(self, name)))
-        object.__setattr__(self, "extrapolation", _extrapolation(self.extrapolation))
         for name in ("pressure", "temperature"):
             if getattr(self, name).size != self.altitude.size:
                 raise RetrievalInputError(
@@ -278,7 +268,6 @@ class MolecularProfile:
         temperature: ArrayLike,
         *,
         pressure_unit: str | None = None,
-        extrapolation: Extrapolation = Extrapolation.SCALED_STANDARD,
     ) -> Self:
         """Return the profile of a sounding or a model.
 
@@ -291,7 +280,6 @@ class MolecularProfile:
         pressure_unit : {"Pa", "hPa"}, optional
             Detected from the lowest level where not given: near 1013 it is hPa, near 101300 Pa.
             A given unit must agree with it.
-        extrapolation : Extrapolation
 
         Raises
         ------
@@ -302,7 +290,7 @@ class MolecularProfile:
         z, p = _levels("altitude", altitude), _levels("pressure", pressure)
         _check_altitude(z)
         scale = _UNITS[_unit(float(z[0]), float(p[0]), pressure_unit)]
-        return cls(z, p * scale, _levels("temperature", temperature), extrapolation)
+        return cls(z, p * scale, _levels("temperature", temperature))
 
     def at(self, altitude: ArrayLike) -> tuple[Array, Array]:
         """Return pressure (Pa) and temperature (K).
@@ -315,7 +303,7 @@ class MolecularProfile:
         Raises
         ------
         RetrievalInputError
-            Outside -5 to 84 km; outside the levels where `extrapolation` is refused.
+            Outside -5 to 84 km.
         """
         z = np.asarray(altitude, dtype=np.float64)
         pressure = np.exp(np.interp(z, self.altitude, np.log(self.pressure)))
@@ -323,13 +311,6 @@ class MolecularProfile:
         inside = (z >= self.altitude[0]) & (z <= self.altitude[-1])
         if np.all(inside):
             return np.asarray(pressure), np.asarray(temperature)
-        if self.extrapolation is Extrapolation.REFUSED or not np.all(np.isfinite(z)):
-            raise RetrievalInputError(
-                f"the molecular profile reaches from {self.altitude[0]:g} to"
-                f" {self.altitude[-1]:g} m",
-                field="altitude",
-                remedy="give a longer profile, or allow its extrapolation",
-            )
         standard = us_standard(z)
         ends = us_standard(np.clip(z, self.altitude[0], self.altitude[-1]))
         return (
@@ -409,17 +390,6 @@ class MolecularProfile:
 
 
 _UNITS: Final = {"Pa": 1.0, "hPa": 100.0}
-
-
-def _extrapolation(name: str) -> Extrapolation:
-    try:
-        return Extrapolation(name)
-    except ValueError:
-        raise RetrievalInputError(
-            f"is {name!r}",
-            field="extrapolation",
-            remedy=f"choose one of {', '.join(Extrapolation)}",
-        ) from None
 
 
 def _levels(field: str, values: ArrayLike) -> Array:

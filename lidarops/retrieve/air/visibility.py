@@ -13,7 +13,6 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 
 Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
 
 MOR_CONTRAST: Final = 0.05
 """Contrast threshold of the meteorological optical range (`wmo8`): V = ln 20 / extinction."""
@@ -26,12 +25,17 @@ REFERENCE_WAVELENGTH: Final = 550e-9
 """m, where visibility is defined."""
 LARGEST_EXTINCTION: Final = 10.0
 """m-1, ten times that of the densest smoke; larger values must be in km-1."""
-LARGE_RELATIVE_ERROR: Final = 0.1
-"""Relative error of extinction above which the interval of visibility is asymmetric by more than
-10 percent."""
 
 _KRUSE_NEAR: Final = 6000.0
 _KRUSE_FAR: Final = 50_000.0
+"""m of visibility, where the exponent of `kruse1962` changes."""
+_KRUSE_SLOPE: Final = 0.585
+_KRUSE_MIDDLE: Final = 1.3
+_KRUSE_CLEAR: Final = 1.6
+"""Exponent below, between and above: the first times the cube root of the visibility in km."""
+_SHORTEST: Final = 200e-9
+_LONGEST: Final = 2e-6
+"""m, wavelengths for which the laws are taken to hold. Assumed."""
 _KRUSE_PASSES: Final = 60
 """Passes of a fixed-point iteration that contracts by at least 0.7 per pass from 200 nm to 2 um."""
 
@@ -55,11 +59,6 @@ class ReferenceExtinction:
     """m-1."""
     extinction_standard_error: Array
     """m-1."""
-    exponent: Array
-    """1, the Angstrom exponent: the negative exponent of wavelength."""
-    ambiguous: Booleans
-    """True where two visibilities obey the law; the lower is taken."""
-    law: WavelengthLaw
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,17 +68,11 @@ class VisibilityResult:
     visibility: Array
     """m; NaN where extinction is missing or not positive."""
     visibility_standard_error: Array
-    """m, to first order; where `asymmetric`, use the interval."""
+    """m, to first order; where extinction is off by a tenth or more, use the interval."""
     visibility_lower: Array
     """m, of extinction plus its standard error."""
     visibility_upper: Array
     """m, of extinction minus its standard error; inf where that is not positive."""
-    asymmetric: Booleans
-    """True where the relative standard error of extinction exceeds 0.1."""
-    unbounded: Booleans
-    """True where the interval has no upper end."""
-    contrast: float
-    """1, the contrast threshold of the definition."""
 
 
 def koschmieder_constant(contrast: float = MOR_CONTRAST) -> float:
@@ -149,9 +142,6 @@ def visibility_from_extinction(
         visibility_standard_error=visibility * relative,
         visibility_lower=lower,
         visibility_upper=upper,
-        asymmetric=positive & (relative > LARGE_RELATIVE_ERROR),
-        unbounded=np.isinf(upper),
-        contrast=float(contrast),
     )
 
 
@@ -171,7 +161,7 @@ def at_reference_wavelength(
     Kruse's exponent depends on the visibility V (contrast 0.02) itself: q = 1.6 above 50 km,
     1.3 from 6 km, 0.585 (V / km)^(1/3) below, so that V follows from an implicit equation. The
     law jumps at 6 and 50 km. Where no branch holds (beyond 550 nm), visibility is that of the
-    jump; where two hold, the lower visibility is taken and marked as ambiguous.
+    jump; where two hold, the lower visibility is taken.
 
     Parameters
     ----------
@@ -201,7 +191,7 @@ def at_reference_wavelength(
     """
     value, error = _checked(extinction, standard_error)
     chosen = inputs.choice(law, WavelengthLaw, "law")
-    if not 200e-9 <= wavelength <= 2e-6:
+    if not _SHORTEST <= wavelength <= _LONGEST:
         raise RetrievalInputError(
             f"is {wavelength:g} m", field="wavelength", remedy="give metres, 200e-9 to 2e-6"
         )
@@ -213,23 +203,22 @@ def at_reference_wavelength(
     if not exponent_standard_error >= 0:
         raise RetrievalInputError("is negative or NaN", field="exponent_standard_error")
     logarithm = float(np.log(wavelength / REFERENCE_WAVELENGTH))
-    ambiguous = np.zeros(value.shape, dtype=np.bool_)
     gain = np.ones(value.shape)
     if chosen is WavelengthLaw.NONE:
         power, logarithm = np.zeros(value.shape), 0.0
     elif chosen is WavelengthLaw.ANGSTROM:
         power = _exponents(exponent, value.shape)
     else:
-        power, gain, ambiguous = _kruse(value, logarithm)
+        power, gain = _kruse(value, logarithm)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         factor = np.exp(power * logarithm)
         spread = value * factor * logarithm * exponent_standard_error
         total = np.hypot(factor * gain * error, gain * spread)
-    return ReferenceExtinction(value * factor, total, power, ambiguous, chosen)
+    return ReferenceExtinction(value * factor, total)
 
 
-def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array, Booleans]:
-    """Return Kruse's exponent, the gain and ambiguity.
+def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array]:
+    """Return Kruse's exponent and the gain.
 
     The gain is d ln(extinction at 550 nm) / d ln(extinction). Where no branch holds, visibility
     is constant at the jump and the gain is 0; it is set to 1 there, so that the error is not
@@ -241,8 +230,8 @@ def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array, Booleans]
         near = plain.copy()
         for _ in range(_KRUSE_PASSES):
             near = plain * np.exp(-_near_exponent(near) * logarithm)
-        middle = plain * np.exp(-1.3 * logarithm)
-        far = plain * np.exp(-1.6 * logarithm)
+        middle = plain * np.exp(-_KRUSE_MIDDLE * logarithm)
+        far = plain * np.exp(-_KRUSE_CLEAR * logarithm)
         holds = np.stack(
             [
                 near < _KRUSE_NEAR,
@@ -251,7 +240,11 @@ def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array, Booleans]
             ]
         )
         exponents = np.stack(
-            [_near_exponent(near), np.full(near.shape, 1.3), np.full(near.shape, 1.6)]
+            [
+                _near_exponent(near),
+                np.full(near.shape, _KRUSE_MIDDLE),
+                np.full(near.shape, _KRUSE_CLEAR),
+            ]
         )
         first = np.argmax(holds, axis=0)
         power = np.take_along_axis(exponents, first[np.newaxis], axis=0)[0]
@@ -261,11 +254,11 @@ def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array, Booleans]
         power = np.where(positive, np.where(none, bridged, power), np.nan)
         slope = np.where(first == 0, _near_exponent(near) / 3.0 * logarithm, 0.0)
         gain = np.where(none | ~positive, 1.0, 1.0 / (1.0 + slope))
-    return power, gain, holds.sum(axis=0) > 1
+    return power, gain
 
 
 def _near_exponent(visibility: Array) -> Array:
-    return 0.585 * np.cbrt(np.minimum(visibility, _KRUSE_NEAR) / 1000.0)
+    return _KRUSE_SLOPE * np.cbrt(np.minimum(visibility, _KRUSE_NEAR) / 1000.0)
 
 
 def _exponents(exponent: npt.ArrayLike | None, shape: tuple[int, ...]) -> Array:

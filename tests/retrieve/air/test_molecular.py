@@ -14,7 +14,6 @@ from scipy.integrate import quad
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import (
     HIGHEST,
-    Extrapolation,
     MolecularProfile,
     molecular_lidar_ratio,
     number_density,
@@ -137,16 +136,6 @@ def test_beyond_the_levels_the_standard_is_scaled(edge):
     np.testing.assert_allclose(far[1] / standard[1], outside[1] / us_standard(edge)[1])
 
 
-def test_beyond_the_levels_may_be_refused():
-    profile = _profile(extrapolation=Extrapolation.REFUSED)
-    assert profile.number_density(LEVELS).shape == LEVELS.shape
-    for altitude in (99.0, 12_001.0):
-        with pytest.raises(RetrievalInputError, match="100 to 12000 m"):
-            profile.extinction([500.0, altitude], 532e-9)
-    with pytest.raises(RetrievalInputError, match="scaled_standard, refused"):
-        _profile(extrapolation="nearest")
-
-
 @pytest.mark.parametrize("altitude", [np.nan, -np.inf, -6e3])
 def test_altitudes_outside_the_standard_are_refused(altitude):
     for call in (STANDARD.at, STANDARD.number_density, lambda z: STANDARD.column(z, 9e3)):
@@ -216,12 +205,6 @@ def test_an_invalid_sounding_is_refused_by_field(name, change, field, message):
     with pytest.raises(RetrievalInputError, match=message) as caught:
         MolecularProfile.from_profile(**arguments)
     assert caught.value.field == field
-
-
-@pytest.mark.parametrize("wavelength", [532.0, 0.532, 1e-7, np.nan])
-def test_a_wavelength_in_another_unit_is_refused(wavelength):
-    with pytest.raises(RetrievalInputError, match="532e-9"):
-        STANDARD.backscatter(0.0, wavelength)
 
 
 def test_a_profile_does_not_change_with_its_input():

@@ -18,21 +18,6 @@ from lidarops.retrieve.air.molecular import (
 )
 
 
-@pytest.mark.parametrize(
-    ("altitude", "pressure", "temperature"),
-    [
-        (0.0, 101_325.0, 288.15),
-        (11_000.0, 22_699.96, 216.774),
-        (20_000.0, 5529.31, 216.65),
-        (50_000.0, 79.78, 270.65),
-    ],
-)
-def test_the_tables_of_us1976_are_reproduced(altitude, pressure, temperature):
-    p, t = us_standard(altitude)
-    assert p == pytest.approx(pressure, rel=2e-5)
-    assert t == pytest.approx(temperature, abs=6e-4)
-
-
 @given(st.floats(-4900.0, 83_000.0))
 def test_air_is_in_hydrostatic_balance(altitude):
     # dp/dz = -rho g with g(z) of the spherical Earth of the standard, by central difference.
@@ -56,20 +41,6 @@ def test_altitudes_keep_their_shape():
 def test_an_altitude_outside_the_standard_is_refused(altitude):
     with pytest.raises(RetrievalInputError, match="altitude"):
         us_standard([0.0, altitude])
-
-
-@pytest.mark.parametrize(
-    ("wavelength", "cross_section", "depth"),
-    [(355e-9, 2.759e-30, 0.5940), (532e-9, 5.167e-31, 0.1113), (1064e-9, 3.130e-32, 0.00674)],
-)
-def test_rayleigh_scattering_of_the_column(wavelength, cross_section, depth):
-    # The check values at 1064 nm are from the fit of bodhaine1999, which is 0.08 % high there.
-    infrared = wavelength > 1e-6
-    relative = 1.5e-3 if infrared else 5e-4
-    assert rayleigh_cross_section(wavelength) == pytest.approx(cross_section, rel=relative)
-    z = np.linspace(0.0, 80e3, 20_001)
-    column = np.trapezoid(number_density(*us_standard(z)), z) * rayleigh_cross_section(wavelength)
-    assert column == pytest.approx(depth, rel=relative)
 
 
 @given(st.floats(0.25, 0.85))
