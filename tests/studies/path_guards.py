@@ -1,0 +1,94 @@
+"""Ablation of the guards of the homogeneous path: ``python tests/studies/path_guards.py``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Final
+from unittest import mock
+
+import numpy as np
+from studies.ablation import Guard, measure, table
+
+from lidarops.bench.stability import random_homogeneous
+from lidarops.flags import Quality
+from lidarops.retrieve.homogeneous import _fit_quality, _routing, path_fit
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+
+CLUSTERS: Final = 150
+PROFILES: Final = 60
+
+
+@contextmanager
+def limits(**changes: float) -> Iterator[None]:
+    """Replace limits of the tests, by name of `CommonLimits`."""
+    common, every = _fit_quality.common_limits, _fit_quality._limits
+    names = {"curvature": "trend", "square": "trend"}
+
+    def changed_common(*arguments: Any, **options: Any) -> Any:
+        return common(*arguments, **options)._replace(**changes)
+
+    def changed(*arguments: Any, **options: Any) -> Any:
+        own = every(*arguments, **options)
+        fields = {names.get(name, name): value for name, value in changes.items()}
+        return replace(own, **{k: np.full_like(own.widening, v) for k, v in fields.items()})
+
+    with (
+        mock.patch.object(_routing, "common_limits", changed_common),
+        mock.patch.object(_fit_quality, "_limits", changed),
+    ):
+        yield
+
+
+@contextmanager
+def without_bend() -> Iterator[None]:
+    """Drop the part of the model errors by a signal that bends."""
+    fit = path_fit.fit_homogeneous_path
+
+    def straight(power: Any, range_: Any, **options: Any) -> Any:
+        result = fit(power, range_, **options)
+        mean = np.mean(range_)
+        slope = THRESHOLDS.model_error * (np.abs(result.extinction) + 1.0 / mean)
+        return replace(
+            result,
+            extinction_model_error=slope,
+            background_model_error=np.zeros_like(result.background),
+        )
+
+    with mock.patch.object(path_fit, "fit_homogeneous_path", straight):
+        yield
+
+
+def _off(**changes: float) -> Callable[[], Any]:
+    return lambda: limits(**changes)
+
+
+GUARDS: Final = (
+    Guard("NEGATIVE_AMPLITUDE", int(Quality.NEGATIVE_AMPLITUDE)),
+    Guard("LOW_SIGNAL", int(Quality.LOW_SIGNAL)),
+    Guard("POORLY_DETERMINED", int(HomogeneousQuality.POORLY_DETERMINED)),
+    Guard("both of these", int(Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED)),
+    Guard("AT_BOUND", int(HomogeneousQuality.AT_BOUND)),
+    Guard("POOR_FIT", int(HomogeneousQuality.POOR_FIT)),
+    Guard("NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
+    Guard("NOT_HOMOGENEOUS, square", off=_off(square=np.inf)),
+    Guard("NOT_HOMOGENEOUS, curvature", off=_off(curvature=np.inf)),
+    Guard("OUTLIER", int(Quality.OUTLIER)),
+    Guard("TOO_FEW_BINS", int(Quality.TOO_FEW_BINS)),
+    Guard("widening of estimated noise", off=_off(widening=1.0)),
+    Guard("bend in the model error", off=without_bend),
+)
+
+BINS: Final = {"sections of 8 to 800 bins": (8, 800), "8 to 24 bins": (8, 24), "4 to 7": (4, 7)}
+
+if __name__ == "__main__":
+    clusters = int(sys.argv[1]) if len(sys.argv) > 1 else CLUSTERS
+    for title, bins in BINS.items():
+        with mock.patch.object(random_homogeneous, "_BINS", bins):
+            counts = measure(
+                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), range(clusters), GUARDS
+            )
+        sys.stdout.write("\n".join([f"\n## {title}\n", *table(counts), ""]))
