@@ -8,10 +8,15 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from lidarops.bench.harness.timing import READ, StepCost
 from lidarops.figures.charts import Chart, Ladder, Panel, Series, pareto
 from lidarops.figures.wording import counted, percent
 from lidarops.reports.benchmark_page import Part, Table
+
+Array = npt.NDArray[np.float64]
 
 CPU_TIME: Final = "CPU time"
 """Quantity against which errors are drawn."""

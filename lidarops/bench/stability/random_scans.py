@@ -11,11 +11,11 @@ import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scan, Scene
+from lidarops.bench.harness.rows import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
-from lidarops.bench.stability.stiff_cases import Array
-from lidarops.bench.stability.stiff_scans import BITS
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
+from lidarops.retrieve.multiangle.labeled import QUALITY_OF_FLAG
 
 Random = np.random.Generator
 
@@ -120,7 +120,7 @@ def _score_quantities(
     failure: Failure, scene: Scene, result: optical_depth.MultiAngleResult, profiles: int
 ) -> Iterator[tuple[ScoredValues, int]]:
     bits = np.asarray(result.quality).copy()
-    for name, bit in BITS.items():
+    for name, bit in QUALITY_OF_FLAG.items():
         bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
     truth: dict[str, Array] = {
         "optical depth": scene.optical_depth,

@@ -14,8 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import MonteCarloFigure
-from lidarops.bench.stability.stiff_cases import Array
+from lidarops.bench.harness.rows import Array, MonteCarloFigure
 from lidarops.flags import FlagBit, Quality, rejecting
 
 Mask = npt.NDArray[np.bool_]

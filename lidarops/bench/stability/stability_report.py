@@ -19,14 +19,9 @@ from lidarops.bench.stability.random_scenes import (
     FalseValueRate,
     Verdict,
 )
-from lidarops.bench.stability.stiff_cases import CaseOutcome
 from lidarops.figures.wording import counted, duration
 from lidarops.reports.benchmark_page import BenchmarkReport, Part
 
-_PASSED: Final = "passed"
-_KNOWN: Final = "known finding"
-_FAILED: Final = "FAILED"
-_PASSED_FINDING: Final = "passed, though listed as a finding"
 _OF_RATE: Final = (
     Quantity("scenes", "scenes"),
     Quantity("values", "values"),
@@ -61,77 +56,20 @@ class Stability:
 
     date: str
     machine: Machine
-    outcomes: tuple[CaseOutcome, ...]
     rates: tuple[FalseValueRate, ...]
     spent: tuple[PartCost, ...]
-
-    @property
-    def failed(self) -> bool:
-        """Whether a case failed unexpectedly, or passed although a failure is known."""
-        return any(outcome.passed == bool(outcome.finding) for outcome in self.outcomes)
 
 
 def stability_report(stability: Stability) -> BenchmarkReport:
     """Return the report page."""
     return BenchmarkReport(
-        title="Stability: stiff and extreme cases, and false values without a flag",
+        title="Stability: false values without a flag",
         facts=(
             *facts(stability.date, stability.machine),
             ("CPU time", ", ".join(f"{s.what} {duration(s.seconds)}" for s in stability.spent)),
         ),
-        parts=(_cases(stability.outcomes), *_rates(stability.rates)),
+        parts=tuple(_rates(stability.rates)),
         data=RESULT,
-    )
-
-
-# Cases ----------------------------------------------------------------------------------------
-
-
-def verdict(outcome: CaseOutcome) -> str:
-    """Return the verdict on a case."""
-    if outcome.finding:
-        return _PASSED_FINDING if outcome.passed else _KNOWN
-    return _PASSED if outcome.passed else _FAILED
-
-
-def _cases(outcomes: tuple[CaseOutcome, ...]) -> Part:
-    verdicts = {outcome: verdict(outcome) for outcome in outcomes}
-    counts = [
-        Row(name, "", word, sum(o.retrieval == name and verdicts[o] == word for o in outcomes))
-        for name in dict.fromkeys(outcome.retrieval for outcome in outcomes)
-        for word in (_PASSED, _KNOWN, _FAILED)
-    ]
-    rows = {
-        outcome: [
-            Row(outcome.retrieval, outcome.name, name, text)
-            for name, text in (
-                ("verdict", verdicts[outcome]),
-                ("expected", outcome.expected),
-                ("got", outcome.got),
-                ("reason", outcome.finding),
-            )
-        ]
-        for outcome in outcomes
-    }
-    unmet = [row for o in outcomes if not o.passed or o.finding for row in rows[o]]
-    passed = sum(outcome.passed for outcome in outcomes)
-    return Part(
-        title="Stiff and extreme cases",
-        text=f"{counted(len(outcomes), 'case')}, {passed:,} passed. A case expects a value "
-        "within a tolerance of a known one (in closed form, or to 60 digits), a flag, or an error "
-        "that names the field. Any other exception, and a warning, counts as a crash.",
-        tables=(
-            table("Cases by retrieval", counts, case="retrieval"),
-            table("Cases that fail, and known findings", unmet, case="retrieval", method="case"),
-        ),
-        details=(
-            table(
-                "All cases",
-                [row for group in rows.values() for row in group if row.quantity != "reason"],
-                case="retrieval",
-                method="case",
-            ),
-        ),
     )
 
 
