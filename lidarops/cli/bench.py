@@ -106,4 +106,4 @@ def _refuse(options: dict[str, object]) -> None:
 def _stability(effort: Effort) -> BenchmarkOutput:
     from lidarops.bench.stability import study
 
-    return study.run_stability(effort)
+    return study.measure_stability(effort).output()

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.bench.harness.rows import Array
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
@@ -25,8 +26,6 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
 from lidarops.retrieve.elastic import inversion, layers, reference_window
 from lidarops.retrieve.homogeneous import path_fit
-
-Array = npt.NDArray[np.float64]
 
 WAVELENGTH: Final = 532e-9
 LIDAR_RATIO: Final = 39.0

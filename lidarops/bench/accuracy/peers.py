@@ -8,9 +8,6 @@ which is better than any start from data.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, Final
 
 import numpy as np
@@ -28,21 +25,15 @@ from lidarops.bench.accuracy.homogeneous_cases import (
 
 KILOMETRE: Final = 1e3
 JIT: Final = "LM, numba"
-JAX: Final = "LM, JAX vmap"
-_JAX_ITERATIONS: Final = 8
-_JAX_DAMPING: Final = 1e-6
 
 
 def iterative_peers() -> dict[str, PathSolver]:
-    """Return the iterative solvers by name; the JAX solver only if JAX is installed."""
-    peers: dict[str, PathSolver] = {
+    """Return the iterative solvers by name."""
+    return {
         JIT: compiled,
         "scipy curve_fit": _one_by_one(_curve_fit),
         "scipy least_squares": _one_by_one(_least_squares),
     }
-    if find_spec("jax") is not None:
-        peers[JAX] = vectorised
-    return peers
 
 
 def start(scenario: Scenario) -> Array:
@@ -60,40 +51,6 @@ def compiled(power: Any, scenario: Scenario) -> Estimates:
         power, ratio, depth, start(scenario), unknowns, covariance
     )
     return _estimates(unknowns, covariance, scenario)
-
-
-def vectorised(power: Any, scenario: Scenario) -> Estimates:
-    """Solve by a fixed number of damped Gauss-Newton steps of all profiles at once, in JAX."""
-    ratio, depth = _geometry(scenario)
-    unknowns, covariance = _jax_solver()(
-        np.asarray(power, np.float64), ratio, depth, start(scenario)
-    )
-    return _estimates(np.asarray(unknowns), np.asarray(covariance), scenario)
-
-
-@cache
-def _jax_solver() -> Callable[..., Any]:
-    jax: Any = import_module("jax")
-    # Single precision, the default, does not reach the least scatter with a large background.
-    jax.config.update("jax_enable_x64", True)  # noqa: FBT003 - the signature of JAX
-    numpy = jax.numpy
-
-    def normal(power: Any, unknowns: Any, ratio: Any, depth: Any) -> tuple[Any, Any]:
-        shape = ratio * numpy.exp(-2.0 * unknowns[2] * depth)
-        slopes = numpy.stack([numpy.ones_like(shape), shape, -2.0 * unknowns[1] * depth * shape])
-        return slopes @ slopes.T, slopes @ (power - unknowns[0] - unknowns[1] * shape)
-
-    def solve(power: Any, ratio: Any, depth: Any, begin: Any) -> tuple[Any, Any]:
-        def step(_: Any, unknowns: Any) -> Any:
-            matrix, side = normal(power, unknowns, ratio, depth)
-            damped = matrix + _JAX_DAMPING * numpy.diag(numpy.diag(matrix))
-            return unknowns + numpy.linalg.solve(damped, side)
-
-        unknowns = jax.lax.fori_loop(0, _JAX_ITERATIONS, step, begin)
-        return unknowns, numpy.linalg.inv(normal(power, unknowns, ratio, depth)[0])
-
-    compiled_solver: Callable[..., Any] = jax.jit(jax.vmap(solve, in_axes=(0, None, None, None)))
-    return compiled_solver
 
 
 def _geometry(scenario: Scenario) -> tuple[Array, Array]:

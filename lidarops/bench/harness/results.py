@@ -5,14 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import TypeAdapter, ValidationError
+from typing import Any
 
 from lidarops.errors import CatalogError
 from lidarops.system.files import write_atomically
-
-_Result = TypeVar("_Result")
 
 
 def plain(result: object) -> Any:
@@ -43,19 +39,3 @@ def save(result: object, path: Path) -> Path:
             remedy="choose a folder you can write to",
         ) from error
     return path
-
-
-def load(kind: type[_Result], path: Path) -> _Result:
-    """Return a result that `save` wrote.
-
-    Raises
-    ------
-    CatalogError
-        If the file is missing or holds something else.
-    """
-    try:
-        return TypeAdapter(kind).validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise CatalogError(
-            f"no result of a benchmark: {error}", file=path, remedy="run the benchmark again"
-        ) from error

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.harness.rows import Array
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, ScoredValues
+from lidarops.bench.harness.rows import Array, Mask
+from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.products.elastic.settings import ReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
