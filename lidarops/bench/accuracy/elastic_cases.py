@@ -11,14 +11,14 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.rows import Array, Mask
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
@@ -26,13 +26,17 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
 from lidarops.retrieve.elastic import inversion, layers, reference_window
 from lidarops.retrieve.homogeneous import path_fit
+from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 WAVELENGTH: Final = 532e-9
 LIDAR_RATIO: Final = 39.0
 SHOTS: Final = 1000.0
 BRIGHTEST: Final = 1.9093e7
 """Counts in the brightest bin, as in the intercomparison."""
-RANGE: Final = 15.0 * (np.arange(1005, dtype=np.float64) + 0.5)
+_BIN_WIDTH: Final = 15.0
+RANGE: Final = bin_centres(1005, _BIN_WIDTH)
+_CELLS: Final = 9
+"""Cells of a bin, over which the optical depth is summed."""
 LEVELS: Final = tuple(10.0**power for power in range(9))
 """Backgrounds in counts per bin and shot."""
 CLEAN_FROM: Final = 6000.0
@@ -72,12 +76,12 @@ class SimulatedSky:
     """m-1 sr-1, true backscatter of the particles."""
 
     @property
-    def compared(self) -> npt.NDArray[np.bool_]:
+    def compared(self) -> Mask:
         """Bins whose backscatter is compared with the truth."""
         return (self.range >= COMPARED[0]) & (self.range <= COMPARED[1])
 
     @property
-    def inverted(self) -> npt.NDArray[np.bool_]:
+    def inverted(self) -> Mask:
         """Bins that the inversion uses."""
         return self.range > OVERLAP
 
@@ -126,22 +130,37 @@ def particles(height: npt.ArrayLike) -> Array:
     return np.asarray(np.where(z < CLEAN_FROM, mixed + aloft, 0.0))
 
 
+def clean_signal(
+    extinction: Callable[[Array], Array], backscatter: Callable[[Array], Array]
+) -> Array:
+    """Return the signal of a short pulse in the bins of `RANGE`, in any unit.
+
+    The optical depth is summed over cells of a ninth of a bin, not by the trapezoids of the
+    inversion. The error of these is therefore part of the measured error.
+
+    Parameters
+    ----------
+    extinction, backscatter : callable
+        Return m-1 and m-1 sr-1 at ranges in m.
+    """
+    cells = bin_centres(_CELLS * RANGE.size, _BIN_WIDTH / _CELLS)
+    signal = backscatter_signal(
+        cells,
+        extinction=extinction(cells),
+        backscatter=backscatter(cells),
+        system_constant=1.0,
+    )
+    return signal[_CELLS // 2 :: _CELLS]
+
+
 @cache
 def simulated_sky() -> SimulatedSky:
-    """Return the simulated set.
-
-    The optical depth is integrated by Gauss quadrature with 8 nodes from bin to bin, not by the
-    trapezoids of the inversion. The error of these is therefore part of the measured error.
-    """
+    """Return the simulated set."""
     air = MolecularProfile.us_standard()
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    edges = np.concatenate([[0.0], RANGE])
-    half = 0.5 * np.diff(edges)[:, np.newaxis]
-    z = edges[:-1, np.newaxis] + half * (1.0 + nodes)
-    extinction = LIDAR_RATIO * particles(z) + air.extinction(z, WAVELENGTH)
-    depth = np.cumsum(np.sum(extinction * weights * half, axis=-1))
-    molecular = air.backscatter(RANGE, WAVELENGTH)
-    signal = (particles(RANGE) + molecular) * np.exp(-2.0 * depth) / RANGE**2
+    signal = clean_signal(
+        lambda z: LIDAR_RATIO * particles(z) + air.extinction(z, WAVELENGTH),
+        lambda z: particles(z) + air.backscatter(z, WAVELENGTH),
+    )
     signal *= np.minimum((np.arange(RANGE.size) + 1.0) / _RAMP, 1.0) ** 3
     return _sky(air, signal, particles(RANGE))
 
@@ -155,7 +174,7 @@ class BackgroundEstimates:
 
     background: Array
     standard_error: Array
-    rejected: npt.NDArray[np.bool_]
+    rejected: Mask
     """Whether a quality bit rejects the value."""
 
 
@@ -176,47 +195,57 @@ def background_methods() -> dict[str, BackgroundMethod]:
     """
     return {
         KNOWN_SHAPE: _known_shape,
-        KNOWN_CLEAN_RANGE: _known_clean_range,
-        TAIL_MEAN: _tail_mean,
+        KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
+        TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
         HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
     }
 
 
-def _known_shape(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    fit = known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS)
-    return _estimates(fit.background, fit.background_standard_error, fit.quality)
-
-
-def _known_clean_range(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    fit = known_shape.fit_known_shape(
-        counts, sky.range, sky.shape, exposure=SHOTS, start=CLEAN_FROM
+def _known_shape(
+    counts: Array, sky: SimulatedSky, start: float | None = None
+) -> BackgroundEstimates:
+    return _estimates(
+        known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS, start=start)
     )
-    return _estimates(fit.background, fit.background_standard_error, fit.quality)
-
-
-def _tail_mean(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    result = cubic_and_tail.tail_mean(counts, sky.range)
-    return _estimates(result.background, result.background_standard_error, result.quality)
 
 
 def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
     variance = photon_counts.mean_profile_variance(counts[:, far], SHOTS)
     fit = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
-    return _estimates(fit.background, fit.background_standard_error, fit.quality)
+    return _estimates(fit)
 
 
 def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
-    result = cubic_and_tail.cubic(
-        counts[:, far], sky.range[far], statistics=cubic_and_tail.Statistics.POISSON, shots=SHOTS
+    return _estimates(
+        cubic_and_tail.cubic(
+            counts[:, far],
+            sky.range[far],
+            statistics=cubic_and_tail.Statistics.POISSON,
+            shots=SHOTS,
+        )
     )
-    return _estimates(result.background, result.background_standard_error, result.quality)
 
 
-def _estimates(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> BackgroundEstimates:
-    return BackgroundEstimates(value, error, (quality & rejecting(Quality)) != 0)
+class _Background(Protocol):
+    """Result of any method."""
+
+    @property
+    def background(self) -> Array: ...
+    @property
+    def background_standard_error(self) -> Array: ...
+    @property
+    def quality(self) -> npt.NDArray[np.int32]: ...
+
+
+def _estimates(result: _Background) -> BackgroundEstimates:
+    return BackgroundEstimates(
+        result.background,
+        result.background_standard_error,
+        (result.quality & rejecting(Quality)) != 0,
+    )
 
 
 def least_error(sky: SimulatedSky, level: float) -> float:
@@ -245,7 +274,7 @@ class Inverted:
     """m-1 sr-1, (profile, range); NaN where withheld."""
     standard_error: Array
     """m-1 sr-1."""
-    calibrated: npt.NDArray[np.bool_]
+    calibrated: Mask
     """Profiles with a reference window."""
 
 
@@ -266,7 +295,7 @@ def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
 
 
 def choose_window(
-    power: Array, noise: Array, sky: SimulatedSky, exclude: npt.NDArray[np.bool_] | None = None
+    power: Array, noise: Array, sky: SimulatedSky, exclude: Mask | None = None
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows chosen from `CANDIDATES`."""
     return reference_window.choose_reference(

@@ -381,7 +381,10 @@ def _priors(size: StudySize) -> Scores:
     ]
     scores: Scores = {}
     for factor in PRIORS:
-        results = [cases.with_prior(scan, factor * truth) for scan in scans]
+        prior = factor * truth
+        results = [
+            cases.estimate(scan, cases.MLD_PRIOR, prior_optical_depth=prior) for scan in scans
+        ]
         scores[f"{factor:g}", ""] = {
             "prior alone": abs(factor - 1.0) * float(np.sqrt(np.mean(truth**2))),
             _DEPTH: _rmse([result.optical_depth for result in results], scene),

@@ -16,12 +16,12 @@ from scipy.optimize import curve_fit, least_squares
 from lidarops.bench.accuracy import levenberg_marquardt
 from lidarops.bench.accuracy.homogeneous_cases import (
     WRONG_PRIOR,
-    Array,
     Estimates,
     PathSolver,
     Scenario,
     estimated,
 )
+from lidarops.bench.harness.rows import Array
 
 KILOMETRE: Final = 1e3
 JIT: Final = "LM, numba"

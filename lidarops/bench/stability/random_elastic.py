@@ -32,6 +32,8 @@ _CLEAN_FROM: Final = 6000.0
 """m; no particles above."""
 _COMPARED: Final = (500.0, 6000.0)
 """m; ranges whose values are compared with the truth."""
+_CLOUD_RATIO: Final = 20.0
+"""sr, lidar ratio of clouds."""
 _STEPS: Final = 30
 """Most iterations of Newton's method."""
 _SHOTS: Final = elastic_cases.SHOTS
@@ -140,23 +142,27 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[RandomSky, Random], RandomSky]], 
 
 
 def _signal(sky: RandomSky) -> Array:
-    """Return noise-free counts of a shot; optical depth by trapezoids of a fifth of a bin."""
-    air = MolecularProfile.us_standard()
-    r = elastic_cases.RANGE
-    fine = np.linspace(0.0, r[-1], 5 * (2 * r.size - 1) + 1)
-    wavelength = elastic_cases.WAVELENGTH
-    molecules = sky.density * air.extinction(fine, wavelength)
-    cirrus = sky.cloud * np.exp(-0.5 * ((fine - 9000.0) / 150.0) ** 2) / (150.0 * 2.5066282746)
-    haze = np.interp(fine, r, sky.particles)
-    total = molecules + sky.lidar_ratio * haze + cirrus
-    depth = np.concatenate([[0.0], np.cumsum(0.5 * (total[1:] + total[:-1]) * np.diff(fine))])
-    cloud = np.interp(r, fine, cirrus) / 20.0
-    scattered = sky.particles + cloud + sky.density * air.backscatter(r, wavelength)
-    signal = scattered * np.exp(-2.0 * np.interp(r, fine, depth)) / r**2
+    """Return the noise-free signal, 1 in the brightest bin that the inversion uses."""
+    air, r = MolecularProfile.us_standard(), elastic_cases.RANGE
+
+    def haze(z: Array) -> Array:
+        return np.interp(z, r, sky.particles)
+
+    def cirrus(z: Array) -> Array:
+        return sky.cloud * np.exp(-0.5 * ((z - 9000.0) / 150.0) ** 2) / (150.0 * 2.5066282746)
+
+    def extinction(z: Array) -> Array:
+        molecules = sky.density * air.extinction(z, elastic_cases.WAVELENGTH)
+        return molecules + sky.lidar_ratio * haze(z) + cirrus(z)
+
+    def backscatter(z: Array) -> Array:
+        molecules = sky.density * air.backscatter(z, elastic_cases.WAVELENGTH)
+        return np.asarray(haze(z) + cirrus(z) / _CLOUD_RATIO + molecules)
+
+    signal = elastic_cases.clean_signal(extinction, backscatter)
     if sky.overlap:
         signal = signal * (1.0 - np.exp(-((r / sky.overlap) ** 2)))
-    bright = signal[r > elastic_cases.OVERLAP].max()
-    return np.asarray(signal / bright)
+    return np.asarray(signal / signal[r > elastic_cases.OVERLAP].max())
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,10 +109,7 @@ def score_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int
         rng = np.random.default_rng((72, cluster, number))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
-        result = optical_depth.retrieve_optical_depth(
-            scan.signal, scene.zenith_angle, scene.altitude, variance=scan.variance,
-            method="joint",
-        )  # fmt: skip
+        result = multiangle_cases.retrieve(scan, multiangle_cases.JOINT)
         yield from _score_quantities(failure, scene, result, profiles)
 
 
