@@ -12,7 +12,7 @@ from lidarops.bench.accuracy.multiangle import StudySize
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.rows import Figure, Work, cpu_time
 
-SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20, random=4)
+SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.accuracy.elastic_cases import BackgroundEstimates, Inverted, SimulatedSky
+from lidarops.bench.accuracy.elastic_cases import BackgroundEstimates, SimulatedSky
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import batch_label, cost_chapter, time_methods
 from lidarops.bench.harness.rows import (
@@ -36,6 +36,7 @@ from lidarops.bench.harness.rows import (
 from lidarops.bench.harness.statistics import SIGMAS, mean, root, share_inside
 from lidarops.bench.harness.timing import READ, affordable
 from lidarops.figures.charts import Chart
+from lidarops.retrieve.elastic.inversion import ElasticResult
 
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
@@ -139,12 +140,11 @@ def _level(sky: SimulatedSky, level: float, draws: int, seed: int) -> tuple[Scor
     return backgrounds, inversions
 
 
-def _errors(solved: Inverted, sky: SimulatedSky) -> Array:
+def _errors(solved: ElasticResult, sky: SimulatedSky) -> Array:
     """Return (error or standard error, profile, compared bin)."""
     near = sky.compared
-    return np.stack(
-        [solved.backscatter[:, near] - sky.backscatter[near], solved.standard_error[:, near]]
-    )
+    error = solved.backscatter[:, near] - sky.backscatter[near]
+    return np.stack([error, solved.backscatter_standard_error[:, near]])
 
 
 def _scale(sky: SimulatedSky) -> float:
@@ -362,7 +362,7 @@ def _closed(sky: SimulatedSky, level: float | None) -> Score:
 def _without_noise(scores: Scores) -> Chapter:
     return Chapter(
         "Without noise",
-        "Errors of the method itself: the signal is integrated by Gauss quadrature, the "
+        "Errors of the method itself: the signal is summed over ninths of a bin, the "
         "inversion and the molecular shape by trapezoids over bins of 15 m.",
         [
             Results(

@@ -266,18 +266,6 @@ def least_error(sky: SimulatedSky, level: float) -> float:
 # Inversion ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Inverted:
-    """Retrieved backscatter of particles of each profile."""
-
-    backscatter: Array
-    """m-1 sr-1, (profile, range); NaN where withheld."""
-    standard_error: Array
-    """m-1 sr-1."""
-    calibrated: Mask
-    """Profiles with a reference window."""
-
-
 def count_variance(counts: Array) -> Array:
     """Return the variance of mean counts, estimated from the counts."""
     # A bin without counts is treated as one count.
@@ -356,8 +344,8 @@ def chains() -> dict[str, Chain]:
 
 def invert(
     counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates, chain: Chain
-) -> Inverted:
-    """Return the backscatter of particles.
+) -> inversion.ElasticResult:
+    """Return the particles of profiles.
 
     Parameters
     ----------
@@ -369,22 +357,18 @@ def invert(
     """
     power, noise = subtract_background(counts, sky, estimates), count_variance(counts)
     edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
-    calibrated = np.ones(len(counts), dtype=np.bool_)
     hidden: npt.ArrayLike = 0.0
     if chain.choose:
         window = choose_window(power, noise, sky, find_clouds(power, noise, sky).mask)
-        edges, calibrated = window.edges, window.chosen
+        edges = window.edges
         hidden = np.nan_to_num(chain.carried * window.scale_standard_error / window.scale)
-    solved = invert_particles(
+    return invert_particles(
         power,
         sky,
         edges,
         noise=noise,
         background_error=estimates.standard_error,
         reference_error=hidden,
-    )
-    return Inverted(
-        solved.backscatter, solved.backscatter_standard_error, calibrated & solved.calibrated
     )
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import Final
 
@@ -33,9 +33,9 @@ from lidarops.bench.harness.rows import (
     share,
     with_error,
 )
-from lidarops.bench.harness.statistics import SIGMAS, clustered_share, over_blocks, root
+from lidarops.bench.harness.statistics import SIGMAS, over_blocks, root
 from lidarops.figures.charts import Chart
-from lidarops.retrieve.multiangle.optical_depth import MultiAngleFlags, MultiAngleResult
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 
 PUBLISHED_ANGLES: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
 """degree, the largest zenith angle."""
@@ -48,15 +48,9 @@ NOTHING: Final = "answer 0"
 PRIORS: Final = (0.0, 0.5, 1.0, 1.5)
 CORRELATIONS: Final = (0.0, 0.5, 0.9, 0.99, 1.0)
 OUTLIERS: Final = (0.0, 0.05, 0.1)
-AIRS: Final = {"any air": 1, "calm air": 4}
-"""How the scatter is drawn, and which part of the random scenes has it."""
 LOW: Final = 2000.0
 """m, altitude up to which the error with outliers is scored separately."""
-FALSE: Final = 4.0
-"""Stated standard errors beyond which a value is false."""
-_NEEDLESS: Final = 2.5
 _CLOSE: Final = 0.5
-_SCENE_PROFILES: Final = 8
 _PER_KM: Final = 1e3
 _DISCREPANCY: Final = "mld 0, discrepancy"
 _UNDRAWN: Final = "mld 0, sum over angles"
@@ -73,7 +67,7 @@ _ERRORS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class StudySize:
-    """Numbers of simulated blocks, profiles and scenes."""
+    """Numbers of simulated blocks and profiles."""
 
     blocks: int
     """Blocks of each scene, at least 2, independent except for the truth."""
@@ -83,8 +77,6 @@ class StudySize:
     """Profiles of a block for the peers."""
     published: int
     """Profiles of a block of the published experiment, which has at most 5 blocks."""
-    random: int
-    """Random scenes; a quarter of that number of calm scenes."""
 
     @property
     def published_blocks(self) -> range:
@@ -92,8 +84,8 @@ class StudySize:
         return range(min(5, self.blocks))
 
 
-QUICK: Final = StudySize(blocks=6, profiles=24, slow=1, published=100, random=150)
-FULL: Final = StudySize(blocks=16, profiles=64, slow=2, published=250, random=3000)
+QUICK: Final = StudySize(blocks=6, profiles=24, slow=1, published=100)
+FULL: Final = StudySize(blocks=16, profiles=64, slow=2, published=250)
 
 
 def measure_multiangle(effort: Effort, *, size: StudySize | None = None) -> Study:
@@ -103,7 +95,7 @@ def measure_multiangle(effort: Effort, *, size: StudySize | None = None) -> Stud
     ----------
     effort : Effort
     size : StudySize, optional
-        Numbers of blocks, profiles and scenes.
+        Numbers of blocks and profiles.
     """
     size = size or (QUICK if effort.quick else FULL)
     compared: Scores = {}
@@ -111,7 +103,7 @@ def measure_multiangle(effort: Effort, *, size: StudySize | None = None) -> Stud
         compared |= _compare(scene, size, number)
         effort.progress(1)
     chapters = [_scenes(compared)]
-    for chapter in (_published, _outliers, _safety):
+    for chapter in (_published, _outliers):
         chapters.append(chapter(size))
         effort.progress(1)
     return Study(
@@ -505,121 +497,3 @@ def _outlier_score(outliers: float, size: StudySize, method: str, *, robust: boo
 
 def _robust_passes_ran(result: MultiAngleResult) -> bool:
     return any(step.ran and step.step == "robust_passes" for step in result.steps)
-
-
-# Random scenes --------------------------------------------------------------------------------
-
-Counts = Mapping[str, float]
-"""Counts of one quantity of one random scene, by name."""
-
-
-def _safety(size: StudySize) -> Chapter:
-    groups: dict[tuple[str, str], list[Counts]] = {}
-    for air, part in AIRS.items():
-        for seed in range(-(-size.random // part)):
-            scene = cases.random_scene(seed, _SCENE_PROFILES, calm=part > 1)
-            scan = scene.draw(_SCENE_PROFILES, seed, 6)
-            for method in (cases.KANO_HAMILTON, cases.JOINT):
-                result = cases.retrieve(scan, method)
-                for quantity in ("optical depth", "extinction"):
-                    counts = _counts_of(result, scene, quantity)
-                    groups.setdefault((air, f"{method}, {quantity}"), []).append(counts)
-    columns = {
-        names: {count: np.array([scene[count] for scene in scenes]) for count in scenes[0]}
-        for names, scenes in groups.items()
-    }
-    flags = {
-        (f"{air}, {method}", flag.name): _flag_score(column, flag.name)
-        for (air, method), column in columns.items()
-        for flag in fields(MultiAngleFlags)
-    }
-    scenes, calm = (-(-size.random // part) for part in AIRS.values())
-    return Chapter(
-        "False and not flagged",
-        f"{scenes:,} scenes ({calm:,} of calm air) that violate the "
-        "assumptions, with 8 profiles and another truth for each: 3 to 20 beams on one side to "
-        "15-75°, clear air or a cloud, scatter up to 40 % (for calm air drawn uniformly in the "
-        "logarithm, from 0.5 %) with a correlation of 0 to 0.95, signal over noise 10 to 1e5. Half "
-        "have up to 10 % outliers; three in five have a horizontal gradient of up to 10 % per km, "
-        "twice the default of the retrieval; in one in seven, extinction varies along the paths. A "
-        "one-sided scan cannot detect a gradient: without the gradient bound, the stated errors "
-        "would be far too small.",
-        [
-            Results(
-                f"Values off by more than {FALSE:g} stated errors",
-                rows_of_scores({names: _safety_score(column) for names, column in columns.items()}),
-                "In brackets: Monte Carlo standard error, from scenes. Flagged: no_residual, "
-                "gradient, undersmoothed, high_correlation or poor_stratification: the stated "
-                "error may be too small. Needlessly: flagged, but off by less than 2.5 stated "
-                "errors. Within 1.96: share of unflagged values. Withheld extinction does not "
-                "count.",
-                case="scenes",
-            ),
-            Results(
-                "By flag",
-                rows_of_scores(flags),
-                "False: off by more than 4 times the random error and gradient bound combined.",
-                method="flag",
-                folded=True,
-            ),
-        ],
-    )
-
-
-def _counts_of(result: MultiAngleResult, scene: Scene, quantity: str) -> Counts:
-    name = quantity.replace(" ", "_")
-    return count_errors(
-        getattr(result, name) - getattr(scene, name),
-        getattr(result, f"{name}_standard_error"),
-        getattr(result, f"{name}_gradient_error"),
-        result.flags,
-    )
-
-
-def count_errors(error: Array, random: Array, bound: Array, flags: MultiAngleFlags) -> Counts:
-    """Count false values, with and without flags, of the (profile, altitude) values of a scene."""
-    size, doubted, stated = np.abs(error), flags.doubtful(), np.hypot(random, bound)
-    valued = np.isfinite(error)
-    # A value without a stated error counts as false.
-    false = valued & ~(size <= FALSE * stated)
-    unflagged = valued & ~doubted
-    masks = {
-        "values": valued,
-        "random only": valued & ~(size <= FALSE * random),
-        "false": false,
-        "unflagged": unflagged,
-        "false ok": false & unflagged,
-        "within": unflagged & (size <= SIGMAS[1] * stated),
-        "needless": valued & doubted & (size <= _NEEDLESS * stated),
-        "profiles": valued.any(axis=1),
-        "false ok profiles": (false & unflagged).any(axis=1),
-    }
-    for flag in fields(flags):
-        masks[flag.name] = valued & getattr(flags, flag.name)
-        masks[f"{flag.name}, false"] = masks[flag.name] & false
-    return {name: float(mask.sum()) for name, mask in masks.items()}
-
-
-def _safety_score(column: Mapping[str, Array]) -> Score:
-    values = column["values"]
-    flagged = clustered_share(values - column["unflagged"], values)
-    return {
-        "values": int(values.sum()),
-        "random error alone": clustered_share(column["random only"], values),
-        "with gradient bound": clustered_share(column["false"], values),
-        "and without a flag": clustered_share(column["false ok"], column["unflagged"]),
-        "profiles with one": clustered_share(column["false ok profiles"], column["profiles"]),
-        "within 1.96": clustered_share(column["within"], column["unflagged"]),
-        "flagged": share(flagged.value),
-        "needlessly": share(clustered_share(column["needless"], values).value),
-    }
-
-
-def _flag_score(column: Mapping[str, Array], flag: str) -> Score:
-    raised = column[flag]
-    return {
-        "share of values": share(clustered_share(raised, column["values"]).value),
-        "false of these": clustered_share(column[f"{flag}, false"], raised)
-        if raised.any()
-        else None,
-    }

@@ -14,7 +14,6 @@ import numpy as np
 
 from lidarops.bench.accuracy import network_cases
 from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals
-from lidarops.bench.accuracy.network_cycles import QUICK_CYCLES, cycle_costs
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import READS
 from lidarops.bench.harness.rows import (
@@ -58,7 +57,6 @@ _WITHIN: Final = {"within 1": SIGMAS[0], "within 1.96": SIGMAS[1], "within 3": 3
 _PEER_PROFILES: Final = 150
 _QUICK_PEER_PROFILES: Final = 30
 _CHUNK_BLOCKS: Final = 5
-_QUICK_REPEATS: Final = 3
 _SHORTEST: Final = 1e-9
 """s. A short call may take less than one tick of the clock."""
 _NOT_DRAWN: Final = frozenset({"multiplier 0.95", "multiplier 0"})
@@ -105,7 +103,6 @@ def measure_network(
             effort.progress(1)
         chapters.append(_errors_chapter(lidars, scores, comparisons, math.prod(chunks)))
         works += _works(lidars, scores)
-    rates = cycle_costs(QUICK_CYCLES, effort.repeats or _QUICK_REPEATS)
     return Study(
         "Networks of lidars: error of extinction and visibility against run time",
         effort.date,
@@ -114,7 +111,6 @@ def measure_network(
             _figure_chapter(),
             _visibility_chapter(visibilities),
             _peers_chapter(comparisons),
-            cycles_chapter(rates),
         ],
         works,
     )
@@ -514,16 +510,4 @@ def _peers_chapter(comparisons: Scores) -> Chapter:
                 method="air",
             ),
         ],
-    )
-
-
-def cycles_chapter(rates: Sequence[Row]) -> Chapter:
-    """Return the chapter on the CPU time of cycles."""
-    return Chapter(
-        "Cycles per second",
-        "Random cycles, one thread, shortest CPU time of interleaved repeats. Values and "
-        "variances at the first crossing; numpy.linalg.solve gives all crossings without "
-        f"variances. {READ} is a vectorised maximum of start, end, integral and variance in the "
-        "same run.",
-        [Results("CPU time of a cycle", rates, f"Reads: multiples of {READ}.", case="beams")],
     )

@@ -323,62 +323,6 @@ def _finite(value: float) -> float | None:
 # Peers ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RandomRows:
-    """Well-conditioned random cycles: (cycle, row) input of `lidarops.retrieve.network.cycles`."""
-
-    start: Array
-    end: Array
-    integral: Array
-    variance: Array
-    """(cycle, row, 3) relative variances."""
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """All arrays that a solution reads."""
-        return self.start, self.end, self.integral, self.variance
-
-    def first(self, count: int) -> RandomRows:
-        """Return the first cycles."""
-        return RandomRows(*(array[:count] for array in self.arrays))
-
-    def last(self, count: int) -> RandomRows:
-        """Return the last cycles."""
-        return RandomRows(*(array[-count:] for array in self.arrays))
-
-
-def random_rows(cycles: int, beams: int) -> RandomRows:
-    """Return random cycles whose beams all lead away from their lidars."""
-    random = np.random.default_rng((cycles, beams))
-    start = random.uniform(1.0, 2.0, (cycles, beams))
-    return RandomRows(
-        start,
-        start * random.uniform(0.6, 0.9, start.shape),
-        random.uniform(0.1, 0.3, start.shape),
-        np.full((*start.shape, 3), 1e-4),
-    )
-
-
-def solve_by_lu(rows: RandomRows) -> Array:
-    """Return (cycle,) reciprocal extinction at the first crossing, by `numpy.linalg.solve`."""
-    return np.asarray(np.linalg.solve(_matrices(rows), rows.integral[..., np.newaxis])[:, 0, 0])
-
-
-def solve_by_lu_one_by_one(rows: RandomRows) -> Array:
-    """Return the same with one call of `numpy.linalg.solve` per cycle."""
-    pairs = zip(_matrices(rows), rows.integral, strict=True)
-    return np.array([np.linalg.solve(matrix, side)[0] for matrix, side in pairs])
-
-
-def _matrices(rows: RandomRows) -> Array:
-    cycles, k = rows.start.shape
-    matrix = np.zeros((cycles, k, k))
-    rows_index = np.arange(k)
-    matrix[:, rows_index, rows_index] = rows.start
-    matrix[:, rows_index, (rows_index + 1) % k] -= rows.end
-    return matrix
-
-
 def network_by_scipy(power: Array, variance: Array, signals: Signals) -> Array:
     """Return (profile, crossing) extinction by `scipy.optimize.least_squares`, without errors.
 

@@ -72,52 +72,6 @@ def _sky(rng: Random) -> RandomSky:
     return RandomSky(particles, elastic_cases.LIDAR_RATIO)
 
 
-def _ratio(sky: RandomSky, rng: Random) -> RandomSky:
-    deviate = np.clip(rng.normal(), -3.0, 3.0)
-    return replace(sky, lidar_ratio=sky.lidar_ratio * (1.0 + _RATIO_ERROR * deviate))
-
-
-def _as_is(sky: RandomSky, _: Random) -> RandomSky:
-    return sky
-
-
-def _hazy(sky: RandomSky, rng: Random, *, least: float = 1e-9) -> RandomSky:
-    haze = np.exp(rng.uniform(np.log(least), np.log(100.0 * least)))
-    return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
-
-
-def _hazier(sky: RandomSky, rng: Random) -> RandomSky:
-    return _hazy(sky, rng, least=1e-8)
-
-
-def _with_density_error(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, density=1.0 + _AIR_ERROR * float(np.clip(rng.normal(), -3.0, 3.0)))
-
-
-def _drifting(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, background=rng.uniform(0.0, 3.0))
-
-
-def _clouded(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, cloud=float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))))
-
-
-def _with_overlap(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, overlap=rng.uniform(50.0, 300.0))
-
-
-def _with_gaps(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, gaps=rng.uniform(0.0, 0.2))
-
-
-def _with_outliers(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, outlying=rng.uniform(0.0, 0.02))
-
-
-def _factor_two(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0])))
-
-
 _STATED: Final = (
     "an elastic signal contains no information on the lidar ratio: the stated error has to cover it"
 )
@@ -126,18 +80,51 @@ _ALIKE: Final = (
     " error of the scattering ratio there can cover it"
 )
 _NEAR: Final = "a signal that is too low near the lidar looks like less haze"
-FAILURES: Final[tuple[tuple[Failure, Callable[[RandomSky, Random], RandomSky]], ...]] = (
-    (Failure("none", satisfied=True), _as_is),
-    (Failure("gaps", satisfied=True), _with_gaps),
-    (Failure("lidar ratio off as stated", unseen=_STATED), _ratio),
-    (Failure("lidar ratio off by a factor of 2", unseen=_STATED), _factor_two),
-    (Failure("density of the air off as stated"), _with_density_error),
-    (Failure("haze at all heights", unseen=_ALIKE), _hazy),
-    (Failure("slow baseline"), _drifting),
-    (Failure("cloud in the far range"), _clouded),
-    (Failure("overlap error", unseen=_NEAR), _with_overlap),
-    (Failure("more haze than stated", unseen=_ALIKE), _hazier),
-    (Failure("outliers"), _with_outliers),
+_Change = Callable[[RandomSky, Random], RandomSky]
+
+
+def _hazy(least: float) -> _Change:
+    """Return the change that adds haze of `least` to 100 times as much, m-1 sr-1 at the ground."""
+
+    def change(sky: RandomSky, rng: Random) -> RandomSky:
+        haze = np.exp(rng.uniform(np.log(least), np.log(100.0 * least)))
+        return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
+
+    return change
+
+
+def _off(rng: Random, error: float) -> float:
+    """Return a factor that deviates by this standard error, at most by 3 of them."""
+    return 1.0 + error * float(np.clip(rng.normal(), -3.0, 3.0))
+
+
+FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
+    (Failure("none", satisfied=True), lambda sky, _: sky),
+    (Failure("gaps", satisfied=True), lambda sky, rng: replace(sky, gaps=rng.uniform(0.0, 0.2))),
+    (
+        Failure("lidar ratio off as stated", unseen=_STATED),
+        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * _off(rng, _RATIO_ERROR)),
+    ),
+    (
+        Failure("lidar ratio off by a factor of 2", unseen=_STATED),
+        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0]))),
+    ),
+    (
+        Failure("density of the air off as stated"),
+        lambda sky, rng: replace(sky, density=_off(rng, _AIR_ERROR)),
+    ),
+    (Failure("haze at all heights", unseen=_ALIKE), _hazy(1e-9)),
+    (Failure("slow baseline"), lambda sky, rng: replace(sky, background=rng.uniform(0.0, 3.0))),
+    (
+        Failure("cloud in the far range"),
+        lambda sky, rng: replace(sky, cloud=float(np.exp(rng.uniform(np.log(0.01), np.log(3.0))))),
+    ),
+    (
+        Failure("overlap error", unseen=_NEAR),
+        lambda sky, rng: replace(sky, overlap=rng.uniform(50.0, 300.0)),
+    ),
+    (Failure("more haze than stated", unseen=_ALIKE), _hazy(1e-8)),
+    (Failure("outliers"), lambda sky, rng: replace(sky, outlying=rng.uniform(0.0, 0.02))),
 )
 
 
@@ -183,11 +170,8 @@ def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _
     counts, noise = np.asarray(bridged.power, dtype=np.float64), bridged.variance
     fit = known_shape.fit_known_shape(counts, r, base.shape, variance=noise)
     power = np.where(base.inverted, counts - fit.background[:, np.newaxis], np.nan)
-    clouds = layers.find_layers(power, r, noise, molecular_attenuated=base.shape)
-    window = reference_window.choose_reference(
-        power, r, noise, molecular_attenuated=base.shape,
-        candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
-    )  # fmt: skip
+    clouds = elastic_cases.find_clouds(power, noise, base)
+    window = elastic_cases.choose_window(power, noise, base, clouds.mask)
     solved = _solve(power, noise, base, window.edges, _input_errors(fit, window))
     return _Processed(fit, clouds, window, solved)
 

@@ -12,13 +12,6 @@ import numpy as np
 from lidarops.bench.accuracy import multiangle_cases, network_cases
 from lidarops.bench.accuracy.elastic import elastic_cost_chapter, elastic_costs
 from lidarops.bench.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
-from lidarops.bench.accuracy.network import cycles_chapter
-from lidarops.bench.accuracy.network_cycles import (
-    CYCLES,
-    QUICK_CYCLES,
-    cycle_costs,
-    cycle_thread_gain,
-)
 from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import batch_label, cost_chapter, thread_gain, time_methods
@@ -175,32 +168,23 @@ def measure_scans(effort: Effort, *, batches: Sequence[int] | None = None) -> St
 
 
 def measure_networks(effort: Effort) -> Study:
-    """Time cycles, whole profiles of networks, and plain peers.
+    """Time whole profiles of networks with every solver.
 
     Parameters
     ----------
     effort : Effort
     """
-    repeats, cycles = _repeats(effort, 7), QUICK_CYCLES if effort.quick else CYCLES
-    rates = cycle_costs(cycles, repeats)
-    effort.progress(1)
-    profiles: list[Row] = []
+    rows: list[Row] = []
     for lidars in network_cases.LIDAR_LINES:
-        profiles += _network_costs(lidars, repeats)
+        rows += _network_costs(lidars, _repeats(effort, 7))
         effort.progress(1)
-    whole = Chapter(
+    chapter = Chapter(
         "Whole profiles",
         "From signals to extinction with errors, visibility and flags: point values, "
-        "integrals and their covariances, and the solution. One thread. Two threads with "
-        f"half of the cycles of 3 beams each are {cycle_thread_gain(cycles[3], repeats):.2f} times "
-        "as fast in wall time, which is meaningful only on a machine with two idle cores.",
-        [Results("CPU time of a profile", profiles, f"Reads: multiples of {READ}.", case="beams")],
+        "integrals and their covariances, and the solution. One thread.",
+        [Results("CPU time of a profile", rows, f"Reads: multiples of {READ}.", case="beams")],
     )
-    return Study(
-        "Networks of lidars: time per cycle and per profile",
-        effort.date,
-        [cycles_chapter(rates), whole],
-    )
+    return Study("Networks of lidars: time per profile", effort.date, [chapter])
 
 
 _TIMED_PROFILES: Final = 250
