@@ -10,12 +10,12 @@ from typing import Final, TypeVar
 
 from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
-from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
 from lidarops.bench.harness.rows import Study
 from lidarops.bench.throughput import archives, campaigns, memory, readers, retrievals
 from lidarops.errors import CampaignError
 from lidarops.reports.benchmark_page import build_benchmark_page
+from lidarops.system.files import write_atomically
 
 STABILITY: Final = "stability"
 """The benchmark that is no `BenchmarkKind`, because it has no cases to choose from."""
@@ -120,8 +120,9 @@ def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
     CatalogError
         If the folder cannot be written.
     """
-    results.save(output.result, folder / RESULT)
-    return build_benchmark_page(output.report, folder)
+    page = build_benchmark_page(output.report, folder)
+    write_atomically(folder / RESULT, output.json().encode())
+    return page
 
 
 def _member(names: type[_Names], value: str, what: str, *other_choices: str) -> _Names:

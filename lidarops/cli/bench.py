@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -69,7 +68,6 @@ def bench(
     Example: lidarops bench stability --quick --out bench
     """
     from lidarops.bench import registry
-    from lidarops.bench.harness import results
     from lidarops.bench.harness.benchmark import Effort
 
     today = datetime.now(UTC).date().isoformat()
@@ -82,7 +80,7 @@ def bench(
             output = registry.run_benchmark(what, case, files or [], effort, data=data)
     page = None if out is None else registry.write_benchmark(output, Path(out))
     if as_json:
-        typer.echo(json.dumps(results.plain(output.result), indent=1))
+        typer.echo(output.json())
         return
     for chapter in output.report.parts:
         for contents in chapter.tables:

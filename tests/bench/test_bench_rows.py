@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from lidarops.bench.harness import results as json_results
+from lidarops.bench import registry
 from lidarops.bench.harness.rows import (
     CPU_TIME,
     Chapter,
@@ -120,14 +120,14 @@ def test_a_study_has_one_json_and_one_page(tmp_path):
     (part,) = output.report.parts
     assert [table.title for table in part.tables] == ["Shown"]
     assert [table.title for table in part.details] == ["Folded"]
-    path = json_results.save(output.result, tmp_path / "sub" / "result.json")
-    content = json.loads(path.read_text())
+    page = registry.write_benchmark(output, tmp_path / "sub")
+    content = json.loads((page.parent / "result.json").read_text())
     assert (content["title"], content["date"]) == ("Title", "2024-01-01")
     row = content["tables"]["Folded"][1]
     assert (row["case"], row["method"], row["quantity"]) == ("clear", "ours", "RMSE")
     assert (row["value"], row["error"], row["unit"]) == (2.0, 0.1, "")
     with pytest.raises(CatalogError, match="cannot be written"):
-        json_results.save(output.result, path / "result.json")
+        registry.write_benchmark(output, page / "sub")
 
 
 @pytest.mark.parametrize(

@@ -489,7 +489,6 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
     peers: dict[str, _Step] = {
         "background, numpy lstsq": lambda few: elastic_cases.lstsq_backgrounds(counts[:few], sky),
         "Klett, numpy": lambda few: elastic_cases.klett_numpy(whole[:few], sky),
-        "Klett, Python": lambda few: elastic_cases.klett_python(whole[:few], sky),
     }
     return ours, peers
 
@@ -501,7 +500,7 @@ def elastic_cost_chapter(costs: Sequence[Row]) -> Chapter:
         f"Profiles of {elastic_cases.RANGE.size} bins, float64, one thread, least CPU time of "
         "interleaved repeats. Steps of lidarops compute all errors and flags; all steps: "
         "background, clouds, reference window and inversion with its error budget. The peers give "
-        "values without errors: a weighted numpy.linalg.lstsq and a Klett inversion for each "
-        "profile, in numpy and in plain Python.",
+        "values without errors: a weighted numpy.linalg.lstsq and a Klett inversion in numpy for "
+        "each profile.",
         costs,
     )

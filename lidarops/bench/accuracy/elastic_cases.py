@@ -7,7 +7,6 @@ background. The files of the intercomparison are read if given.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -388,45 +387,11 @@ def lstsq_backgrounds(counts: Array, sky: SimulatedSky) -> Array:
     return backgrounds
 
 
-def klett_python(power: Array, sky: SimulatedSky) -> Array:
-    """Return the backscatter of particles by loops over profiles and bins, without errors.
+def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
+    """Return the backscatter of particles profile by profile, without errors.
 
     fernald1984, backward and forward from the middle of `GIVEN_WINDOW`, by trapezoids.
     """
-    distance = sky.range.tolist()
-    air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
-    inside = [k for k, r in enumerate(distance) if GIVEN_WINDOW[0] <= r <= GIVEN_WINDOW[1]]
-    rows = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
-    return np.asarray(rows)
-
-
-def _klett(
-    power: list[float],
-    distance: list[float],
-    air: list[float],
-    loss: list[float],
-    inside: list[int],
-) -> list[float]:
-    start, size = inside[len(inside) // 2], len(power)
-    excess = [a - LIDAR_RATIO * b for a, b in zip(loss, air, strict=True)]
-    corrected, integral = [0.0] * size, [0.0] * size
-    for step in (1, -1):
-        depth = total = 0.0
-        last = start
-        corrected[start] = power[start] * distance[start] ** 2
-        for k in range(start + step, size if step > 0 else -1, step):
-            width = distance[k] - distance[last]
-            depth += 0.5 * width * (excess[k] + excess[last])
-            corrected[k] = power[k] * distance[k] ** 2 * math.exp(2.0 * depth)
-            total += 0.5 * width * LIDAR_RATIO * (corrected[k] + corrected[last])
-            integral[k] = total
-            last = k
-    ratio = sum(corrected[k] / air[k] for k in inside) / len(inside)
-    return [q / (ratio - 2.0 * i) - b for q, i, b in zip(corrected, integral, air, strict=True)]
-
-
-def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
-    """Return the backscatter of `klett_python` by cumulative sums, profile by profile."""
     inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
     start = inside[inside.size // 2]
     excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Final, Protocol
 
@@ -28,8 +29,12 @@ class BenchmarkOutput:
     """Result and report page of a benchmark."""
 
     result: object
-    """A frozen dataclass, or a list of them."""
+    """Lists and dicts, or a dataclass."""
     report: BenchmarkReport
+
+    def json(self) -> str:
+        """Return the result as JSON."""
+        return json.dumps(self.result, indent=1, allow_nan=False, default=asdict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -168,12 +168,7 @@ def measure_scans(effort: Effort, *, batches: Sequence[int] | None = None) -> St
 
 
 def measure_networks(effort: Effort) -> Study:
-    """Time whole profiles of networks with every solver.
-
-    Parameters
-    ----------
-    effort : Effort
-    """
+    """Time whole profiles of networks with every solver."""
     rows: list[Row] = []
     for lidars in network_cases.LIDAR_LINES:
         rows += _network_costs(lidars, _repeats(effort, 7))
