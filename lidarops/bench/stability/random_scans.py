@@ -82,9 +82,6 @@ _ONE_SIDE: Final = (
     "a scan to one side cannot separate a gradient from optical depth; the declared largest"
     " gradient has to cover it"
 )
-_ALL_AT_ONCE: Final = Failure("everything at once")
-_AIRS: Final = ("any air", "calm air")
-"""How scatter is drawn: also little of it, which makes stated errors small."""
 FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
     (Failure("none", satisfied=True), _level, _plain),
     (Failure("gaps", satisfied=True), _level, _with_gaps),
@@ -103,7 +100,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
         _with_overlap,
     ),
     (Failure("background error of each beam"), _level, _with_background),
-    (_ALL_AT_ONCE, _as_drawn, _plain),
+    (Failure("everything at once"), _as_drawn, _plain),
 )
 
 
@@ -115,11 +112,19 @@ def score_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
         result = multiangle_cases.retrieve(scan, multiangle_cases.JOINT)
         yield from _score_quantities(failure, scene, result, profiles)
-    for air, method in product(_AIRS, (multiangle_cases.KANO_HAMILTON, multiangle_cases.JOINT)):
-        if (air, method) != (_AIRS[0], multiangle_cases.JOINT):
-            scene = multiangle_cases.random_scene(cluster, profiles, calm=air == _AIRS[1])
-            result = multiangle_cases.retrieve(scene.draw(profiles, cluster, 6), method)
-            yield from _score_quantities(_ALL_AT_ONCE, scene, result, profiles, f"{air}, {method}")
+
+
+def score_scan_methods(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+    """Solve random scans with all violations at once, of any air and of calm air, by two methods.
+
+    Little scatter makes stated errors small.
+    """
+    methods = (multiangle_cases.KANO_HAMILTON, multiangle_cases.JOINT)
+    for calm, method in product((False, True), methods):
+        failure = Failure(f"{'calm' if calm else 'any'} air, {method}")
+        scene = multiangle_cases.random_scene(cluster, profiles, calm=calm)
+        result = multiangle_cases.retrieve(scene.draw(profiles, cluster, 6), method)
+        yield from _score_quantities(failure, scene, result, profiles)
 
 
 def _score_quantities(
@@ -127,7 +132,6 @@ def _score_quantities(
     scene: Scene,
     result: optical_depth.MultiAngleResult,
     profiles: int,
-    group: str = "",
 ) -> Iterator[tuple[ScoredValues, int]]:
     bits = np.asarray(result.quality).copy()
     for name, bit in QUALITY_OF_FLAG.items():
@@ -138,11 +142,10 @@ def _score_quantities(
     }
     for quantity, true in truth.items():
         name = quantity.replace(" ", "_")
-        label = f"{quantity}, {group}" if group else quantity
         error: Any = getattr(result, name) - true
         yield (
             ScoredValues(
-                failure, label, error, getattr(result, f"{name}_standard_error"),
+                failure, quantity, error, getattr(result, f"{name}_standard_error"),
                 getattr(result, f"{name}_gradient_error"), bits, MultiAngleQuality,
                 uncertain=result.flags.doubtful(), solvable=np.isfinite(error),
             ),

@@ -51,6 +51,7 @@ DRAWS: Final = (
     Draws("signal chain", random_signals.score_signals, 50, 1500, 60, 0.05),
     Draws("elastic", random_elastic.score_elastic, 20, 1500, 40, 0.05),
     Draws("multi-angle", random_scans.score_scans, 8, 2000, 60, 0.13),
+    Draws("scans of any and of calm air", random_scans.score_scan_methods, 8, 750, 40, 0.13),
     Draws("network", random_networks.score_networks, 50, 800, 30, 0.05),
 )
 """Sizes for about 20 minutes on one core, and less than 2 for a quick run."""
