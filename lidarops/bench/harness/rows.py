@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.benchmark import BenchmarkOutput, study_page
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, facts
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.figures.charts import Chart, Ladder, Panel, Series, pareto
 from lidarops.figures.wording import percent
-from lidarops.reports.benchmark_page import Part, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -423,9 +423,10 @@ class Study:
     def output(self) -> BenchmarkOutput:
         """Return all rows for JSON, and the page."""
         tables = {r.title: [asdict(w) for w in r.rows] for c in self.chapters for r in c.results}
-        facts = {"title": self.title, "date": self.date, "machine": asdict(self.machine)}
-        parts = [_part(chapter) for chapter in self.chapters]
-        return BenchmarkOutput({**facts, "tables": tables}, study_page(self.title, self, *parts))
+        about = {"title": self.title, "date": self.date, "machine": asdict(self.machine)}
+        parts = tuple(_part(chapter) for chapter in self.chapters)
+        page = BenchmarkReport(self.title, facts(self.date, self.machine), parts, RESULT)
+        return BenchmarkOutput({**about, "tables": tables}, page)
 
 
 def _part(chapter: Chapter) -> Part:
