@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -23,8 +23,11 @@ from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
+from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
+from lidarops.retrieve.background.known_shape import KnownShapeResult
 from lidarops.retrieve.elastic import inversion, layers, reference_window
 from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 WAVELENGTH: Final = 532e-9
@@ -228,18 +231,9 @@ def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     )
 
 
-class _Background(Protocol):
-    """Result of any method."""
-
-    @property
-    def background(self) -> Array: ...
-    @property
-    def background_standard_error(self) -> Array: ...
-    @property
-    def quality(self) -> npt.NDArray[np.int32]: ...
-
-
-def _estimates(result: _Background) -> BackgroundEstimates:
+def _estimates(
+    result: KnownShapeResult | HomogeneousResult | BackgroundResult,
+) -> BackgroundEstimates:
     return BackgroundEstimates(
         result.background,
         result.background_standard_error,

@@ -7,11 +7,10 @@ which is better than any start from data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
-from scipy.optimize import curve_fit, least_squares
+from scipy.optimize import curve_fit
 
 from lidarops.bench.accuracy import levenberg_marquardt
 from lidarops.bench.accuracy.homogeneous_cases import (
@@ -31,8 +30,7 @@ def iterative_peers() -> dict[str, PathSolver]:
     """Return the iterative solvers by name."""
     return {
         JIT: compiled,
-        "scipy curve_fit": _one_by_one(_curve_fit),
-        "scipy least_squares": _one_by_one(_least_squares),
+        "scipy curve_fit": _by_scipy,
     }
 
 
@@ -69,43 +67,24 @@ def _slopes(geometry: tuple[Array, Array], _: float, signal: float, sigma: float
     return np.stack([np.ones_like(shape), shape, -2.0 * signal * depth * shape], axis=1)
 
 
-_Single = Callable[[Array, tuple[Array, Array], Array], tuple[Array, Array]]
-
-
-def _curve_fit(power: Array, geometry: tuple[Array, Array], begin: Array) -> tuple[Array, Array]:
-    unknowns, covariance = curve_fit(
-        _model,
-        geometry,
-        power,
-        p0=begin,
-        sigma=np.ones_like(power),
-        absolute_sigma=True,
-        jac=_slopes,
-    )
-    return unknowns, covariance
-
-
-def _least_squares(
-    power: Array, geometry: tuple[Array, Array], begin: Array
-) -> tuple[Array, Array]:
-    solution = least_squares(
-        lambda unknowns: _model(geometry, *unknowns) - power,
-        begin,
-        jac=lambda unknowns: _slopes(geometry, *unknowns),
-        method="lm",
-        x_scale="jac",
-    )
-    return solution.x, np.linalg.inv(solution.jac.T @ solution.jac)
-
-
-def _one_by_one(single: _Single) -> PathSolver:
-    def solve(power: Any, scenario: Scenario) -> Estimates:
-        geometry, begin = _geometry(scenario), start(scenario)
-        fits = [single(np.asarray(row, np.float64), geometry, begin) for row in power]
-        unknowns, covariance = zip(*fits, strict=True)
-        return _estimates(np.stack(unknowns), np.stack(covariance), scenario)
-
-    return solve
+def _by_scipy(power: Any, scenario: Scenario) -> Estimates:
+    """Solve by `scipy.optimize.curve_fit`, profile by profile."""
+    geometry, begin = _geometry(scenario), start(scenario)
+    noise = np.ones(scenario.bins)
+    fits = [
+        curve_fit(
+            _model,
+            geometry,
+            np.asarray(row, np.float64),
+            p0=begin,
+            sigma=noise,
+            absolute_sigma=True,
+            jac=_slopes,
+        )
+        for row in power
+    ]
+    unknowns, covariance = zip(*fits, strict=True)
+    return _estimates(np.stack(unknowns), np.stack(covariance), scenario)
 
 
 def _estimates(unknowns: Array, covariance: Array, scenario: Scenario) -> Estimates:
