@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -297,7 +298,7 @@ def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, floa
     """Return the log-log slope of times, and half of its 95 percent interval."""
     fit = stats.linregress(np.log(sizes), np.log(seconds))
     half = stats.t.ppf(0.975, len(sizes) - 2) * fit.stderr if len(sizes) > 2 else 0.0
-    return float(fit.slope), float(half)
+    return float(fit.slope), float(half) if math.isfinite(half) else 0.0
 
 
 # Page -----------------------------------------------------------------------------------------
