@@ -224,7 +224,7 @@ def _overview(scores: Scores) -> Chapter:
     methods_of = list(dict.fromkeys(method for _, method in scores))
     complete = {row.method for row in summary if row.quantity == "solved" and row.value == "all"}
     hollow = {method for method in methods_of if method not in complete} | _INFORMED
-    drawn = [row for row in paths if row.method in {"compressed", "fast", "direct", "cubic"}]
+    drawn = [row for row in paths if row.method in {"compressed", "direct", "cubic"}]
     profiles = next(row.value for row in paths if row.quantity == "profiles")
     return Chapter(
         "Error against time",
@@ -273,7 +273,7 @@ def _overview(scores: Scores) -> Chapter:
                         drawn,
                         f"{quantity.replace('_', ' ')}: RMSE",
                         x=_DIFFICULTY,
-                        hollow={HomogeneousMethod.FAST, HomogeneousMethod.DIRECT},
+                        hollow={HomogeneousMethod.DIRECT},
                         level=1.0,
                     )
                     for quantity in QUANTITIES

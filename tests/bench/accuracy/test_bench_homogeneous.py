@@ -218,7 +218,7 @@ def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
             time = rows[setting, method, CPU_TIME].value
             assert rows[setting, method, "reads"].value == pytest.approx(time / read)
     gains = timed.figures("Gain of two threads")
-    assert {method for _, method, _ in gains} == {"compressed", "fast"}
+    assert {method for _, method, _ in gains} == {"compressed"}
 
 
 def test_calls_alternate_and_the_least_time_counts(monkeypatch):
