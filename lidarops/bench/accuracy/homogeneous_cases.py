@@ -207,7 +207,7 @@ def _solver(method: HomogeneousMethod) -> PathSolver:
             scenario.range,
             variance=1.0,
             method=method.value,
-            **method_arguments(method, scenario),  # type: ignore[arg-type]
+            **method_arguments(method, scenario),
         )
         return estimates(fit)
 
