@@ -6,13 +6,10 @@ Exit codes: 0 success, 1 something was refused or failed, 2 wrong use.
 from lidarops.cli import (
     aggregate,
     archive,
-    audit,
     bench,
-    campaign_files,
     files,
-    publish,
-    reproduce,
-    simulation,
+    ledger,
+    preparation,
     site,
 )
 from lidarops.cli.app import app
@@ -21,12 +18,9 @@ __all__ = [
     "aggregate",
     "app",
     "archive",
-    "audit",
     "bench",
-    "campaign_files",
     "files",
-    "publish",
-    "reproduce",
-    "simulation",
+    "ledger",
+    "preparation",
     "site",
 ]

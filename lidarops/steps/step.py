@@ -29,6 +29,8 @@ C_contra = TypeVar("C_contra", bound="ChannelCase", contravariant=True)
 ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"
 REQUESTED: Final = "requested by the campaign"
 NOT_REQUESTED: Final = "not requested by the campaign"
+REQUEST: Final = "request"
+"""Name of the rule that leaves out what the campaign does not request."""
 
 
 # No slots: typing sets an attribute of generic instances, where it can.
