@@ -153,7 +153,7 @@ class _Scan:
         self._archive = campaign.archive
         self._store = store
         self._progress = progress
-        self._before_write = before_write
+        self._write = before_write or (lambda: None)
         self._claims = _claims(campaign)
         self._folder: str | None = None
         self._near: list[_Claim] = []
@@ -236,10 +236,6 @@ class _Scan:
         self._write()
         self._store.replace(self._pending)
         self._pending.clear()
-
-    def _write(self) -> None:
-        if self._before_write is not None:
-            self._before_write()
 
     def _report_progress(self) -> None:
         if self._progress and self._files > self._reported:
