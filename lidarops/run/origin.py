@@ -24,7 +24,7 @@ RAW: Final = (Role.SIGNAL, Role.DARK)
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
+class RecordedOrigin:
     """The provenance of a product."""
 
     file: Path
@@ -40,7 +40,7 @@ class Origin:
     """SOURCE_DATE_EPOCH by which the product was dated; empty if there was none."""
 
     @classmethod
-    def of(cls, file: Path) -> Origin:
+    def of(cls, file: Path) -> RecordedOrigin:
         """Read the provenance of a product; raise ProductError if it is insufficient."""
         document = read_provenance(file)
         try:
@@ -63,7 +63,7 @@ class Origin:
             raise _insufficient(file, repr(error)) from error
         for record in origin.inputs:
             # Copies are written under this path, which a forged product could choose freely.
-            if record.role in RAW and not inside(record.path):
+            if record.role in RAW and not stays_inside(record.path):
                 raise ProductError(
                     f"names a raw file outside its archive: {record.path}",
                     file=file,
@@ -159,7 +159,7 @@ class Origin:
         )
 
 
-def inside(path: str) -> bool:
+def stays_inside(path: str) -> bool:
     """Return whether a path stays in the folder that it is relative to."""
     pure = PurePosixPath(path)
     return not (pure.is_absolute() or ".." in pure.parts)

@@ -22,7 +22,7 @@ from lidarops.netcdf.provenance import EPOCH_VARIABLE, package_versions
 from lidarops.process.job import Job
 from lidarops.process.scene import process_scene
 from lidarops.records import InputRecord
-from lidarops.run.origin import RAW, Origin, inside
+from lidarops.run.origin import RAW, RecordedOrigin, stays_inside
 from lidarops.system.code_version import code_version
 from lidarops.system.files import sha256_of
 from lidarops.system.stores import RemoteStore, is_url
@@ -100,7 +100,7 @@ def reproduce_product(
     for field, folder in (("--archive", local), ("--ancillary", ancillary)):
         if folder is not None and not Path(folder).is_dir():
             raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
-    origin = Origin.of(Path(product))
+    origin = RecordedOrigin.of(Path(product))
     raw = [record for record in origin.inputs if record.role in RAW]
     others = [record for record in origin.inputs if record.role not in RAW]
     with _staged(origin, raw, archive, catalog) as (root, wrong):
@@ -121,7 +121,10 @@ def reproduce_product(
 
 @contextmanager
 def _staged(
-    origin: Origin, records: Sequence[InputRecord], archive: str | Path | None, catalog: str | None
+    origin: RecordedOrigin,
+    records: Sequence[InputRecord],
+    archive: str | Path | None,
+    catalog: str | None,
 ) -> Iterator[tuple[Path, list[Difference]]]:
     """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
@@ -174,7 +177,9 @@ def _cleared(target: Path) -> Path:
     return target
 
 
-def _moved(origin: Origin, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
+def _moved(
+    origin: RecordedOrigin, lost: Sequence[InputRecord], catalog: str | None
+) -> dict[str, str]:
     """Return recorded name -> present name of files that a catalog knows under another name."""
     url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(origin.file)
     if not lost or not url:
@@ -188,7 +193,7 @@ def _moved(origin: Origin, lost: Sequence[InputRecord], catalog: str | None) -> 
             raise
         return {}
     names = {record.path: present.get(record.sha256, record.path) for record in lost}
-    return {old: new for old, new in names.items() if old != new and inside(new)}
+    return {old: new for old, new in names.items() if old != new and stays_inside(new)}
 
 
 def _nearest_catalog(file: Path) -> str:
@@ -199,7 +204,7 @@ def _nearest_catalog(file: Path) -> str:
 
 
 def _folder(
-    origin: Origin, records: Sequence[InputRecord], option: str, catalog: str | None
+    origin: RecordedOrigin, records: Sequence[InputRecord], option: str, catalog: str | None
 ) -> Path:
     """Return the nearest folder above the product, or subfolder of one, that holds any input."""
     for paths in (
@@ -245,7 +250,7 @@ def _changed(folder: Path, records: Iterable[InputRecord], place: str) -> Iterat
                 yield Difference("input", record.path, problem)
 
 
-def _software(origin: Origin) -> Iterator[Difference]:
+def _software(origin: RecordedOrigin) -> Iterator[Difference]:
     code = code_version(origin.kind)
     if origin.code_version != code:
         yield Difference("code", "lidarops", f"{code}, was {origin.code_version}")
@@ -256,7 +261,9 @@ def _software(origin: Origin) -> Iterator[Difference]:
             yield Difference("package", name, problem)
 
 
-def _made_again(origin: Origin, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
+def _made_again(
+    origin: RecordedOrigin, root: Path, folder: Path, out: Path
+) -> Iterator[Difference]:
     """Yield the differences between a product and the one made from its inputs now."""
     with _dated(origin.epoch):
         campaign, scene = origin.campaign(root, folder, out), origin.scene(root)
