@@ -22,7 +22,7 @@ from lidarops.netcdf.provenance import EPOCH_VARIABLE, package_versions
 from lidarops.process.job import Job
 from lidarops.process.scene import process_scene
 from lidarops.records import InputRecord
-from lidarops.run.origin import RAW, RecordedOrigin, stays_inside
+from lidarops.run.recipe import RAW, Recipe, stays_inside
 from lidarops.system.code_version import code_version
 from lidarops.system.files import sha256_of
 from lidarops.system.stores import RemoteStore, is_url
@@ -100,19 +100,19 @@ def reproduce_product(
     for field, folder in (("--archive", local), ("--ancillary", ancillary)):
         if folder is not None and not Path(folder).is_dir():
             raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
-    origin = RecordedOrigin.of(Path(product))
-    raw = [record for record in origin.inputs if record.role in RAW]
-    others = [record for record in origin.inputs if record.role not in RAW]
-    with _staged(origin, raw, archive, catalog) as (root, wrong):
+    recipe = Recipe.of(Path(product))
+    raw = [record for record in recipe.inputs if record.role in RAW]
+    others = [record for record in recipe.inputs if record.role not in RAW]
+    with _staged(recipe, raw, archive, catalog) as (root, wrong):
         ancillaries = root
         if others:
-            ancillaries = Path(ancillary or _folder(origin, others, "--ancillary", catalog))
+            ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog))
         changed = [*wrong, *_changed(ancillaries, others, str(ancillaries))]
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
-        software = tuple(_software(origin))
+        software = tuple(_software(recipe))
         with tempfile.TemporaryDirectory(prefix="lidarops-") as out:
-            differences = tuple(_made_again(origin, root, ancillaries, Path(out)))
+            differences = tuple(_made_again(recipe, root, ancillaries, Path(out)))
     # Other software is a difference only if the bytes differ.
     if differences:
         differences = (*differences, *software)
@@ -121,10 +121,7 @@ def reproduce_product(
 
 @contextmanager
 def _staged(
-    origin: RecordedOrigin,
-    records: Sequence[InputRecord],
-    archive: str | Path | None,
-    catalog: str | None,
+    recipe: Recipe, records: Sequence[InputRecord], archive: str | Path | None, catalog: str | None
 ) -> Iterator[tuple[Path, list[Difference]]]:
     """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
@@ -133,13 +130,13 @@ def _staged(
             store = RemoteStore(str(archive))
             place, bring = store.url, _from_store(store, staged)
         else:
-            folder = Path(archive) if archive else _folder(origin, records, "--archive", catalog)
+            folder = Path(archive) if archive else _folder(recipe, records, "--archive", catalog)
             place, bring = str(folder), _from_folder(folder, staged)
         bring({record.path: record.path for record in records})
         changed = list(_changed(staged, records, place))
         wrong = {difference.name for difference in changed}
         lost = [record for record in records if record.path in wrong]
-        moved = _moved(origin, lost, catalog)
+        moved = _moved(recipe, lost, catalog)
         if moved:
             bring(moved)
         wrong = {difference.name for difference in _changed(staged, lost, place)}
@@ -177,15 +174,13 @@ def _cleared(target: Path) -> Path:
     return target
 
 
-def _moved(
-    origin: RecordedOrigin, lost: Sequence[InputRecord], catalog: str | None
-) -> dict[str, str]:
+def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
     """Return recorded name -> present name of files that a catalog knows under another name."""
-    url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(origin.file)
+    url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(recipe.file)
     if not lost or not url:
         return {}
     try:
-        with Store(url, origin.campaign_name, create=False) as store:
+        with Store(url, recipe.campaign_name, create=False) as store:
             present = store.paths_by_digest({record.sha256 for record in lost})
     except CatalogError:
         # A catalog that was not given but only found may be unusable.
@@ -204,19 +199,19 @@ def _nearest_catalog(file: Path) -> str:
 
 
 def _folder(
-    origin: RecordedOrigin, records: Sequence[InputRecord], option: str, catalog: str | None
+    recipe: Recipe, records: Sequence[InputRecord], option: str, catalog: str | None
 ) -> Path:
     """Return the nearest folder above the product, or subfolder of one, that holds any input."""
     for paths in (
         [record.path for record in records],
-        list(_moved(origin, records, catalog).values()),
+        list(_moved(recipe, records, catalog).values()),
     ):
-        folder = _folder_with(origin.file, paths)
+        folder = _folder_with(recipe.file, paths)
         if folder is not None:
             return folder
     raise ProductError(
         f"was made from {records[0].path}, which is in no folder above the product",
-        file=origin.file,
+        file=recipe.file,
         remedy=f"give its folder with {option}",
     )
 
@@ -250,33 +245,31 @@ def _changed(folder: Path, records: Iterable[InputRecord], place: str) -> Iterat
                 yield Difference("input", record.path, problem)
 
 
-def _software(origin: RecordedOrigin) -> Iterator[Difference]:
-    code = code_version(origin.kind)
-    if origin.code_version != code:
-        yield Difference("code", "lidarops", f"{code}, was {origin.code_version}")
+def _software(recipe: Recipe) -> Iterator[Difference]:
+    code = code_version(recipe.kind)
+    if recipe.code_version != code:
+        yield Difference("code", "lidarops", f"{code}, was {recipe.code_version}")
     now = package_versions()
-    for name in sorted({*origin.versions, *now}):
-        if origin.versions.get(name) != now.get(name):
-            problem = f"{now.get(name, 'absent')}, was {origin.versions.get(name, 'absent')}"
+    for name in sorted({*recipe.versions, *now}):
+        if recipe.versions.get(name) != now.get(name):
+            problem = f"{now.get(name, 'absent')}, was {recipe.versions.get(name, 'absent')}"
             yield Difference("package", name, problem)
 
 
-def _made_again(
-    origin: RecordedOrigin, root: Path, folder: Path, out: Path
-) -> Iterator[Difference]:
+def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
     """Yield the differences between a product and the one made from its inputs now."""
-    with _dated(origin.epoch):
-        campaign, scene = origin.campaign(root, folder, out), origin.scene(root)
-        outcome = process_scene(Job(campaign, scene, origin.plan, only=origin.channel))
+    with _dated(recipe.epoch):
+        campaign, scene = recipe.campaign(root, folder, out), recipe.scene(root)
+        outcome = process_scene(Job(campaign, scene, recipe.plan, only=recipe.channel))
     if outcome.internal:
         _LOG.error("scene %s: %s\n%s", outcome.scene, outcome.error, outcome.internal)
-    record = next((made for made in outcome.products if made.kind == origin.kind), None)
+    record = next((made for made in outcome.products if made.kind == recipe.kind), None)
     if record is None:
-        problem = outcome.error or f"no longer gives a {origin.kind} product"
-        yield Difference("processing", origin.plan.scene, problem)
+        problem = outcome.error or f"no longer gives a {recipe.kind} product"
+        yield Difference("processing", recipe.plan.scene, problem)
         return
-    if record.sha256 != sha256_of(origin.file):
-        yield from _compared(origin.file, out / "products" / record.path)
+    if record.sha256 != sha256_of(recipe.file):
+        yield from _compared(recipe.file, out / "products" / record.path)
 
 
 @contextmanager

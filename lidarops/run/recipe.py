@@ -1,4 +1,4 @@
-"""The origin of a product: what its provenance says of campaign, plan and inputs."""
+"""The recipe of a product: what its provenance says of campaign, plan and inputs."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ RAW: Final = (Role.SIGNAL, Role.DARK)
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedOrigin:
-    """The provenance of a product."""
+class Recipe:
+    """What a product was made from, and how, according to itself."""
 
     file: Path
     kind: str
@@ -40,14 +40,14 @@ class RecordedOrigin:
     """SOURCE_DATE_EPOCH by which the product was dated; empty if there was none."""
 
     @classmethod
-    def of(cls, file: Path) -> RecordedOrigin:
+    def of(cls, file: Path) -> Recipe:
         """Read the provenance of a product; raise ProductError if it is insufficient."""
         document = read_provenance(file)
         try:
             entities = document["entity"]
             attributes = entities["lidarops:product"]
             software = document["agent"]["lidarops:software"]
-            origin = cls(
+            recipe = cls(
                 file=file,
                 kind=str(attributes["lidarops:kind"]),
                 channel=str(attributes["lidarops:channel"]),
@@ -61,7 +61,7 @@ class RecordedOrigin:
             )
         except (KeyError, ValueError, TypeError) as error:
             raise _insufficient(file, repr(error)) from error
-        for record in origin.inputs:
+        for record in recipe.inputs:
             # Copies are written under this path, which a forged product could choose freely.
             if record.role in RAW and not stays_inside(record.path):
                 raise ProductError(
@@ -70,7 +70,7 @@ class RecordedOrigin:
                     field="provenance",
                     remedy="lidarops does not write such products: do not trust this one",
                 )
-        return origin
+        return recipe
 
     def campaign(self, archive: Path, folder: Path, output: Path) -> Campaign:
         """Return a campaign that gives only this product; its other inputs are in `folder`."""
