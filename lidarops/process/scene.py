@@ -35,7 +35,7 @@ from lidarops.records import (
 )
 from lidarops.steps.channels import channel_ranges, file_channels, member_channel
 from lidarops.steps.conditioning import DARK
-from lidarops.steps.data import Chunk, ProductStream, RowProduct, Source, WholeProduct, in_one_batch
+from lidarops.steps.data import Chunk, ProductStream, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
 from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
@@ -241,34 +241,30 @@ class _Instrument(_Work):
             for kind in streams
         }
         with ExitStack() as until_written:
-            writers = {
-                kind: until_written.enter_context(self._writer(stream.frame(), contexts[kind]))
-                for kind, stream in streams.items()
-                if isinstance(stream, RowProduct)
-            }
+            writers: dict[str, ProductWriter] = {}
             profiles = self._chunk_profiles(source, channel)
             for chunk in execution.chunks(source, channel, streams.values(), profiles):
-                self._take(chunk, streams, writers)
+                for kind, rows in _taken(chunk, streams):
+                    self._clock.lap("retrieve")
+                    if kind in writers:
+                        writers[kind].add(rows)
+                        self._clock.lap("write")
+                    else:
+                        writer = self._writer(rows, contexts[kind])
+                        writers[kind] = until_written.enter_context(writer)
         yield from (_record(contexts[kind], writer) for kind, writer in writers.items())
         for kind, stream in streams.items():
             if isinstance(stream, WholeProduct):
                 yield self._written(contexts[kind], stream.results())
 
-    def _take(
-        self,
-        chunk: Chunk,
-        streams: Mapping[str, ProductStream],
-        writers: Mapping[str, ProductWriter],
-    ) -> None:
-        """Give a chunk to all products, and write the rows that are complete."""
-        for kind, stream in streams.items():
-            if isinstance(stream, WholeProduct):
-                stream.add(chunk)
-            else:
-                rows = stream.rows(chunk)
-                self._clock.lap("retrieve")
-                writers[kind].add(rows)
-                self._clock.lap("write")
+
+def _taken(chunk: Chunk, streams: Mapping[str, ProductStream]) -> Iterator[tuple[str, xr.Dataset]]:
+    """Give a chunk to all products, and yield the rows that are complete, with their kinds."""
+    for kind, stream in streams.items():
+        if isinstance(stream, WholeProduct):
+            stream.add(chunk)
+        else:
+            yield from ((kind, rows) for rows in stream.rows(chunk))
 
 
 class _Network(_Work):

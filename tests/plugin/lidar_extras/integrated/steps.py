@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -89,7 +90,7 @@ class _Integrals(RowProduct):
         known = np.ones(centres.size) if overlap is None else overlap(centres)
         self._windows = [Window.of(centres, known, limits) for limits in settings.windows]
 
-    def frame(self) -> xr.Dataset:
+    def _frame(self) -> xr.Dataset:
         """Return times and pointing of all profiles, and the windows."""
         background_range, method = self._background
         frame = self._geometry.assign_coords(
@@ -101,8 +102,10 @@ class _Integrals(RowProduct):
         words = background_words(method, background_range)
         return frame.assign(bins=("window", bins)).assign_attrs(steps=words)
 
-    def rows(self, chunk: Chunk) -> xr.Dataset:
-        """Return the integrals of profiles."""
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Yield the integrals of profiles."""
+        if chunk.rows.start == 0:
+            yield self._frame()
         conditioned = chunk.profiles(self._profiles)
         signals = correct_for_range(conditioned, *self._background)
         sky = signals[["background", "background_standard_error"]]
@@ -125,7 +128,7 @@ class _Integrals(RowProduct):
             quality_flag=(dims, np.stack([part.flags for part in integrals], axis=1)),
             shots=self._profiles.shots(chunk.counts),
         )
-        return values.assign(gluing(conditioned)).assign_coords(chunk.geometry.variables)
+        yield values.assign(gluing(conditioned)).assign_coords(chunk.geometry.variables)
 
 
 STEP: Final = Integrated()
