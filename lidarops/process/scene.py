@@ -221,13 +221,15 @@ class _Instrument(_Work):
         for channel in channels:
             yield from self._channel_products(source, channel)
 
-    def _sample(self, channel: str, granules: Sequence[Granule]) -> xr.Dataset:
-        """Return power, variance and quality of a channel in some granules."""
+    def _sample(self, channel: str, granules: Sequence[Granule]) -> Iterator[xr.Dataset]:
+        """Yield power, variance and quality of a channel in some granules."""
         channels = (channel, *file_channels(channel))
         steps = [step for step in self.job.plan.steps if step.channel in channels]
         few = replace(self._scene, granules=tuple(granules))
         # The signal is compared with bins beyond the sections.
-        return execution.profiles_of(self._source(few, steps), steps, channel)
+        source = self._source(few, steps)
+        profiles = self._chunk_profiles(source, channel)
+        return execution.profiles_of(source, steps, channel, profiles)
 
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
         steps = self.job.plan.steps

@@ -153,8 +153,8 @@ class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):
         return planned, []
 
 
-Sample = Callable[[str, Sequence[Granule]], "xr.Dataset"]
-"""Channel and granules -> power, variance and quality of their profiles."""
+Sample = Callable[[str, Sequence[Granule]], Iterator["xr.Dataset"]]
+"""Channel and granules -> power, variance and quality of their profiles, some at a time."""
 
 
 @dataclass(frozen=True, slots=True)
