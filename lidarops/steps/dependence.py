@@ -21,6 +21,7 @@ from lidarops.steps.conditioning import DARK
 from lidarops.steps.reading import ARCHIVE, required_by
 from lidarops.steps.registry import definition, gives
 from lidarops.steps.step import Definition
+from lidarops.steps.workload import Workload
 
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
@@ -119,6 +120,14 @@ def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> Planned
     of_part = f"{step.channel}/"
     glued = sorted({s.channel for s in steps if any(n.startswith(of_part) for n in s.needs)})
     return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
+
+
+def workloads(scene: Scene, plan: Plan) -> Iterator[tuple[PlannedStep, Workload]]:
+    """Yield the planned steps of a scene, with what each has to process."""
+    members = {member.instrument: member for member in scene.members}
+    for step in plan.steps:
+        own = plan_closure(plan, [(step.name, step.channel)]) if is_product(step) else plan
+        yield step, Workload(members.get(step.instrument, scene), step.channel, own)
 
 
 def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:

@@ -94,6 +94,14 @@ class Definition(ABC, Generic[S]):
         """Return the estimated CPU time on a common server core, s."""
         return 0.0
 
+    def held(self, settings: S, work: Workload) -> float:  # noqa: ARG002 - most hold little
+        """Return the estimated number of bytes that are held for the whole scene."""
+        return 0.0
+
+    def together(self, settings: S, work: Workload) -> int:  # noqa: ARG002 - most take any profiles
+        """Return the largest number of profiles that a chunk must not part."""
+        return 1
+
 
 class Choice(Definition[S], Generic[C_contra, S]):
     """Something about a channel or a product that is decided from headers and campaign alone."""
@@ -129,10 +137,6 @@ class MakingStep(Definition[S], Generic[R, S]):
     """What it takes from steps, where they run."""
     parts: tuple[Definition[Any], ...] = ()
     """Other entries of the kind: steps, and choices by which the product is made."""
-
-    def held(self, settings: S, work: Workload) -> float:  # noqa: ARG002
-        """Return the number of bytes that the product holds for the whole scene."""
-        return 0.0
 
 
 class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):

@@ -53,12 +53,11 @@ _ANALOG: Final = ["analog_532o"]
 _PHOTON: Final = ["photon_532o"]
 _HOMOGENEOUS: Final[Mapping[str, Any]] = {"channels": _PHOTON, "sections": [[750, 6000]]}
 _NETWORK: Final = {
-    "west": ("h*[0-2]", 47.25, 11.3, 70.0),
-    "east": ("h*[3-5]", 47.25, 11.353, 310.0),
-    "north": ("h*[6-9]", 47.2811, 11.3265, 190.0),
+    "west": ("012", 47.25, 11.3, 70.0),
+    "east": ("345", 47.25, 11.353, 310.0),
+    "north": ("6789", 47.2811, 11.3265, 190.0),
 }
-"""Files, latitude, longitude and azimuth of each lidar, all level; each reads a share of the files
-of the scene."""
+"""Last digits of the files, latitude, longitude and azimuth of each lidar; all are level."""
 
 
 def _of_one(
@@ -92,11 +91,11 @@ def _network() -> dict[str, Any]:
         "instruments": {
             name: {
                 "station": name,
-                "files": files,
-                "facts": [{"zenith_angle": 90.0, "azimuth": azimuth}],
+                "files": [f"h*{digit}" for digit in digits],
+                "facts": [{"full_overlap_range": 150, "zenith_angle": 90.0, "azimuth": azimuth}],
                 "products": {},
             }
-            for name, (files, _, _, azimuth) in _NETWORK.items()
+            for name, (digits, _, _, azimuth) in _NETWORK.items()
         },
         "networks": {
             "valley": {
@@ -125,7 +124,7 @@ CASES: Final[Mapping[str, Mapping[str, Any]]] = {
             "elastic": {"channels": _PHOTON, "reference": {"lowest": 1000, "highest": 4000}},
         },
     ),
-    "multiangle": _of_one(None, {"multiangle": {"channels": _PHOTON}}),
+    "multiangle": _of_one(None, {"multiangle": {"channels": _PHOTON, "step": 15}}),
     "visibility": _network(),
 }
 """Part of the campaign file of each row of the table; all have the same files."""

@@ -15,7 +15,7 @@ from lidarops.retrieve.signal.averaging import RunningMean
 
 _PROFILES_IN_CACHE: Final = 32
 """Profiles averaged together; they fit the processor cache."""
-_MEANS_TOGETHER: Final = 16
+MEANS_TOGETHER: Final = 16
 """Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
@@ -78,7 +78,7 @@ class ClockAverage:
         self._shared_variance = shared_variance
         self._distance = distance
         self._added = 0
-        self._edges = np.append(first[::_MEANS_TOGETHER], interval.size)
+        self._edges = np.append(first[::MEANS_TOGETHER], interval.size)
         self._completed: list[xr.Dataset] = []
         self._begin(0)
 
@@ -93,7 +93,7 @@ class ClockAverage:
 
     def _begin(self, number: int) -> None:
         """Begin the means that are completed together."""
-        self._open = slice(number, number + _MEANS_TOGETHER)
+        self._open = slice(number, number + MEANS_TOGETHER)
         times = self._middles[self._open]
         shape = times.size, self._distance.size
         self._sums, self._bits = RunningMean(shape), np.zeros(shape, dtype=np.int32)
