@@ -183,8 +183,9 @@ def _process(file: Path) -> None:
 def _check_nothing_stale(file: Path) -> None:
     campaign = load_campaign(file)
     with Store(campaign.catalog_url, campaign.name) as store:
-        signatures, verdicts = Judge(campaign, store).signatures(), store.verdicts()
-    if any(verdicts.get(day, ("",))[0] != now.whole for day, now in signatures.items()):
+        judge, verdicts = Judge(campaign, store), store.verdicts()
+        days = judge.signatures().items()
+    if not all(judge.is_settled(now, verdicts.get(day)) for day, now in days):
         raise CampaignError("the simulated archive is not up to date", file=file)
 
 
