@@ -107,7 +107,7 @@ def _solve(method: HomogeneousMethod, variance: float | None, power: Any, path: 
         path.range,
         variance=variance,
         method=method.value,
-        **method_arguments(method, path),  # type: ignore[arg-type]
+        **method_arguments(method, path),
     )
 
 
