@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import xarray as xr
 
-from lidarops.products.homogeneous.report_figures import overview
+from lidarops.figures import svg
+from lidarops.figures.kind_figures import ProductSource, figures_of
+from lidarops.figures.panels import Figure, Panel
 
-DEMO = Path(__file__).resolve().parents[1] / "demo"
+DEMO = Path(sys.argv[1] if sys.argv[1:] else Path(__file__).resolve().parents[1] / "demo")
 
 
-def _day(kind: str) -> xr.Dataset:
+def _panel(kind: str, source: ProductSource) -> Panel:
+    """Return the main panel of all products of a kind."""
     files = sorted(DEMO.glob(f"products/coast/*/{kind}/*/*_photon_532o_*.nc"))
-    parts = [xr.load_dataset(file) for file in files]
-    return xr.concat(parts, dim="time", data_vars="minimal", coords="minimal", compat="override")
+    figures = figures_of(kind)
+    if figures is None or not files:
+        raise SystemExit(f"{DEMO} holds no {kind} products: run make demo")
+    view = figures.views[0]
+    contents = [view.read(xr.load_dataset(file), source) for file in files]
+    figure, *_ = view.draw([content for content in contents if content is not None])
+    return figure.panels[0]
 
 
 def main() -> None:
-    """Write ``docs/overview.png``."""
+    """Write ``docs/overview.svg``."""
     truth = xr.load_dataset(DEMO / "raw" / "truth.nc")
-    truth = truth.isel(granule=(truth["instrument"] == "coast-horizontal").values)
-    figure = overview(_day("homogeneous"), truth, _day("signal"))
-    figure.savefig(Path(__file__).with_suffix(".png"), dpi=100)
+    source = ProductSource("coast-horizontal", "photon_532o", truth=truth)
+    signal = _panel("signal", source)
+    extinction = replace(_panel("homogeneous", source), x=signal.x)
+    figure = Figure("One day of the demo", "extinction and signal", (extinction, signal))
+    Path(__file__).with_suffix(".svg").write_bytes(svg.file(figure))
 
 
 if __name__ == "__main__":

@@ -171,7 +171,8 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     if built.quicklook is not None:
         # The server may run on another machine, so the artifact contains the picture.
         encoded = base64.b64encode(built.quicklook.read_bytes()).decode()
-        create_image_artifact(image_url=f"data:image/png;base64,{encoded}", key=f"{key}-quicklook")
+        url = f"data:image/svg+xml;base64,{encoded}"
+        create_image_artifact(image_url=url, key=f"{key}-quicklook")
     return built.page
 
 

@@ -127,6 +127,18 @@ class Quality(FlagBit):
     )
 
 
+SIGNAL_BITS: Final = (
+    Quality.INPUT_MISSING,
+    Quality.SATURATED,
+    Quality.PILE_UP,
+    Quality.INCOMPLETE_OVERLAP,
+    Quality.OUTLIER,
+    Quality.BACKGROUND_UNCERTAIN,
+    Quality.NO_GLUING,
+)
+"""Bits of signals that retrievals of profiles pass on."""
+
+
 def rejecting(bits: Iterable[FlagBit]) -> int:
     """Return the union of the bits whose severity is `Severity.REJECT`."""
     return sum({int(bit) for bit in bits if bit.severity is Severity.REJECT})

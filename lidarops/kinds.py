@@ -1,8 +1,8 @@
 """Registry of the kinds of product, which are found by entry point.
 
 A kind of product is one package: its ``__init__`` holds a `Kind`, and its modules ``settings``,
-``steps``, ``variables``, ``flags``, ``figures`` and ``report_figures`` hold everything else about
-it. Without the last two, its main variable is drawn. A package outside lidarops adds a kind by an
+``steps``, ``variables``, ``flags`` and ``figures`` hold everything else about it. Without the last,
+its main variable is drawn. A package outside lidarops adds a kind by an
 entry point of the group ``lidarops.product_kinds``::
 
     [project.entry-points."lidarops.product_kinds"]

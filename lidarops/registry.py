@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import entry_points
-from typing import Final, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from lidarops.errors import LidarOpsError
-
-RAW_FORMATS: Final = "lidarops.raw_formats"
-"""Group of entry points of raw formats."""
 
 
 class _Named(Protocol):

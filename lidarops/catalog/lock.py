@@ -148,8 +148,15 @@ class Lock:
             row = connection.execute(query).one_or_none()
         if row is None:
             return None
-        _campaign, *known, _heartbeat, silent = row
-        return Holder(*(*known, silent))
+        return Holder(
+            row.token,
+            row.holder,
+            row.machine,
+            row.process,
+            row.process_started,
+            row.acquired,
+            row.silent,
+        )
 
     def _own_row(self) -> tuple[sa.ColumnElement[bool], ...]:
         return _L.campaign == self._database.campaign, _L.token == self.token

@@ -1,13 +1,12 @@
-"""Data reduction and drawing that kinds of product share, for the report and the site.
+"""Figures of products, which the report and the site share.
 
 Three layers of modules:
 
 - Data reduction: ``series_data.py`` and ``raster.py`` hold what figures show as plain arrays;
-  ``time_axis.py`` lays out time axes; ``reading.py`` and ``report_sources.py`` read products in
-  parallel; ``wording.py`` formats numbers and names. The report and the site both use them.
-- Drawing: ``svg.py`` and ``svg_*.py`` for the site, without matplotlib; ``panels.py``,
-  ``product_figures.py`` and ``charts.py`` with matplotlib for reports.
-- Kinds: ``kind_figures.py`` is what a kind of product states about its figures in its modules
-  ``figures`` and ``report_figures``; ``kind_images.py`` is the image that several have;
-  ``any_kind.py`` and ``any_kind_report.py`` draw products of a kind that states nothing.
+  ``time_axis.py`` lays out time axes; ``wording.py`` formats numbers and names.
+- Panels: ``panels.py`` states what a figure shows, as values; ``series_panels.py``,
+  ``image_panels.py`` and ``charts.py`` make them; ``svg.py`` and ``pixels.py`` draw them, in the
+  style of ``figure.css``. A figure takes at most 0.1 s of CPU time and 300 kB.
+- Kinds: ``kind_figures.py`` is what a kind of product states about its figures in its module
+  ``figures``; ``any_kind.py`` draws products of a kind that states nothing.
 """

@@ -1,19 +1,23 @@
-"""The figure of a product of any kind: its main variable against time."""
+"""The figure of products of any kind: their main variable against time."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures import svg, svg_series
-from lidarops.figures.kind_figures import PageFigures, no_figures, preferred_variables
-from lidarops.figures.series_data import NumberedSeries, SeriesEstimate, quality_bits
+from lidarops.figures.kind_figures import ProductSource, View, preferred_variables
+from lidarops.figures.panels import Figure, units
+from lidarops.figures.series_data import NumberedSeries, SeriesEstimate, join, quality_bits
+from lidarops.figures.series_panels import SERIES, Quantity, series_figures
+from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
-from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.netcdf.variables import QUALITY_FLAG, layout_of
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +44,7 @@ class MainVariable:
 
 
 def read_main_variable(
-    product: xr.Dataset, *, kind: str, most: int = svg_series.SERIES
+    product: xr.Dataset, *, kind: str, most: int = SERIES
 ) -> MainVariable | None:
     """Return the main variable of a product as series over time.
 
@@ -111,11 +115,24 @@ def _table(variable: xr.DataArray) -> Floats:
     return variable.values.reshape(variable.sizes["time"], -1).astype(np.float64)
 
 
-def draw_page(product: xr.Dataset) -> PageFigures:
-    """Draw the main variable of a product of any kind for a page."""
-    main = read_main_variable(product, kind=product.attrs.get("lidarops_kind", ""))
-    if main is None:
-        return no_figures("no variable to draw")
-    units = svg.units(main.series[0].estimates[main.name].units)
-    quantity = svg_series.Quantity(main.name, 1.0, units)
-    return svg_series.stacked_page(main.series, (quantity,), main.title)
+def view_of(kind: str) -> View[MainVariable]:
+    """Return the view of products of a kind that states no figures, or is unknown."""
+    return View(kind, _variables(kind), partial(_read, kind), _draw)
+
+
+def _read(kind: str, product: xr.Dataset, _: ProductSource) -> MainVariable | None:
+    return read_main_variable(product, kind=kind)
+
+
+def _variables(kind: str) -> tuple[str, ...]:
+    """Return the variables of which one may be the main variable, with their errors."""
+    data = layout_of(kind).data if kind in kinds() else ()
+    names = dict.fromkeys([*(row.name for row in data if row.uncertain), *preferred_variables()])
+    return "time", QUALITY_FLAG, *names, *(f"{name}_standard_error" for name in names)
+
+
+def _draw(variables: Sequence[MainVariable]) -> Iterator[Figure]:
+    first = variables[0]
+    joined = join(one for main in variables if main.name == first.name for one in main.series)
+    unit = units(first.series[0].estimates[first.name].units)
+    return series_figures(joined[:SERIES], (Quantity(first.name, 1.0, unit),), first.title)

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+import numpy as np
 
 from lidarops.figures import panels
+from lidarops.figures.panels import SERIES_MARKS, Band, Curve, Figure, Layer, finite
+from lidarops.figures.time_axis import Tick
 
-_DPI: Final = 150
-_HEIGHT: Final = 4.6
-_WIDTH: Final = 10.0
-_ROW: Final = 0.3
-_FEW_DECADES: Final = 2e3
-"""Axes that span less than this ratio are labelled at 1, 2 and 5 of each decade."""
-_COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
-_LINES: Final = ("-", "--", "-.", ":")
+_HEIGHT: Final = 340
+_ROW: Final = 28
+_COLOURS: Final = 5
+_DASHES: Final = 5
+_MARGIN: Final = 0.05
+"""Room at both ends of an axis, relative to its length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +37,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class ChartPanel:
     """One panel of a chart."""
 
     title: str
@@ -64,7 +60,7 @@ class Chart:
     """File name without suffix."""
     title: str
     caption: str
-    panels: tuple[Panel, ...]
+    panels: tuple[ChartPanel, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +77,9 @@ class Ladder:
 
 
 def draw_chart(chart: Chart | Ladder) -> Figure:
-    """Draw a chart; `lidarops.figures.product_figures.render` converts it to a file."""
-    figure = _chart(chart) if isinstance(chart, Chart) else _ladder(chart)
-    panels.title(figure, chart.title)
-    figure.set_label(f"{chart.title}. {chart.caption}")
-    return figure
+    """Return a chart as a figure."""
+    drawn = _chart(chart) if isinstance(chart, Chart) else (_ladder(chart),)
+    return Figure(chart.title, chart.caption.removesuffix("."), drawn, beside=True)
 
 
 def pareto(
@@ -102,99 +96,70 @@ def pareto(
     return tuple(front)
 
 
-def _chart(chart: Chart) -> Figure:
-    figure = Figure(figsize=(_WIDTH, _HEIGHT), dpi=_DPI, layout="constrained")
-    axes = figure.subplots(1, len(chart.panels), squeeze=False, sharey=True)[0]
-    for panel, drawn in zip(axes, chart.panels, strict=True):
-        _panel(panel, drawn)
-    if chart.panels[0].y_log:
-        _plain_ticks(axes[0].yaxis)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
-    return figure
-
-
-def _panel(panel: Axes, drawn: Panel) -> None:
-    panel.set_title(drawn.title, fontsize=10, loc="left")
-    panel.set_xlabel(drawn.x_label)
-    panel.set_ylabel(drawn.y_label)
-    if drawn.x_log:
-        panel.set_xscale("log")
-    if drawn.y_log:
-        panel.set_yscale("log")
-    if drawn.level is not None:
-        panel.axhline(drawn.level, color=panels.GREY, linewidth=0.8)
-    if drawn.front:
-        x, y = zip(*drawn.front, strict=True)
-        panel.step(x, y, where="post", color=panels.INK, linewidth=1.0, label="Pareto front")
-    for number, series in enumerate(drawn.series):
-        _series(panel, series, number)
-    if drawn.x_log:
-        _plain_ticks(panel.xaxis)
-    _calm(panel)
-
-
-def _series(panel: Axes, series: Series, number: int) -> None:
-    color = _COLORS[number % len(_COLORS)]
-    bars = None
-    if series.band:
-        panel.fill_between(series.x, series.low, series.high, color=color, alpha=0.18, linewidth=0)
-    elif series.low:
-        bars = (
-            [y - low for y, low in zip(series.y, series.low, strict=True)],
-            [high - y for y, high in zip(series.y, series.high, strict=True)],
-        )
-    panel.errorbar(
-        series.x,
-        series.y,
-        yerr=bars,
-        label=series.label,
-        color=color,
-        marker=_MARKERS[number % len(_MARKERS)],
-        markerfacecolor="none" if series.hollow else color,
-        markersize=5.5,
-        linestyle=_LINES[number % len(_LINES)] if series.joined else "none",
-        linewidth=1.0,
-        elinewidth=0.8,
-        capsize=2,
+def _chart(chart: Chart) -> tuple[panels.Panel, ...]:
+    first = chart.panels[0]
+    heights = [y for panel in chart.panels for y in _heights(panel)]
+    y = _axis(first.y_label, heights, log=first.y_log)
+    return tuple(
+        _panel(panel, replace(y, label=panel.y_label), legend=panel is first)
+        for panel in chart.panels
     )
 
 
-def _ladder(ladder: Ladder) -> Figure:
-    height = 1.6 + _ROW * len(ladder.rows)
-    figure = Figure(figsize=(_WIDTH, height), dpi=_DPI, layout="constrained")
-    panel = figure.subplots()
-    panel.set_xscale("log")
-    panel.set_xlabel(ladder.x_label)
-    places = range(len(ladder.rows))
-    panel.set_yticks(places, ladder.rows)
-    panel.invert_yaxis()
+def _heights(panel: ChartPanel) -> Iterator[float]:
+    for series in panel.series:
+        yield from (*series.y, *series.low, *series.high)
+    yield from (y for _, y in panel.front)
+    if panel.level is not None:
+        yield panel.level
+
+
+def _panel(panel: ChartPanel, y: panels.Axis, *, legend: bool) -> panels.Panel:
+    across = [x for series in panel.series for x in series.x]
+    x = _axis(panel.x_label, [*across, *(at for at, _ in panel.front)], log=panel.x_log)
+    layers: list[Layer] = []
+    if panel.level is not None:
+        layers.append(Curve(np.array([x.low, x.high]), np.full(2, panel.level), "soft thin"))
+    if panel.front:
+        at, front = np.array(panel.front, dtype=np.float64).T
+        layers.append(Curve(at, front, "ink thin", steps=True, label="Pareto front" * legend))
+    for number, series in enumerate(panel.series):
+        layers += _series(series, number, series.label * legend)
+    return panels.Panel(x, y, tuple(layers), height=_HEIGHT, title=panel.title)
+
+
+def _series(series: Series, number: int, label: str) -> Iterator[Layer]:
+    x = np.array(series.x, dtype=np.float64)
+    style = f"c{number % _COLOURS}"
+    if series.low:
+        low, high = (np.array(ends, dtype=np.float64) for ends in (series.low, series.high))
+        yield Band(x, low, high, style, bars=not series.band)
+    style += f" d{number % _DASHES}" + " hollow" * series.hollow
+    mark = SERIES_MARKS[number % len(SERIES_MARKS)]
+    y = np.array(series.y, dtype=np.float64)
+    yield Curve(x, y, style, mark, joined=series.joined, label=label)
+
+
+def _ladder(ladder: Ladder) -> panels.Panel:
+    count = len(ladder.rows)
+    ticks = tuple(Tick(float(place), name) for place, name in enumerate(ladder.rows))
+    y = panels.Axis("", count - 0.5, -0.5, ticks=ticks)
+    times = [value for _, values in ladder.series for value in values if value]
+    layers = []
     for number, (label, values) in enumerate(ladder.series):
-        drawn = [(value, at) for at, value in zip(places, values, strict=True) if value]
-        x, y = zip(*drawn, strict=True) if drawn else ((), ())
-        panel.plot(
-            x,
-            y,
-            label=label,
-            linestyle="none",
-            color=_COLORS[number % len(_COLORS)],
-            marker=_MARKERS[number % len(_MARKERS)],
-            markerfacecolor="none" if number % 2 else _COLORS[number % len(_COLORS)],
+        x = np.array([value or np.nan for value in values])
+        style = f"c{number % _COLOURS}" + " hollow" * (number % 2)
+        mark = SERIES_MARKS[number % len(SERIES_MARKS)]
+        layers.append(
+            Curve(x, np.arange(count, dtype=np.float64), style, mark, joined=False, label=label)
         )
-    panels.legend(panel, columns=4)
-    _calm(panel)
-    return figure
+    return panels.Panel(_axis(ladder.x_label, times, log=True), y, tuple(layers), _ROW * count + 20)
 
 
-def _plain_ticks(axis: Axis) -> None:
-    low, high = axis.get_view_interval()
-    if high / low < _FEW_DECADES:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
-        axis.set_minor_formatter(NullFormatter())
-
-
-def _calm(panel: Axes) -> None:
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.grid(which="major", color="#dddddd", linewidth=0.6)
-    panel.set_axisbelow(True)
+def _axis(label: str, values: Iterable[float], *, log: bool) -> panels.Axis:
+    known = finite([np.array([*values], dtype=np.float64)])
+    known = np.log10(known[known > 0]) if log else known
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    room = _MARGIN * (high - low) or 0.3
+    low, high = low - room, high + room
+    return panels.Axis(label, 10.0**low if log else low, 10.0**high if log else high, log)

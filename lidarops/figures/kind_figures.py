@@ -1,100 +1,101 @@
-"""What a kind of product states about its figures, and how views find it.
+"""What a kind of product states about its figures, and how pages and reports find it.
 
-A kind has up to two modules for figures. Its module ``figures`` holds `KindFigures` by the name
-``FIGURES``, for the site. Its module ``report_figures`` holds `ReportFigures` by the name
-``REPORT``, for reports; it is apart because it needs matplotlib. Products of other kinds are drawn
-by `lidarops.figures.any_kind`.
+A kind has a module ``figures``, which holds `KindFigures` by the name ``FIGURES``. Products of
+other kinds are drawn by `lidarops.figures.any_kind`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Generic, TypeVar
 
 import xarray as xr
-from markupsafe import Markup
 
-from lidarops.figures.report_sources import Group, Sources
-from lidarops.figures.svg import THUMB, Sheet
+from lidarops.figures.image_panels import image_figure
+from lidarops.figures.panels import Figure
+from lidarops.figures.raster import Raster
+from lidarops.figures.series_data import Comparison
 from lidarops.kinds import kinds
+from lidarops.records import SceneOutcome
+
+Content = TypeVar("Content")
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
-    """A figure of a page."""
+class ProductSource:
+    """What is known about a product beside its data; nothing on a page of the product alone."""
 
-    caption: str
-    figure: Markup
-
-    @classmethod
-    def of(cls, sheet: Sheet, caption: str, words: str, key: str) -> Drawn:
-        """Return a figure with its caption, a description, and a key that is unique on a page."""
-        text = f"{caption}. {words}."
-        return cls(text, sheet.svg(key, text))
+    instrument: str = ""
+    channel: str = ""
+    scene: SceneOutcome | None = None
+    truth: xr.Dataset | None = None
+    """Truth of a simulated campaign."""
+    profiles: int = 0
+    """Profiles per column of an image; 0 for as many as fit the product."""
 
 
 @dataclass(frozen=True, slots=True)
-class PageFigures:
-    """The figures of the page of a product."""
+class View(Generic[Content]):
+    """A way to look at products of one instrument and channel."""
 
-    figures: tuple[Drawn, ...]
-    thumbnail: Sheet
-    alt: str
-    """Description of the thumbnail."""
-
-
-def no_figures(words: str) -> PageFigures:
-    """Return a page without figures, with the reason as thumbnail."""
-    width, height = THUMB
-    sheet = Sheet(height=height, width=width)
-    sheet.text(width / 2, height / 2 + 5, words, css="t m")
-    return PageFigures((), sheet, f"No figure: {words}")
+    name: str
+    """Start of the names of its files."""
+    variables: tuple[str, ...]
+    """Variables that `read` needs."""
+    read: Callable[[xr.Dataset, ProductSource], Content | None]
+    """Reduces an open product, which may be lazy; None if there is nothing to show. Raises
+    `ProductError` if the product is of another kind. It is sent to another process, so it must be
+    possible to pickle it."""
+    draw: Callable[[Sequence[Content]], Iterable[Figure]]
+    """Returns the figures of the contents of at least one product."""
+    compare: Callable[[Sequence[Content]], Iterable[Comparison | None]] | None = None
+    """Compares contents with the truth."""
+    first: bool = False
+    """Whether a report draws only the first product that has content."""
+    image: bool = False
+    """Whether `read` needs `ProductSource.profiles`."""
 
 
 @dataclass(frozen=True, slots=True)
 class KindFigures:
-    """Figures of a kind of product on pages."""
+    """Figures of a kind of product."""
 
-    page: Callable[[xr.Dataset], PageFigures]
-    """Draws an open product, which may be lazy. Raises `ProductError` if it is of another kind."""
+    views: tuple[View[Any], ...]
+    """The first figure of the first view is the thumbnail of a product."""
     preferred: str
     """Variable for an overview of any product that has it."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReportFigure:
-    """A figure of a report, to be drawn with matplotlib."""
+def image_view(
+    name: str,
+    variables: tuple[str, ...],
+    read: Callable[..., Raster],
+    what: str,
+    along: str = "range",
+) -> View[Raster]:
+    """Return the view of a quantity, named `what`, against time and range or altitude.
 
-    name: str
-    """Start of its file name."""
-    caption: str
-    draw: Callable[..., Any]
-    """Called with `content` and ``title``; returns a `matplotlib.figure.Figure`. It is sent to
-    another process, so it must be possible to pickle it."""
-    content: Any
+    `read` is called with a product and ``profiles``, the profiles per column.
+    """
+    return View(
+        name,
+        variables,
+        partial(_read_raster, read),
+        lambda rasters: [image_figure(rasters, what, along)],
+        image=True,
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class ReportFigures:
-    """Figures of a kind of product in reports."""
-
-    figures: Callable[[Group, Sources], Iterator[ReportFigure]]
-    """Yields the figures of a group of products."""
-    compares: bool = False
-    """Whether it notes comparisons with the truth, before it yields the first figure."""
+def _read_raster(read: Callable[..., Raster], product: xr.Dataset, source: ProductSource) -> Raster:
+    return read(product, profiles=source.profiles)
 
 
 def figures_of(kind: str) -> KindFigures | None:
-    """Return how pages show a kind of product; None if the kind is unknown or does not state it."""
+    """Return the figures of a kind of product; None if the kind is unknown or states none."""
     known = kinds().get(kind)
     return known.optional_part("figures", "FIGURES") if known else None
-
-
-def report_figures_of(kind: str) -> ReportFigures | None:
-    """Return how reports show a kind of product; None as `figures_of`."""
-    known = kinds().get(kind)
-    return known.optional_part("report_figures", "REPORT") if known else None
 
 
 def preferred_variables() -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -23,24 +23,11 @@ Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
 """Sums are computed in double and kept in single precision, enough for an image."""
 
-COLUMNS: Final = 1500
-"""Most columns of an image: about the width of a figure in pixels."""
-ROWS: Final = 800
+COLUMNS: Final = 780
+"""Most columns of an image, about what the eye resolves across a figure."""
+ROWS: Final = 200
 """Most rows of an image."""
 _ALONG_TIME: Final = ("time", "background", "background_standard_error")
-_COLUMNWISE: Final = (
-    "start",
-    "stop",
-    "total",
-    "variance",
-    "used",
-    "rejected",
-    "profiles",
-    "background",
-    "background_error",
-    "clouds",
-)
-"""Fields of a raster along its columns."""
 _READ_ROWS: Final = 4096
 """Most rows while reading, because the range to show is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
@@ -138,7 +125,7 @@ class Raster:
         )
 
 
-def raster_variables(quantity: str = "signal") -> tuple[str, ...]:
+def raster_variables(quantity: str) -> tuple[str, ...]:
     """Return the variables that `read_raster` reads, including optional ones."""
     return (*_ALONG_TIME, "range", *_along_both(quantity), "cloud_base_range", "altitude")
 
@@ -147,18 +134,16 @@ def _along_both(quantity: str) -> tuple[str, ...]:
     return quantity, f"{quantity}_standard_error", "quality_flag"
 
 
-def read_raster(
-    product: xr.Dataset, *, quantity: str = "signal", kind: str = "signal", profiles: int = 0
-) -> Raster:
+def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int = 0) -> Raster:
     """Reduce one quantity of a product to block means.
 
     Parameters
     ----------
     product : Dataset
         Dimensions (time, range); may be lazy, because it is read in blocks.
-    quantity : str, optional
+    quantity : str
         A variable of the product with a standard error.
-    kind : str, optional
+    kind : str
         Kind of the product, whose quality bits it has.
     profiles : int, optional
         Profiles per column; 0 for about `COLUMNS` columns. Columns do not extend across gaps in
@@ -205,47 +190,6 @@ def read_raster(
         background_units=str(product["background"].attrs.get("units", "")),
         bits=flags.raised(int(np.bitwise_or.reduce([block.bits for block in blocks]))),
         altitude=_altitude(product, ranges),
-    )
-
-
-def joined(rasters: Sequence[Raster]) -> list[Raster]:
-    """Join consecutive rasters with the same rows, because one raster is drawn faster.
-
-    Parameters
-    ----------
-    rasters : sequence of Raster
-        Of one quantity.
-
-    Returns
-    -------
-    list of Raster
-        All columns in their order. Rasters that overlap in time are not joined.
-    """
-    groups: list[list[Raster]] = []
-    for raster in rasters:
-        last = groups[-1][-1] if groups else None
-        if (
-            last is not None
-            and last.stop[-1] <= raster.start[0]
-            and np.array_equal(last.edges, raster.edges)
-        ):
-            groups[-1].append(raster)
-        else:
-            groups.append([raster])
-    return [_joined(group) for group in groups]
-
-
-def _joined(rasters: Sequence[Raster]) -> Raster:
-    if len(rasters) == 1:
-        return rasters[0]
-    along_time: dict[str, Any] = {
-        name: np.concatenate([getattr(raster, name) for raster in rasters]) for name in _COLUMNWISE
-    }
-    return replace(
-        rasters[0],
-        **along_time,
-        with_care=sum(raster.with_care for raster in rasters),
-        bits=tuple(sorted({bit for raster in rasters for bit in raster.bits})),
     )
 
 

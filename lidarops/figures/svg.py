@@ -1,23 +1,36 @@
-"""Drawing primitives: panels, axes, lines, marks and images as SVG text.
+"""Draws figures as SVG text.
 
-Pages contain figures as SVG: text and lines are sharp, colours adapt to light and dark mode, and
-drawing takes milliseconds. Colours are classes of the style sheet. Marks and dashes differ too, so
-that figures do not depend on colour alone.
+Text and lines are sharp, colours adapt to light and dark mode, and drawing takes milliseconds.
 """
 
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
+from lidarops.figures import pixels
+from lidarops.figures.panels import (
+    Axis,
+    Band,
+    Curve,
+    Figure,
+    Image,
+    Layer,
+    Mark,
+    Palette,
+    Panel,
+    Words,
+    number,
+)
 from lidarops.figures.wording import visible
 
 Floats = NDArray[np.float64]
@@ -26,61 +39,313 @@ WIDTH: Final = 960
 """Width of a figure in its own units."""
 THUMB: Final = (240, 84)
 """Width and height of a thumbnail."""
-LEFT: Final = 74
-RIGHT: Final = 18
-BAR: Final = 122
-"""Space on the right for a colour bar."""
-COLOURS: Final = 253
-"""Steps of the colour scale of images."""
-BLANK: Final = 0
-"""Palette index of blocks without data (transparent)."""
-REJECTED: Final = 1
-"""Palette index of the dark stripes of rejected blocks; the light stripes have the next index."""
+_LEFT: Final = 74
+_LETTER: Final = 6.9
+"""Mean width of a letter."""
+_LINE: Final = 18
+"""Height of a line of text."""
+_BAR: Final = 110
+"""Space for a colour bar."""
+_RIGHT: Final = 62
+"""Space for an axis at the right."""
+_BETWEEN: Final = 72
+"""Space between panels side by side, for the labels of an axis."""
+_FEW: Final = 150
+"""Most points of a curve in a thumbnail."""
 
-# viridis without its dark end, as in the figures of a run's report.
-_VIRIDIS: Final = (
-    "463480 404588 3a538b 33628d 2e6f8e 287c8e 23898e 1f958b 1fa287 28ae80 3bbb75 56c667 73d056"
-    " 95d840 b8de29 dde318 fde725"
-)
+Place = Callable[[Floats], Floats]
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class _Scale:
     """Maps values to positions along an axis."""
 
-    low: float
-    high: float
+    axis: Axis
     start: float
-    """Position of `low`, in units of the figure."""
+    """Position of the low end."""
     stop: float
-    """Position of `high`."""
-    log: bool = False
 
     def __call__(self, values: Floats | float) -> Floats:
         """Return positions, clipped at one axis length outside the ends."""
-        low, high = (np.log(self.low), np.log(self.high)) if self.log else (self.low, self.high)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            along = np.log(np.asarray(values)) if self.log else np.asarray(values, dtype=np.float64)
-        share = (along - low) / (high - low)
-        return self.start + np.clip(share, -1.0, 2.0) * (self.stop - self.start)
+        low, high, along = self.axis.low, self.axis.high, np.asarray(values, dtype=np.float64)
+        if self.axis.log:
+            along = np.log(np.where(along > 0, along, np.nan))
+            low, high = np.log(low), np.log(high)
+        return self.start + np.clip((along - low) / (high - low), -1.0, 2.0) * (
+            self.stop - self.start
+        )
 
-    def ticks(self, at_most: int = 6) -> list[float]:
-        """Return round values between the ends."""
-        return _decades(self.low, self.high) if self.log else _round_steps(*self.ends, at_most)
+    def ticks(self, at_most: int) -> list[tuple[float, str]]:
+        """Return positions and labels of ticks."""
+        labelled = (
+            _round_ticks(self.axis, at_most)
+            if self.axis.ticks is None
+            else [(tick.x, tick.label) for tick in self.axis.ticks]
+        )
+        return [(float(self(value)), words) for value, words in labelled]
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    """The place of a panel in a figure."""
+
+    panel: Panel
+    left: float
+    top: float
+    width: float
+    labelled: bool
+    """Whether the horizontal axis has labels."""
+    legend: tuple[Curve | Band, ...]
+    """Layers whose label no earlier panel has."""
 
     @property
-    def ends(self) -> tuple[float, float]:
-        """The lower and the higher end."""
-        return min(self.low, self.high), max(self.low, self.high)
+    def foot(self) -> float:
+        """Lower edge."""
+        return self.top + self.panel.height
+
+    @property
+    def x(self) -> _Scale:
+        """Horizontal scale."""
+        return _Scale(self.panel.x, self.left, self.left + self.width)
+
+    @property
+    def y(self) -> _Scale:
+        """Vertical scale."""
+        return _Scale(self.panel.y, self.foot, self.top)
+
+
+def inline(figure: Figure) -> Markup:
+    """Return a figure as markup for a page whose style includes `style`."""
+    content, height = _content(figure)
+    alt = escape(visible(figure.text))
+    return Markup(  # noqa: S704 - `_text` escapes every text of the content
+        f'<svg class="fig" viewBox="0 0 {WIDTH} {height:.0f}" role="img" aria-label="{alt}">'
+        f"{content}</svg>"
+    )
+
+
+def file(figure: Figure) -> bytes:
+    """Return a figure as an SVG file."""
+    content, height = _content(figure)
+    return _file(f"<title>{escape(visible(figure.text))}</title>{content}", WIDTH, height)
+
+
+def thumbnail(figure: Figure | None, words: str = "") -> bytes:
+    """Return the first panel of a figure without axes as an SVG file; `words` without a figure."""
+    width, height = THUMB
+    if figure is None:
+        return _file(_text(width / 2, height / 2 + 5, words, "m s"), width, height)
+    panel = figure.panels[0]
+    x, y = _Scale(panel.x, 0, width), _Scale(panel.y, height - 4, 4)
+    content = "".join(_layer(layer, x, y) for layer in map(_small, panel.layers) if layer)
+    stretched = any(isinstance(layer, Image) for layer in panel.layers)
+    return _file(content, width, height, ' preserveAspectRatio="none"' if stretched else "")
+
+
+def _small(layer: Layer) -> Layer | None:
+    """Return a layer with few points or pixels; None if a thumbnail does not show it."""
+    match layer:
+        case Image():
+            rows, columns = (
+                -(-layer.pixels.shape[0] // THUMB[1]),
+                -(-layer.pixels.shape[1] // THUMB[0]),
+            )
+            return Image(layer.pixels[::rows, ::columns], layer.palette)
+        case Curve():
+            few = slice(None, None, -(-layer.x.size // _FEW) or 1)
+            return Curve(layer.x[few], layer.y[few], layer.style, layer.mark, layer.joined)
+    return None
+
+
+@cache
+def style() -> str:
+    """Return the style sheet of figures."""
+    return Path(__file__).with_name("figure.css").read_text(encoding="utf-8")
+
+
+def _file(content: str, width: float, height: float, aspect: str = "") -> bytes:
+    size = f'width="{width:g}" height="{height:.0f}"'
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:.0f}" {size}'
+        f"{aspect}><style>{style()}</style>{content}</svg>\n"
+    ).encode()
+
+
+def _content(figure: Figure) -> tuple[str, float]:
+    boxes = list(_beside(figure.panels) if figure.beside else _stacked(figure.panels))
+    return "".join(map(_panel, boxes)), max(box.foot + _below(box) for box in boxes)
+
+
+# Layout --------------------------------------------------------------------------------------
+
+
+def _margins(panels: Sequence[Panel]) -> tuple[float, float]:
+    """Return the space left and right of panels."""
+    labels = [tick.label for panel in panels for tick in panel.y.ticks or ()]
+    left = max(_LEFT, 24 + 1.1 * _LETTER * max(map(len, labels), default=0))
+    right = _RIGHT * any(panel.right for panel in panels) + _BAR * any(p.bar for p in panels)
+    return left, right or 18
+
+
+def _stacked(panels: Sequence[Panel]) -> Iterator[_Box]:
+    left, right = _margins(panels)
+    width = WIDTH - left - right
+    y = 0.0
+    for place, (panel, legend) in enumerate(zip(panels, _legends(panels), strict=True), 1):
+        labelled = place == len(panels) or panels[place].x is not panel.x
+        top = y + _above(panel, legend, width)
+        box = _Box(panel, left, top, width, labelled, legend)
+        yield box
+        y = box.foot + _below(box)
+
+
+def _beside(panels: Sequence[Panel]) -> Iterator[_Box]:
+    left, right = _margins(panels)
+    width = (WIDTH - left - right - _BETWEEN * (len(panels) - 1)) / len(panels)
+    legends = list(_legends(panels))
+    top = max(_above(panel, legend, width) for panel, legend in zip(panels, legends, strict=True))
+    for place, (panel, legend) in enumerate(zip(panels, legends, strict=True)):
+        yield _Box(panel, left + place * (width + _BETWEEN), top, width, True, legend)  # noqa: FBT003
+
+
+def _legends(panels: Sequence[Panel]) -> Iterator[tuple[Curve | Band, ...]]:
+    known: set[str] = {""}
+    for panel in panels:
+        legend = [
+            la for la in panel.layers if isinstance(la, Curve | Band) and la.label not in known
+        ]
+        known |= {layer.label for layer in legend}
+        yield tuple(legend)
+
+
+def _above(panel: Panel, legend: Sequence[Curve | Band], width: float) -> float:
+    return 12 + _LINE * (len([*_legend_lines(legend, width)]) + bool(panel.title))
+
+
+def _below(box: _Box) -> float:
+    if not box.labelled:
+        return 2
+    two = any("\n" in tick.label for tick in box.panel.x.ticks or ())
+    return 26 + 16 * two + _LINE * bool(box.panel.x.label)
+
+
+# Axes ----------------------------------------------------------------------------------------
+
+
+def _panel(box: _Box) -> str:
+    panel, height = box.panel, box.panel.height
+    grid, edge, words = "", f"M{box.left:.1f} {box.top:.1f}v{height:.1f}h{box.width:.1f}", []
+    for y, label in box.y.ticks(max(3, round(height / 45))):
+        grid += f"M{box.left:.1f} {y:.1f}h{box.width:.1f}"
+        edge += f"M{box.left:.1f} {y:.1f}h-4"
+        words.append(_text(box.left - 9, y + 4, label, "e"))
+    for x, label in box.x.ticks(max(2, round(box.width / 110))):
+        grid += f"M{x:.1f} {box.top:.1f}v{height:.1f}"
+        edge += f"M{x:.1f} {box.foot:.1f}v4"
+        for row, line in enumerate(label.split("\n") if box.labelled else ()):
+            words.append(_text(x, box.foot + 19 + 16 * row, line, "m"))
+    for x in box.x(np.array(panel.x.breaks)).tolist():
+        edge += f"M{x - 5:.1f} {box.foot + 5:.1f}l4-10m2 10l4-10"
+    middle = box.top + height / 2
+    words.append(_text(box.left - 56, middle, panel.y.label, "m s", turned=True))
+    if box.labelled and panel.x.label:
+        below = box.foot + _below(box) - 8
+        words.append(_text(box.left + box.width / 2, below, panel.x.label, "m s"))
+    if panel.note:
+        words.append(_text(box.left + box.width / 2, middle, panel.note, "m s"))
+    layers = [_layer(layer, box.x, box.y) for layer in panel.layers]
+    clip = f"{box.left:.1f} {box.top:.1f} {box.width:.1f} {height:.1f}"
+    left, top, width, tall = clip.split()
+    return (
+        f'<path class="gap" d="M{left} {top}h{width}v{tall}h-{width}z"/>'
+        * any(isinstance(layer, Image) for layer in panel.layers)
+        + f'<path class="grid" d="{grid}"/>'
+        # An inner svg element clips what lies outside its rectangle.
+        f'<svg x="{left}" y="{top}" width="{width}" height="{tall}" viewBox="{clip}">'
+        f'{"".join(layers)}</svg><path class="axis" d="{edge}"/>'
+        f"{''.join(words)}{_sides(box)}{_legend(box)}"
+    )
+
+
+def _sides(box: _Box) -> str:
+    """Return the axis at the right of a panel, and its colour bar."""
+    x, parts = box.left + box.width, []
+    for axis, space in ((box.panel.right, _RIGHT), (box.panel.bar, _BAR)):
+        if axis is None:
+            continue
+        if axis is box.panel.bar:
+            x += 14
+            palette = next(la.palette for la in box.panel.layers if isinstance(la, Image))
+            parts.append(_image(pixels.ramp(), palette, x, box.top, 14, box.panel.height))
+            x += 14
+        edge = f"M{x:.1f} {box.top:.1f}v{box.panel.height:.1f}"
+        for y, label in _Scale(axis, box.foot, box.top).ticks(6):
+            edge += f"M{x:.1f} {y:.1f}h4"
+            parts.append(_text(x + 7, y + 4, label))
+        parts.append(f'<path class="axis" d="{edge}"/>')
+        middle = box.top + box.panel.height / 2
+        across = x + space - (42 if axis is box.panel.bar else 16)
+        parts.append(_text(across, middle, axis.label, "m s", turned=True))
+        x += space - 14 if axis is box.panel.right else 0
+    return "".join(parts)
+
+
+def _legend(box: _Box) -> str:
+    lines = [*_legend_lines(box.legend, box.width)]
+    y = box.top - 8 - _LINE * (len(lines) - 1)
+    parts = [_text(box.left, box.top - 8 - _LINE * len(lines), box.panel.title, "b")]
+    for row, line in enumerate(lines):
+        for x, layer in line:
+            at = f"translate({box.left + 14 + x:.1f} {y + _LINE * row - 4:.1f})"
+            parts.append(f'<g transform="{at}">{_sample(layer)}</g>')
+            parts.append(_text(box.left + 28 + x, y + _LINE * row, layer.label, "s"))
+    return "".join(parts)
+
+
+def _legend_lines(
+    legend: Sequence[Curve | Band], width: float
+) -> Iterator[list[tuple[float, Curve | Band]]]:
+    """Yield the lines of a legend: positions and layers."""
+    line: list[tuple[float, Curve | Band]] = []
+    x = 0.0
+    for layer in legend:
+        step = 40 + _LETTER * len(layer.label)
+        if line and x + step > width:
+            yield line
+            line, x = [], 0.0
+        line.append((x, layer))
+        x += step
+    if line:
+        yield line
+
+
+def _sample(layer: Curve | Band) -> str:
+    ends = np.array([-9.0, 9.0])
+    if isinstance(layer, Band):
+        return _path("band", layer.style, _band(ends, np.full(2, -4.0), np.full(2, 4.0)))
+    line = _path("line", layer.style, _line(ends, np.zeros(2))) if layer.joined else ""
+    return line + (_path("mark", layer.style, _MARKS[layer.mark](0, 0)) if layer.mark else "")
+
+
+def _round_ticks(axis: Axis, at_most: int) -> list[tuple[float, str]]:
+    """Return round values and their labels, with equal decimals on a linear axis."""
+    if axis.log:
+        return [(tick, number(tick)) for tick in _decades(axis.low, axis.high)]
+    ticks = _round_steps(min(axis.low, axis.high), max(axis.low, axis.high), at_most)
+    words = [number(tick) for tick in ticks]
+    if not any("\N{MULTIPLICATION SIGN}" in text for text in words):
+        decimals = max((len(text.partition(".")[2]) for text in words), default=0)
+        words = [f"{tick:.{decimals}f}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
+    return list(zip(ticks, words, strict=True))
 
 
 def _round_steps(low: float, high: float, at_most: int) -> list[float]:
     """Return multiples of 1, 2, 2.5 or 5 times a power of ten between two values."""
-    rough = (high - low) / max(at_most, 1)
+    rough = (high - low) / at_most
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(power * m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if power * m >= rough * (1 - 1e-9))
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
-    return [float(step * number) for number in range(first, last + 1)]
+    return [float(step * count) for count in range(first, last + 1)]
 
 
 def _decades(low: float, high: float) -> list[float]:
@@ -93,236 +358,102 @@ def _decades(low: float, high: float) -> list[float]:
     return [low, high]
 
 
-def _labelled(scale: Scale, at_most: int) -> list[tuple[float, str]]:
-    """Return ticks with labels, with equal decimals on a linear scale."""
-    ticks = scale.ticks(at_most)
-    words = [number(tick) for tick in ticks]
-    if not scale.log and not any("\N{MULTIPLICATION SIGN}" in text for text in words):
-        decimals = max((len(text.partition(".")[2]) for text in words), default=0)
-        words = [f"{tick:.{decimals}f}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
-    return list(zip(ticks, words, strict=True))
+# Layers --------------------------------------------------------------------------------------
 
 
-def number(value: float) -> str:
-    """Return a number for axes: with a minus sign, and powers of ten if it is long."""
-    if value == 0.0:
-        return "0"
-    text = f"{value:.4g}"
-    if "e" in text:
-        digits, power = text.split("e")
-        text = f"{digits}\N{MULTIPLICATION SIGN}10{_raised(int(power))}"
-        text = text.removeprefix("1\N{MULTIPLICATION SIGN}")
-    return text.replace("-", "\N{MINUS SIGN}")
+def _layer(layer: Layer, x: _Scale, y: _Scale) -> str:
+    match layer:
+        case Image():
+            top, height = min(y.start, y.stop), abs(y.start - y.stop)
+            return _image(layer.pixels, layer.palette, x.start, top, x.stop - x.start, height)
+        case Band():
+            along, across = (y, x) if layer.upright else (x, y)
+            edges = along(layer.along), across(layer.low), across(layer.high)
+            if layer.bars:
+                return _path("err", layer.style, _bars(*edges))
+            return _path("band", layer.style, _band(*edges, upright=layer.upright))
+        case Curve():
+            return _curve(layer, x(layer.x), y(layer.y))
+        case Words():
+            places = zip(x(layer.x).tolist(), y(layer.y).tolist(), layer.texts, strict=True)
+            return "".join(_text(a + 9, b - 7, words) for a, b, words in places)
 
 
-_SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+def _curve(curve: Curve, x: Floats, y: Floats) -> str:
+    drawn = ""
+    if curve.joined:
+        ends = (np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]) if curve.steps else (x, y)
+        drawn = _path("line", curve.style, _line(*ends))
+    if curve.mark is not None:
+        shape, good = _MARKS[curve.mark], np.isfinite(x) & np.isfinite(y)
+        marks = zip(x[good].tolist(), y[good].tolist(), strict=True)
+        drawn += _path("mark", curve.style, "".join(shape(a, b) for a, b in marks))
+    return drawn
 
 
-def _raised(power: int) -> str:
-    return str(power).translate(_SUPERSCRIPT)
-
-
-def units(text: str) -> str:
-    """Return CF units with superscript exponents: ``m-1 sr-1`` becomes m⁻¹ sr⁻¹."""
-    plain = text.replace("$^{-1}$", "-1")
-    words = []
-    for word in plain.split():
-        name = word.rstrip("-0123456789")
-        power = word[len(name) :]
-        words.append(name + power.translate(_SUPERSCRIPT) if name else word)
-    return " ".join(words)
-
-
-@dataclass(frozen=True, slots=True)
-class SvgPanel:
-    """A rectangle with two scales."""
-
-    x: Scale
-    y: Scale
-
-    @property
-    def box(self) -> tuple[float, float, float, float]:
-        """Left, top, width and height."""
-        left, right = self.x.start, self.x.stop
-        return left, self.y.stop, right - left, self.y.start - self.y.stop
-
-
-@dataclass(slots=True)
-class Sheet:
-    """A figure that is being drawn."""
-
-    height: float
-    width: float = WIDTH
-    stretched: bool = False
-    """Whether the aspect ratio of the file may change; for images only."""
-    parts: list[str] = field(default_factory=list)
-    _clips: int = 0
-
-    def text(self, x: float, y: float, words: str, *, css: str = "t", turned: bool = False) -> None:
-        """Write text; `css` names style and anchor."""
-        turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
-        plain = escape(visible(words))
-        self.parts.append(f'<text class="{css}" x="{x:.1f}" y="{y:.1f}"{turn}>{plain}</text>')
-
-    def path(self, data: str, css: str) -> None:
-        """Draw a path."""
-        if data:
-            self.parts.append(f'<path class="{css}" d="{data}"/>')
-
-    def clipped(self, panel: SvgPanel, draw: Callable[[], None], key: str) -> None:
-        """Draw with clipping at the edges of a panel; `key` must be unique on a page."""
-        self._clips += 1
-        name = f"{key}-{self._clips}"
-        left, top, width, height = panel.box
-        self.parts.append(
-            f'<clipPath id="{name}"><rect x="{left:.1f}" y="{top:.1f}" width="{width:.1f}"'
-            f' height="{height:.1f}"/></clipPath><g clip-path="url(#{name})">'
-        )
-        draw()
-        self.parts.append("</g>")
-
-    def frame(self, panel: SvgPanel, label: str, *, below: str = "", at_most: int = 5) -> None:
-        """Draw the axes of a panel; the horizontal axis only if `below` labels it."""
-        left, top, width, height = panel.box
-        bottom = top + height
-        grid, edge = "", f"M{left:.1f} {top:.1f}V{bottom:.1f}h{width:.1f}"
-        for value, words in _labelled(panel.y, at_most):
-            y = float(panel.y(value))
-            grid += f"M{left:.1f} {y:.1f}h{width:.1f}"
-            edge += f"M{left:.1f} {y:.1f}h-4"
-            self.text(left - 9, y + 4, words, css="t e")
-        if below:
-            for value, words in _labelled(panel.x, 6):
-                x = float(panel.x(value))
-                grid += f"M{x:.1f} {top:.1f}v{height:.1f}"
-                edge += f"M{x:.1f} {bottom:.1f}v4"
-                self.text(x, bottom + 19, words, css="t m")
-            self.text(left + width / 2, bottom + 38, below, css="t m s")
-        self.path(grid, "grid")
-        self.path(edge, "axis")
-        self.text(left - 56, top + height / 2, label, css="t m s", turned=True)
-
-    def image(self, panel: SvgPanel, png: bytes) -> None:
-        """Fill a panel with an image."""
-        left, top, width, height = panel.box
-        data = base64.b64encode(png).decode("ascii")
-        self.parts.append(
-            f'<image class="px" x="{left:.1f}" y="{top:.1f}" width="{width:.1f}"'
-            f' height="{height:.1f}" preserveAspectRatio="none"'
-            f' href="data:image/png;base64,{data}"/>'
-        )
-
-    def svg(self, key: str, alt: str) -> Markup:
-        """Return the figure as markup for a page; `alt` describes it."""
-        return Markup(  # noqa: S704 - every text in `parts` was escaped by `text`
-            f'<svg class="fig" viewBox="0 0 {self.width:g} {self.height:g}" role="img"'
-            f' aria-labelledby="{key}-t"><title id="{key}-t">{escape(visible(alt))}</title>'
-            f"{''.join(self.parts)}</svg>"
-        )
-
-    def file(self, style: str) -> bytes:
-        """Return the figure as an SVG file that includes its style."""
-        aspect = ' preserveAspectRatio="none"' if self.stretched else ""
-        return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g}'
-            f' {self.height:g}" width="{self.width:g}" height="{self.height:g}"{aspect}>'
-            f"<style>{style}</style>{''.join(self.parts)}</svg>\n"
-        ).encode()
-
-
-def line(x: Floats, y: Floats) -> str:
+def _line(x: Floats, y: Floats) -> str:
     """Return a path through points, interrupted at points that are not finite."""
     parts, pen = [], "M"
-    for px, py in zip(x.tolist(), y.tolist(), strict=True):
-        if not (np.isfinite(px) and np.isfinite(py)):
-            pen = "M"
-            continue
-        parts.append(f"{pen}{px:.1f} {py:.1f}")
-        pen = "L"
+    for a, b, good in zip(
+        x.tolist(), y.tolist(), (np.isfinite(x) & np.isfinite(y)).tolist(), strict=True
+    ):
+        if good:
+            parts.append(f"{pen}{a:.1f} {b:.1f}")
+        pen = "L" if good else "M"
     return "".join(parts)
 
 
-def band(along: Floats, low: Floats, high: Floats, *, upright: bool = False) -> str:
-    """Return closed paths between two curves, one per stretch without a gap.
-
-    Parameters
-    ----------
-    along, low, high : ndarray, shape (n,)
-        Positions; `along` is vertical if `upright`.
-    """
+def _band(along: Floats, low: Floats, high: Floats, *, upright: bool = False) -> str:
+    """Return closed paths between two curves, one per stretch without a gap."""
     good = np.isfinite(along) & np.isfinite(low) & np.isfinite(high)
     cuts = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     parts = []
-    for start, stop in zip(cuts[::2], cuts[1::2], strict=True):
+    for start, stop in list(pairwise(cuts.tolist()))[::2]:
         a = np.concatenate([along[start:stop], along[start:stop][::-1]])
         b = np.concatenate([low[start:stop], high[start:stop][::-1]])
-        parts.append((line(b, a) if upright else line(a, b)) + "Z")
+        parts.append((_line(b, a) if upright else _line(a, b)) + "Z")
     return "".join(parts)
 
 
-MARKS: Final[Sequence[Callable[[float, float], str]]] = (
-    lambda x, y: f"M{x - 3:.1f} {y:.1f}a3 3 0 1 0 6 0a3 3 0 1 0-6 0",
-    lambda x, y: f"M{x - 3:.1f} {y - 3:.1f}h6v6h-6z",
-    lambda x, y: f"M{x - 3.6:.1f} {y + 3:.1f}h7.2l-3.6-6.4z",
-    lambda x, y: f"M{x:.1f} {y - 4:.1f}l4 4l-4 4l-4-4z",
-)
-"""Marks of the series of a panel: disc, square, triangle, diamond."""
+def _bars(x: Floats, low: Floats, high: Floats) -> str:
+    good = np.isfinite(x + low + high)
+    ends = zip(x[good].tolist(), low[good].tolist(), high[good].tolist(), strict=True)
+    return "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
 
 
-def cross(x: float, y: float) -> str:
-    """Return the mark of a rejected value."""
-    return f"M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6"
+_MARKS: Final[Mapping[Mark, Callable[[float, float], str]]] = {
+    Mark.DISC: lambda x, y: f"M{x - 3:.1f} {y:.1f}a3 3 0 1 0 6 0a3 3 0 1 0-6 0",
+    Mark.SQUARE: lambda x, y: f"M{x - 3:.1f} {y - 3:.1f}h6v6h-6z",
+    Mark.TRIANGLE: lambda x, y: f"M{x - 3.6:.1f} {y + 3:.1f}h7.2l-3.6-6.4z",
+    Mark.DIAMOND: lambda x, y: f"M{x:.1f} {y - 4:.1f}l4 4l-4 4l-4-4z",
+    Mark.CROSS: lambda x, y: f"M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6",
+    Mark.DOWN: lambda x, y: f"M{x - 5:.1f} {y - 8:.1f}h10l-5 8z",
+    Mark.DASH: lambda x, y: f"M{x - 5:.1f} {y:.1f}h10",
+}
 
 
-def marks(x: Floats, y: Floats, mark: Callable[[float, float], str]) -> str:
-    """Return a mark at every finite point."""
-    good = np.isfinite(x) & np.isfinite(y)
-    return "".join(mark(px, py) for px, py in zip(x[good].tolist(), y[good].tolist(), strict=True))
+def _path(what: str, css: str, data: str) -> str:
+    return f'<path class="{what} {css}" d="{data}"/>' if data else ""
 
 
-def draw_legend(sheet: Sheet, x: float, y: float, entries: Iterable[tuple[str, str, str]]) -> None:
-    """Draw a legend in one line; entries are path data around the origin, style and text."""
-    for data, css, words in entries:
-        sheet.parts.append(
-            f'<path class="{css}" transform="translate({x:.1f} {y - 4:.1f})" d="{data}"/>'
-        )
-        sheet.text(x + 14, y, words, css="t s")
-        x += 40 + 6.9 * len(words)
-
-
-def png(pixels: NDArray[np.uint8]) -> bytes:
-    """Return an indexed image as PNG: blank, two kinds of stripes, and the colour scale.
-
-    Parameters
-    ----------
-    pixels : ndarray of uint8, shape (row, column)
-        `BLANK`, `REJECTED`, `REJECTED` + 1, or 3 + the step of the colour scale.
-    """
-    height, width = pixels.shape
-    rows = np.zeros((height, width + 1), dtype=np.uint8)
-    rows[:, 1:] = pixels
-    header = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        _chunk(kind, data)
-        for kind, data in (
-            (b"IHDR", header),
-            (b"PLTE", _palette()),
-            (b"tRNS", b"\x00"),
-            (b"IDAT", zlib.compress(rows.tobytes(), 6)),
-            (b"IEND", b""),
-        )
+def _image(
+    values: NDArray[np.uint8],
+    palette: Palette,
+    x: float,
+    y: float,
+    width: float,
+    tall: float,
+) -> str:
+    data = base64.b64encode(pixels.png(values, palette)).decode("ascii")
+    return (
+        f'<image class="px" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{tall:.1f}"'
+        f' preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
     )
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    body = kind + data
-    return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-
-def _palette() -> bytes:
-    anchors = np.array([list(bytes.fromhex(color)) for color in _VIRIDIS.split()], dtype=float)
-    places = np.linspace(0.0, len(anchors) - 1.0, COLOURS)
-    scale = [np.interp(places, np.arange(len(anchors)), anchors[:, c]) for c in range(3)]
-    colors = np.rint(np.stack(scale, axis=-1)).astype(np.uint8)
-    special = np.array([[0, 0, 0], [20, 20, 20], [170, 174, 180]], dtype=np.uint8)
-    return np.concatenate([special, colors]).tobytes()
+def _text(x: float, y: float, words: str, css: str = "", *, turned: bool = False) -> str:
+    """Return a text; `css` names style and anchor."""
+    if not words:
+        return ""
+    turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
+    return f'<text class="t {css}" x="{x:.1f}" y="{y:.1f}"{turn}>{escape(visible(words))}</text>'

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from lidarops.records import Plan, Scene
-from lidarops.steps.dependence import is_product, planned_products, workloads
+from lidarops.steps.dependence import is_product, plan_closure, planned_products
 from lidarops.steps.registry import definition
+from lidarops.steps.workload import Workload
 
 _START: Final = 9.0
 """s for the process, its imports, compiled code and the ledger."""
@@ -23,7 +24,7 @@ _BYTE: Final = 2e-9
 """s for the digest of a byte of a raw file."""
 _PAGE: Final = 0.2
 """s for the page of a report."""
-_FIGURE: Final = 1.0
+_FIGURE: Final = 0.2
 """s for the figures of one kind of product of one channel of an instrument."""
 MOST_FIGURES: Final = 40
 """Number of groups of products that a report draws."""
@@ -42,8 +43,11 @@ def scene_cpu_time(scene: Scene, plan: Plan, *, whole: bool = False) -> float:
     """
     if not planned_products(plan):
         return 0.0
+    members = {member.instrument: member for member in scene.members}
     times = [_SCENE]
-    for step, work in workloads(scene, plan):
+    for step in plan.steps:
+        own = plan_closure(plan, [(step.name, step.channel)]) if is_product(step) else plan
+        work = Workload(members.get(step.instrument, scene), step.channel, own)
         known = definition(step)
         times.append(known.cpu_time(known.typed(step), work))
     files = (*scene.granules, *scene.dark)

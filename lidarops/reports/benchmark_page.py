@@ -11,7 +11,7 @@ from typing import Final
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops.errors import CatalogError
-from lidarops.figures import product_figures
+from lidarops.figures import svg
 from lidarops.figures.charts import Chart, Ladder, draw_chart
 from lidarops.figures.wording import visible
 from lidarops.system.files import write_atomically
@@ -102,10 +102,10 @@ def build_benchmark_page(report: BenchmarkReport, folder: Path) -> Path:
 def _pictures(charts: Sequence[Chart | Ladder], folder: Path) -> list[ChartFile]:
     pictures = []
     for chart in charts:
-        rendered = product_figures.render(draw_chart(chart))
-        name = f"{chart.name}.png"
-        write_atomically(folder / name, rendered.png)
-        pictures.append(ChartFile(name, chart.caption, rendered.alt))
+        figure = draw_chart(chart)
+        name = f"{chart.name}.svg"
+        write_atomically(folder / name, svg.file(figure))
+        pictures.append(ChartFile(name, chart.caption, figure.text))
     return pictures
 
 

@@ -6,23 +6,24 @@ A missing or unreadable product does not stop the report; it is listed as a prob
 from __future__ import annotations
 
 import re
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.figures import any_kind_report, product_figures
-from lidarops.figures.kind_figures import ReportFigure, report_figures_of
-from lidarops.figures.reading import UNREADABLE, Readers, reason
-from lidarops.figures.report_sources import Compared, Group, Problem, Sources
+from lidarops.figures import any_kind, svg
+from lidarops.figures.kind_figures import View, figures_of
+from lidarops.figures.panels import Figure
+from lidarops.figures.wording import counted
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
+from lidarops.reports.reading import UNREADABLE, Readers, reason
+from lidarops.reports.sources import Compared, Group, Problem, Sources
 from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40
@@ -31,7 +32,7 @@ _FLAG_ROWS: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class Picture:
     """A figure of the report."""
 
     file: str
@@ -45,68 +46,13 @@ class Figure:
 class Gallery:
     """Figures, comparisons and problems from the products of a run."""
 
-    pictures: list[Figure] = field(default_factory=list)
-    flags: Figure | None = None
+    pictures: list[Picture] = field(default_factory=list)
+    flags: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Label of channel and kind -> name of a bit, with * where it asks for care -> share."""
     compared: list[Compared] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     undrawn: list[str] = field(default_factory=list)
     """Labels of channels that are not drawn because of the limit on figures."""
-
-
-@dataclass(frozen=True, slots=True)
-class _PendingFigure:
-    """A figure that is being drawn."""
-
-    name: str
-    """Start of its file name."""
-    instrument: str
-    caption: str
-    rendered: Callable[[], product_figures.Rendered]
-    """Returns the figure once it is drawn."""
-
-
-class _Album:
-    """Writes figures to files in their order; a bounded number is drawn at the same time."""
-
-    def __init__(self, folder: Path, readers: Readers) -> None:
-        self.pictures: list[Figure] = []
-        self._folder = folder
-        self._readers = readers
-        self._waiting: deque[_PendingFigure] = deque()
-        self._taken: Counter[str] = Counter()
-
-    def __len__(self) -> int:
-        return len(self.pictures) + len(self._waiting)
-
-    def add(self, figure: ReportFigure, group: Group) -> None:
-        name = f"{figure.name}_{group.instrument}_{group.channel}"
-        self._waiting.append(_started(self._readers, figure, group.label, name, group.instrument))
-        # Bounded, because the data of a figure stay in memory until it is drawn.
-        self._keep(self._readers.processes)
-
-    def finish(self) -> list[Figure]:
-        self._keep(0)
-        return self.pictures
-
-    def _keep(self, ahead: int) -> None:
-        while len(self._waiting) > ahead:
-            figure = self._waiting.popleft()
-            self.pictures.append(_written(self._folder, figure, _unique(figure.name, self._taken)))
-
-
-def _started(
-    readers: Readers, figure: ReportFigure, title: str, name: str, instrument: str
-) -> _PendingFigure:
-    """Start to draw a figure, in another process if there is one."""
-    sketch = product_figures.Sketch(figure.draw, figure.content, title)
-    rendered = readers.later(product_figures.draw_figure, sketch)
-    return _PendingFigure(name, instrument, figure.caption, rendered)
-
-
-def _written(folder: Path, figure: _PendingFigure, file: str) -> Figure:
-    rendered = figure.rendered()
-    write_atomically(folder / file, rendered.png)
-    return Figure(file, figure.instrument, figure.caption, rendered.alt)
 
 
 def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
@@ -116,31 +62,54 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
     ----------
     record : RunRecord
     folder : Path
-        Existing folder for the PNG files.
+        Existing folder for the SVG files.
     limit : int, optional
         Most figures of products. Comparisons with the truth are made for all products.
     workers : int, optional
-        Most processes that read and draw. The figures do not depend on it.
+        Most processes that read. The figures do not depend on it.
 
     Returns
     -------
     Gallery
         One or more figures per instrument and channel, over all scenes.
     """
-    gallery = Gallery()
-    with _sources(record, gallery, workers) as sources:
-        flags = _flags(record, sources.readers)
-        album = _Album(folder, sources.readers)
+    gallery = Gallery(flags=_shares(record))
+    taken: Counter[str] = Counter()
+    truth = _truth(record, gallery)
+    products = sum(len(scene.products) for scene in record.scenes)
+    with Readers(workers, products, truth) as readers:
+        sources = Sources(readers, gallery.problems)
         for group in _groups(record):
-            full = len(album) >= limit
+            full = len(gallery.pictures) >= limit
             if full:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
-            for figure in _draw(group, sources, full=full):
-                album.add(figure, group)
-        gallery.pictures = album.finish()
-        if flags is not None:
-            gallery.flags = _written(folder, flags, f"{flags.name}.png")
+            for view in _views(group.kind):
+                compares = truth is not None and view.compare is not None
+                contents = list(sources.read(group, view)) if compares or not full else []
+                if contents and compares:
+                    gallery.compared += _compared(view, contents, group)
+                for drawn in view.draw(contents) if contents and not full else ():
+                    file = _unique(f"{view.name}_{group.instrument}_{group.channel}", taken)
+                    write_atomically(folder / file, svg.file(drawn))
+                    gallery.pictures.append(_picture(file, drawn, group))
     return gallery
+
+
+def _views(kind: str) -> Sequence[View[Any]]:
+    figures = figures_of(kind)
+    return figures.views if figures is not None else (any_kind.view_of(kind),)
+
+
+def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterator[Compared]:
+    for comparison in view.compare(contents) if view.compare else ():
+        if comparison is not None:
+            yield Compared(group.instrument, group.channel, comparison)
+
+
+def _picture(file: str, drawn: Figure, group: Group) -> Picture:
+    scenes = counted(len(group.members), "scene")
+    words = f"{group.label}; {scenes}. {drawn.words}."
+    return Picture(file, group.instrument, f"{drawn.caption}: {words}", drawn.text)
 
 
 def missing_products(record: RunRecord) -> frozenset[str]:
@@ -171,26 +140,6 @@ def _groups(record: RunRecord) -> list[Group]:
     return [group for *_, group in sorted(ordered, key=lambda row: row[:5])]
 
 
-def _draw(group: Group, sources: Sources, *, full: bool) -> Iterator[ReportFigure]:
-    """Yield the figures of a group; none if the report is full, but compare with the truth."""
-    report = report_figures_of(group.kind) or any_kind_report.REPORT
-    figures = report.figures(group, sources)
-    if not full:
-        yield from figures
-    elif report.compares and sources.truth is not None:
-        # All comparisons are made before the first figure.
-        next(figures, None)
-
-
-def _flags(record: RunRecord, readers: Readers) -> _PendingFigure | None:
-    shares = _shares(record)
-    if not shares:
-        return None
-    caption = "Share of values with each quality bit, by channel and product kind, over all scenes."
-    figure = ReportFigure("flags", caption, product_figures.flags_overview, shares)
-    return _started(readers, figure, "Flagged values", figure.name, "")
-
-
 def _shares(record: RunRecord) -> Mapping[str, Mapping[str, float]]:
     """Return label -> name of a bit, with * where it asks for care only -> share, by place."""
     values: Counter[str] = Counter()
@@ -216,15 +165,14 @@ def _shares(record: RunRecord) -> Mapping[str, Mapping[str, float]]:
         if values[label] > 0
     }
     worst = sorted(rows, key=lambda label: -max(rows[label].values(), default=0.0))
-    return {label: rows[label] for label in sorted(worst[:_FLAG_ROWS])}
-
-
-@contextmanager
-def _sources(record: RunRecord, gallery: Gallery, workers: int) -> Iterator[Sources]:
-    truth = _truth(record, gallery)
-    products = sum(len(scene.products) for scene in record.scenes)
-    with Readers(workers, products, truth) as readers:
-        yield Sources(readers, truth, gallery.compared, gallery.problems)
+    names = [
+        name
+        for name in sorted(order, key=lambda name: order[name])
+        if any(row.get(name) for row in rows.values())
+    ]
+    return {
+        label: {name: rows[label][name] for name in names} for label in sorted(worst[:_FLAG_ROWS])
+    }
 
 
 def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
@@ -248,7 +196,7 @@ def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
 def _unique(name: str, taken: Counter[str]) -> str:
     plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name)[:100]
     taken[plain] += 1
-    return f"{plain}.png" if taken[plain] == 1 else f"{plain}_{taken[plain]}.png"
+    return f"{plain}.svg" if taken[plain] == 1 else f"{plain}_{taken[plain]}.svg"
 
 
 def comparisons_by_quantity(compared: Sequence[Compared]) -> Mapping[str, tuple[int, int, int]]:

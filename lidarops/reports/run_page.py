@@ -15,12 +15,12 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops.errors import CatalogError
-from lidarops.figures.report_sources import Compared
 from lidarops.figures.wording import duration, lacking, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
-from lidarops.reports.gallery import Figure, Gallery
+from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME
+from lidarops.reports.sources import Compared
 from lidarops.system.files import write_atomically
 
 INDEX: Final = "index.html"
@@ -157,7 +157,8 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         compared_words=_compared_words(filled.compared),
         pictures=pictures,
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
-        flags_picture=filled.flags,
+        flag_shares=filled.flags,
+        flag_names=next(iter(filled.flags.values()), {}),
         undrawn=filled.undrawn,
         plan_hash=_plan_hash(record),
         run_file=FILE_NAME if (folder / FILE_NAME).is_file() else "",
@@ -221,7 +222,7 @@ def _href(record: RunRecord, product: str, folder: Path) -> str:
     return quote(os.fsencode(Path(relative).as_posix()))
 
 
-def _by_instrument(pictures: Sequence[Figure]) -> list[tuple[str, list[Figure]]]:
+def _by_instrument(pictures: Sequence[Picture]) -> list[tuple[str, list[Picture]]]:
     ordered = sorted(pictures, key=lambda picture: picture.instrument)
     return [
         (name, list(figures))

@@ -44,10 +44,12 @@ class Selection:
 
     def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
         """Return whether a product is selected; its scene may no longer exist."""
-        owner, start = parse_scene_id(made.scene)
+        instrument, start = parse_scene_id(made.scene)
+        owner = campaign.instruments.get(instrument)
         return (
             (not self.kinds or made.kind in self.kinds)
-            and self.owner(owner, _station(campaign, owner))
+            and (not self.instruments or instrument in self.instruments)
+            and (not self.stations or (owner.station if owner else instrument) in self.stations)
             and (self.since is None or scene_stop(made.scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
@@ -57,13 +59,8 @@ class Selection:
         return tuple(
             scene
             for scene in select_scenes(scenes, since=self.since, until=self.until)
-            if self.owner(scene.instrument, scene.station)
-        )
-
-    def owner(self, name: str, station: str) -> bool:
-        """Return whether an instrument or network, and its station, are selected."""
-        return (not self.instruments or name in self.instruments) and (
-            not self.stations or station in self.stations
+            if (not self.instruments or scene.instrument in self.instruments)
+            and (not self.stations or scene.station in self.stations)
         )
 
 
@@ -87,7 +84,7 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
                     f"the campaign has no {word} {name!r}",
                     remedy=f"known: {', '.join(sorted(set(names)))}",
                 )
-    requested = requested_kinds(campaign)
+    requested = _requested_kinds(campaign)
     for kind in selection.kinds:
         if kind not in requested:
             raise CampaignError(
@@ -103,7 +100,7 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
         )
 
 
-def requested_kinds(campaign: Campaign) -> list[str]:
+def _requested_kinds(campaign: Campaign) -> list[str]:
     """Return the kinds of product that a campaign requests."""
     requested: set[str] = set()
     for instrument in campaign.instruments.values():
@@ -179,7 +176,8 @@ def unmet_requests(campaign: Campaign, store: Store, selection: Selection) -> tu
         member
         for name, members in owners.items()
         for member in members
-        if selection.owner(name, _station(campaign, name))
+        if (not selection.instruments or name in selection.instruments)
+        and (not selection.stations or _station(campaign, name) in selection.stations)
     }
     return availability.unavailable_channels(
         campaign,

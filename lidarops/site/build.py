@@ -21,8 +21,9 @@ import xarray as xr
 
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError
-from lidarops.figures import any_kind
-from lidarops.figures.kind_figures import PageFigures, figures_of, no_figures
+from lidarops.figures import any_kind, svg
+from lidarops.figures.kind_figures import ProductSource, View, figures_of
+from lidarops.figures.panels import Figure
 from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -37,11 +38,12 @@ from lidarops.site.paths import (
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
-from lidarops.system.files import sha256_of, write_atomically
+from lidarops.system.files import write_atomically
 
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
 _FORMAT: Final = "lidarops site"
+_EMPTY: Final = "no figure of the product"
 _OURS: Final = ("product", "station")
 """Folders that only the site writes to."""
 # Exceptions observed when damaged or foreign files are opened and read.
@@ -180,7 +182,8 @@ def _page(task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
     try:
         file = inside(task.products, task.path)
-        sha256 = sha256_of(file)
+        with file.open("rb") as stream:
+            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
         if task.known is not None and _is_kept(task.known, sha256, task.site):
             return task.known, False
         return _make(task, file, sha256), True
@@ -210,7 +213,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         origin = product_contents.origin(opened)
         span = product_contents.span(opened)
         kind = product_contents.attribute(opened, "lidarops_kind")
-        gallery, problem = _draw(opened, kind)
+        figures, problem = _draw(opened, kind)
         page = product_page(task.path)
         station = product_contents.attribute(opened, "lidarops_station")
         entry = Entry(
@@ -231,12 +234,12 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             values=quality.values,
             usable=quality.usable,
             unflagged=quality.unflagged,
-            alt=gallery.alt,
+            alt=figures[0].text if figures else _EMPTY.capitalize(),
             problem=_joined(problem, origin.problem, _missing_flags(opened)),
         )
         contents = (
-            pages.product(entry, opened, quality, origin, gallery.figures),
-            gallery.thumbnail.file(pages.style("thumb.css")),
+            pages.product(entry, opened, quality, origin, figures),
+            svg.thumbnail(figures[0] if figures else None, _EMPTY),
             origin.text.encode(),
         )
     for name, content in zip(entry.files, contents, strict=True):
@@ -244,19 +247,29 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
-def _draw(opened: xr.Dataset, kind: str) -> tuple[PageFigures, str]:
+def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:
     """Draw a product; if it does not fit its kind, as a product of unknown kind."""
     figures = figures_of(kind)
     problem = ""
     try:
         if figures is not None:
-            return figures.page(with_current_flags(opened)), ""
+            return _figures(with_current_flags(opened), figures.views), ""
     except _UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        return any_kind.draw_page(opened), problem
+        return _figures(opened, [any_kind.view_of(kind)]), problem
     except _UNREADABLE as error:
-        return no_figures("it cannot be drawn"), problem or f"it cannot be drawn: {error}"
+        return [], problem or f"it cannot be drawn: {error}"
+
+
+def _figures(opened: xr.Dataset, views: Sequence[View[Any]]) -> list[Figure]:
+    contents = ((view, view.read(opened, ProductSource())) for view in views)
+    return [
+        figure
+        for view, content in contents
+        if content is not None
+        for figure in view.draw([content])
+    ]
 
 
 def _missing_flags(opened: xr.Dataset) -> str:
@@ -298,7 +311,7 @@ def _write_calendar(site: Path, entries: Sequence[Entry], problems: Sequence[Pro
                 expected.add(name)
                 _write(site, name, pages.day(station, day, by_day[day], before, after))
     campaigns = sorted({entry.campaign for entry in entries})
-    _write(site, "site.css", pages.style("site.css").encode())
+    _write(site, "site.css", pages.style().encode())
     _write(site, pages.INDEX, pages.index(entries, problems, campaigns))
     return expected
 
@@ -322,7 +335,7 @@ def _version() -> str:
         package / "flags.py",
         *package.glob("products/*/flags.py"),
         *package.glob("retrieve/*/flags.py"),
-        *(package / "figures").glob("*.py"),
+        *(package / "figures").glob("*.*"),
         package / "reports/run_record.py",
     ]
     for kind in kinds().values():

@@ -15,7 +15,8 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops import __version__
-from lidarops.figures.kind_figures import Drawn
+from lidarops.figures import svg
+from lidarops.figures.panels import Figure
 from lidarops.figures.wording import counted, percent, size, visible
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
@@ -49,9 +50,10 @@ def _environment() -> Environment:
 
 
 @cache
-def style(name: str) -> str:
-    """Return a style sheet of the site."""
-    return files("lidarops.site").joinpath("templates", name).read_text(encoding="utf-8")
+def style() -> str:
+    """Return the style sheet of the site, with that of figures."""
+    own = files("lidarops.site").joinpath("templates", "site.css").read_text(encoding="utf-8")
+    return svg.style() + own
 
 
 def _render(template: str, page: str, **context: Any) -> bytes:
@@ -65,7 +67,7 @@ def product(
     opened: xr.Dataset,
     quality: QualityCounts,
     origin: Origin,
-    figures: Sequence[Drawn],
+    figures: Sequence[Figure],
 ) -> bytes:
     """Return the page of a product; it depends only on the product and its path."""
     page = entry.page
@@ -92,7 +94,7 @@ def product(
         sha256=entry.sha256,
         problem=entry.problem,
         summary=summary,
-        figures=figures,
+        figures=[(svg.inline(figure), figure.text) for figure in figures],
         quality=quality,
         grade=entry.grade,
         quality_text=_quality(entry),

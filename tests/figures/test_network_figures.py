@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.colors import to_rgba
+from support.products.drawn import figures, labelled, views
 from support.products.made_network import EXTINCTION, product
 
 from lidarops.errors import ProductError
-from lidarops.figures import product_figures
+from lidarops.figures.panels import Curve, Words
 from lidarops.figures.series_data import compare, join
 from lidarops.flags import Quality
-from lidarops.products.visibility import report_figures
 from lidarops.products.visibility.figure_data import instruments_of, read_crossings, read_map
 from lidarops.products.visibility.steps import NetworkSettings
 from lidarops.records import LeftOut, Plan, PlannedStep, SceneOutcome
@@ -95,19 +94,22 @@ def test_scenes_are_joined_in_time(made):
         )
 
 
-def test_the_map_shows_each_crossing_in_words_and_colour(made):
+def test_the_map_shows_each_crossing_to_scale(made):
     network = read_map(made, NAMES)
-    figure = report_figures.draw_map(network, title="valley")
-    (panel, *_) = figure.axes
-    texts = [text.get_text() for text in panel.texts]
+    (figure,) = figures("visibility", "network", [made])
+    (panel,) = figure.panels
+    (words,) = (layer for layer in panel.layers if isinstance(layer, Words))
     medians = np.median(made["visibility_in_air"].values, axis=0) / 1e3
-    assert texts == [f"{v}: {value:.3g} km" for v, value in enumerate(medians)]
-    marks = [line for line in panel.lines if line.get_gid() == "crossing"]
-    assert len({to_rgba(mark.get_markerfacecolor()) for mark in marks}) == 3
-    assert sum(line.get_gid() == "beam" for line in panel.lines) == 3
-    alt = product_figures.alt_text(figure)
-    assert "3 beams of 3 instruments" in alt
-    assert f"crossing 0: {medians[0]:.3g} km, 12 values" in alt
+    assert words.texts == tuple(f"{v}: {value:.3g} km" for v, value in enumerate(medians))
+    np.testing.assert_array_equal([words.x, words.y], network.crossings.T)
+    stations = np.concatenate([[*m.x, *m.y] for m in labelled(panel, "beam")])
+    np.testing.assert_array_equal(stations, network.stations.ravel())
+    lines = [layer for layer in panel.layers if isinstance(layer, Curve) and layer.joined]
+    for line, start, end in zip(lines, network.stations, network.ends, strict=True):
+        np.testing.assert_array_equal([line.x[:2], line.y[:2]], np.transpose([start, end]))
+    scale = (panel.x.high - panel.x.low) / 868
+    assert (panel.y.high - panel.y.low) / panel.height == pytest.approx(scale)
+    assert f"{medians[0]:.3g} km at crossing 0 (12 of 12 values)" in figure.words
     # The first beam points to the north-east of its lidar.
     assert network.axes[0].startswith("east")
     np.testing.assert_allclose(
@@ -118,8 +120,11 @@ def test_the_map_shows_each_crossing_in_words_and_colour(made):
 def test_a_crossing_without_a_value_is_labelled(made):
     lost = made.copy(deep=True)
     lost["quality_flag"][:, 1] = int(Quality.LOW_SIGNAL)
-    figure = report_figures.draw_map(read_map(lost))
-    assert "1: no value" in [text.get_text() for text in figure.axes[0].texts]
+    ((panel,),) = (figure.panels for figure in figures("visibility", "network", [lost]))
+    (words,) = (layer for layer in panel.layers if isinstance(layer, Words))
+    assert words.texts[1] == "1: no value"
+    (hollow,) = labelled(panel, "crossing without a usable value")
+    assert hollow.x.size == 1
 
 
 def test_beams_in_a_vertical_plane_are_drawn_upright(made):
@@ -140,21 +145,18 @@ def test_beams_in_a_vertical_plane_are_drawn_upright(made):
 
 def test_series_are_drawn_with_errors_and_truth(made):
     series = read_crossings(made, truth(made), instruments=NAMES)
-    figure = report_figures.draw_crossings(series, title="valley")
-    upper, lower = figure.axes
-    for panel, quantity, scale in ((upper, "visibility", 1.0), (lower, "extinction", 1e3)):
-        gids = [line.get_gid() for line in panel.lines]
-        assert gids.count(f"values-{quantity}") == 3
-        assert gids.count(f"truth-{quantity}") == 3
-        lines = [line for line in panel.lines if line.get_gid() == f"values-{quantity}"]
-        for line, crossing in zip(lines, series, strict=True):
+    view = views("visibility")["visibility"]
+    (figure,) = view.draw([series])
+    for panel, quantity, scale in zip(
+        figure.panels, ("visibility", "extinction"), (1.0, 1e3), strict=True
+    ):
+        for line, crossing in zip(labelled(panel, "crossing"), series, strict=True):
             np.testing.assert_allclose(
-                line.get_ydata(), scale * crossing.estimates[quantity].value, rtol=1e-6
+                line.y, scale * crossing.estimates[quantity].value, rtol=1e-6
             )
-        assert "km" in panel.get_ylabel()
-    assert "0 of 12 rejected" in product_figures.alt_text(figure)
-    again = report_figures.draw_crossings(series, title="valley")
-    assert product_figures.render(figure).png == product_figures.render(again).png
+        assert labelled(panel, "simulated truth")
+        assert "km" in panel.y.label
+    assert [comparison.count for comparison in view.compare([series])] == [12, 12, 12]
 
 
 def test_a_foreign_product_is_refused(made):

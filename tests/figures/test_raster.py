@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import timedelta
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from hypothesis import strategies as st
 from support.products.fabricated import START, signal, times
 
 from lidarops.errors import ProductError
-from lidarops.figures import panels, product_figures, raster
-from lidarops.figures.raster import joined, read_raster, share_with_care
+from lidarops.figures import raster
+from lidarops.figures.raster import read_raster, share_with_care
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
+read = partial(read_raster, quantity="signal", kind="signal")
 BITS = list(flags_of("signal"))
 BAD = flags_of("signal").rejecting
 CARE = [int(bit) for bit in BITS if not bit & BAD]
@@ -46,7 +48,7 @@ def test_blocks_are_means_of_usable_bins(count, bins, profiles, seed):
     flag = random.choice([0, 0, 0, *map(int, BITS)], size=(count, bins))
     product["quality_flag"][:] = flag.astype(np.int32)
     product["signal"].values[random.random((count, bins)) < 0.1] = np.nan
-    image = read_raster(product, profiles=profiles)
+    image = read(product, profiles=profiles)
     columns = [slice(i, min(i + profiles, count)) for i in range(0, count, profiles)]
     rows = [slice(j, j + 1) for j in range(bins)]
     np.testing.assert_allclose(image.mean, oracle(product, columns, rows), rtol=1e-5, atol=1e-3)
@@ -60,7 +62,7 @@ def test_blocks_are_means_of_usable_bins(count, bins, profiles, seed):
 @settings(max_examples=20, deadline=None)
 def test_rows_merge_without_loss(bins, share):
     product = signal(times(START, 3, 60.0), bins=bins, bin_width=5.0)
-    image = read_raster(product)
+    image = read(product)
     cut = image.shown_to(share * bins * 5.0)
     assert cut.edges.size - 1 <= raster.ROWS
     assert cut.edges[-1] >= share * bins * 5.0 - 1e-6 or cut.edges[-1] == image.edges[-1]
@@ -72,10 +74,10 @@ def test_rows_merge_without_loss(bins, share):
 
 def test_many_bins_are_read_in_blocks(monkeypatch):
     product = signal(times(START, 30, 60.0), bins=9000, bin_width=3.0)
-    whole = read_raster(product, profiles=4)
+    whole = read(product, profiles=4)
     assert whole.mean.shape == (8, 3000)
     monkeypatch.setattr(raster, "_READ_BYTES", 1)
-    in_blocks = read_raster(product, profiles=4)
+    in_blocks = read(product, profiles=4)
     np.testing.assert_array_equal(whole.total, in_blocks.total)
     np.testing.assert_array_equal(whole.rejected, in_blocks.rejected)
     rows = [slice(j, j + 3) for j in range(0, 9000, 3)]
@@ -85,7 +87,7 @@ def test_many_bins_are_read_in_blocks(monkeypatch):
 
 def test_columns_touch_except_at_gaps():
     time = np.concatenate([times(START, 10, 60.0), times(START + timedelta(hours=2), 4, 60.0)])
-    image = read_raster(signal(time), profiles=3)
+    image = read(signal(time), profiles=3)
     gaps = (image.start[1:] - image.stop[:-1]) / np.timedelta64(1, "m")
     # 10 profiles in 4 columns, then 4 in 2: one gap, from 10 min to 2 h.
     np.testing.assert_allclose(gaps, [0, 0, 0, 110, 0], atol=1e-9)
@@ -96,7 +98,7 @@ def test_columns_touch_except_at_gaps():
 def test_background_is_the_mean_with_its_error():
     product = signal(times(START, 6, 60.0))
     product["background"].values[4:] = np.nan
-    image = read_raster(product, profiles=2)
+    image = read(product, profiles=2)
     expected = product["background"].values[:4].reshape(2, 2).mean(axis=1)
     np.testing.assert_allclose(image.background[:2], expected, rtol=1e-6)
     np.testing.assert_allclose(image.background_error[:2], 4e-3 / np.sqrt(2), rtol=1e-6)
@@ -110,74 +112,37 @@ def test_reach_ends_where_noise_dominates():
         * np.random.default_rng(0).standard_normal((60, 1600))
     )  # fmt: skip
     product["signal"].values[:, :400] = 5 * product["signal_standard_error"].values[:, :400]
-    assert read_raster(product).reach == pytest.approx(6000.0, abs=15.0 * 25)
+    assert read(product).reach == pytest.approx(6000.0, abs=15.0 * 25)
     product["signal"].values[:] = 0.0
-    assert read_raster(product).reach == 0.0
+    assert read(product).reach == 0.0
 
 
 def test_altitude_is_a_line_in_range():
-    image = read_raster(signal(times(START, 3, 60.0)))
+    image = read(signal(times(START, 3, 60.0)))
     np.testing.assert_allclose(image.altitude, (120.0, 0.94))
-    assert read_raster(signal(times(START, 3, 60.0)).drop_vars("altitude")).altitude is None
+    assert read(signal(times(START, 3, 60.0)).drop_vars("altitude")).altitude is None
 
 
 def test_unsorted_times_are_sorted():
     product = signal(times(START, 12, 60.0))
     backwards = product.isel(time=slice(None, None, -1))
-    np.testing.assert_array_equal(read_raster(product).total, read_raster(backwards).total)
+    np.testing.assert_array_equal(read(product).total, read(backwards).total)
 
 
 def test_share_with_care_is_over_all_bins():
     product = signal(times(START, 5, 60.0), bins=100)
     product["quality_flag"].values[:] = 0
     product["quality_flag"].values[:, :25] = int(Quality.PILE_UP)
-    assert share_with_care([read_raster(product)]) == 0.25
+    assert share_with_care([read(product)]) == 0.25
     assert share_with_care([]) == 0.0
 
 
 @pytest.mark.parametrize("name", ["signal", "background", "quality_flag", "range"])
 def test_missing_variable_is_named(name):
     with pytest.raises(ProductError, match=f"{name}: is missing"):
-        read_raster(signal(times(START, 3, 60.0)).drop_vars(name))
+        read(signal(times(START, 3, 60.0)).drop_vars(name))
 
 
 def test_empty_product_is_refused():
     with pytest.raises(ProductError, match="no profile"):
-        read_raster(signal(times(START, 3, 60.0)).isel(time=slice(0)))
-
-
-def rasters_of(*starts: float, bins: int = 30) -> list[raster.Raster]:
-    """Return rasters of one hour each, at the given hours after the start."""
-    return [
-        read_raster(signal(times(START + timedelta(hours=hours), 60, 60.0), bins=bins, seed=seed))
-        for seed, hours in enumerate(starts)
-    ]
-
-
-def test_consecutive_rasters_with_the_same_rows_are_joined():
-    following = rasters_of(0, 1, 5)
-    (whole,) = joined(following)
-    assert whole.start.size == 180
-    np.testing.assert_array_equal(whole.mean, np.concatenate([image.mean for image in following]))
-    np.testing.assert_array_equal(
-        whole.flagged, np.concatenate([image.flagged for image in following])
-    )
-    np.testing.assert_array_equal(whole.edges, following[0].edges)
-    assert whole.with_care == sum(image.with_care for image in following)
-    assert share_with_care([whole]) == pytest.approx(share_with_care(following))
-    assert set(whole.bits) == {bit for image in following for bit in image.bits}
-
-
-def test_other_rasters_are_not_joined():
-    overlapping, backwards = rasters_of(0, 0.5), rasters_of(1, 0)
-    other_rows = [*rasters_of(0), *rasters_of(1, bins=31)]
-    for separate in (overlapping, backwards, other_rows):
-        assert joined(separate) == separate
-    assert joined([]) == []
-
-
-def test_joining_does_not_change_the_figure(monkeypatch):
-    parts = rasters_of(0, 1, 2, 6, 6.5)
-    expected = product_figures.render(product_figures.draw_image(parts, title="joined"))
-    monkeypatch.setattr(panels, "joined", list)
-    assert product_figures.render(product_figures.draw_image(parts, title="joined")) == expected
+        read(signal(times(START, 3, 60.0)).isel(time=slice(0)))

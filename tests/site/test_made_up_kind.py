@@ -63,25 +63,23 @@ LAYOUT = replace(
 )
 """
 FIGURES = """
-from lidarops.figures.kind_figures import KindFigures, no_figures
+import numpy as np
 
-FIGURES = KindFigures(page=lambda product: no_figures("a smooth page"), preferred="amplitude")
-"""
-REPORT = """
-from matplotlib.figure import Figure
-
-from lidarops.figures.kind_figures import ReportFigure, ReportFigures
+from lidarops.figures.kind_figures import KindFigures, View
+from lidarops.figures.panels import Axis, Curve, Figure, Panel
 
 
-def draw(content, *, title):
-    return Figure(figsize=(2.0, 2.0), label=f"{title}: {content}")
+def read(product, source):
+    return product.sizes["time"]
 
 
-def figures(group, sources):
-    yield ReportFigure("even", f"A smooth figure of {group.label}", draw, "nothing but smoothness")
+def draw(contents):
+    axis, ends = Axis("smooth", 0.0, 1.0), np.array([0.0, 1.0])
+    panel = Panel(axis, axis, (Curve(ends, ends),))
+    yield Figure("A smooth figure", f"Of {sum(contents)} times", (panel,))
 
 
-REPORT = ReportFigures(figures)
+FIGURES = KindFigures((View("even", ("time",), read, draw),), preferred="amplitude")
 """
 Register = Callable[..., None]
 
@@ -158,21 +156,19 @@ def test_without_figures_the_main_variable_is_shown(register: Register, tmp_path
     first, second, third = _report(tmp_path).pictures
     assert first.file.startswith("homogeneous_")
     assert second.file.startswith("smooth_")
-    assert "extinction against time" in second.alt
+    assert "against time" in second.alt
     assert third.file.startswith("wind_"), "a kind that is not installed comes last"
 
 
 def test_figures_are_those_of_the_kind(register: Register, tmp_path: Path) -> None:
-    register(figures=FIGURES, report_figures=REPORT)
+    register(figures=FIGURES)
     text = _page(tmp_path / "out")
-    assert '<svg class="fig"' not in text
-    assert "a smooth page" in text or any(
-        "a smooth page" in path.read_text() for path in (tmp_path / "out/site").rglob("*.svg")
-    )
+    assert text.count('<svg class="fig"') == 1
+    assert "A smooth figure" in text
     _, figure, _ = _report(tmp_path).pictures
     assert figure.file.startswith("even_")
-    assert figure.caption.startswith("A smooth figure of")
-    assert figure.alt.endswith("nothing but smoothness")
+    assert figure.caption.startswith("A smooth figure: ")
+    assert figure.alt.endswith("Of 40 times.")
 
 
 def test_means_follow_its_budget(

@@ -479,5 +479,5 @@ def read_extinction(product: xr.Dataset, *, profiles: int = 0) -> Raster:
         .rename(altitude="range")
         .assign(background=unknown, background_standard_error=unknown)
     )
-    drawn["extinction"].attrs["units"] = "km$^{-1}$"
+    drawn["extinction"].attrs["units"] = "km-1"
     return read_raster(drawn, quantity="extinction", kind="multiangle", profiles=profiles)

@@ -1,97 +1,236 @@
-"""The figures of the ``multiangle`` product: an image of extinction, and one scan cycle."""
+"""The figures of the ``multiangle`` product: extinction, one scan cycle, residuals of the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures import svg
-from lidarops.figures import svg_profiles as profiles
-from lidarops.figures.kind_figures import Drawn, KindFigures, PageFigures
-from lidarops.figures.kind_images import KindImage
-from lidarops.figures.svg import LEFT, Sheet, SvgPanel
-from lidarops.figures.wording import utc
+from lidarops.figures import pixels
+from lidarops.figures.kind_figures import KindFigures, ProductSource, View, image_view
+from lidarops.figures.panels import (
+    Axis,
+    Band,
+    Curve,
+    Figure,
+    Image,
+    Layer,
+    Mark,
+    Palette,
+    Panel,
+    finite,
+    number,
+    percentile_axis,
+    span_in_words,
+)
+from lidarops.figures.time_axis import Tick
+from lidarops.figures.wording import counted, utc
+from lidarops.kinds import flags_of
 from lidarops.products.multiangle.figure_data import (
+    CYCLE_VARIABLES,
     EXTINCTION_VARIABLES,
     QUANTITIES,
+    RESIDUAL_VARIABLES,
     ScanProfile,
+    ScanResiduals,
     clearest_cycle,
     read_extinction,
+    read_residuals,
 )
 
 Floats = NDArray[np.float64]
 
-_MARKS: Final = 120
-"""Most marks of flagged values."""
-IMAGE: Final = KindImage(EXTINCTION_VARIABLES, read_extinction, "extinction", along="altitude")
+_SCALES: Final = {
+    "optical_depth": (1.0, "optical depth from the lidar"),
+    "extinction": (1e3, "extinction (km⁻¹)"),
+}
+_HEIGHT: Final = 366
+_MARKS: Final = 30
+"""About the largest number of marks of one kind in a panel."""
+_USUAL: Final = 0.97
+"""Share of the residuals inside the colour scale."""
+_LEAST: Final = 0.01
+"""Percent, smallest end of the colour scale."""
+_BEAM_TICKS: Final = 24
+_MAP: Final = 306
+"""Height of the map of residuals, and its number of pixels."""
 
 
-def _page(product: xr.Dataset) -> PageFigures:
-    page = IMAGE.page(product)
-    profile = clearest_cycle(product)
-    if profile is None:
-        return page
-    sheet, words = _cycle(profile, "f2")
-    caption = f"Scan cycle at {utc(profile.time)} (most unflagged values)"
-    return replace(page, figures=(*page.figures, Drawn.of(sheet, caption, words, "f2")))
+def _read_cycle(product: xr.Dataset, source: ProductSource) -> ScanProfile | None:
+    return clearest_cycle(product, source.truth, instrument=source.instrument)
 
 
-FIGURES: Final = KindFigures(page=_page, preferred="optical_depth")
+def _read_residuals(product: xr.Dataset, _: ProductSource) -> ScanResiduals | None:
+    return read_residuals(product)
 
 
-def _cycle(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
-    """Draw optical depth and extinction of one scan cycle against altitude."""
-    sheet = Sheet(height=profiles.HEIGHT)
-    y = profile.altitude / 1e3
-    factors = {"optical_depth": 1.0, "extinction": 1e3}
-    shown = {}
-    for name in QUANTITIES:
-        estimate = profile.estimates[name]
-        shown[name] = [
-            factors[name] * part
-            for part in (
-                estimate.value,
-                estimate.standard_error,
-                estimate.standard_error + np.nan_to_num(estimate.gradient_error),
-                estimate.rejected,
-            )
-        ]
-    spans = [profiles.span([value - error, value + error]) for value, error, _, _ in shown.values()]
-    panels = profiles.panels(y, spans, log=False)
-    labels = ("optical depth", "extinction (km⁻¹)")
-    for number, (panel, label, parts) in enumerate(
-        zip(panels, labels, shown.values(), strict=True)
-    ):
-        sheet.frame(panel, "" if number else "altitude (km)", below=label)
-        _estimate(sheet, panel, panel.y(y), parts, f"{key}-s{number}")
-    named = [("M-9 0H9", "line c0", "retrieved, with standard error")]
-    wide = ("M-9-4H9V4H-9z", "band wide c0", "plus largest error from a horizontal gradient")
-    svg.draw_legend(sheet, LEFT + 14, 20, [*named, wide, (svg.cross(0, 0), "off", "rejected")])
-    value = shown["extinction"][0]
-    good = value[np.isfinite(value)]
-    reach = (
-        f"{svg.number(float(good.min()))} to {svg.number(float(good.max()))} km⁻¹"
-        if good.size
-        else "no usable value"
-    )
+def _draw_cycle(profiles: Sequence[ScanProfile]) -> list[Figure]:
+    """Return optical depth and extinction of one scan cycle against altitude."""
+    profile = profiles[0]
+    extinction = span_in_words(1e3 * profile.estimates["extinction"].value, "km⁻¹")
+    bits = flags_of("multiangle").raised(int(np.bitwise_or.reduce(profile.flag)))
+    names = f" ({', '.join(bit.word for bit in bits)})" if bits else ""
     flagged = int((profile.flag != 0).sum())
-    return sheet, f"Extinction {reach}; {flagged} of {profile.flag.size} altitudes flagged"
+    words = [
+        f"Extinction {extinction}",
+        f"{flagged} of {profile.flag.size} altitudes flagged{names}",
+    ]
+    if np.isfinite(profile.reach):
+        words.append(f"reach {profile.reach / 1e3:.3g} km")
+    caption = f"Scan cycle at {utc(profile.time)} (most unflagged values)"
+    z = profile.altitude / 1e3
+    ground = z[0] if profile.truth is None else min(z[0], profile.truth.edges[0] / 1e3)
+    y = Axis("altitude (km)", float(ground), float(z[-1] + 0.02 * (z[-1] - ground) or z[-1] + 1.0))
+    panels = tuple(_cycle(profile, name, y) for name in QUANTITIES)
+    return [Figure(caption, "; ".join(words), panels, beside=True)]
 
 
-def _estimate(sheet: Sheet, panel: SvgPanel, up: Floats, parts: Sequence[Floats], key: str) -> None:
-    value, error, wide, rejected = parts
+def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
+    """Return a quantity of one cycle with its errors, flags, reach and truth."""
+    scale, label = _SCALES[quantity]
+    estimate, z = profile.estimates[quantity], profile.altitude / 1e3
+    value, error = scale * estimate.value, scale * estimate.standard_error
+    whole = error + scale * np.nan_to_num(estimate.gradient_error)
+    truth = _truth(profile, quantity, scale)
+    # A truth beyond the reach, such as a cloud, does not set the axis.
+    reached = truth.y <= np.fmin(profile.reach, profile.altitude[-1]) / 1e3
+    spans = [value - error, value + error, truth.x[reached]]
+    if not finite(spans).size:
+        spans = [scale * estimate.rejected]
+    x = percentile_axis(label, spans, share=0.5, room=0.08)
+    layers: list[Layer] = [
+        Band(
+            z, value - whole, value + whole, "c0 wide", upright=True, label="largest gradient error"
+        ),
+        Band(z, value - error, value + error, upright=True, label="standard error"),
+        Curve(value, z, label="retrieved"),
+        truth,
+        *_flagged(profile, quantity, scale, x),
+    ]
+    if np.isfinite(profile.reach):
+        level = np.full(2, profile.reach / 1e3)
+        reach = f"reach, {profile.reach / 1e3:.3g} km"
+        layers.append(Curve(np.array([x.low, x.high]), level, "ink thin d3", label=reach))
+    return Panel(x, y, tuple(layers), _HEIGHT)
 
-    def draw() -> None:
-        for width, css in ((wide, "band wide c0"), (error, "band c0")):
-            low, high = panel.x(value - width), panel.x(value + width)
-            sheet.path(svg.band(up, low, high, upright=True), css)
-        sheet.path(svg.line(panel.x(value), up), "line c0")
-        some = slice(None, None, max(1, -(-rejected.size // _MARKS)))
-        sheet.path(svg.marks(panel.x(rejected[some]), up[some], svg.cross), "off")
 
-    sheet.clipped(panel, draw, key)
+def _truth(profile: ScanProfile, quantity: str, scale: float) -> Curve:
+    """Return the truth, empty if unknown; means over cells are steps."""
+    truth = profile.truth
+    if truth is None:
+        return Curve(np.array([]), np.array([]))
+    late = float((truth.time - profile.time) / np.timedelta64(1, "m"))
+    label = f"truth at zenith angle {truth.zenith_angle:.3g}°, {late:+.0f} min"
+    if quantity == "optical_depth":
+        return Curve(scale * truth.optical_depth, truth.edges / 1e3, "ink d1", label=label)
+    edges = np.repeat(truth.edges / 1e3, 2)[1:-1]
+    return Curve(scale * np.repeat(truth.extinction, 2), edges, "ink d1", label=label)
+
+
+def _flagged(profile: ScanProfile, quantity: str, scale: float, x: Axis) -> list[Curve]:
+    """Return marks at values to use with care, values not to use, altitudes without a value."""
+    estimate, z = profile.estimates[quantity], profile.altitude / 1e3
+    known, rejected = np.isfinite(estimate.value), np.isfinite(estimate.rejected)
+    marks = []
+    for where, value, style, mark, words in (
+        (
+            profile.with_care & known,
+            scale * estimate.value,
+            "ink hollow",
+            Mark.DISC,
+            "use with care",
+        ),
+        (rejected, scale * estimate.rejected, "soft hollow", Mark.CROSS, "do not use"),
+        (~known & ~rejected, np.full(z.size, x.low), "soft", Mark.DASH, "no value"),
+    ):
+        index = np.flatnonzero(where)
+        if index.size:
+            some = index[:: -(-index.size // _MARKS)]
+            label = f"{words}: {counted(index.size, 'altitude')}"
+            marks.append(Curve(value[some], z[some], style, mark, joined=False, label=label))
+    return marks
+
+
+def _draw_residuals(contents: Sequence[ScanResiduals]) -> list[Figure]:
+    """Return the residuals against beam and altitude, and below their rms by beam.
+
+    For horizontally homogeneous air there is no pattern and no difference between the sides.
+    """
+    residuals = contents[0]
+    limit = max(_usual(residuals), _LEAST)
+    beams = np.arange(residuals.zenith_angle.size, dtype=np.float64)
+    some = beams[:: -(-beams.size // _BEAM_TICKS)]
+    ticks = tuple(
+        Tick(float(k), number(float(f"{residuals.zenith_angle[int(k)]:.3g}"))) for k in some
+    )
+    x = Axis(_beam_label(residuals), -0.5, beams.size - 0.5, ticks=ticks)
+    y = Axis("altitude (km)", float(residuals.edges[0]) / 1e3, float(residuals.edges[-1]) / 1e3)
+    altitude = 1e3 * (y.high - (np.arange(_MAP) + 0.5) / _MAP * (y.high - y.low))
+    rows = np.searchsorted(residuals.edges, altitude) - 1
+    image = Image(pixels.steps(0.5 + 0.5 * residuals.mean / limit)[rows], Palette.SIGNED)
+    planes = [
+        Curve(np.full(2, cut + 0.5), np.array([y.low, y.high]), "ink thin")
+        for cut in np.flatnonzero(np.diff(residuals.plane))
+    ]
+    bar = Axis("residual, 100 ln(signal / fit) (%)", -limit, limit)
+    upper = Panel(x, y, (image, *planes), height=_MAP, bar=bar)
+    lower = Panel(x, Axis("rms (%)", 0.0, _top(residuals)), _rms(residuals, beams), height=110)
+    rms = np.where(np.isfinite(residuals.rms), residuals.rms, -np.inf)
+    worst = int(np.argmax(rms))
+    words = (
+        f"Mean of {counted(residuals.cycles, 'cycle')}, colours to {limit:.2g} percent; the root"
+        f" mean square is largest, {rms[worst]:.2g} percent, at a zenith angle of"
+        f" {residuals.zenith_angle[worst]:.3g} degrees"
+    )
+    return [Figure("Residuals of the fit against zenith angle and altitude", words, (upper, lower))]
+
+
+def _usual(residuals: ScanResiduals) -> float:
+    """Return the absolute mean residual below which `_USUAL` of all residuals lie.
+
+    Cells that few cycles reach count little, because they are mostly noise.
+    """
+    size, count = np.abs(residuals.mean).ravel(), residuals.count.ravel()
+    order = np.argsort(np.where(count > 0, size, np.inf), kind="stable")
+    share = np.cumsum(count[order])
+    return float(size[order[np.searchsorted(share, _USUAL * share[-1])]])
+
+
+def _top(residuals: ScanResiduals) -> float:
+    return 1.1 * float(finite([residuals.rms]).max()) or 1.0
+
+
+def _rms(residuals: ScanResiduals, beams: Floats) -> tuple[Layer, ...]:
+    """Return the rms residual of every beam, and the part that does not average out."""
+    many = residuals.cycles > 1
+    label = "single cycles" if many else "one cycle"
+    single = Curve(beams, residuals.rms, mark=Mark.DISC, joined=False, label=label)
+    if not many:
+        return (single,)
+    label = f"mean of {residuals.cycles:,} cycles"
+    mean = Curve(beams, residuals.rms_of_mean, "c1", Mark.SQUARE, joined=False, label=label)
+    return single, mean
+
+
+def _beam_label(residuals: ScanResiduals) -> str:
+    names = [
+        "azimuth not known" if np.isnan(azimuth) else f"azimuth {azimuth:.4g}°"
+        for azimuth in residuals.azimuths
+    ]
+    if not names:
+        return "zenith angle of the beam (°)"
+    toward = "; ".join(names[:4]) + ("; ..." if len(names) > 4 else "")
+    return f"zenith angle of the beam (°), positive toward {toward}"
+
+
+FIGURES: Final = KindFigures(
+    (
+        image_view("multiangle", EXTINCTION_VARIABLES, read_extinction, "extinction", "altitude"),
+        View("scan-profile", CYCLE_VARIABLES, _read_cycle, _draw_cycle, first=True),
+        View("scan-residuals", RESIDUAL_VARIABLES, _read_residuals, _draw_residuals, first=True),
+    ),
+    preferred="optical_depth",
+)

@@ -1,12 +1,15 @@
-"""The figures of the ``signal`` product: an image of the signal."""
+"""The figure of the ``signal`` product: an image of the signal."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
-from lidarops.figures.kind_figures import KindFigures
-from lidarops.figures.kind_images import KindImage
+from lidarops.figures.kind_figures import KindFigures, image_view
 from lidarops.figures.raster import raster_variables, read_raster
 
-IMAGE: Final = KindImage(raster_variables(), read_raster, "range-corrected signal")
-FIGURES: Final = KindFigures(page=IMAGE.page, preferred="signal")
+_READ: Final = partial(read_raster, quantity="signal", kind="signal")
+FIGURES: Final = KindFigures(
+    (image_view("signal", raster_variables("signal"), _READ, "range-corrected signal"),),
+    preferred="signal",
+)

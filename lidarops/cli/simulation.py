@@ -1,0 +1,56 @@
+"""Commands that simulate: raw files of a campaign, and a first use of all retrievals."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from lidarops.cli.app import (
+    ArchiveOption,
+    CampaignFile,
+    OutOption,
+    app,
+    progress_bar,
+    with_plain_errors,
+)
+
+
+@app.command()
+@with_plain_errors
+def simulate(
+    campaign: CampaignFile,
+    archive: ArchiveOption = None,
+    out: OutOption = None,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
+) -> None:
+    """Write the raw Licel files of a simulated campaign, and the truth behind them.
+
+    Example: lidarops simulate catalogs/demo.yaml --workers 2
+    """
+    from contextlib import nullcontext
+
+    from lidarops.campaign.model import load_campaign
+    from lidarops.netcdf.write import write_plain
+    from lidarops.run.executor import local_client
+    from lidarops.simulate.campaign import plan_simulation, write_simulation
+
+    settings = load_campaign(campaign, archive=archive, output=out)
+    planned = plan_simulation(settings)
+    cluster = nullcontext() if workers == 1 else local_client(workers)
+    with progress_bar("simulate", len(planned.paths)) as advance, cluster as client:
+        simulated = write_simulation(planned, client=client, progress=advance)
+    write_plain(simulated.truth, settings.truth_path)
+    typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
+
+
+@app.command("compile")
+@with_plain_errors
+def compile_code() -> None:
+    """Compile the retrievals now, so that the first run need not: once after installation.
+
+    Example: lidarops compile
+    """
+    from lidarops.run.compilation import compile_retrievals
+
+    typer.echo(f"compiled code is kept in {compile_retrievals()}")

@@ -1,0 +1,89 @@
+"""Pixels of images, and their encoding as PNG."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.figures.panels import Palette
+
+Floats = NDArray[np.float64]
+
+BLANK: Final = 0
+"""Pixel without data, transparent."""
+REJECTED: Final = 1
+"""Dark stripes over rejected blocks; light stripes are the next value."""
+_COLOURS: Final = 253
+"""Steps of the colour scale."""
+_STRIPE: Final = 5
+"""Width of a stripe, pixels."""
+_ANCHORS: Final = {
+    # viridis without its dark end, because stripes are black.
+    Palette.SIGNAL: "463480 404588 3a538b 33628d 2e6f8e 287c8e 23898e 1f958b 1fa287 28ae80 3bbb75"
+    " 56c667 73d056 95d840 b8de29 dde318 fde725",
+    # cividis: its middle is grey, and it can be read with colour vision deficiency and in grey.
+    Palette.SIGNED: "00224e 123570 3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
+}
+
+
+def steps(shares: Floats) -> NDArray[np.uint8]:
+    """Return the pixels of shares of the colour scale, 0 to 1; blank for NaN."""
+    inside = np.clip(np.nan_to_num(shares), 0.0, 1.0)
+    level = 3 + np.rint(inside * (_COLOURS - 1)).astype(np.uint8)
+    return np.where(np.isfinite(shares), level, BLANK).astype(np.uint8)
+
+
+def ramp() -> NDArray[np.uint8]:
+    """Return the colour scale as an image, shape (row, 1)."""
+    return np.arange(_COLOURS + 2, 2, -1, dtype=np.uint8)[:, None]
+
+
+def striped(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image whose rejected pixels are stripes, the first row on top."""
+    height, width = image.shape
+    stripes = (np.arange(height)[:, None] + np.arange(width)[None, :]) // _STRIPE % 2
+    return np.where(image == REJECTED, REJECTED + stripes, image).astype(np.uint8)
+
+
+def png(pixels: NDArray[np.uint8], palette: Palette) -> bytes:
+    """Return an indexed image as PNG.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint8, shape (row, column)
+        `BLANK`, `REJECTED`, `REJECTED` + 1, or of `steps`.
+    palette : Palette
+    """
+    height, width = pixels.shape
+    rows = np.zeros((height, width + 1), dtype=np.uint8)
+    rows[:, 1:] = pixels
+    header = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        _chunk(kind, data)
+        for kind, data in (
+            (b"IHDR", header),
+            (b"PLTE", _colours(palette)),
+            (b"tRNS", b"\x00"),
+            (b"IDAT", zlib.compress(rows.tobytes(), 6)),
+            (b"IEND", b""),
+        )
+    )
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    body = kind + data
+    return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+
+@cache
+def _colours(palette: Palette) -> bytes:
+    anchors = np.array([list(bytes.fromhex(word)) for word in _ANCHORS[palette].split()], float)
+    places = np.linspace(0.0, len(anchors) - 1.0, _COLOURS)
+    scale = [np.interp(places, np.arange(len(anchors)), anchors[:, c]) for c in range(3)]
+    special = np.array([[0, 0, 0], [20, 20, 20], [170, 174, 180]], dtype=np.uint8)
+    return np.concatenate([special, np.rint(np.stack(scale, -1)).astype(np.uint8)]).tobytes()

@@ -1,0 +1,111 @@
+"""Parallel reading of products, in one process or several.
+
+Results and their order do not depend on the number of processes. For a product that is missing or
+cannot be read, the result is a `ReadFailure` with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Generic, Self, TypeVar
+
+import xarray as xr
+
+from lidarops.errors import ProductError
+from lidarops.figures.kind_figures import ProductSource
+from lidarops.netcdf.read import open_product, profiles_in
+from lidarops.system.processes import Processes
+
+FEWEST: Final = 50
+"""Fewest products per process for which starting the process pays."""
+UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
+"""Exceptions observed when damaged or foreign files are opened and read."""
+_AT_A_TIME: Final = 8
+"""Products sent to a process together, so that it waits less."""
+_LENGTHS_AT_A_TIME: Final = 32
+
+Content = TypeVar("Content")
+_Content_co = TypeVar("_Content_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadTask(Generic[_Content_co]):
+    """A product to read, and how. Can be pickled, for another process."""
+
+    path: Path
+    names: tuple[str, ...]
+    """Names of the variables to read."""
+    read: Callable[[xr.Dataset, ProductSource], _Content_co]
+    source: ProductSource
+    """Without the truth, which `Readers` add."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFailure:
+    """Why a product could not be read."""
+
+    reason: str
+
+
+class Readers:
+    """Reads products, in several processes if there are enough products. A context manager.
+
+    Parameters
+    ----------
+    workers : int
+        Most processes; with fewer than 2, no process is started.
+    products : int
+        Approximate number of products to read in all.
+    truth : xr.Dataset, optional
+        In memory, for the sources of tasks.
+    """
+
+    def __init__(
+        self, workers: int = 1, products: int = 0, truth: xr.Dataset | None = None
+    ) -> None:
+        self._truth = truth
+        self._processes = Processes(min(workers, products // FEWEST), truth)
+
+    def __enter__(self) -> Self:
+        self._processes.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._processes.__exit__(*error)
+
+    def read(self, reading: ReadTask[Content]) -> Content | ReadFailure:
+        """Read one product, in this process."""
+        return _read(self._truth, reading)
+
+    def read_all(self, readings: Iterable[ReadTask[Content]]) -> Iterator[Content | ReadFailure]:
+        """Yield the content of each product, in their order."""
+        for _, content in self._processes.map_items(_read, readings, at_a_time=_AT_A_TIME):
+            yield content
+
+    def lengths(self, paths: Iterable[Path]) -> Iterator[int | ReadFailure]:
+        """Yield the number of profiles of each product, in their order, without reading data."""
+        for _, length in self._processes.map_items(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
+            yield length
+
+
+def _read(truth: xr.Dataset | None, reading: ReadTask[Content]) -> Content | ReadFailure:
+    try:
+        with open_product(reading.path, reading.names) as product:
+            return reading.read(product, replace(reading.source, truth=truth))
+    except UNREADABLE as error:
+        return ReadFailure(reason(reading.path, error))
+
+
+def _length(_: object, path: Path) -> int | ReadFailure:
+    try:
+        return profiles_in(path)
+    except UNREADABLE as error:
+        return ReadFailure(reason(path, error))
+
+
+def reason(path: Path, error: BaseException) -> str:
+    """Return the message of an error without the path, which is shown beside it."""
+    words = str(error).removeprefix(f"{path}: ").replace(str(path), path.name)
+    return words or type(error).__name__

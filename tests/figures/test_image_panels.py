@@ -1,0 +1,118 @@
+"""Images show block means, flags, gaps, clouds and the background."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import numpy as np
+import pytest
+from support.products.drawn import figures, image, labelled
+from support.products.fabricated import START, signal, times
+
+from lidarops.figures.pixels import BLANK, REJECTED
+from lidarops.figures.raster import COLUMNS
+from lidarops.flags import Quality
+from lidarops.kinds import flags_of
+
+
+def drawn(*products):
+    profiles = -(-sum(product.sizes["time"] for product in products) // COLUMNS)
+    (figure,) = figures("signal", "signal", products, profiles=profiles)
+    return figure
+
+
+def test_colours_are_the_signal_and_flags_are_striped():
+    product = signal(times(START, 48, 1800.0), bins=150)
+    figure = drawn(product)
+    panel, below = figure.panels
+    pixels = image(panel)
+    height, width = pixels.shape
+    far = panel.y.high * 1e3
+    column = ((np.arange(width) + 0.5) / width * 48).astype(int)
+    ranges = product["range"].values
+    along = far - (np.arange(height) + 0.5) / height * (far - 1e3 * panel.y.low)
+    row = np.abs(ranges[None, :] - along[:, None]).argmin(axis=1)
+    flag = product["quality_flag"].values
+    rejected = ((flag & flags_of("signal").rejecting) != 0)[np.ix_(column, row)].T
+    striped = np.isin(pixels, [REJECTED, REJECTED + 1])
+    # A pixel on the border of two blocks may take either.
+    assert (striped == rejected).mean() > 0.99
+    value = np.clip(product["signal"].values, panel.bar.low, panel.bar.high)
+    share = np.log(value / panel.bar.low) / np.log(panel.bar.high / panel.bar.low)
+    expected = 3 + 252 * share[np.ix_(column, row)].T
+    close = np.abs(pixels - expected)[~rejected & ~striped] < 1.5
+    assert close.mean() > 0.99
+    assert panel.bar.label == "range-corrected signal (MHz m²)"
+    (line,) = (layer for layer in below.layers if hasattr(layer, "mark"))
+    np.testing.assert_allclose(line.y, product["background"].values, rtol=1e-6)
+    assert "striped" in figure.words
+
+
+def test_gaps_in_time_are_blank():
+    time = np.concatenate([times(START, 12, 600.0), times(START + timedelta(hours=4), 12, 600.0)])
+    panel = drawn(signal(time, bins=100)).panels[0]
+    x = panel.x.low + (np.arange(COLUMNS) + 0.5) / COLUMNS * (panel.x.high - panel.x.low)
+    blank = (image(panel) == BLANK).all(axis=0)
+    np.testing.assert_array_equal(blank, (x > 2 / 24) & (x < 4 / 24))
+
+
+def test_scenes_are_drawn_as_one():
+    whole = signal(times(START, 120, 60.0), bins=200)
+    halves = [whole.isel(time=slice(60, None)), whole.isel(time=slice(60))]
+    expected, joined = drawn(whole), drawn(*halves)
+    np.testing.assert_array_equal(image(expected.panels[0]), image(joined.panels[0]))
+    assert expected.words == joined.words
+
+
+def test_scenes_with_different_grids_share_a_panel():
+    coarse = signal(times(START, 30, 60.0), bins=200, bin_width=15.0)
+    fine = signal(times(START + timedelta(minutes=30), 30, 60.0), bins=800, bin_width=7.5)
+    panel = drawn(coarse, fine).panels[0]
+    assert panel.y.high <= 6.0
+    filled = image(panel) != BLANK
+    assert filled[-1].all()
+    assert filled[:, -COLUMNS // 3 :].all()
+
+
+def test_large_products_are_reduced():
+    panel = drawn(signal(times(START, 1600, 20.0), bins=1700, bin_width=3.0)).panels[0]
+    assert image(panel).shape == (306, COLUMNS)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, 0.0])
+def test_an_empty_panel_has_a_note(value):
+    product = signal(times(START, 5, 60.0), bins=40)
+    product["signal"][:] = value
+    panel = drawn(product).panels[0]
+    assert panel.note == "no usable value above zero"
+    assert panel.bar is None
+
+
+def test_altitude_stands_beside_range():
+    panel = drawn(signal(times(START, 5, 60.0), bins=40)).panels[0]
+    assert panel.right.label == "altitude (km)"
+    ends = np.array([panel.y.low, panel.y.high])
+    np.testing.assert_allclose([panel.right.low, panel.right.high], 0.12 + 0.94 * ends)
+
+
+def test_share_with_care_is_that_of_the_product():
+    product = signal(times(START, 60, 60.0), bins=4000, bin_width=15.0)
+    share = ((product["quality_flag"].values & int(Quality.PILE_UP)) != 0).mean()
+    assert share > 0.0015
+    assert f"{100 * share:.1f} % of all bins: use with care (pile_up)" in drawn(product).words
+
+
+def test_far_noise_is_left_out_with_a_note():
+    figure = drawn(signal(times(START, 60, 60.0), bins=4000, bin_width=15.0))
+    assert figure.panels[0].y.high < 30.0
+    assert "noise dominates beyond" in figure.words
+
+
+def test_triangles_mark_the_lowest_cloud_bases():
+    product = signal(times(START, 8, 60.0), bins=100)
+    assert not labelled(drawn(product).panels[0], "base of the lowest cloud")
+    product["cloud_base_range"] = ("time", [90.0, np.nan, 40.0, 60.0, *[np.nan] * 4])
+    figure = drawn(product)
+    (marks,) = labelled(figure.panels[0], "base of the lowest cloud")
+    np.testing.assert_array_equal(marks.y[:4], [0.09, np.nan, 0.04, 0.06])
+    assert "cloud base in 3 of 8 columns (triangles)" in figure.words

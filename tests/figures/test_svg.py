@@ -1,0 +1,188 @@
+"""SVG files of figures: positions, text, legends, images, thumbnails."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from PIL import Image as Pictures
+
+from lidarops.figures import pixels, svg
+from lidarops.figures.panels import (
+    Axis,
+    Band,
+    Curve,
+    Figure,
+    Image,
+    Mark,
+    Palette,
+    Panel,
+    Words,
+    decade_axis,
+    percentile_axis,
+    units,
+)
+
+ONE = np.array([0.0, 1.0])
+
+
+def panel(*layers, y=Axis("up", 0.0, 1.0), **options):  # noqa: B008 - it is frozen
+    return Panel(Axis("across", 0.0, 1.0), y, layers, **options)
+
+
+def figure(*panels, **options):
+    return Figure("Caption", "words", panels, **options)
+
+
+def drawn(*panels, **options):
+    return svg.file(figure(*panels, **options)).decode()
+
+
+def texts(document):
+    return [element.text for element in ET.fromstring(document).iter() if "text" in element.tag]
+
+
+def numbers(path):
+    return [float(word) for word in re.findall(r"-?\d+\.?\d*", path)]
+
+
+def paths(document, css):
+    return re.findall(rf'<path class="{css}" d="([^"]*)"', document)
+
+
+def frame(document):
+    """Return left, top, width and height of the first panel."""
+    return [float(re.search(rf'<svg [^>]*\b{n}="([\d.]+)"', document[60:])[1]) for n in
+            ("x", "y", "width", "height")]  # fmt: skip
+
+
+def test_curves_lie_where_the_axes_say():
+    document = drawn(panel(Curve(np.array([0.0, 0.5, 1.0]), np.array([0.0, 1.0, 0.5]))))
+    left, top, width, height = frame(document)
+    (path,) = paths(document, "line c0")
+    expected = [left, top + height, left + width / 2, top, left + width, top + height / 2]
+    np.testing.assert_allclose(numbers(path), expected, atol=0.11)
+
+
+def test_logarithmic_axes():
+    y = Axis("up", 1.0, 100.0, log=True)
+    curve = Curve(np.array([0.0, 0.5, 1.0]), np.array([1.0, 10.0, -1.0]))
+    document = drawn(panel(curve, y=y))
+    _, top, _, height = frame(document)
+    (path,) = paths(document, "line c0")
+    np.testing.assert_allclose(numbers(path)[1::2], [top + height, top + height / 2], atol=0.11)
+    assert {"1", "10", "100"} <= set(texts(document))
+
+
+def test_no_line_bridges_a_value_that_is_not_finite():
+    y = np.array([0.1, 0.2, np.nan, 0.3, 0.4])
+    x = np.linspace(0.0, 1.0, 5)
+    document = drawn(panel(Band(x, y - 0.1, y + 0.1), Curve(x, y, mark=Mark.SQUARE)))
+    assert paths(document, "line c0")[0].count("M") == 2
+    assert paths(document, "band c0")[0].count("Z") == 2
+    assert paths(document, "mark c0")[0].count("M") == 4
+
+
+def test_steps_run_across_then_up():
+    document = drawn(panel(Curve(ONE, ONE, steps=True)))
+    left, top, width, height = frame(document)
+    expected = [left, top + height, left + width, top + height, left + width, top]
+    np.testing.assert_allclose(numbers(paths(document, "line c0")[0]), expected, atol=0.11)
+
+
+def test_bars_are_one_at_each_point():
+    document = drawn(panel(Band(ONE, ONE - 0.1, ONE + 0.1, bars=True)))
+    assert paths(document, "err c0")[0].count("V") == 2
+
+
+def test_layers_are_clipped_at_the_panel():
+    (inner,) = re.findall(r'<svg x=[^>]*viewBox="([^"]*)"', drawn(panel(Curve(ONE, 5 * ONE))))
+    assert [float(word) for word in inner.split()] == frame(drawn(panel(Curve(ONE, 5 * ONE))))
+
+
+def test_each_legend_lists_only_what_no_earlier_panel_has():
+    first = panel(Curve(ONE, ONE, label="both"))
+    second = panel(Curve(ONE, ONE, label="both"), Curve(ONE, ONE, "c1", label="second"))
+    for beside in (False, True):
+        words = texts(drawn(first, second, beside=beside))
+        assert words.count("both") == words.count("second") == 1
+
+
+def test_long_legends_get_more_lines():
+    layers = [Curve(ONE, ONE, label=f"{'long ' * 8}{n}") for n in range(6)]
+    few, many = (frame(drawn(panel(*layers[:n])))[1] for n in (1, 6))
+    assert many >= few + 18
+
+
+def test_names_are_text():
+    nasty = "<b>&\x1b$\\frac"
+    document = drawn(panel(Words(ONE, ONE, (nasty, "")), title=nasty, note=nasty))
+    assert texts(document).count("<b>&\\x1b$\\frac") == 3
+    assert "aria-label" in svg.inline(Figure(nasty, nasty, (panel(),)))
+
+
+def test_ticks_are_round_and_have_equal_decimals():
+    words = texts(drawn(panel(y=Axis("up", -0.13, 0.93))))
+    assert {"0.0", "0.2", "0.4", "0.6", "0.8"} <= set(words)
+    assert "\u22121" in texts(drawn(panel(y=Axis("up", -1.3, 1.4))))
+
+
+def test_panels_that_share_an_axis_are_labelled_once():
+    lower = panel()
+    upper = Panel(lower.x, lower.y, ())
+    assert texts(drawn(upper, lower)).count("across") == 1
+    assert texts(drawn(panel(), panel(y=Axis("u", 0, 2)), beside=True)).count("across") == 2
+
+
+@pytest.mark.parametrize("palette", Palette)
+def test_images_hold_their_pixels_and_the_scale_becomes_lighter(palette):
+    values = np.array([[0.0, 0.5, 1.0], [np.nan, 0.25, 0.75]])
+    encoded = drawn(panel(Image(pixels.steps(values), palette), bar=Axis("bar", 1.0, 2.0)))
+    first, ramp = re.findall(r"base64,([^\"]*)", encoded)
+    image = Pictures.open(io.BytesIO(base64.b64decode(first)))
+    np.testing.assert_array_equal(np.asarray(image), pixels.steps(values))
+    assert np.asarray(image.convert("RGBA"))[1, 0, 3] == 0
+    colours = np.asarray(Pictures.open(io.BytesIO(base64.b64decode(ramp))).convert("RGB"))[:, 0]
+    luminance = colours @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(luminance) < 1.0).all()
+    assert luminance[0] > 180
+    # Stripes of rejected blocks are darker than the scale.
+    assert luminance[-1] > 25
+    assert "bar" in texts(encoded)
+
+
+def test_a_second_axis_stands_at_the_right():
+    document = drawn(panel(right=Axis("altitude", 100.0, 300.0)))
+    assert {"altitude", "200"} <= set(texts(document))
+    assert frame(document)[2] < frame(drawn(panel()))[2]
+
+
+def test_thumbnails_are_small_and_without_axes():
+    many = np.linspace(0.0, 1.0, 5000)
+    for layer in (Curve(many, many), Image(np.full((306, 780), 9, dtype=np.uint8))):
+        small = svg.thumbnail(figure(panel(layer)))
+        assert len(small) < 8000
+        assert texts(small) == []
+    assert texts(svg.thumbnail(None, "nothing <here>")) == ["nothing <here>"]
+
+
+def test_axes_of_data():
+    values = [np.array([1.0, 2.0, 3.0, np.nan]), np.array([np.inf])]
+    axis = percentile_axis("name", values, share=0.0, room=0.5)
+    assert (axis.low, axis.high) == (0.0, 4.0)
+    for values in ([np.array([])], [np.array([5.0, 5.0])], [np.array([np.nan])]):
+        for axis in (percentile_axis("name", values), decade_axis("name", values)):
+            assert axis.low < axis.high
+            drawn(panel(y=axis))
+    wide = decade_axis("name", [np.array([-1.0, *[1e-30] * 9, 1.0])])
+    assert wide.low == pytest.approx(1e-5 * wide.high)
+
+
+def test_units_have_superscripts():
+    assert units("m-1 sr-1") == "m⁻¹ sr⁻¹"
+    assert units("MHz m2") == "MHz m²"
+    assert units("1") == "1"

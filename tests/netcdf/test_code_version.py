@@ -1,0 +1,219 @@
+"""Code versions: what changes that of a kind of product, and what does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support.sources import Copy
+
+from lidarops.errors import LidarOpsError
+from lidarops.kinds import Kind, kind_of, kinds
+from lidarops.netcdf import code_version as versions
+from lidarops.netcdf.code_version import (
+    _APART,
+    code_version,
+    joint_code_version,
+    source_roots,
+    sources_in,
+    version_of,
+)
+from lidarops.settings import ChannelProduct
+from lidarops.system.source_closure import Sources
+
+ALL = set(kinds())
+OWN = sorted(kind.name for kind in kinds().values() if kind.package.startswith("lidarops."))
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of facts about sources."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def copy(repository: Path, tmp_path: Path, cache: Path) -> Copy:
+    """A copy of the sources."""
+    return Copy(repository, tmp_path, cache)
+
+
+def changed(copy: Copy, *modules: str) -> set[str]:
+    """Return the kinds whose version changes with some modules."""
+    before = copy.versions()
+    for module in modules:
+        copy.change(module)
+    after = copy.versions()
+    return {kind for kind in after if after[kind] != before[kind]}
+
+
+def test_a_copy_has_the_versions_of_the_installation(copy: Copy):
+    assert copy.versions() == {kind: code_version(kind) for kind in ALL}
+    assert len(set(copy.versions().values())) == len(ALL)
+
+
+def test_comments_docstrings_and_line_ends_of_any_module_change_nothing(copy: Copy):
+    before = copy.versions()
+    for path in copy.root.rglob("*.py"):
+        text = path.read_text(encoding="utf-8").replace('"""', '"""In other words. ', 1)
+        path.write_bytes(f"# A comment.\n{text}".replace("\n", "\r\n").encode())
+    assert copy.versions() == before
+
+
+@pytest.mark.parametrize(
+    ("module", "kind"),
+    [
+        ("retrieve/elastic/inversion.py", "elastic"),
+        ("retrieve/elastic/_layer_search.py", "elastic"),
+        ("retrieve/elastic/__init__.py", "elastic"),
+        ("retrieve/homogeneous/path_fit.py", "homogeneous"),
+        ("retrieve/multiangle/vertical/gaps.py", "multiangle"),
+        ("retrieve/network/noise/outlying_bins.py", "visibility"),
+        *((f"products/{kind}/settings.py", kind) for kind in OWN),
+        *((f"products/{kind}/steps.py", kind) for kind in OWN),
+        *((f"products/{kind}/variables.py", kind) for kind in OWN),
+    ],
+)
+def test_a_change_of_a_kind_changes_its_version_and_no_other(copy: Copy, module: str, kind: str):
+    assert changed(copy, module) == {kind}
+
+
+@pytest.mark.parametrize(
+    "package",
+    ["aggregate", "bench", "catalog", "cli", "figures", "reports", "run", "simulate", "site",
+     "system"],
+)  # fmt: skip
+def test_what_makes_no_product_changes_no_version(copy: Copy, package: str):
+    modules = [str(path.relative_to(copy.root)) for path in (copy.root / package).rglob("*.py")]
+    assert modules
+    assert changed(copy, *modules) == set()
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["campaign/simulation.py", "campaign/yaml_errors.py", "campaign/expected.py",
+     "netcdf/read.py", "plan/cost_estimate.py", "plan/scenes.py", "site/templates/day.html"],
+)  # fmt: skip
+def test_neighbours_of_what_makes_products_change_no_version(copy: Copy, module: str):
+    assert changed(copy, module) == set()
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["process/scene.py", "netcdf/build.py", "netcdf/write.py", "netcdf/_deflate.py",
+     "netcdf/__init__.py", "raw/licel_format.py", "raw/licel.py", "records.py", "flags.py",
+     "__init__.py"],
+)  # fmt: skip
+def test_what_every_product_passes_through_changes_all_versions(copy: Copy, module: str):
+    assert changed(copy, module) == ALL
+
+
+def test_a_new_module_counts_as_soon_as_it_is_imported(copy: Copy):
+    before = copy.versions()
+    copy.write("retrieve/elastic/tails.py", "STEEPEST = 2\n")
+    assert copy.versions() == before
+    copy.change(
+        "retrieve/elastic/inversion.py",
+        "if TYPE_CHECKING:\n    from lidarops.retrieve.elastic import tails",
+    )
+    assert copy.versions() == before
+    copy.change(
+        "retrieve/elastic/inversion.py",
+        "def late():\n    from lidarops.retrieve.elastic import tails\n    return tails",
+    )
+    imported = copy.versions()
+    assert imported["elastic"] != before["elastic"]
+    copy.write("retrieve/elastic/tails.py", "STEEPEST = 3\n")
+    assert copy.versions()["elastic"] not in {before["elastic"], imported["elastic"]}
+
+
+def test_a_table_of_a_retrieval_counts(copy: Copy):
+    copy.write("retrieve/elastic/ratios.csv", "sr\r\n50\r\n")
+    before = copy.versions()
+    copy.write("retrieve/elastic/ratios.csv", "sr\n50\n")
+    assert copy.versions() == before
+    copy.write("retrieve/elastic/ratios.csv", "sr\n60\n")
+    assert copy.versions()["elastic"] != before["elastic"]
+
+
+def test_files_that_python_writes_do_not_count(copy: Copy):
+    before = copy.versions()
+    folder = copy.root / "retrieve/elastic"
+    (folder / "__pycache__").mkdir()
+    for name in ("__pycache__/inversion.nbi", "inversion.pyc", ".inversion.py.swp"):
+        (folder / name).write_bytes(b"\0")
+    assert copy.versions() == before
+
+
+def test_a_kind_of_another_package_counts_its_own_modules(copy: Copy, cache: Path, tmp_path: Path):
+    package = tmp_path / "other"
+    (package / "clouds" / "tables").mkdir(parents=True)
+    for name, text in {
+        "__init__.py": "",
+        "unused.py": "",
+        "optics.py": "from lidarops.retrieve.elastic import inversion\n",
+        "clouds/__init__.py": "",
+        "clouds/steps.py": "from .. import optics\nfrom .heights import top\n",
+        "clouds/heights.py": "top = 1\n",
+        "clouds/figures.py": "",
+        "clouds/tables/base.csv": "1",
+    }.items():
+        (package / name).write_text(text)
+    kind = Kind("clouds", "Clouds", "other.clouds", ChannelProduct, 50)
+
+    def versions() -> tuple[str, str]:
+        sources = sources_in(
+            {**source_roots(), "lidarops": (copy.root,), "other": (package,)}, cache
+        )
+        return version_of(kind, sources), version_of(kind_of("signal"), sources)
+
+    first = versions()
+    for name in ("unused.py", "clouds/figures.py"):
+        (package / name).write_text("a = 1\n")
+        assert versions() == first
+    seen = {first[0]}
+    for name in ("optics.py", "clouds/heights.py", "clouds/tables/base.csv", "clouds/__init__.py"):
+        with (package / name).open("a") as file:
+            file.write("b = 2\n")
+        assert versions()[1] == first[1]
+        assert versions()[0] not in seen
+        seen.add(versions()[0])
+    copy.change("retrieve/elastic/layers.py")
+    assert versions()[0] not in seen
+
+
+def test_a_raw_format_of_another_package_counts_for_every_kind(
+    copy: Copy, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    reader = tmp_path / "raymetrics.py"
+    reader.write_text("FORMAT = 1\n")
+    monkeypatch.setattr(versions, "_formats", lambda: ("raymetrics",))
+
+    def now() -> dict[str, str]:
+        sources = sources_in(
+            {**source_roots(), "lidarops": (copy.root,), "raymetrics": (reader,)}, cache
+        )
+        return {kind.name: version_of(kind, sources) for kind in kinds().values()}
+
+    before = now()
+    reader.write_text("FORMAT = 2\n")
+    assert all(version != before[kind] for kind, version in now().items())
+
+
+def test_modules_that_are_kept_apart_are_imported(copy: Copy, cache: Path):
+    """Otherwise they need not be named."""
+    sources = Sources({"lidarops": (copy.root,)}, cache=cache)
+    closure = sources.closure(["lidarops.process.scene"])
+    assert set(_APART) <= set(closure)
+
+
+def test_joint_versions_depend_on_their_kinds(copy: Copy):
+    assert joint_code_version() == joint_code_version(sorted(ALL))
+    assert joint_code_version(["signal"]) != joint_code_version(["elastic"])
+    assert joint_code_version(["signal", "elastic"]) == joint_code_version(["elastic", "signal"])
+    assert code_version("signal", "lidarops.aggregate.means") != code_version("signal")
+
+
+def test_a_missing_source_of_every_product_is_an_error(copy: Copy):
+    (copy.root / "process/scene.py").unlink()
+    with pytest.raises(LidarOpsError, match=r"lidarops\.process\.scene is missing"):
+        copy.versions()
