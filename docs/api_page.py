@@ -28,7 +28,6 @@ MODULES: Final = (
     "lidarops.retrieve.elastic.labeled",
     "lidarops.retrieve.multiangle",
     "lidarops.retrieve.multiangle.labeled",
-    "lidarops.retrieve.multiangle.vertical.smooth_profile",
     "lidarops.retrieve.network.extinction_field",
     "lidarops.retrieve.network.geometry",
     "lidarops.retrieve.network.cycles",

@@ -133,7 +133,7 @@ BY_FIELD = {
     ),
     "MultiAngleQuality.NO_RESIDUAL": (
         "no_residual",
-        "test_smooth_profile::test_noise_estimated_from_few_residuals_widens_the_errors",
+        "test_optical_depth::test_two_beams_have_no_residual",
     ),
     "MultiAngleQuality.UNDERSMOOTHED": (
         "undersmoothed",

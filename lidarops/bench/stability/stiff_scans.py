@@ -403,7 +403,6 @@ def _refused_cases() -> tuple[StiffCase, ...]:
         wrong("one angle too few", None, zenith_angle=np.linspace(0.0, 70.0, 11)),
         wrong("negative variance", "variance", variance=-1.0),
         wrong("negative gradient", "largest_gradient", largest_gradient=-1.0),
-        wrong("block labels as floats", "block", block=np.zeros(16)),
         wrong("unknown method", "method", method="magic"),
         wrong("altitudes that are not uniform, joined", "altitude",
               altitude=height + np.where(height > 1000.0, 5.0, 0.0)),

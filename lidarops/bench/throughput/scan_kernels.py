@@ -97,15 +97,15 @@ def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
         fit.residual,
         np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
         np.nan_to_num(fit.leverage, nan=1.0),
-        np.broadcast_to(fit.inhomogeneity, share.shape),
+        fit.inhomogeneity,
         np.nan_to_num(share),
+        beams.gaps,
     )
     smooth = partial(
         smooth_profile.smooth_optical_depth,
         fit.column(kh.TAU),
         fit.column(kh.INFORMATION),
         scene.altitude,
-        station_altitude=0.0,
         residuals=residuals,
     )
     return {

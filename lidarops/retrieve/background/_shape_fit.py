@@ -4,7 +4,6 @@ Sums are centred on weighted means, so that a background 1e8 times the signal co
 of the signal. All sums of a profile run over its bins from near to far.
 """
 
-# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
@@ -27,16 +26,14 @@ BACKGROUND: Final = 0
 AMPLITUDE: Final = 1
 BACKGROUND_VARIANCE: Final = 2
 AMPLITUDE_VARIANCE: Final = 3
-COVARIANCE: Final = 4
-CHI2: Final = 5
-BINS: Final = 6
-CONDITION: Final = 7
-CURVATURE: Final = 8
-WAVES: Final = 9
-WINDOW: Final = 10
-ROUGHNESS: Final = 11
-CONSTANT: Final = 12
-COLUMNS: Final = 13
+CHI2: Final = 4
+BINS: Final = 5
+CONDITION: Final = 6
+CURVATURE: Final = 7
+WAVES: Final = 8
+WINDOW: Final = 9
+CONSTANT: Final = 10
+COLUMNS: Final = 11
 
 
 class ShapeNoise(NamedTuple):
@@ -46,8 +43,6 @@ class ShapeNoise(NamedTuple):
     """(profile or 1, bin), in the square of the power's unit; not used for counts."""
     exposure: Array
     """(profile or 1,), counts per unit of power; NaN where the noise is not Poisson noise."""
-    known: bool
-    """Whether the variance is known, or only its shape."""
 
 
 class Limits(NamedTuple):
@@ -117,22 +112,6 @@ def _group(residuals: Array, phi: Array, lever: Array, weights: Array, tilt: Any
         norm += weights[i] * curved * curved
         score += weighted * curved
     return chi2, weight, total, norm, score
-
-
-@_compiled
-def _roughness(residuals: Array, weights: Array) -> float:
-    """Return the mean squared difference of neighbours over that expected from their weights."""
-    total = before = last = 0.0
-    pairs = 0
-    for i in range(weights.size):
-        if weights[i] == 0.0:
-            continue
-        if last > 0.0:
-            step = residuals[i] - before
-            total += step * step * (weights[i] * last) / (weights[i] + last)
-            pairs += 1
-        before, last = residuals[i], weights[i]
-    return total / pairs if pairs > 0 else math.nan
 
 
 @_summing
@@ -234,7 +213,6 @@ def _fit(
     lever: Array,
     usable: Array,
     exposure: float,
-    known: bool,
     weights: Array,
     residuals: Array,
     row: Array,
@@ -257,43 +235,31 @@ def _fit(
     row[AMPLITUDE] = product / square
     row[BACKGROUND] = power - row[AMPLITUDE] * shape
     row[AMPLITUDE_VARIANCE] = 1.0 / square
-    row[COVARIANCE] = -shape / square
     row[BACKGROUND_VARIANCE] = 1.0 / total + shape * shape / square
     row[CONDITION] = math.sqrt(row[BACKGROUND_VARIANCE] * total)
     _subtract(values, phi, row, residuals)
     sums = (total, shape, square)
     _test_residuals(residuals, phi, lever, weights, sums, row)
-    if not known:
-        row[ROUGHNESS] = _roughness(residuals, weights)
 
 
 @_compiled
-def _level(row: Array, known: bool) -> float:
-    """Return the variance of unit weight, estimated from differences of bins if not known."""
-    return 1.0 if known else row[ROUGHNESS]
+def _passes(row: Array, limits: Limits) -> bool:
+    return bool(abs(row[CURVATURE]) <= limits.deviation and row[WAVES] <= limits.waves)
 
 
 @_compiled
-def _passes(row: Array, limits: Limits, known: bool) -> bool:
-    level = _level(row, known)
-    straight = abs(row[CURVATURE]) <= limits.deviation * math.sqrt(level)
-    calm = row[WAVES] <= limits.waves * level
-    return bool(straight and calm)
-
-
-@_compiled
-def _choose(rows: Array, limits: Limits, known: bool) -> int:
+def _choose(rows: Array, limits: Limits) -> int:
     """Return the longest window that passes and agrees with all shorter ones, else the shortest."""
     shortest = rows.shape[0] - 1
     for k in range(shortest):
-        if not (rows[k, BINS] > 0 and _passes(rows[k], limits, known)):
+        if not (rows[k, BINS] > 0 and _passes(rows[k], limits)):
             continue
         agrees = True
         for j in range(k + 1, rows.shape[0]):
             # The variance of a difference of nested fits is the difference of their variances.
             gap = rows[j, BACKGROUND_VARIANCE] - rows[k, BACKGROUND_VARIANCE]
             step = rows[j, BACKGROUND] - rows[k, BACKGROUND]
-            if step * step > limits.deviation**2 * gap * _level(rows[k], known):
+            if step * step > limits.deviation**2 * gap:
                 agrees = False
         if agrees:
             return int(k)
@@ -409,14 +375,12 @@ def fit_shape(
                 lever[window],
                 usable[window],
                 exposure,
-                noise.known,
                 weights[window],
                 residuals[window],
                 rows[j],
             )
             rows[j, WINDOW] = j
-        chosen = _choose(rows, limits, noise.known) if windows > 1 else 0
+        chosen = _choose(rows, limits) if windows > 1 else 0
         out[k] = rows[chosen]
         out[k, AMPLITUDE] /= unit
         out[k, AMPLITUDE_VARIANCE] /= unit * unit
-        out[k, COVARIANCE] /= unit

@@ -30,10 +30,8 @@ class KnownShapeResult:
     amplitude: Array
     """Power over shape."""
     amplitude_standard_error: Array
-    covariance: Array
-    """Covariance of background and amplitude; negative."""
     chi2: Array
-    """Sum of the squared residuals over their variances; over 1 where no variance is known."""
+    """Sum of the squared residuals over their variances."""
     degrees_of_freedom: npt.NDArray[np.int64]
     """Bins less 2, at least 0."""
     condition: Array
@@ -136,8 +134,7 @@ def fit_known_shape(
         skipped. See `molecular_shape`.
     variance : (..., range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`. It must not
-        follow the noise of the single bin. Where neither it nor `exposure` is given, all bins
-        weigh the same and the noise level is estimated from the residuals.
+        follow the noise of the single bin. Either it or `exposure` is required.
     exposure : (...) float, optional
         For Poisson counts: counts per unit of power. That is the number of shots where power is
         a mean count per shot, and shots times bin time in microseconds where it is in MHz.
@@ -153,8 +150,7 @@ def fit_known_shape(
     Returns
     -------
     KnownShapeResult
-        With the leading axes of `power`. The standard errors cover random noise. Where the noise
-        level is estimated they are widened, so that 4 standard errors have the same coverage.
+        With the leading axes of `power`. The standard errors cover random noise.
         They do not cover an error of the shape, which `curvature` and `waves` show only where it
         exceeds the noise. With haze of 0.6 to 3 times the backscatter of air (scale height 3 km)
         in the shape but not in the air, 11 percent of the backgrounds that are not `poor_fit` are
@@ -168,7 +164,7 @@ def fit_known_shape(
 
     References
     ----------
-    potapova2021, golub1973, vonneumann1941
+    potapova2021, golub1973
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
@@ -190,7 +186,7 @@ def fit_known_shape(
     if exposure is not None:
         # In the dark, a whole window may be without a count.
         out[:, _shape_fit.CONSTANT] = 0.0
-    return _result(out, noise.known, grid.values, first, pasts, leading)
+    return _result(out, grid.values, first, pasts, leading)
 
 
 def _noise(
@@ -199,11 +195,11 @@ def _noise(
     grid: inputs.RangeGrid,
     leading: tuple[int, ...],
 ) -> _shape_fit.ShapeNoise:
-    if variance is not None and exposure is not None:
+    if (variance is None) == (exposure is None):
         raise RetrievalInputError(
-            "is given for counts, whose variance follows from the fit",
+            "is given for counts" if exposure is not None else "is missing",
             field="variance",
-            remedy="leave out either the variance or the exposure",
+            remedy="give the exposure of counts, else the variance",
         )
     counts = inputs.profile_values(exposure, "exposure", leading)
     if counts is not None and np.any(counts <= 0):
@@ -213,7 +209,6 @@ def _noise(
     return _shape_fit.ShapeNoise(
         frozen(inputs.variance_rows(variance, grid, leading)),
         frozen(np.full(1, np.nan) if counts is None else counts),
-        variance is not None or counts is not None,
     )
 
 
@@ -272,39 +267,8 @@ def _limits(false_alarm: float) -> _shape_fit.Limits:
     return _shape_fit.Limits(float(waves), float(-special.ndtri(0.5 * rate)))
 
 
-def _estimated_limits(false_alarm: float, bins: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-    r"""Return the limits of waves and curvature over a noise estimated from differences of bins.
-
-    The mean square of n - 1 differences of neighbours scatters like a variance with
-    :math:`2 (n - 1)^2 / (3 n - 4)` degrees of freedom (vonneumann1941).
-    """
-    rate = 0.5 * false_alarm
-    counts, kind = np.unique(bins, return_inverse=True)
-    count = np.maximum(counts.astype(np.float64), 2.0)
-    freedom = 2.0 * (count - 1.0) ** 2 / (3.0 * count - 4.0)
-    waves_freedom = np.maximum(freedom, THRESHOLDS.least_freedom_of_waves)
-    curvature_freedom = np.maximum(freedom, THRESHOLDS.least_freedom_of_curvature)
-    groups = _shape_fit.GROUPS - 2.0
-    waves = groups * special.fdtri(groups, waves_freedom, 1.0 - rate)
-    return waves[kind], -special.stdtrit(curvature_freedom, 0.5 * rate)[kind]
-
-
-def _level(chi2: Array, freedom: npt.NDArray[np.int64]) -> Array:
-    """Return the factor on variances of unit weight: the estimated noise, widened for its scatter.
-
-    An error over its estimate follows Student's distribution.
-    """
-    counts, kind = np.unique(freedom, return_inverse=True)
-    widening = (
-        -special.stdtrit(counts.astype(np.float64), special.ndtr(-THRESHOLDS.far)) / THRESHOLDS.far
-    )
-    level: Array = chi2 / freedom * widening[kind] ** 2
-    return level
-
-
 def _result(
     out: Array,
-    known: bool,  # noqa: FBT001 - an internal function
     range_: Array,
     first: npt.NDArray[np.intp],
     pasts: npt.NDArray[np.intp],
@@ -313,14 +277,10 @@ def _result(
     bins = out[:, _shape_fit.BINS].astype(np.int64)
     freedom = np.maximum(bins - 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        level = np.ones(len(out)) if known else _level(out[:, _shape_fit.CHI2], freedom)
-        rough = np.ones(len(out)) if known else out[:, _shape_fit.ROUGHNESS]
-        curvature = out[:, _shape_fit.CURVATURE] / np.sqrt(rough)
-        waves = out[:, _shape_fit.WAVES] / rough
-        amplitude_error = np.sqrt(out[:, _shape_fit.AMPLITUDE_VARIANCE] * level)
-        rate = THRESHOLDS.false_alarm
-        limits = _limits(rate) if known else _estimated_limits(rate, bins)
-        poor = (np.abs(curvature) > limits[1]) | (waves > limits[0])
+        curvature, waves = out[:, _shape_fit.CURVATURE], out[:, _shape_fit.WAVES]
+        amplitude_error = np.sqrt(out[:, _shape_fit.AMPLITUDE_VARIANCE])
+        limits = _limits(THRESHOLDS.false_alarm)
+        poor = (np.abs(curvature) > limits.deviation) | (waves > limits.waves)
         negative = out[:, _shape_fit.AMPLITUDE] < -THRESHOLDS.negative * amplitude_error
     condition = out[:, _shape_fit.CONDITION]
     unsolved = (bins > 0) & ~np.isfinite(out[:, _shape_fit.BACKGROUND])
@@ -335,13 +295,12 @@ def _result(
     empty = bins == 0
     start = np.where(empty, np.nan, range_[np.minimum(first, range_.size - 1)])
     stop = np.where(empty, np.nan, range_[np.maximum(pasts - 1, 0)])
-    error = np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE] * level)
+    error = np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE])
     return KnownShapeResult(
         background=out[:, _shape_fit.BACKGROUND].reshape(leading),
         background_standard_error=error.reshape(leading),
         amplitude=out[:, _shape_fit.AMPLITUDE].reshape(leading),
         amplitude_standard_error=amplitude_error.reshape(leading),
-        covariance=(out[:, _shape_fit.COVARIANCE] * level).reshape(leading),
         chi2=out[:, _shape_fit.CHI2].reshape(leading),
         degrees_of_freedom=freedom.reshape(leading),
         condition=condition.reshape(leading),

@@ -39,16 +39,6 @@ class Thresholds:
     largest_condition: float = 30.0
     """Standard error of the background over that of the mean of the same bins, beyond which the
     shape does not differ from a constant; assumed."""
-    far: float = 4.0
-    """Standard errors beyond which a value lies as often as with a known variance; values beyond
-    count as false in the benchmark of stability."""
-    least_freedom_of_waves: float = 54.0
-    """Least degrees of freedom of the estimated noise in the test of waves. In short windows it
-    contains part of the tested misfit, which bounds the ratio: largest quantile at 8 to 60 bins,
-    from 1 percent to 1e-4 false alarms; simulations."""
-    least_freedom_of_curvature: float = 18.0
-    """The same in the test of curvature; simulations."""
-
     nearest: float = 0.6
     """Begin of the window that is compared with the tail, over the start of the tail; assumed."""
     farthest: float = 0.7

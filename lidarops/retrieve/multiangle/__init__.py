@@ -11,8 +11,8 @@ A scan passes through these modules in order:
 3. Method "joint": `vertical` combines the optical depths of single altitudes into one profile
    with smooth extinction. Methods "mld" and "mld_prior": `mld` differentiates the logarithm along
    the slant path with regularisation (the historical method), each altitude on its own.
-4. `_methods` adds extinction, errors and flags. `_neighbours` and `_path_variation` test whether
-   the air is horizontally stratified.
+4. `_methods` adds extinction, errors and flags. `_path_variation` tests whether the air is
+   horizontally stratified.
 5. `labeled.retrieve_optical_depth` turns the result into the ``multiangle`` product.
 """
 

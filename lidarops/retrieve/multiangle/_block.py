@@ -13,30 +13,12 @@ from scipy.special import ndtri
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle import _sample_mask, robust_weights
 from lidarops.retrieve.multiangle.slant_paths import Scan, surrounds_zenith
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import gaps as _gaps
 
 Array = npt.NDArray[np.float64]
 
-WINDOW: Final = 15
-"""Altitudes over which the inhomogeneity is pooled."""
-_FIRST_GUESS: Final = 0.03**2
-"""Variance of the inhomogeneity with which the first fit is weighted."""
-_LEAST_GUESS: Final = 0.01
-"""Smallest variance of the second fit, over the largest of all altitudes."""
-_FEWEST_FREEDOM: Final = 4.1
-"""Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2. No study is
-recorded that set it."""
-OUTLYING: Final = 4.5
-"""Least limit, in standard errors, beyond which a residual starts the robust passes."""
-FALSE_ALARM: Final = 0.01
-"""Probability that any of the residuals, if normal, exceeds the limit by chance."""
-GRADIENT_WINDOW: Final = 1000.0
-"""m, window in which the residuals are tested for a gradient."""
-GRADIENT_LIMIT: Final = 4.0
-"""Standard errors beyond which a gradient is flagged."""
-_GRADIENT_NOISE: Final = 0.02
-"""Variance of a logarithm (signal 7 times its noise) above which its skew, averaged over many
-profiles, looks like a gradient."""
+WINDOW: Final = THRESHOLDS.pooled
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -155,7 +137,7 @@ def shows_gradient(
     ratio = fit.residual * np.where(np.isnan(fit.residual), 0.0, weights_of(beams, fit))
     ratio = np.nan_to_num(ratio)
     noisiest = np.where(beams.noise < np.inf, beams.noise, 0.0).max(axis=1)
-    testable = (fit.column(kh.SIDES) == 0.0) & (noisiest < _GRADIENT_NOISE)
+    testable = (fit.column(kh.SIDES) == 0.0) & (noisiest < THRESHOLDS.gradient_noise)
     gradient = np.zeros(altitude.size, dtype=np.bool_)
     for d in beams.distance:
         product = np.einsum("tak,ak->tk", ratio, d)
@@ -163,10 +145,10 @@ def shows_gradient(
         used = testable & (known > 0.0)
         total = np.where(used, product * altitude, 0.0).sum(axis=0)
         square = np.where(used, known * altitude**2, 0.0).sum(axis=0)
-        inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * GRADIENT_WINDOW
+        inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
         weight = inside @ square
         spread = weight * (1.0 + correlation) / (1.0 - correlation) + (slack * weight) ** 2
-        gradient |= np.abs(inside @ total) > GRADIENT_LIMIT * np.sqrt(spread)
+        gradient |= np.abs(inside @ total) > THRESHOLDS.gradient_limit * np.sqrt(spread)
     return gradient
 
 
@@ -256,37 +238,34 @@ def _fit(
     """Estimate the inhomogeneity in two steps from a first guess, and fit with it."""
     if inhomogeneity is not None:
         return _fit_known(beams, keep, np.full(keep.shape[2], inhomogeneity**2), moments[1])
-    table = np.empty((beams.noise.shape[0], kh.COLUMNS, beams.noise.shape[2]))
-    variance = np.full(keep.shape[2], _FIRST_GUESS)
+    variance, nothing = (
+        np.full(keep.shape[2], THRESHOLDS.first_guess),
+        np.empty((0, *beams.noise.shape[1:])),
+    )
     for _ in range(2):
         # With a guess of zero, one altitude would have all the weight of its window.
-        guess = np.maximum(variance, _LEAST_GUESS * variance.max())
-        _run(beams, keep, guess, table)
+        guess = np.maximum(variance, THRESHOLDS.least_guess * variance.max())
+        table = _table(beams, keep, guess, nothing, nothing)
         variance, freedom = _dersimonian_laird(table, guess, moments[0])
     return replace(_fit_known(beams, keep, variance, moments[1]), freedom=freedom)
 
 
 def _fit_known(beams: BeamBlock, keep: Array, variance: Array, of_information: float) -> Regression:
-    table = np.empty((beams.noise.shape[0], kh.COLUMNS, beams.noise.shape[2]))
     residual, leverage = np.empty(beams.noise.shape), np.empty(beams.noise.shape)
-    y, x, d = beams.logarithm, beams.path, beams.distance
-    noise = beams.noise
-    if beams.sides:
-        kh.fit_levels(y, noise, keep, variance, x, d, beams.sides, table, residual, leverage)
-    else:
-        kh.fit_details(y, noise, keep, variance, x, d, table, residual, leverage)
+    table = _table(beams, keep, variance, residual, leverage)
     table[:, kh.INFORMATION] *= of_information
     freedom = np.zeros_like(variance)
     return Regression(table, variance, freedom, keep, keep.shape[1] > 0, residual, leverage)
 
 
-def _run(beams: BeamBlock, keep: Array, variance: Array, table: Array) -> None:
+def _table(
+    beams: BeamBlock, keep: Array, variance: Array, residual: Array, leverage: Array
+) -> Array:
+    """Return the fit of every altitude; residuals and leverages are filled if they have rows."""
+    table = np.empty((beams.noise.shape[0], kh.COLUMNS, beams.noise.shape[2]))
     y, noise, x, d = beams.logarithm, beams.noise, beams.path, beams.distance
-    if beams.sides:
-        nothing = np.empty((0, *noise.shape[1:]))
-        kh.fit_levels(y, noise, keep, variance, x, d, beams.sides, table, nothing, nothing)
-    else:
-        kh.fit_kano_hamilton(y, noise, keep, variance, x, table)
+    kh.fit_levels(y, noise, keep, variance, x, d, beams.sides, table, residual, leverage)
+    return table
 
 
 def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Array, Array]:
@@ -327,7 +306,7 @@ def pooled_freedom(fit: Regression) -> Array:
 
 def student_factor(freedom: Array) -> Array:
     """Return the factor by which few degrees of freedom widen a standard error."""
-    nu = np.maximum(freedom, _FEWEST_FREEDOM)
+    nu = np.maximum(freedom, THRESHOLDS.fewest_freedom)
     return np.where(freedom > 0, np.sqrt(nu / (nu - 2.0)), 1.0)
 
 
@@ -345,7 +324,9 @@ def _has_outliers(beams: BeamBlock, fit: Regression) -> bool:
 
 def outlier_limit(count: int) -> float:
     """Return the limit, in standard errors, that chance exceeds in 1 percent of blocks."""
-    return max(OUTLYING, -float(ndtri(0.5 * FALSE_ALARM / max(count, 1))))
+    return max(
+        THRESHOLDS.outlying_residual, -float(ndtri(0.5 * THRESHOLDS.false_alarm / max(count, 1)))
+    )
 
 
 def _fit_robustly(beams: BeamBlock, inhomogeneity: float | None) -> Regression:

@@ -42,236 +42,12 @@ EXPECTED: Final = 12
 """Expectation of chi2: the degrees of freedom, fewer where weights are reduced."""
 COLUMNS: Final = 13
 
-TILE: Final = 256
-"""Altitudes processed together."""
 _SAME_PATH: Final = 1e-20
 """Variance of slant paths up to which they count as equal."""
 _OPPOSITE: Final = 1e-6
 """radian, rounding by which the gap between opposite azimuths may exceed half a turn."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_compiled
-def _fill_weights(
-    noise: Array, keep: Array, inhomogeneity: Array, first: int, last: int, weights: Array
-) -> None:
-    """Fill weights (angle, TILE) of the altitudes from `first` to before `last`."""
-    angles, width = noise.shape[0], last - first
-    added = inhomogeneity[first:last]
-    for a in range(angles):
-        row, variance = weights[a, :width], noise[a, first:last]
-        for j in range(width):
-            row[j] = 1.0 / (variance[j] + added[j])
-        if keep.shape[0] > 0:
-            kept = keep[a, first:last]
-            for j in range(width):
-                row[j] *= kept[j]
-
-
-@_compiled
-def _average_tile(y: Array, weights: Array, x: Array, first: int, last: int, sums: Array) -> None:
-    """Fill the sums of weights, and the weighted means of path and logarithm."""
-    width = last - first
-    sw, mx, my = sums[0, :width], sums[1, :width], sums[2, :width]
-    for j in range(width):
-        sw[j] = mx[j] = my[j] = 0.0
-    for a in range(x.shape[0]):
-        w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
-        for j in range(width):
-            sw[j] += w[j]
-            mx[j] += w[j] * xs[j]
-            my[j] += w[j] * ys[j]
-    for j in range(width):
-        inverse = 1.0 / sw[j] if sw[j] > 0.0 else 0.0
-        mx[j] *= inverse
-        my[j] *= inverse
-
-
-@_compiled
-def _fit_tile(
-    y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
-) -> None:
-    """Fit the altitudes from `first` to before `last` with sums centred on the weighted means.
-
-    Parameters
-    ----------
-    y, x : (angle, altitude) float
-    weights : (angle, TILE) float
-    first, last : int
-    sums : (8, TILE) float
-        Output: sums of weights, means of path and logarithm, the inverse of the weighted squares
-        of the path, the slope and the share of inhomogeneity.
-    out : (COLUMNS, altitude) float
-    """
-    width = last - first
-    _average_tile(y, weights, x, first, last, sums)
-    sw, mx, my, sxx = sums[0, :width], sums[1, :width], sums[2, :width], sums[3, :width]
-    sxy, sww = sums[4, :width], sums[5, :width]
-    for j in range(width):
-        sxx[j] = sxy[j] = sww[j] = 0.0
-    for a in range(x.shape[0]):
-        w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
-        for j in range(width):
-            wx = w[j] * (xs[j] - mx[j])
-            sxx[j] += wx * (xs[j] - mx[j])
-            sxy[j] += wx * (ys[j] - my[j])
-            sww[j] += wx * wx
-    columns = out[:, first:last]
-    for j in range(width):
-        fits = sxx[j] > _SAME_PATH * sw[j]
-        inverse = 1.0 / sxx[j] if fits else 0.0
-        tau = -0.5 * sxy[j] * inverse
-        columns[TAU, j] = tau if fits else np.nan
-        columns[INFORMATION, j] = 4.0 * sxx[j] if fits else 0.0
-        columns[INTERCEPT, j] = my[j] + 2.0 * tau * mx[j] if fits else np.nan
-        columns[INTERCEPT_VARIANCE, j] = 1.0 / sw[j] + mx[j] * mx[j] * inverse if fits else np.nan
-        columns[SHARE, j] = sww[j] * inverse
-        sxx[j] = inverse
-        sxy[j] = -2.0 * tau
-
-
-@_compiled
-def _chi2_tile(
-    y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
-) -> None:
-    """Fill CHI2, FREEDOM, EXPECTED and TRACE from the sums of `_fit_tile`.
-
-    Parameters
-    ----------
-    y, x, weights, first, last, sums, out
-        As in `_fit_tile`.
-    """
-    width = last - first
-    sw, mx, my, inverse = sums[0, :width], sums[1, :width], sums[2, :width], sums[3, :width]
-    slope, chi2, trace, beams = sums[4, :width], sums[5, :width], sums[6, :width], sums[7, :width]
-    for j in range(width):
-        chi2[j] = trace[j] = beams[j] = 0.0
-        sw[j] = 1.0 / sw[j] if sw[j] > 0.0 else 0.0
-    for a in range(x.shape[0]):
-        w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
-        for j in range(width):
-            dx = xs[j] - mx[j]
-            residual = ys[j] - my[j] - slope[j] * dx
-            chi2[j] += w[j] * residual * residual
-            trace[j] += w[j] * (1.0 - w[j] * (sw[j] + dx * dx * inverse[j]))
-            beams[j] += 1.0 if w[j] > 0.0 else 0.0
-    columns = out[:, first:last]
-    for j in range(width):
-        on = inverse[j] > 0.0 and beams[j] > 2.0
-        columns[CHI2, j] = chi2[j] if on else 0.0
-        columns[FREEDOM, j] = beams[j] - 2.0 if on else 0.0
-        columns[EXPECTED, j] = beams[j] - 2.0 if on else 0.0
-        columns[TRACE, j] = trace[j] if on else 0.0
-
-
-@_compiled
-def _expect_tile(
-    keep: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
-) -> None:
-    """Fill the expectation of chi2 with reduced weights, from the sums of `_chi2_tile`."""
-    expected = out[EXPECTED, first:last]
-    for j in range(last - first):
-        if expected[j] > 0.0:
-            expected[j] = 0.0
-            for a in range(x.shape[0]):
-                dx = x[a, first + j] - sums[1, j]
-                hat = weights[a, j] * (sums[0, j] + dx * dx * sums[3, j])
-                on = weights[a, j] > 0.0
-                expected[j] += keep[a, first + j] * (1.0 - hat) if on else 0.0
-
-
-@_compiled
-def fit_kano_hamilton(
-    y: Array, noise: Array, keep: Array, inhomogeneity: Array, x: Array, out: Array
-) -> None:
-    """Fit optical depth and intercept at every altitude of every profile.
-
-    Parameters
-    ----------
-    y, noise : (profile, angle, altitude) float
-        Logarithms and their variances; 0 and inf where there is no sample.
-    keep : (profile, angle or 0, altitude) float
-        Factors of the weights.
-    inhomogeneity : (altitude,) float
-        Variance of the logarithms on top of the noise.
-    x : (angle, altitude) float
-        Slant path, finite.
-    out : (profile, COLUMNS, altitude) float
-        Output: all columns except those of `_geometry_tile`.
-    """
-    count, angles, altitudes = y.shape
-    weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
-    for t in range(count):
-        for first in range(0, altitudes, TILE):
-            last = min(first + TILE, altitudes)
-            _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
-            _fit_tile(y[t], weights, x, first, last, sums, out[t])
-            _chi2_tile(y[t], weights, x, first, last, sums, out[t])
-            if keep.shape[1] > 0:
-                _expect_tile(keep[t], weights, x, first, last, sums, out[t])
-
-
-@_compiled
-def fit_details(
-    y: Array,
-    noise: Array,
-    keep: Array,
-    inhomogeneity: Array,
-    x: Array,
-    d: Array,
-    out: Array,
-    residuals: Array,
-    leverages: Array,
-) -> None:
-    """Fit as `fit_kano_hamilton`, with all outputs of `fit_levels` but no gradient.
-
-    Parameters
-    ----------
-    y, noise, keep, inhomogeneity, x, out
-        As in `fit_kano_hamilton`.
-    d, residuals, leverages
-        As in `fit_levels`, for all profiles.
-    """
-    fit_kano_hamilton(y, noise, keep, inhomogeneity, x, out)
-    count, angles, altitudes = y.shape
-    weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
-    for t in range(count):
-        for first in range(0, altitudes, TILE):
-            last = min(first + TILE, altitudes)
-            _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
-            _fit_tile(y[t], weights, x, first, last, sums, out[t])
-            _geometry_tile(weights, x, d, first, last, sums, out[t])
-            for a in range(angles):
-                for k in range(first, last):
-                    j = k - first
-                    fits = sums[3, j] > 0.0
-                    on = noise[t, a, k] < np.inf
-                    dx = x[a, k] - sums[1, j]
-                    left = y[t, a, k] - sums[2, j] - sums[4, j] * dx
-                    hat = weights[a, j] * (1.0 / sums[0, j] + dx * dx * sums[3, j])
-                    residuals[t, a, k] = left if on and fits else np.nan
-                    leverages[t, a, k] = (hat if fits else 1.0) if on else np.nan
-
-
-@_compiled
-def _geometry_tile(
-    weights: Array, x: Array, d: Array, first: int, last: int, sums: Array, out: Array
-) -> None:
-    """Fill the span of slant paths and the effect of a gradient, which depend on geometry only."""
-    for k in range(first, last):
-        j = k - first
-        low, high, east, north = np.inf, -np.inf, 0.0, 0.0
-        for a in range(x.shape[0]):
-            if weights[a, j] > 0.0:
-                low, high = min(low, x[a, k]), max(high, x[a, k])
-                wx = weights[a, j] * (x[a, k] - sums[1, j])
-                east += wx * d[0, a, k]
-                north += wx * d[1, a, k]
-        out[SPAN, k] = high - low if high >= low else 0.0
-        out[SLOPE_EAST, k] = -0.5 * east * sums[3, j]
-        out[SLOPE_NORTH, k] = -0.5 * north * sums[3, j]
-        out[SIDES, k] = 0.0
 
 
 @_compiled
@@ -464,16 +240,24 @@ def fit_levels(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_kano_hamilton`, with gradients at altitudes whose beams surround the zenith.
+    """Fit every altitude of every profile, with gradients where the beams surround the zenith.
 
     Parameters
     ----------
-    y, noise, keep, inhomogeneity, x, out
-        As in `fit_kano_hamilton`.
+    y, noise : (profile, angle, altitude) float
+        Logarithms and their variances; 0 and inf where there is no sample.
+    keep : (profile, angle or 0, altitude) float
+        Factors of the weights.
+    inhomogeneity : (altitude,) float
+        Variance of the logarithms on top of the noise.
+    x : (angle, altitude) float
+        Slant path, finite.
     d : (2, angle, altitude) float
         Horizontal distance over altitude, eastward and northward.
     sides : bool
         Whether all beams of the scan together surround the zenith.
+    out : (profile, COLUMNS, altitude) float
+        Output.
     residuals, leverages : (profile or 0, angle, altitude) float
         Outputs: residuals of the logarithms (NaN where there is no sample) and the diagonal of the
         hat matrix; not filled if they have no profile.

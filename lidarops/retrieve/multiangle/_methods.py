@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.multiangle import _block, _mld_blocks, _neighbours, _path_variation
+from lidarops.retrieve.multiangle import _block, _mld_blocks, _path_variation
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
-from lidarops.retrieve.multiangle._result import Profiles
+from lidarops.retrieve.multiangle._result import MultiAngleResult, StepRecord
 from lidarops.retrieve.multiangle.mld import Regularisation
 from lidarops.retrieve.multiangle.slant_paths import Scan
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import smooth_profile
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-Step = tuple[str, bool, str]
-
-LEAST_SPAN: Final = 0.1
-"""Span of slant paths below which `low_leverage` is flagged (0 to 25 degrees)."""
-_HARMLESS: Final = 0.02
-"""Share of the declared gradient that raises no flag, however certain it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +36,6 @@ class BlockSettings:
     largest_gradient: float
     """m-1."""
     robust: bool
-    tolerance: float | None
     regularisation: Regularisation
     layers: tuple[tuple[int, int], ...]
     """Indices of the altitudes at bottom and top of layers, -1 for the lidar."""
@@ -49,8 +43,8 @@ class BlockSettings:
 
 def solve_block(
     signal: npt.NDArray[np.floating], variance: Array, prior: Array | None, settings: BlockSettings
-) -> tuple[Profiles, list[Step]]:
-    """Solve the profiles of one block.
+) -> MultiAngleResult:
+    """Return the solution of the profiles of one block, without quality bits.
 
     Parameters
     ----------
@@ -58,71 +52,69 @@ def solve_block(
     prior : (profile, altitude) float, optional
         Optical depth, for "mld_prior".
     settings : BlockSettings
-
-    Returns
-    -------
-    Profiles
-    list of (str, bool, str)
-        Steps, whether they ran, and the reason.
     """
     beams = _block.make_beam_block(signal, variance, settings.scan)
     steps = [_angles_step(settings.scan)]
     fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
     steps += [_robust_step(fit, settings), _gradient_step(beams)]
-    method, reason = _choose_method(beams, fit, settings)
-    steps.append((method, True, reason))
+    method, reason = _choose_method(beams, settings)
+    steps.append(StepRecord(method, ran=True, reason=reason))
     profiles = _METHODS[method](beams, fit, prior, settings)
-    alike = _neighbours.neighbours_alike(beams, fit)
-    lowest = 0 if alike else _path_variation.path_variation_from(beams, fit)
+    lowest = _path_variation.path_variation_from(beams, fit)
     if lowest is not None:
-        profiles.flags["poor_stratification"][:, lowest:] = True
-        _withhold_extinction(profiles, profiles.flags["poor_stratification"])
+        profiles.flags.poor_stratification[:, lowest:] = True
+        _withhold_extinction(profiles, profiles.flags.poor_stratification)
     _raise_common_flags(profiles, beams, fit)
     if method in _BLIND:
         # These methods fit no gradient, even if beams point to all sides.
-        profiles.flags["one_sided"] |= np.isfinite(profiles.optical_depth)
-    return profiles, steps
+        profiles.flags.one_sided[:] |= np.isfinite(profiles.optical_depth)
+    return replace(profiles, steps=tuple(steps))
 
 
-def _angles_step(scan: Scan) -> Step:
+def _angles_step(scan: Scan) -> StepRecord:
     left_out = int(np.count_nonzero(~scan.usable))
     if left_out:
-        return ("drop_longest_paths", True, f"{left_out} beams are longer than 10 vertical paths")
-    return ("drop_longest_paths", False, "no beam is longer than 10 vertical paths")
+        return StepRecord(
+            "drop_longest_paths",
+            ran=True,
+            reason=f"{left_out} beams are longer than 10 vertical paths",
+        )
+    return StepRecord(
+        "drop_longest_paths", ran=False, reason="no beam is longer than 10 vertical paths"
+    )
 
 
-def _robust_step(fit: Regression, settings: BlockSettings) -> Step:
+def _robust_step(fit: Regression, settings: BlockSettings) -> StepRecord:
     if not settings.robust:
-        return ("robust_passes", False, "not requested")
+        return StepRecord("robust_passes", ran=False, reason="not requested")
     if fit.robust:
-        return ("robust_passes", True, "a residual is too large for chance")
-    return ("robust_passes", False, "no residual is too large for chance, or fewer than 4 beams")
+        return StepRecord("robust_passes", ran=True, reason="a residual is too large for chance")
+    return StepRecord(
+        "robust_passes",
+        ran=False,
+        reason="no residual is too large for chance, or fewer than 4 beams",
+    )
 
 
-def _gradient_step(beams: BeamBlock) -> Step:
+def _gradient_step(beams: BeamBlock) -> StepRecord:
     if beams.sides:
-        return ("horizontal_gradient", True, "beams point to all sides")
-    return ("horizontal_gradient", False, "a half turn around the zenith has no beam")
+        return StepRecord("horizontal_gradient", ran=True, reason="beams point to all sides")
+    return StepRecord(
+        "horizontal_gradient", ran=False, reason="a half turn around the zenith has no beam"
+    )
 
 
-def _choose_method(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> tuple[str, str]:
+def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]:
     if settings.method != "auto":
         return settings.method, "requested"
     if np.max(np.count_nonzero(beams.noise < np.inf, axis=1), initial=0) <= 2:
         return "two_angle", "no altitude has more than two beams"
-    if settings.tolerance is not None:
-        information = fit.column(kh.INFORMATION)
-        known = information[information > 0]
-        error = np.sqrt(1.0 / np.median(known)) if known.size else np.inf
-        if error <= settings.tolerance:
-            return "kano_hamilton", "its standard error is within the tolerance"
-        return "joint", "the standard error of single altitudes exceeds the tolerance"
     return "joint", "extinction is requested"
 
 
 def _kano_hamilton(
     beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
-) -> Profiles:
+) -> MultiAngleResult:
     """Return the estimates of single altitudes."""
     profiles = _start(beams, fit, settings)
     within = np.isfinite(profiles.optical_depth)
@@ -146,7 +138,7 @@ def _kano_hamilton(
 
 def _two_angle(
     beams: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
-) -> Profiles:
+) -> MultiAngleResult:
     """Solve with the shortest and the longest path of each altitude.
 
     The inhomogeneity comes from all beams of the scan.
@@ -155,13 +147,13 @@ def _two_angle(
     profiles = _kano_hamilton(
         ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), prior, settings
     )
-    profiles.flags["gradient"][:] = False
+    profiles.flags.gradient[:] = False
     return profiles
 
 
 def _joint(
     beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
-) -> Profiles:
+) -> MultiAngleResult:
     """Combine the estimates of single altitudes into profiles with smooth extinction."""
     profiles = _start(beams, fit, settings)
     within = np.isfinite(profiles.optical_depth)
@@ -170,7 +162,7 @@ def _joint(
         fit.residual * _block.residual_scale(beams, fit)[:, np.newaxis],
         np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
         np.nan_to_num(fit.leverage, nan=1.0),
-        np.broadcast_to(fit.inhomogeneity, share.shape),
+        fit.inhomogeneity,
         np.where(within, share, 0.0),
         beams.gaps,
     )
@@ -178,9 +170,11 @@ def _joint(
         profiles.optical_depth,
         np.where(within, fit.column(kh.INFORMATION), 0.0),
         settings.height,
-        station_altitude=0.0,
         residuals=residuals,
     )
+    if smooth is None:
+        profiles.optical_depth[:] = np.nan
+        return profiles
     profiles.optical_depth[:] = smooth.optical_depth
     profiles.optical_depth_standard_error[:] = smooth.optical_depth_standard_error
     profiles.extinction[:] = smooth.extinction
@@ -188,44 +182,38 @@ def _joint(
     profiles.effective_degrees_of_freedom[:] = smooth.effective_degrees_of_freedom
     profiles.data_share[:] = smooth.data_share
     slopes = _gradient_slopes(fit, settings)
-    responses = [
-        smooth_profile.respond(smooth.system, np.where(within, slope, 0.0)) for slope in slopes
-    ]
+    responses = [smooth.respond(np.where(within, slope, 0.0)) for slope in slopes]
     _fill_gradient_errors(profiles, np.stack(responses), settings)
-    levels = np.append(settings.height, 0.0)
     for number, (bottom, top) in enumerate(settings.layers):
-        layer = smooth_profile.layer_optical_depth(
-            smooth, float(levels[bottom]), float(levels[top])
-        )
-        profiles.layer_optical_depth[:, number] = layer.optical_depth
-        profiles.layer_optical_depth_standard_error[:, number] = layer.optical_depth_standard_error
+        depth, error = smooth.layer(bottom, top)
+        profiles.layer_optical_depth[:, number] = depth
+        profiles.layer_optical_depth_standard_error[:, number] = error
     _take_vertical_flags(profiles, smooth)
-    correlation = float(np.nanmax(np.append(smooth.correlation, 0.0)))
-    _raise_gradient(profiles, beams, fit, settings, correlation)
+    _raise_gradient(profiles, beams, fit, settings, smooth.correlation)
     _withhold_extinction(profiles, _dominated(profiles))
     return profiles
 
 
-def _take_vertical_flags(profiles: Profiles, smooth: smooth_profile.VerticalResult) -> None:
-    profiles.flags["interpolated"] |= smooth.interpolated
-    profiles.flags["outlier"] |= smooth.downweighted
-    profiles.flags["prior_dominated"] |= smooth.prior_dominated
+def _take_vertical_flags(profiles: MultiAngleResult, smooth: smooth_profile.VerticalResult) -> None:
+    profiles.flags.interpolated[:] |= smooth.interpolated
+    profiles.flags.outlier[:] |= smooth.downweighted
+    profiles.flags.prior_dominated[:] |= smooth.prior_dominated
     for name, mask in (
         ("saturated", smooth.saturated),
         ("undersmoothed", smooth.undersmoothed),
         ("high_correlation", smooth.high_correlation),
     ):
-        profiles.flags[name] |= mask[:, np.newaxis]
+        getattr(profiles.flags, name)[mask] = True
 
 
-def _dominated(profiles: Profiles) -> Mask:
+def _dominated(profiles: MultiAngleResult) -> Mask:
     """Return where smoothness or a prior, not the data, determines the optical depth."""
     with np.errstate(invalid="ignore"):
-        below = profiles.data_share < smooth_profile.LEAST_SHARE
-        return np.asarray(below | (profiles.data_share > smooth_profile.LARGEST_SHARE))
+        below = profiles.data_share < THRESHOLDS.least_share
+        return np.asarray(below | (profiles.data_share > THRESHOLDS.largest_share))
 
 
-def _withhold_extinction(profiles: Profiles, where: Mask) -> None:
+def _withhold_extinction(profiles: MultiAngleResult, where: Mask) -> None:
     for values in (
         profiles.extinction,
         profiles.extinction_standard_error,
@@ -234,10 +222,10 @@ def _withhold_extinction(profiles: Profiles, where: Mask) -> None:
         values[where] = np.nan
 
 
-def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Profiles:
+def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Return profiles with the values common to all methods; optical depths within the reach."""
     count, angles, altitudes = beams.noise.shape
-    profiles = Profiles.missing(count, angles, altitudes, len(settings.layers))
+    profiles = MultiAngleResult.missing(count, angles, altitudes, len(settings.layers))
     tau = fit.column(kh.TAU)
     within = (beams.alive >= beams.needed) & np.isfinite(tau)
     profiles.optical_depth[:] = np.where(within, tau, np.nan)
@@ -254,36 +242,42 @@ def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Profil
     top = np.where(within, settings.height, -np.inf).max(axis=1, initial=-np.inf)
     profiles.reach[:] = np.where(np.isfinite(top), top + settings.station_altitude, np.nan)
     beyond = settings.height > np.where(np.isfinite(top), top, -np.inf)[:, np.newaxis]
-    profiles.flags["extrapolated"][:] = beyond
+    profiles.flags.extrapolated[:] = beyond
     empty = np.asarray(~within.any(axis=1))
-    profiles.flags["no_data"][:] = empty[:, np.newaxis]
+    profiles.flags.no_data[:] = empty[:, np.newaxis]
     return profiles
 
 
-def _raise_common_flags(profiles: Profiles, beams: BeamBlock, fit: Regression) -> None:
+def _raise_common_flags(profiles: MultiAngleResult, beams: BeamBlock, fit: Regression) -> None:
     """Raise the flags common to all methods, wherever there is a value."""
     valued = np.isfinite(profiles.optical_depth)
     estimated = fit.column(kh.INFORMATION) > 0
-    profiles.flags["low_leverage"] |= valued & estimated & (fit.column(kh.SPAN) < LEAST_SPAN)
-    profiles.flags["no_residual"] |= valued & (_block.pooled_freedom(fit) == 0)
+    profiles.flags.low_leverage[:] |= (
+        valued & estimated & (fit.column(kh.SPAN) < THRESHOLDS.least_span)
+    )
+    profiles.flags.no_residual[:] |= valued & (_block.pooled_freedom(fit) == 0)
     one_sided = np.hypot(fit.column(kh.SLOPE_EAST), fit.column(kh.SLOPE_NORTH)) > 1e-6
-    profiles.flags["one_sided"] |= (valued & one_sided) if beams.sides else valued
+    profiles.flags.one_sided[:] |= (valued & one_sided) if beams.sides else valued
     if fit.robust:
         low = (fit.keep < 0.5) & (beams.noise < np.inf)
-        profiles.flags["outlier"] |= low.any(axis=1)
+        profiles.flags.outlier[:] |= low.any(axis=1)
 
 
 def _raise_gradient(
-    profiles: Profiles,
+    profiles: MultiAngleResult,
     beams: BeamBlock,
     fit: Regression,
     settings: BlockSettings,
     correlation: float,
 ) -> None:
     gradient = _block.shows_gradient(
-        beams, fit, settings.height, correlation, _HARMLESS * settings.largest_gradient
+        beams,
+        fit,
+        settings.height,
+        correlation,
+        THRESHOLDS.harmless_gradient * settings.largest_gradient,
     )
-    profiles.flags["gradient"] |= gradient & np.isfinite(profiles.optical_depth)
+    profiles.flags.gradient[:] |= gradient & np.isfinite(profiles.optical_depth)
 
 
 def _lag_one(beams: BeamBlock, fit: Regression) -> float:
@@ -300,7 +294,9 @@ def _gradient_slopes(fit: Regression, settings: BlockSettings) -> Array:
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
 
-def _fill_gradient_errors(profiles: Profiles, slopes: Array, settings: BlockSettings) -> None:
+def _fill_gradient_errors(
+    profiles: MultiAngleResult, slopes: Array, settings: BlockSettings
+) -> None:
     """Fill the gradient errors from the signed errors of gradients to the east and north."""
     profiles.optical_depth_gradient_error[:] = np.hypot(*slopes)
     profiles.extinction_gradient_error[:] = np.hypot(
@@ -322,7 +318,7 @@ def _below(values: Array) -> Array:
     return np.concatenate([np.zeros((values.shape[0], 1)), values[:, :-1]], axis=1)
 
 
-def _subtract_bounds(profiles: Profiles, settings: BlockSettings) -> None:
+def _subtract_bounds(profiles: MultiAngleResult, settings: BlockSettings) -> None:
     """Fill optical depths of layers with the differences between their bounds."""
     lidar = np.zeros((profiles.optical_depth.shape[0], 1))
     tau = np.hstack([profiles.optical_depth, lidar])
@@ -334,25 +330,24 @@ def _subtract_bounds(profiles: Profiles, settings: BlockSettings) -> None:
         )
 
 
-def _mld(
-    beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
-) -> Profiles:
-    return _regularised(beams, fit, None, settings)
-
-
 def _mld_prior(
     beams: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
-) -> Profiles:
-    return _regularised(beams, fit, _mld_blocks.MldPrior(prior), settings)
+) -> MultiAngleResult:
+    return _mld(beams, fit, prior, settings, from_below=prior is None)
 
 
-def _regularised(
-    beams: BeamBlock, fit: Regression, prior: _mld_blocks.MldPrior | None, settings: BlockSettings
-) -> Profiles:
+def _mld(
+    beams: BeamBlock,
+    fit: Regression,
+    prior: Array | None,
+    settings: BlockSettings,
+    *,
+    from_below: bool = False,
+) -> MultiAngleResult:
     """Differentiate along the slant path, each altitude on its own."""
     profiles = _start(beams, fit, settings)
     estimates = _mld_blocks.solve_mld_blocks(
-        beams, fit.inhomogeneity, settings.regularisation, prior
+        beams, fit.inhomogeneity, settings.regularisation, prior, from_below=from_below
     )
     within = np.isfinite(profiles.optical_depth) & np.isfinite(estimates.optical_depth)
     profiles.optical_depth[:] = np.where(within, estimates.optical_depth, np.nan)
@@ -370,7 +365,7 @@ def _regularised(
         within.any(axis=1), np.where(within, estimates.freedom, 0.0).sum(axis=1), np.nan
     )
     dominated = _dominated(profiles)
-    profiles.flags["prior_dominated"] |= within & dominated
+    profiles.flags.prior_dominated[:] |= within & dominated
     _subtract_bounds(profiles, settings)
     _withhold_extinction(profiles, dominated)
     return profiles
@@ -379,7 +374,7 @@ def _regularised(
 _BLIND: Final = ("two_angle", "mld", "mld_prior")
 """Methods that cannot detect a horizontal gradient."""
 _METHODS: Final[
-    dict[str, Callable[[BeamBlock, Regression, Array | None, BlockSettings], Profiles]]
+    dict[str, Callable[[BeamBlock, Regression, Array | None, BlockSettings], MultiAngleResult]]
 ] = {
     "two_angle": _two_angle,
     "kano_hamilton": _kano_hamilton,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -12,14 +11,6 @@ from lidarops.retrieve.multiangle import mld
 from lidarops.retrieve.multiangle._block import BeamBlock
 
 Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class MldPrior:
-    """Prior that is subtracted first: given optical depths, or the result at the altitude below."""
-
-    optical_depth: Array | None
-    """(profile, altitude); None for the result at the altitude below."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +31,9 @@ def solve_mld_blocks(
     beams: BeamBlock,
     inhomogeneity: Array,
     regularisation: mld.Regularisation,
-    prior: MldPrior | None,
+    prior: Array | None,
+    *,
+    from_below: bool = False,
 ) -> MldEstimates:
     """Solve every altitude with the beams that have a sample there.
 
@@ -50,15 +43,14 @@ def solve_mld_blocks(
     inhomogeneity : (altitude,) float
         Variance of the logarithms on top of the noise.
     regularisation : Regularisation
-    prior : MldPrior, optional
+    prior : (profile, altitude) float, optional
+        Optical depths that are subtracted first.
+    from_below : bool
+        Whether the prior is the result at the altitude below.
     """
     profiles, _, altitudes = beams.noise.shape
     out = np.full((profiles, altitudes, _ESTIMATES), np.nan)
-    walk = prior is not None and prior.optical_depth is None
-    known = np.zeros((profiles, altitudes))
-    if prior is not None and prior.optical_depth is not None:
-        known = prior.optical_depth
-    # From below upwards, because the result at one altitude may be the prior of the next.
+    known = np.zeros((profiles, altitudes)) if prior is None else prior
     below = np.zeros((profiles, 2))
     operators: dict[bytes, mld.Operator] = {}
     for k in range(altitudes):
@@ -72,23 +64,19 @@ def solve_mld_blocks(
             if key not in operators:
                 operators[key] = mld.make_operator(path, regularisation)
             members = np.flatnonzero(which == number)
-            _solve_altitude(
-                beams.logarithm[:, :, k],
-                beams.noise[:, :, k],
-                members,
-                np.flatnonzero(pattern),
+            rows = np.ix_(members, np.flatnonzero(pattern))
+            out[members, k] = _solve_altitude(
+                beams.logarithm[:, :, k][rows],
+                beams.noise[:, :, k][rows] + inhomogeneity[k],
                 path,
-                np.ascontiguousarray(beams.distance[:, pattern, k]),
-                inhomogeneity[k],
-                operators[key].coordinates,
-                operators[key].penalty,
-                operators[key].gain,
-                regularisation.strengths,
-                regularisation.rule,
-                below if walk else np.stack([known[:, k], np.zeros(profiles)], axis=1),
-                out[:, k],
+                beams.distance[:, pattern, k],
+                operators[key],
+                regularisation,
+                (below if from_below else np.stack([known[:, k], np.zeros(profiles)], axis=1))[
+                    members
+                ],
             )
-        if walk:
+        if from_below:
             solved = np.isfinite(out[:, k, 0])
             below[solved] = out[solved, k, :2]
     return MldEstimates(
@@ -111,81 +99,51 @@ def _patterns(on: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDA
 
 _ESTIMATES = 6
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
 def _solve_altitude(
     y: Array,
-    noise: Array,
-    members: npt.NDArray[np.intp],
-    beams: npt.NDArray[np.intp],
+    variance: Array,
     path: Array,
     distance: Array,
-    inhomogeneity: float,
-    coordinates: Array,
-    penalty: Array,
-    gain: Array,
-    strengths: Array,
-    rule: int,
+    operator: mld.Operator,
+    regularisation: mld.Regularisation,
     prior: Array,
-    out: Array,
-) -> None:
-    """Solve the members of one altitude that share one set of beams.
+) -> Array:
+    """Return the estimates of profiles that share one set of beams at one altitude.
 
     Parameters
     ----------
-    y, noise : (profile, angle) float
-    members : (member,) int
-        Profiles.
-    beams : (beam,) int
-        Angles.
+    y, variance : (profile, beam) float
     path : (beam,) float
     distance : (2, beam) float
-    inhomogeneity : float
-    coordinates, penalty, gain
-        Of the operator.
-    strengths, rule
-        Of the regularisation.
+    operator : Operator
+    regularisation : Regularisation
     prior : (profile, 2) float
         Optical depth and its variance.
-    out : (profile, 6) float
-        Output: optical depth, variance, data share, degrees of freedom and slopes.
+
+    Returns
+    -------
+    (profile, 6) float
+        Optical depth, variance, data share, degrees of freedom and slopes.
     """
-    count = beams.size
-    left, variance, t = np.empty(count), np.empty(count), np.empty(count)
-    b = np.empty(penalty.size)
-    for p in members:
-        middle = spread = 0.0
-        for i in range(count):
-            left[i] = y[p, beams[i]] + 2.0 * path[i] * prior[p, 0]
-            variance[i] = noise[p, beams[i]] + inhomogeneity
-            middle += left[i] / count
-            spread += variance[i] / count
-        unit = np.sqrt(spread)
-        rest = 0.0
-        for i in range(count):
-            left[i] -= middle
-            rest += left[i] * left[i] / spread
-        for c in range(b.size):
-            b[c] = 0.0
-            for i in range(count):
-                b[c] += coordinates[c, i] * left[i] / unit
-            rest -= b[c] * b[c]
-        strength = mld.choose_strength(b, max(rest, 0.0), penalty, strengths, count, rule)
-        row = out[p]
-        row[:] = 0.0
-        t[:] = 0.0
-        for c in range(b.size):
-            kept = 1.0 / (1.0 + strength * penalty[c])
-            row[3] += kept
-            for i in range(count):
-                t[i] += gain[c] * kept * coordinates[c, i]
-        for i in range(count):
-            row[0] += t[i] * left[i]
-            row[1] += t[i] * t[i] * variance[i]
-            row[2] -= 2.0 * t[i] * path[i]
-            row[4] += t[i] * distance[0, i]
-            row[5] += t[i] * distance[1, i]
-        row[0] += prior[p, 0]
-        row[1] += (1.0 - row[2]) ** 2 * prior[p, 1]
+    left = y + 2.0 * path * prior[:, :1]
+    left -= left.mean(axis=1, keepdims=True)
+    scaled = left / np.sqrt(variance.mean(axis=1, keepdims=True))
+    b = np.einsum("ci,ti->tc", operator.coordinates, scaled)
+    rest = np.maximum((scaled**2).sum(axis=1) - (b**2).sum(axis=1), 0.0)
+    kept = 1.0 / (1.0 + regularisation.strengths[:, np.newaxis] * operator.penalty)
+    rss = rest[:, np.newaxis] + np.einsum("tc,sc->ts", b**2, (1.0 - kept) ** 2)
+    freedom = kept.sum(axis=1)
+    chosen = regularisation.choose(rss, freedom, path.size)
+    t = np.einsum("tc,ci->ti", operator.gain * kept[chosen], operator.coordinates)
+    share = -2.0 * np.einsum("ti,i->t", t, path)
+    return np.stack(
+        [
+            prior[:, 0] + (t * left).sum(axis=1),
+            (t**2 * variance).sum(axis=1) + (1.0 - share) ** 2 * prior[:, 1],
+            share,
+            freedom[chosen],
+            *np.einsum("ti,di->dt", t, distance),
+        ],
+        axis=1,
+    )

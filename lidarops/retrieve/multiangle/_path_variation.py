@@ -20,24 +20,16 @@ from scipy.special import polygamma
 
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-GROWTH: Final = 1.5**2
-"""Ratio of the variances in the upper and the lower third, up to which they count as equal."""
-CERTAINTY: Final = 2.5
-"""Standard errors by which the logarithm of that ratio must exceed zero. In simulated scenes
-without variation, 0.3 percent exceed both limits."""
-_FEWEST_ALTITUDES: Final = 6
-_FEWEST_PROFILES: Final = 4
-_CLIP: Final = 3.0
-"""Standard errors to which residuals are clipped, so that no outlier dominates."""
+_CLIP: Final = THRESHOLDS.clipped
 _DEPENDENT: Final = 1e-8
 """Squared length of a column outside those before it, over its own, up to which it depends on
 them."""
-_LEAST_WEIGHT: Final = 1e-3
-"""Robust weight up to which a sample is left out."""
+_LEAST_WEIGHT: Final = THRESHOLDS.least_weight
 _COLUMNS: Final = 4
 """Constant, slant path, distance to the east and to the north."""
 
@@ -73,7 +65,7 @@ def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
         Index of the altitude.
     """
     tested = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
-    if tested.size < _FEWEST_ALTITUDES:
+    if tested.size < THRESHOLDS.fewest_altitudes:
         return None
     third = tested.size // 3
     thirds = tested[:third], tested[-third:]
@@ -83,7 +75,7 @@ def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
     lower, upper = lower.select(known), upper.select(known)
     if not _grows(lower, upper):
         return None
-    if np.count_nonzero(known) < _FEWEST_PROFILES:
+    if np.count_nonzero(known) < THRESHOLDS.fewest_profiles:
         return 0
     return 0 if _grows(lower.deviations(), upper.deviations()) else int(thirds[0][-1]) + 1
 
@@ -118,7 +110,7 @@ def _grows(lower: _Means, upper: _Means) -> bool:
     # growth from there to 1 is that of detector noise.
     growth = squares[1] / freedom[1] / max(squares[0] / freedom[0], 1.0)
     spread = math.sqrt(sum(polygamma(1, 0.5 * count) for count in freedom))
-    return growth > GROWTH and math.log(growth) > CERTAINTY * spread
+    return growth > THRESHOLDS.growth and math.log(growth) > THRESHOLDS.growth_certainty * spread
 
 
 def _beam_means(

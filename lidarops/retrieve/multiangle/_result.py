@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,7 @@ class MultiAngleFlags:
     """The residuals show a horizontal gradient that the fit does not account for."""
     poor_stratification: Mask
     """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
-    explain, as when extinction varies along the horizontal; or neighbouring beams scatter alike,
-    as in patches of air wider than the distance of beams. Extinction is withheld."""
+    explain, as when extinction varies along the horizontal. Extinction is withheld."""
     prior_dominated: Mask
     """Smoothness or a prior, not the data, determines the value. Extinction is withheld where
     the data share is outside 0.9-1.1."""
@@ -62,9 +62,8 @@ class MultiAngleFlags:
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """One step of the retrieval of one block: whether it ran, and why or why not."""
+    """One step of the retrieval: whether it ran, and why or why not."""
 
-    block: int
     step: str
     ran: bool
     reason: str
@@ -112,46 +111,11 @@ class MultiAngleResult:
     quality: npt.NDArray[np.int32]
     """Bits of `lidarops.flags.Quality`."""
     steps: tuple[StepRecord, ...]
-    """Steps that ran or were left out, block by block."""
-
-
-def _empty_flags(shape: tuple[int, ...]) -> dict[str, Mask]:
-    """Return an array of False for every flag."""
-    return {field.name: np.zeros(shape, dtype=np.bool_) for field in fields(MultiAngleFlags)}
-
-
-@dataclass(slots=True)
-class Profiles:
-    """Results that blocks fill in; arrays are (profile, altitude) unless stated."""
-
-    optical_depth: Array
-    optical_depth_standard_error: Array
-    optical_depth_gradient_error: Array
-    extinction: Array
-    extinction_standard_error: Array
-    extinction_gradient_error: Array
-    log_intercept: Array
-    log_intercept_standard_error: Array
-    data_share: Array
-    inhomogeneity: Array
-    reduced_chi_square: Array
-    effective_degrees_of_freedom: Array
-    """(profile,)"""
-    reach: Array
-    """(profile,)"""
-    layer_optical_depth: Array
-    """(profile, layer)"""
-    layer_optical_depth_standard_error: Array
-    """(profile, layer)"""
-    layer_optical_depth_gradient_error: Array
-    """(profile, layer)"""
-    residual: Array
-    """(profile, angle, altitude)"""
-    flags: dict[str, Mask]
+    """Steps that ran or were left out."""
 
     @classmethod
-    def missing(cls, profiles: int, angles: int, altitudes: int, layers: int) -> Profiles:
-        """Return profiles that are NaN everywhere, without flags."""
+    def missing(cls, profiles: int, angles: int, altitudes: int, layers: int) -> MultiAngleResult:
+        """Return profiles that are NaN everywhere, without flags; methods fill the arrays."""
         shapes: dict[str, tuple[int, ...]] = {
             "effective_degrees_of_freedom": (profiles,),
             "reach": (profiles,),
@@ -160,37 +124,35 @@ class Profiles:
             "layer_optical_depth_gradient_error": (profiles, layers),
             "residual": (profiles, angles, altitudes),
         }
+        profile = (profiles, altitudes)
         values: dict[str, Any] = {
-            field.name: np.full(shapes.get(field.name, (profiles, altitudes)), np.nan)
-            for field in fields(cls)
-            if field.name != "flags"
+            name: np.full(shapes.get(name, profile), np.nan) for name in cls.value_names()
         }
-        return cls(**values, flags=_empty_flags((profiles, altitudes)))
+        flags = {field.name: np.zeros(profile, np.bool_) for field in fields(MultiAngleFlags)}
+        return cls(
+            **values,
+            flags=MultiAngleFlags(**flags),
+            quality=np.zeros(profile, dtype=np.int32),
+            steps=(),
+        )
 
-    def put(self, rows: npt.NDArray[np.intp], block: Profiles) -> None:
-        """Copy the profiles of one block into these rows."""
-        for field in fields(self):
-            if field.name != "flags":
-                getattr(self, field.name)[rows] = getattr(block, field.name)
-        for name, mask in block.flags.items():
-            self.flags[name][rows] = mask
+    @classmethod
+    def value_names(cls) -> Iterator[str]:
+        """Yield the names of the arrays of values."""
+        names = (field.name for field in fields(cls))
+        return (name for name in names if name not in ("flags", "quality", "steps"))
 
-    def result(
-        self,
-        leading: tuple[int, ...],
-        quality: npt.NDArray[np.int32],
-        steps: tuple[StepRecord, ...],
-    ) -> MultiAngleResult:
-        """Return the result with the leading axes of the signal."""
-        values = {
-            field.name: _restored(getattr(self, field.name), leading)
-            for field in fields(self)
-            if field.name != "flags"
+    def with_leading_axes(self, leading: tuple[int, ...]) -> MultiAngleResult:
+        """Return the result with the leading axes of the signal in place of that of profiles."""
+
+        def restored(values: Any) -> Any:
+            return values.reshape((*leading, *values.shape[1:]))
+
+        flags = {
+            field.name: restored(getattr(self.flags, field.name))
+            for field in fields(MultiAngleFlags)
         }
-        shape = (*leading, quality.shape[-1])
-        flags = MultiAngleFlags(**{k: mask.reshape(shape) for k, mask in self.flags.items()})
-        return MultiAngleResult(**values, flags=flags, quality=quality.reshape(shape), steps=steps)
-
-
-def _restored(values: Array, leading: tuple[int, ...]) -> Array:
-    return values.reshape((*leading, *values.shape[1:]))
+        values = {name: restored(getattr(self, name)) for name in self.value_names()}
+        return replace(
+            self, **values, flags=MultiAngleFlags(**flags), quality=restored(self.quality)
+        )

@@ -13,24 +13,17 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Ends = npt.NDArray[np.int32]
 
-LOWEST_SNR: Final = 3.0
-"""Mean signal over noise in a window around an altitude, below which a beam ends. In a wide window
-a sample has little influence on its own selection."""
-AROUND: Final = 15
-"""Altitudes in that window."""
-SWALLOWED_SNR: Final = 2.0
-"""The same in a window from the altitude upwards: the wide window would accept samples behind a
-thick cloud that attenuates the beam completely."""
-AHEAD: Final = 5
-"""Altitudes in that window."""
-LEAST_NOISE: Final = 1e-6
-"""Smallest noise over signal; no lidar has less, and a variance of zero would have an infinite
-weight."""
-_FARTHEST: Final = 3.0
-"""Standard deviations by which the expected signal may differ from the sample."""
+LOWEST_SNR: Final = THRESHOLDS.lowest_snr
+AROUND: Final = THRESHOLDS.around
+SWALLOWED_SNR: Final = THRESHOLDS.swallowed_snr
+AHEAD: Final = THRESHOLDS.ahead
+LEAST_NOISE: Final = THRESHOLDS.least_noise
+_FARTHEST: Final = THRESHOLDS.farthest_expected
 _HUGE: Final = 1e300
 """Values from here on count as missing."""
 _LARGEST_RATIO: Final = 1.0 / LOWEST_SNR**2

@@ -76,8 +76,7 @@ def retrieve_optical_depth(
     Parameters
     ----------
     beams : xr.Dataset
-        From `lidarops.retrieve.multiangle.labeled_altitudes.AltitudeCycles`. All cycles
-        are one block of `lidarops.retrieve.multiangle.optical_depth.retrieve_optical_depth`.
+        From `lidarops.retrieve.multiangle.labeled_altitudes.AltitudeCycles`.
     station_altitude : float
         m above mean sea level.
     method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
@@ -179,7 +178,7 @@ def _solve(*data: Array, method: str, **settings: Any) -> MultiAngleResult:
     )
     causes = [name for name in ("undersmoothed", "high_correlation") if getattr(flags, name).any()]
     reason = f"its standard errors would be too small ({' and '.join(causes)})"
-    joint = StepRecord(0, MultiAngleMethod.JOINT.value, ran=False, reason=reason)
+    joint = StepRecord(MultiAngleMethod.JOINT.value, ran=False, reason=reason)
     return replace(single, steps=(*single.steps, joint))
 
 

@@ -19,7 +19,7 @@ from lidarops.retrieve.air.molecular import (
 )
 from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
-from lidarops.retrieve.multiangle._common_altitude import to_altitude
+from lidarops.retrieve.multiangle._common_altitude import along_beam
 from lidarops.retrieve.signal import averaging
 
 Array = npt.NDArray[np.float64]
@@ -35,8 +35,6 @@ CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
 _BATCH: Final = 64
 """Profiles interpolated together, unless one cycle has more."""
-_AT_ONCE: Final = 32
-"""Profiles whose background is estimated together: their arrays fit into the processor cache."""
 _BESIDE: Final = 4
 """Bins beside an altitude that an interpolation may need."""
 
@@ -97,9 +95,8 @@ class AltitudeCycles:
         directions = scan_cycles.directions(zenith_angle, azimuth)
         numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
         levels = np.asarray(altitude_grid, dtype=np.float64)
-        self._order = order = _order(
-            directions, numbers, slant_paths.altitude_grid(levels, station_altitude)
-        )
+        height = slant_paths.altitude_grid(levels, station_altitude)
+        self._order = order = _order(directions, numbers, height)
         self._settings = _Settings(
             distance=distance,
             overlap=overlap,
@@ -107,9 +104,8 @@ class AltitudeCycles:
             shapes=None
             if molecules is None
             else _shapes(molecules, wavelength, order.zenith_angle, distance, station_altitude),
-            zenith_angle=order.zenith_angle,
             altitude=levels,
-            station_altitude=station_altitude,
+            slant_ranges=slant_paths.slant_path(order.zenith_angle, height) * height,
         )
         self._weights = np.asarray(shots, dtype=np.float64)
         self._bounds = np.asarray(time_bnds)
@@ -221,9 +217,9 @@ class _Settings:
     background_range: tuple[float, float]
     shapes: Array | None
     """(beam, range): signal of clean air."""
-    zenith_angle: Array
     altitude: Array
-    station_altitude: float
+    slant_ranges: Array
+    """(beam, altitude) m: the range at which a beam crosses an altitude."""
 
     @property
     def in_front(self) -> slice:
@@ -233,25 +229,10 @@ class _Settings:
     @property
     def interpolated(self) -> slice:
         """Bins needed to interpolate all beams up to the highest altitude."""
-        height = self.altitude[-1:] - self.station_altitude
-        farthest = float(np.max(slant_paths.slant_path(self.zenith_angle, height) * height))
+        farthest = float(np.max(self.slant_ranges[:, -1]))
         first = self.in_front.start
         bins = int(np.searchsorted(self.distance, farthest)) + _BESIDE
         return slice(first, max(bins, first + _BESIDE))
-
-
-@dataclass(frozen=True, slots=True)
-class _NetProfiles:
-    """Profiles after subtraction of the background."""
-
-    power: Array
-    """(profile, range), divided by the overlap; NaN where withheld."""
-    variance: Array
-    """(profile, range), with that of the background."""
-    left: Array
-    """(profile,): the signal that may have been subtracted with the background."""
-    uncertain: npt.NDArray[np.bool_]
-    """(profile,): the far range does not fit clean air, or `left` cannot be estimated."""
 
 
 def _order(directions: scan_cycles.Directions, numbers: Integers, height: Array) -> _Order:
@@ -306,27 +287,19 @@ def _batch_on_altitudes(
     The fourth array is, as (cycle, beam), the signal that may have been subtracted with the
     background.
     """
-    pieces = [
-        _net_bins(
-            power[profiles],
-            variance[profiles],
-            quality[profiles],
-            beam[first : first + _AT_ONCE],
-            settings,
-        )
-        for first in range(0, members.size, _AT_ONCE)
-        for profiles in [members[first : first + _AT_ONCE]]
-    ]
-    values, noise, bits, left = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
+    values, noise, bits, left = _net_bins(
+        power[members], variance[members], quality[members], beam, settings
+    )
     distance = settings.distance[settings.interpolated]
     unexplained = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
-    visit = cycle * settings.zenith_angle.size + beam
+    beams = len(settings.slant_ranges)
+    visit = cycle * beams + beam
     first = np.flatnonzero(np.diff(visit, prepend=-1))
     if first.size < visit.size:
         values, noise, bits, left = _visit_means(values, noise, bits, left, shots, first)
     values, noise = values * distance**2, noise * distance**4
-    shape = (int(cycle[-1]) + 1, settings.zenith_angle.size, settings.altitude.size)
+    shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
     signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     flags = np.zeros((shape[0], shape[2]), dtype=np.int32)
     left_by_beam = np.full(shape[:2], np.nan)
@@ -334,56 +307,42 @@ def _batch_on_altitudes(
     beam, cycle = beam[first], cycle[first]
     for number in np.unique(beam):
         rows = beam == number
-        angle = settings.zenith_angle[number : number + 1]
-        interpolated = to_altitude(
-            values[rows, np.newaxis],
-            distance,
-            angle,
-            settings.altitude,
-            variance=noise[rows, np.newaxis],
-            station_altitude=settings.station_altitude,
+        target = settings.slant_ranges[number]
+        signal[cycle[rows], number], spread[cycle[rows], number] = along_beam(
+            values[rows], noise[rows], distance, target
         )
-        signal[cycle[rows], number] = interpolated.signal[:, 0]
-        spread[cycle[rows], number] = interpolated.variance[:, 0]
-        flags[cycle[rows]] |= _bits_at_altitudes(bits[rows], distance, angle, settings)
+        flags[cycle[rows]] |= _bits_beside(bits[rows], distance, target)
     return signal, spread, flags, left_by_beam
 
 
 def _net_bins(
     power: _Block, variance: _Block, quality: _Block, beam: Integers, settings: _Settings
 ) -> tuple[Array, Array, Flags, Array]:
-    """Return signal, variance and bits of the bins to interpolate, and `_NetProfiles.left`."""
+    """Return signal without background, variance and bits of the bins to interpolate.
+
+    The fourth array is, as (profile,), the signal that may have been subtracted.
+    """
     bits = quality & np.int32(WITHHELD | CARE)
-    if settings.overlap is not None:
-        unknown = ~(np.isfinite(settings.overlap) & (settings.overlap > 0))
+    front, near, overlap = settings.in_front, settings.interpolated, settings.overlap
+    if overlap is not None:
+        unknown = ~(np.isfinite(overlap) & (overlap > 0))
         bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    net = _without_background(power, variance, bits, beam, settings)
-    bits |= np.where(net.uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))[
-        :, np.newaxis
-    ]
-    # Farther bins serve the background only.
-    near = settings.interpolated
-    return net.power[:, near], net.variance[:, near], bits[:, near], net.left
-
-
-def _without_background(
-    power: _Block, variance: _Block, bits: Flags, beam: Integers, settings: _Settings
-) -> _NetProfiles:
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
-    distance = settings.distance
-    front = settings.in_front
-    data, tail = (values[:, front], distance[front], variance[:, front]), settings.background_range
+    data = (values[:, front], settings.distance[front], variance[:, front])
+    tail = settings.background_range
     sky = (
         estimate.from_tail(*data, tail)
         if settings.shapes is None
         else estimate.from_known_shape(*data, settings.shapes[beam][:, front], tail)
     )
-    values = values - sky.background[:, np.newaxis]
-    noise = variance + sky.standard_error[:, np.newaxis] ** 2
-    if settings.overlap is not None:
+    uncertain = np.where(sky.unjudged, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
+    # Farther bins serve the background only.
+    values = values[:, near] - sky.background[:, np.newaxis]
+    noise = variance[:, near] + sky.standard_error[:, np.newaxis] ** 2
+    if overlap is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            values, noise = values / settings.overlap, noise / settings.overlap**2
-    return _NetProfiles(values, noise, sky.left.detected, sky.unjudged)
+            values, noise = values / overlap[near], noise / overlap[near] ** 2
+    return values, noise, bits[:, near] | uncertain[:, np.newaxis], sky.left.detected
 
 
 def _shapes(
@@ -430,12 +389,10 @@ def _visit_means(
     return means.values, means.variance, bits, total / count
 
 
-def _bits_at_altitudes(bits: Flags, distance: Array, angle: Array, settings: _Settings) -> Flags:
-    """Return the bits of the two bins beside each altitude."""
-    height = settings.altitude - settings.station_altitude
-    slant_range = slant_paths.slant_path(angle, height)[0] * height
-    below = np.searchsorted(distance, slant_range, side="right") - 1
+def _bits_beside(bits: Flags, distance: Array, target: Array) -> Flags:
+    """Return the bits of the two bins beside each target range."""
+    below = np.searchsorted(distance, target, side="right") - 1
     below = np.clip(below, 0, distance.size - 2)
     combined = bits[:, below] | bits[:, below + 1]
-    outside = (slant_range < distance[0]) | (slant_range > distance[-1])
+    outside = (target < distance[0]) | (target > distance[-1])
     return np.where(outside, np.int32(Quality.INPUT_MISSING), combined)

@@ -14,10 +14,9 @@ depth lies between that of the end beams and that of the regression on the slant
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from typing import Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -53,12 +52,6 @@ class Average(StrEnum):
     ANGLES = "angles"
     """Over the intervals between beams; worse, because the short intervals near the zenith weigh
     as much as the long ones."""
-
-
-class _Rule(IntEnum):
-    DISCREPANCY = 0
-    CP = 1
-    GCV = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +99,27 @@ class Regularisation:
         """Strengths to choose from, ascending."""
         return STRENGTHS if self.strength is None else np.array([self.strength])
 
-    @property
-    def rule(self) -> int:
-        """Number of the rule of choice; without effect if one strength is given."""
-        names = {StrengthChoice.CP: _Rule.CP, StrengthChoice.GCV: _Rule.GCV}
-        return int(names.get(StrengthChoice(self.choice), _Rule.DISCREPANCY))
+    def choose(self, rss: Array, freedom: Array, beams: int) -> npt.NDArray[np.intp]:
+        """Return the indices of the strengths that the rule chooses, (profile,).
+
+        Parameters
+        ----------
+        rss : (profile, strength) float
+            Sums of squared residuals over their variances.
+        freedom : (strength,) float
+            Degrees of freedom.
+        beams : int
+        """
+        if self.choice == StrengthChoice.CP:
+            return np.asarray(np.argmin(rss + 2.0 * freedom, axis=1))
+        left = beams - 1.0 - freedom
+        if self.choice == StrengthChoice.GCV:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                scores = np.where(left > 1e-9, rss / left**2, np.inf)
+            return np.asarray(np.argmin(scores, axis=1))
+        within = rss <= beams - 1.0
+        last = within.shape[1] - 1 - np.argmax(within[:, ::-1], axis=1)
+        return np.where(within.any(axis=1), last, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,47 +197,3 @@ def _roughness(width: Array, order: int) -> Array:
         return np.diag(np.sqrt(width))
     distance = 0.5 * (width[1:] + width[:-1])
     return np.diff(np.eye(width.size), axis=0) / np.sqrt(distance)[:, np.newaxis]
-
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_compiled
-def _score(rss: float, freedom: float, beams: int, rule: int) -> float:
-    """Return the score to minimise; the discrepancy rule takes the last strength with score 0."""
-    if rule == 1:
-        return rss + 2.0 * freedom
-    if rule == 2:
-        left = beams - 1.0 - freedom
-        return rss / (left * left) if left > 1e-9 else np.inf
-    return 0.0 if rss <= beams - 1.0 else 1.0
-
-
-@_compiled
-def choose_strength(
-    b: Array, rest: float, penalty: Array, strengths: Array, beams: int, rule: int
-) -> float:
-    """Return the strength that a rule chooses from a grid.
-
-    Parameters
-    ----------
-    b : (component,) float
-        Coordinates in units of their standard error.
-    rest : float
-        Sum of squares, in the same units, outside all components.
-    penalty : (component,) float
-    strengths : (strength,) float
-        Ascending; the first is taken if no score is better.
-    beams, rule : int
-    """
-    best, least = strengths[0], np.inf
-    for strength in strengths:
-        rss, freedom = rest, 0.0
-        for i in range(b.size):
-            kept = 1.0 / (1.0 + strength * penalty[i])
-            rss += (b[i] * (1.0 - kept)) ** 2
-            freedom += kept
-        score = _score(rss, freedom, beams, rule)
-        if score < least or (rule == 0 and score == least and score == 0.0):
-            best, least = strength, score
-    return float(best)

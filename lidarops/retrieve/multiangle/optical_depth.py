@@ -14,17 +14,11 @@ from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.multiangle import _methods, slant_paths
 from lidarops.retrieve.multiangle._methods import BlockSettings
-from lidarops.retrieve.multiangle._result import (
-    MultiAngleFlags,
-    MultiAngleResult,
-    Profiles,
-    StepRecord,
-)
+from lidarops.retrieve.multiangle._result import MultiAngleFlags, MultiAngleResult, StepRecord
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.mld import Regularisation
 
 Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 LARGEST_GRADIENT: Final = 5e-5
 """m-1, default horizontal gradient of ln backscatter covered by the gradient errors."""
@@ -45,8 +39,7 @@ class MultiAngleMethod(StrEnum):
     """Method of retrieving optical depths."""
 
     AUTO = "auto"
-    """`TWO_ANGLE` for two beams; `KANO_HAMILTON` if it meets the tolerance and no extinction is
-    requested; else `JOINT`."""
+    """`TWO_ANGLE` for two beams, else `JOINT`."""
     TWO_ANGLE = "two_angle"
     """Only the shortest and the longest path."""
     KANO_HAMILTON = "kano_hamilton"
@@ -67,12 +60,10 @@ def retrieve_optical_depth(
     variance: npt.ArrayLike,
     azimuth: npt.ArrayLike | None = None,
     method: str = "auto",
-    block: npt.ArrayLike | None = None,
     station_altitude: float = 0.0,
     inhomogeneity: float | None = None,
     largest_gradient: float = LARGEST_GRADIENT,
     robust: bool = True,
-    tolerance: float | None = None,
     regularisation: Regularisation | None = None,
     prior_optical_depth: npt.ArrayLike | None = None,
     layers: Sequence[tuple[float, float]] = (),
@@ -90,8 +81,9 @@ def retrieve_optical_depth(
     left out. A beam ends where the mean signal of the 15 altitudes around is less than 3 times its
     noise, or that of the next 5 less than twice.
 
-    :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles of
-    a block and 15 altitudes. If a residual of the block is too large for chance (beyond 4.5
+    All profiles are one block: inhomogeneity, correlation and smoothness are common to them.
+    :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles
+    and 15 altitudes. If a residual of the block is too large for chance (beyond 4.5
     standard errors, with a probability of 1 percent among all residuals), outliers get less
     weight, starting from repeated medians and the pair of beams with which most others agree. The
     number of passes is fixed.
@@ -118,9 +110,6 @@ def retrieve_optical_depth(
         degree; the same for all angles if not given.
     method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
         See `MultiAngleMethod`.
-    block : (...) int, optional
-        Label of the block of each profile. Inhomogeneity, correlation and smoothness are common
-        to a block and independent of other blocks. All profiles are one block if not given.
     station_altitude : float
         m, altitude of the lidar, where the optical depth is zero.
     inhomogeneity : float, optional
@@ -130,9 +119,6 @@ def retrieve_optical_depth(
         `extinction_gradient_error`.
     robust : bool
         Whether to test for outliers.
-    tolerance : float, optional
-        Sufficient standard error of optical depth for "auto" if no extinction is requested. A
-        block with a smaller median standard error is solved by "kano_hamilton".
     regularisation : Regularisation, optional
         For "mld" and "mld_prior".
     prior_optical_depth : (..., altitude) float, optional
@@ -156,11 +142,10 @@ def retrieve_optical_depth(
     kano1968, hamilton1969, dersimonian1986, siegel1982.
     """
     chosen = inputs.choice(method, MultiAngleMethod, "method")
-    _refuse_unused_options(chosen, tolerance, regularisation, prior_optical_depth)
+    _refuse_unused_options(chosen, regularisation, prior_optical_depth)
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
     rows, noise, leading = _cube(signal, variance, scan.path.shape)
-    labels = _labels(block, leading)
     settings = BlockSettings(
         chosen.value,
         height,
@@ -169,23 +154,14 @@ def retrieve_optical_depth(
         _positive(inhomogeneity, "inhomogeneity"),
         _positive(largest_gradient, "largest_gradient") or 0.0,
         robust,
-        _positive(tolerance, "tolerance"),
         regularisation or Regularisation(),
         _layers(layers, np.append(height, 0.0) + station_altitude),
     )
     prior = _prior(prior_optical_depth, leading, height.size)
-    angles, altitudes = scan.path.shape
-    profiles = Profiles.missing(rows.shape[0], angles, altitudes, len(settings.layers))
-    steps: list[StepRecord] = []
-    for label in np.unique(labels):
-        members = np.flatnonzero(labels == label)
-        solved, block_steps = _methods.solve_block(
-            rows[members], noise[members], None if prior is None else prior[members], settings
-        )
-        profiles.put(members, solved)
-        steps += [StepRecord(int(label), *step) for step in block_steps]
+    result = _methods.solve_block(rows, noise, prior, settings)
     observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
-    return profiles.result(leading, _quality(profiles, observed), tuple(steps))
+    result.quality[:] = _quality(result, observed)
+    return result.with_leading_axes(leading)
 
 
 def layer_bounds(
@@ -218,14 +194,10 @@ def layer_bounds(
 
 
 def _refuse_unused_options(
-    method: MultiAngleMethod,
-    tolerance: float | None,
-    regularisation: Any,
-    prior: npt.ArrayLike | None,
+    method: MultiAngleMethod, regularisation: Any, prior: npt.ArrayLike | None
 ) -> None:
     """Raise for options that the method would silently ignore."""
     allowed = {
-        "tolerance": (tolerance, (MultiAngleMethod.AUTO,)),
         "regularisation": (regularisation, (MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR)),
         "prior_optical_depth": (prior, (MultiAngleMethod.MLD_PRIOR,)),
     }
@@ -264,20 +236,6 @@ def _cube(
             field="variance",
         ) from None
     return array.reshape(count, *shape), noise.reshape(count, *shape), leading
-
-
-def _labels(block: npt.ArrayLike | None, leading: tuple[int, ...]) -> Integers:
-    count = int(np.prod(leading, dtype=np.int64))
-    if block is None:
-        return np.zeros(count, dtype=np.int64)
-    labels = np.asarray(block)
-    if labels.dtype.kind not in "iu" or labels.shape != leading:
-        raise RetrievalInputError(
-            f"has the shape {labels.shape} and the type {labels.dtype}",
-            field="block",
-            remedy=f"give one whole number per profile, in the shape {leading}",
-        )
-    return labels.reshape(count).astype(np.int64)
 
 
 def _layers(layers: Sequence[tuple[float, float]], levels: Array) -> tuple[tuple[int, int], ...]:
@@ -332,20 +290,20 @@ def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], altitudes: in
         ) from None
 
 
-def _quality(profiles: Profiles, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+def _quality(profiles: MultiAngleResult, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
     """Return the common quality bits; each missing optical depth has a rejecting bit.
 
     Parameters
     ----------
-    profiles : Profiles
+    profiles : MultiAngleResult
     observed : (profile, altitude) bool
         Whether any angle has a signal and its variance.
     """
     quality = np.zeros(profiles.optical_depth.shape, dtype=np.int32)
     quality[~observed.any(axis=1)] |= np.int32(Quality.INPUT_MISSING)
-    lost = profiles.flags["extrapolated"] & ~profiles.flags["no_data"]
+    lost = profiles.flags.extrapolated & ~profiles.flags.no_data
     quality[lost] |= np.int32(Quality.LOW_SIGNAL)
-    quality[profiles.flags["outlier"]] |= np.int32(Quality.OUTLIER)
+    quality[profiles.flags.outlier] |= np.int32(Quality.OUTLIER)
     unexplained = np.isnan(profiles.optical_depth) & (quality & REJECTING == 0)
     quality[unexplained & ~observed] |= np.int32(Quality.INPUT_MISSING)
     quality[unexplained & observed] |= np.int32(MultiAngleQuality.NO_LEVERAGE)

@@ -14,26 +14,20 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 
-START_WIDTH: Final = 5.0
-"""Standard errors from the start beyond which a sample has no weight."""
-PASS_WIDTH: Final = 7.0
-"""Standard errors from a weighted fit beyond which a sample has no weight."""
-FEWEST_BEAMS: Final = 4
-"""Number of beams at or above which one outlier can be identified."""
-_CLOSEST: Final = 1e-3
-"""Distance of two slant paths, over their span, below which they define no slope."""
-_KEPT: Final = 0.3
-"""Weight above which a beam counts as kept."""
-_FEWEST_KEPT: Final = 3
-"""Beams that must be kept; with fewer, all keep their full weight."""
+START_WIDTH: Final = THRESHOLDS.start_width
+PASS_WIDTH: Final = THRESHOLDS.pass_width
+FEWEST_BEAMS: Final = THRESHOLDS.fewest_beams
+_CLOSEST: Final = THRESHOLDS.closest_paths
+_KEPT: Final = THRESHOLDS.kept_weight
+_FEWEST_KEPT: Final = THRESHOLDS.fewest_kept
 _GAUSS: Final = 1.4826
 """Standard deviation over median absolute deviation of normal deviates."""
-_CLEAR: Final = 0.01
-"""Variance of a logarithm (signal 10 times its noise) up to which its noise is well known."""
-_MEDIAN_OF: Final = 100_000
-"""Residuals that suffice for the median of their sizes."""
+_CLEAR: Final = THRESHOLDS.clear_variance
+_MEDIAN_OF: Final = THRESHOLDS.median_of
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 

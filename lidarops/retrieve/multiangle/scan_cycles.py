@@ -14,24 +14,11 @@ from scipy.spatial import cKDTree
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.inputs import real_array
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-TOLERANCE: Final = 0.25
-"""degree, by which encoder readings of one direction may differ from each other."""
-WIDEST: Final = 3.0
-"""Largest spread of the profiles of one direction, in tolerances. A wider group is a slow sweep,
-and a smaller tolerance splits it."""
-LONGEST_PAUSE: Final = 3.0
-"""Median intervals between profiles beyond which a pause starts a new cycle: more than two
-profiles are lost."""
-_LOST_DWELL: Final = 1.5
-"""A pause must also be longer than this multiple of the longest dwell, which is one lost file."""
-_FINEST: Final = 0.01
-"""degree, smallest tolerance; encoders resolve no less."""
-_PLANES: Final = 1.0
-"""degree, by which neighbouring azimuths in one vertical plane may differ."""
 _UNKNOWN: Final = -1
 
 
@@ -79,7 +66,7 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     """
     zenith, heading = _angles(zenith_angle, azimuth)
     tilt = np.abs(zenith)
-    upright = np.minimum(tilt, 180.0 - tilt) < 0.5 * TOLERANCE
+    upright = np.minimum(tilt, 180.0 - tilt) < 0.5 * THRESHOLDS.same_direction
     bearing = np.where(zenith < 0, heading + 180.0, heading) % 360.0
     known = np.flatnonzero(np.isfinite(zenith) & (np.isfinite(heading) | upright))
     index = np.full(zenith.size, _UNKNOWN, dtype=np.int64)
@@ -88,7 +75,7 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     tilt, bearing = tilt[known], np.where(upright, 0.0, bearing)[known]
     label = _clusters(_unit_vectors(tilt, bearing))
     angle = np.bincount(label, weights=tilt) / np.bincount(label)
-    vertical = np.minimum(angle, 180.0 - angle) < 0.5 * TOLERANCE
+    vertical = np.minimum(angle, 180.0 - angle) < 0.5 * THRESHOLDS.same_direction
     towards = _mean_bearings(bearing, label)
     plane, side = _planes(towards, ~vertical)
     order = np.lexsort((towards, side * angle, plane))
@@ -152,20 +139,20 @@ def _unit_vectors(tilt: Array, bearing: Array) -> Array:
 
 def _clusters(vectors: Array) -> Integers:
     """Return the number of the direction of each profile, from 0."""
-    step = math.radians(_FINEST)
+    step = math.radians(THRESHOLDS.finest_direction)
     # Encoder readings repeat: there are far fewer places than profiles.
     cells = np.unique(np.rint(vectors / step).astype(np.int64), axis=0, return_inverse=True)[1]
     cells = cells.reshape(-1)
     sums = np.stack([np.bincount(cells, weights=axis) for axis in vectors.T], axis=-1)
     places = np.asarray(sums / np.bincount(cells)[:, np.newaxis], dtype=np.float64)
     label = np.zeros(len(places), dtype=np.int64)
-    tolerance, wide = TOLERANCE, np.ones(len(places), dtype=np.bool_)
+    tolerance, wide = THRESHOLDS.same_direction, np.ones(len(places), dtype=np.bool_)
     while wide.any():
         members = np.flatnonzero(wide)
         label[members] = label.max() + 1 + _linked(places[members], tolerance)
         tolerance *= 0.5
-        spread = _spreads(places, label) > WIDEST * TOLERANCE
-        wide = spread[label] & (tolerance >= _FINEST)
+        spread = _spreads(places, label) > THRESHOLDS.widest_direction * THRESHOLDS.same_direction
+        wide = spread[label] & (tolerance >= THRESHOLDS.finest_direction)
     return np.unique(label, return_inverse=True)[1].reshape(-1)[cells].astype(np.int64)
 
 
@@ -205,17 +192,19 @@ def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, In
     members = np.flatnonzero(tilted)
     if members.size == 0:
         return plane, side
-    start = -0.5 * _PLANES
+    start = -0.5 * THRESHOLDS.same_plane
     folded = np.sort((bearing[members] - start) % 180.0)
-    wide = np.diff(np.append(folded, folded[0] + 180.0)) > _PLANES
+    wide = np.diff(np.append(folded, folded[0] + 180.0)) > THRESHOLDS.same_plane
     if wide.any() and not wide[-1]:
         # Otherwise a plane at the origin of azimuth would be split into the first and the last.
-        start += folded[np.flatnonzero(wide)[-1] + 1] - 180.0 - 0.5 * _PLANES
+        start += folded[np.flatnonzero(wide)[-1] + 1] - 180.0 - 0.5 * THRESHOLDS.same_plane
     turned = (bearing[members] - start) % 360.0
     side[members] = np.where(turned < 180.0, 1, -1)
     along = turned % 180.0
     order = np.argsort(along, kind="stable")
-    plane[members[order]] = np.cumsum(np.diff(along[order], prepend=along[order][0]) > _PLANES)
+    plane[members[order]] = np.cumsum(
+        np.diff(along[order], prepend=along[order][0]) > THRESHOLDS.same_plane
+    )
     return plane, side
 
 
@@ -282,7 +271,8 @@ def _stretches(bounds: Array, index: Integers) -> Integers:
     lengths = bounds[:, 1] - bounds[:, 0]
     dwells = [float(np.median(lengths[index == number])) for number in np.unique(index)]
     longest = max(
-        LONGEST_PAUSE * float(np.median(np.diff(bounds[:, 0]))), _LOST_DWELL * max(dwells)
+        THRESHOLDS.longest_pause * float(np.median(np.diff(bounds[:, 0]))),
+        THRESHOLDS.lost_dwell * max(dwells),
     )
     pauses = bounds[1:, 0] - bounds[:-1, 1]
     return np.append(0, np.cumsum(pauses > longest)).astype(np.int64)
@@ -307,7 +297,7 @@ def _angles(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None) -> tuple
                 f"has angles beyond {limit:g} degree", field=name, remedy="give degree"
             )
     if not np.any(np.isfinite(heading)):
-        if np.any(zenith < -0.5 * TOLERANCE):
+        if np.any(zenith < -0.5 * THRESHOLDS.same_direction):
             raise RetrievalInputError(
                 "is negative, but no azimuth gives the direction",
                 field="zenith_angle",

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.inputs import real_array
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -17,10 +18,6 @@ Integers = npt.NDArray[np.int64]
 
 EARTH_RADIUS: Final = 6_371_000.0
 """m, mean."""
-SPHERICAL_BEYOND: Final = 75.0
-"""degree. Up to here the error of the secant is less than 0.3 percent of the optical depth."""
-LONGEST: Final = 10.0
-"""Slant over vertical path beyond which refraction and curvature make the model wrong."""
 _UPRIGHT: Final = 1e-9
 """Horizontal distance over altitude up to which a beam is vertical and has no azimuth."""
 _OPPOSITE: Final = 1e-6
@@ -117,7 +114,7 @@ def slant_path(angle: Array, altitude: Array) -> Array:
     # the digits.
     root = np.sqrt((EARTH_RADIUS * cosine) ** 2 + (2.0 * EARTH_RADIUS + altitude) * altitude)
     spherical = (2.0 * EARTH_RADIUS + altitude) / (root + EARTH_RADIUS * cosine)
-    steep = angle[:, np.newaxis] <= SPHERICAL_BEYOND
+    steep = angle[:, np.newaxis] <= THRESHOLDS.spherical_beyond
     return np.asarray(np.where(steep, secant, spherical), dtype=np.float64)
 
 
@@ -175,7 +172,9 @@ def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:
 
 def _scan(path: Array, angle: Array, heading: Array) -> Scan:
     with np.errstate(invalid="ignore"):
-        usable = np.all(np.isfinite(path) & (path <= LONGEST), axis=1) & np.isfinite(heading)
+        usable = np.all(
+            np.isfinite(path) & (path <= THRESHOLDS.longest_path), axis=1
+        ) & np.isfinite(heading)
     azimuth = np.radians(np.where(angle < 0, heading + 180.0, heading))
     path = np.where(usable[:, np.newaxis], path, np.nan)
     reach = path * np.sin(np.radians(np.abs(angle)))[:, np.newaxis]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -69,13 +68,12 @@ def test_the_fit_keeps_its_digits(background):
         )
         d, e = mp.fdot(w, p), mp.fsum(x * y * z for x, y, z in zip(w, phi, p, strict=True))
         det = a * c - b * b
-        exact = [(c * d - b * e) / det, (a * e - b * d) / det, c / det, a / det, -b / det]
+        exact = [(c * d - b * e) / det, (a * e - b * d) / det, c / det, a / det]
     grain = max(background, 1.0) * 1e-14
     assert abs(fit.background - float(exact[0])) < grain
     assert abs(fit.amplitude - float(exact[1])) < 10 * grain
     assert fit.background_standard_error**2 == pytest.approx(float(exact[2]), rel=1e-10)
     assert fit.amplitude_standard_error**2 == pytest.approx(float(exact[3]), rel=1e-10)
-    assert fit.covariance == pytest.approx(float(exact[4]), rel=1e-10)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.floats(-30, 30))
@@ -85,7 +83,7 @@ def test_without_noise_background_and_amplitude_are_exact(seed, background, ampl
     shape = air()
     power = background + amplitude * shape
     power[np.random.default_rng(seed).random(1000) < 0.3] = np.nan
-    fit = fit_known_shape(power, RANGE, shape * scale, start=4000.0)
+    fit = fit_known_shape(power, RANGE, shape * scale, variance=1.0, start=4000.0)
     assert fit.background == pytest.approx(background, abs=1e-11 * (1e3 + amplitude))
     assert fit.amplitude * scale == pytest.approx(amplitude, rel=1e-9, abs=1e-11 * 1e3)
 
@@ -94,25 +92,18 @@ def test_without_noise_background_and_amplitude_are_exact(seed, background, ampl
 
 
 @pytest.mark.parametrize("start", [None, 5000.0])
-@pytest.mark.parametrize("known", [True, False])
-def test_standard_errors_cover_the_scatter(start, known):
+def test_standard_errors_cover_the_scatter(start):
     rng = np.random.default_rng(2)
     shape = air()
-    noise = 0.3 if not known else 0.1 + 0.4 * np.exp(-RANGE / 4000.0)
+    noise = 0.1 + 0.4 * np.exp(-RANGE / 4000.0)
     power = 20.0 + 5.0 * shape + noise * rng.normal(size=(3000, 1000))
-    fit = fit_known_shape(power, RANGE, shape, variance=noise**2 if known else None, start=start)
+    fit = fit_known_shape(power, RANGE, shape, variance=noise**2, start=start)
     off = (fit.background - 20.0) / fit.background_standard_error
     scale = (fit.amplitude - 5.0) / fit.amplitude_standard_error
     assert off.std() == pytest.approx(1.0, abs=0.06)
     assert scale.std() == pytest.approx(1.0, abs=0.06)
     assert off.mean() == pytest.approx(0.0, abs=0.08)
-    if start is None:
-        return  # windows of different length have different correlations
-    correlation = np.corrcoef(fit.background, fit.amplitude)[0, 1]
-    both = fit.background_standard_error * fit.amplitude_standard_error
-    assert correlation == pytest.approx(np.mean(fit.covariance / both), abs=0.05)
-    if known:
-        assert np.mean(fit.chi2 / fit.degrees_of_freedom) == pytest.approx(1.0, abs=0.01)
+    assert np.mean(fit.chi2 / fit.degrees_of_freedom) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("background", [0.0, 0.05, 2.0])
@@ -142,42 +133,12 @@ def test_model_weights_reach_the_error_of_the_true_ones():
     power = rng.poisson(shots * truth, (1500, 1000)) / shots
     model = fit_known_shape(power, RANGE, shape, exposure=shots, start=3000.0)
     true = fit_known_shape(power, RANGE, shape, variance=truth / shots, start=3000.0)
-    flat = fit_known_shape(power, RANGE, shape, start=3000.0)
+    flat = fit_known_shape(power, RANGE, shape, variance=1.0, start=3000.0)
     assert model.background.std() == pytest.approx(true.background.std(), rel=0.01)
     assert flat.background.std() > 1.5 * true.background.std()
     np.testing.assert_allclose(
         model.background_standard_error, true.background_standard_error, rtol=0.02
     )
-
-
-def fit_few_bins(bins, profiles, variance):
-    """Return fits of a shape, 1 where it is largest, with noise of 1 over bins to 30 km."""
-    range_ = np.linspace(4500.0, 30000.0, bins)
-    shape = np.exp(-range_ / 8000.0) / range_**2
-    shape /= shape[0]
-    power = 5.0 + 50.0 * shape + np.random.default_rng(11).normal(size=(profiles, bins))
-    return fit_known_shape(power, range_, shape, variance=variance, start=0.0)
-
-
-@pytest.mark.parametrize("bins", [8, 12, 20])
-def test_errors_of_short_windows_hold_where_the_noise_is_estimated(bins):
-    known = fit_few_bins(bins, 100_000, 1.0)
-    fit = fit_few_bins(bins, 100_000, None)
-    freedom = bins - 2
-    student = stats.t.isf(stats.norm.sf(4.0), freedom) / 4.0
-    usual = student * np.sqrt(stats.chi2.median(freedom) / freedom)
-    for name, truth in (("background", 5.0), ("amplitude", 50.0)):
-        error = getattr(fit, f"{name}_standard_error")
-        assert np.mean(np.abs(getattr(fit, name) - truth) > 4.0 * error) < 2e-4
-        ratio = np.median(error / getattr(known, f"{name}_standard_error"))
-        assert ratio == pytest.approx(usual, rel=0.02)
-    both = fit.background_standard_error * fit.amplitude_standard_error
-    assert np.ptp(fit.covariance / both) < 1e-9
-
-
-@pytest.mark.parametrize("bins", [16, 40, 100])
-def test_estimated_noise_raises_no_more_false_alarms(bins):
-    assert fit_few_bins(bins, 60_000, None).poor_fit.sum() <= 16
 
 
 # Windows ------------------------------------------------------------------------------------
@@ -191,12 +152,10 @@ def test_false_alarms_are_as_rare_as_designed():
     assert fit.poor_fit.sum() <= 8
     assert (np.abs(fit.curvature) > 1.96).mean() == pytest.approx(0.05, abs=0.006)
     assert fit.waves.mean() == pytest.approx(14.0, abs=0.3)
-    unknown = fit_known_shape(power[:5000], RANGE, shape, start=5000.0)
-    assert unknown.poor_fit.sum() <= 4
 
 
-@pytest.mark.parametrize("variance", [0.05**2, None])
-def test_a_cloud_in_the_window_is_detected(variance):
+def test_a_cloud_in_the_window_is_detected():
+    variance = 0.05**2
     rng = np.random.default_rng(6)
     shape = air()
     cloud = 1.0 + 0.5 * np.exp(-(((RANGE - 8000.0) / 300.0) ** 2))
@@ -294,16 +253,14 @@ def test_missing_profiles_stay_missing():
     assert fit.quality[1] == Quality.INPUT_MISSING
     assert fit.quality[2] & Quality.TOO_FEW_BINS
     assert fit.degrees_of_freedom[2] == 1
-    none = fit_known_shape(np.full((2, 1000), np.nan), RANGE, shape)
+    none = fit_known_shape(np.full((2, 1000), np.nan), RANGE, shape, variance=1.0)
     assert np.isnan(none.background).all()
-    assert fit_known_shape(np.empty((0, 1000)), RANGE, shape).background.shape == (0,)
+    assert fit_known_shape(np.empty((0, 1000)), RANGE, shape, variance=1.0).background.shape == (0,)
 
 
 def test_a_constant_signal_is_flagged():
-    for options in ({}, {"variance": 1.0}):
-        assert (
-            fit_known_shape(np.full(1000, 7.0), RANGE, air(), **options).quality & Quality.NO_SIGNAL
-        )
+    constant = fit_known_shape(np.full(1000, 7.0), RANGE, air(), variance=1.0)
+    assert constant.quality & Quality.NO_SIGNAL
     dark = fit_known_shape(np.zeros(1000), RANGE, air(), exposure=100.0)
     assert dark.quality == 0
     assert dark.background == 0.0
@@ -321,7 +278,7 @@ def test_no_bit_depends_on_batch_order_or_layout():
     shape = air()
     power = (3.0 + shape + rng.normal(0.0, 0.1, (24, 1000))).astype(np.float32)
     power[rng.random(power.shape) < 0.05] = np.nan
-    for options in ({}, {"exposure": 50.0}, {"variance": 0.01}):
+    for options in ({"exposure": 50.0}, {"variance": 0.01}):
         whole = fit_known_shape(power.reshape(2, 3, 4, 1000), RANGE, shape, **options)
         alone = [fit_known_shape(row, RANGE, shape, **options).background for row in power]
         np.testing.assert_array_equal(whole.background.ravel(), alone)
@@ -338,6 +295,7 @@ def test_no_bit_depends_on_batch_order_or_layout():
         ({"shape": np.ones(7)}, "shape"),
         ({"variance": -1.0}, "variance"),
         ({"variance": 1.0, "exposure": 10.0}, "variance"),
+        ({"variance": None}, "variance"),
         ({"exposure": 0.0}, "exposure"),
         ({"start": 1e5}, "start"),
         ({"start": np.nan}, "start"),
@@ -346,7 +304,9 @@ def test_no_bit_depends_on_batch_order_or_layout():
     ],
 )
 def test_invalid_arguments_are_refused(change, field):
-    arguments = {"power": np.ones(1000), "range": RANGE, "shape": air()} | change
+    arguments = {"power": np.ones(1000), "range": RANGE, "shape": air(), "variance": 1.0} | change
+    if "exposure" in change and "variance" not in change:
+        del arguments["variance"]
     with pytest.raises(RetrievalInputError) as error:
         fit_known_shape(**arguments)
     assert error.value.field == field
@@ -397,7 +357,7 @@ def test_published_backgrounds_are_reproduced(data_root, wavelength):
         assert level > 1e5 or abs(off) <= 1.0
         assert not fit.poor_fit
         assert fit.quality == 0
-        flat = fit_known_shape(power, range_, shape)
+        flat = fit_known_shape(power, range_, shape, variance=1.0)
         assert level > 1e5 or abs(flat.background - truth.background) <= 1.0
         if level <= 1e4:
             tail = tail_mean(power, range_).background - truth.background

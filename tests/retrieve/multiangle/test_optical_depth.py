@@ -1,4 +1,4 @@
-"""The whole retrieval: error and coverage in scenes, extreme cases, blocks, and refusals."""
+"""The whole retrieval: error and coverage in scenes, extreme cases and refusals."""
 
 from __future__ import annotations
 
@@ -351,7 +351,6 @@ def test_no_profile_at_all(small):
     signal, variance, height, _ = small
     result = retrieve_optical_depth(signal[:0], ANGLES, height, variance=variance[:0])
     assert result.optical_depth.shape == (0, height.size)
-    assert result.steps == ()
 
 
 def test_constant_extinction_leaves_the_smoother_saturated():
@@ -396,26 +395,7 @@ def test_two_beams_have_no_residual(small):
     assert result.optical_depth == pytest.approx(expected, abs=2e-3)
 
 
-# Blocks and chunks --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_blocks_are_independent(small, method):
-    signal, variance, height, _ = small
-    labels = np.repeat([7, 2, 5], [5, 10, 1])
-    options = {"method": method, "layers": [(0.0, 600.0), (800.0, 1400.0)]}
-    whole = retrieve_optical_depth(
-        signal, ANGLES, height, variance=variance, block=labels, **options
-    )
-    for label in (2, 5, 7):
-        rows = np.flatnonzero(labels == label)
-        alone = retrieve_optical_depth(
-            signal[rows], ANGLES, height, variance=variance[rows], **options
-        )
-        for name in PROFILES:
-            values = getattr(whole, name)[rows]
-            assert np.array_equal(values, getattr(alone, name), equal_nan=True), name
-    assert [step.block for step in whole.steps[:: len(whole.steps) // 3]] == [2, 5, 7]
+# Axes and layout ----------------------------------------------------------------------------
 
 
 def test_leading_axes_and_layout_have_no_effect(small):
@@ -464,16 +444,6 @@ def test_any_input_gives_a_result(seed, method):
 # Skipped steps and refusals -----------------------------------------------------------------
 
 
-def test_auto_takes_single_altitudes_within_the_tolerance(small):
-    signal, variance, height, _ = small
-    for tolerance, expected in ((0.1, "kano_hamilton"), (1e-4, "joint")):
-        result = retrieve_optical_depth(
-            signal, ANGLES, height, variance=variance, tolerance=tolerance
-        )
-        assert result.steps[-1].step == expected
-        assert result.steps[-1].ran
-
-
 def test_known_inhomogeneity_is_not_estimated(small):
     signal, variance, height, _ = small
     result = retrieve_optical_depth(
@@ -493,11 +463,8 @@ def test_known_inhomogeneity_is_not_estimated(small):
         ({"variance": -1.0}, "variance"),
         ({"variance": np.ones(7)}, "variance"),
         ({"method": "best"}, "method"),
-        ({"block": [0, 1]}, "block"),
-        ({"block": np.zeros(16)}, "block"),
         ({"inhomogeneity": -0.1}, "inhomogeneity"),
         ({"largest_gradient": np.nan}, "largest_gradient"),
-        ({"tolerance": 0.1, "method": "joint"}, "tolerance"),
         ({"regularisation": Regularisation()}, "regularisation"),
         ({"prior_optical_depth": 0.1}, "prior_optical_depth"),
         ({"prior_optical_depth": np.ones(3), "method": "mld_prior"}, "prior_optical_depth"),

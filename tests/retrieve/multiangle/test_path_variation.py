@@ -16,8 +16,9 @@ from support.oracles.multiangle import (
 )
 
 from lidarops.retrieve.multiangle import _block
-from lidarops.retrieve.multiangle._path_variation import GROWTH, path_variation_from
+from lidarops.retrieve.multiangle._path_variation import path_variation_from
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 
 def varies(scan: Scan) -> bool:
@@ -50,7 +51,7 @@ def test_variation_is_detected_where_scatter_itself_grows_little():
     assert all(varies(scene.draw(24, seed, 5)) for seed in range(8))
     inhomogeneity = scene.draw(24, 0, 5).retrieve().inhomogeneity[0]
     lower, upper = inhomogeneity[:13].mean(), inhomogeneity[-13:].mean()
-    assert (upper / lower) ** 2 < GROWTH
+    assert (upper / lower) ** 2 < THRESHOLDS.growth
 
 
 def test_variation_is_detected_in_most_random_clouds():
@@ -96,7 +97,7 @@ def test_extinction_is_withheld_whatever_the_method():
 
 def test_robust_passes_run_by_chance_in_few_clean_blocks_and_wherever_outliers_are():
     """With a probability of 1 percent, however many residuals a block has."""
-    assert _block.outlier_limit(100) == _block.OUTLYING
+    assert _block.outlier_limit(100) == THRESHOLDS.outlying_residual
     counts = 10 ** np.arange(4, 9)
     limits = np.array([_block.outlier_limit(int(count)) for count in counts])
     np.testing.assert_allclose(counts * erfc(limits / np.sqrt(2.0)), 0.01, rtol=1e-6)

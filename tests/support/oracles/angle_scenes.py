@@ -152,8 +152,8 @@ def kano_hamilton(scene, logarithm, variance):
         share = between * ((w * centred) ** 2).sum(axis=1) / square[:, 0]
         tangent = np.tan(np.arccos(1.0 / x))
         slant = (w * centred * tangent).sum(axis=1) / square[:, 0]
-    squares = np.broadcast_to(between, share.shape)
-    moments = residual_moments(residual, w, leverage, squares, share)
+    gaps = np.zeros(len(share), dtype=np.bool_)
+    moments = residual_moments(residual, w, leverage, between, share, gaps)
     return Estimates(-0.5 * slope[:, 0], 4.0 * square[:, 0], moments, slant)
 
 

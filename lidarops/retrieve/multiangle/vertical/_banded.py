@@ -26,7 +26,7 @@ _LOGARITHM_EVERY: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def penalty(altitude: Array, station_altitude: float) -> Array:
+def penalty(altitude: Array) -> Array:
     r"""Return :math:`\int (d\alpha/dz)^2 dz` as the bands of a quadratic form in optical depth.
 
     Extinction is the optical depth gained between neighbouring altitudes over their distance;
@@ -35,16 +35,14 @@ def penalty(altitude: Array, station_altitude: float) -> Array:
     Parameters
     ----------
     altitude : (altitude,) float
-        m, ascending.
-    station_altitude : float
-        m, below all of them.
+        m above the lidar, ascending.
 
     Returns
     -------
     (3, altitude) float64
         m-3: diagonal, first and second off-diagonal.
     """
-    return _penalty(np.diff(altitude, prepend=station_altitude))
+    return _penalty(np.diff(altitude, prepend=0.0))
 
 
 @_compiled

@@ -9,21 +9,14 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import _banded
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
-PILOT: Final = 0.01
-"""Weight of smoothness of the pilot solution over that of the solution."""
-_MOST_ROWS: Final = 256
-"""Differences that are calibrated one by one; others are interpolated between them."""
-_LARGEST_DEVIATION: Final = 3.0
-"""Standard deviations to which the smoothing errors of the pilot solution are clipped."""
-_LEAST_SCALE: Final = 0.7
-"""Least scale of a profile, because a thin haze may still have a sharp layer. With 1, errors would
-be too large where profiles differ by noise alone, more so for thin hazes than for thick ones."""
+PILOT: Final = THRESHOLDS.pilot
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -222,7 +215,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     usual_square = (np.where(total > 0.0, mean, square) + noise)[at_top]
     known = np.isfinite(own_square) & np.isfinite(usual_square) & (usual_square > 0.0)
     relative = np.where(known, own_square, 1.0) / np.where(known, usual_square, 1.0)
-    scale: Array = np.maximum(relative, _LEAST_SCALE)
+    scale: Array = np.maximum(relative, THRESHOLDS.least_scale)
     return scale
 
 
@@ -254,7 +247,7 @@ def _smoothing_square(bias: Array, known: Array) -> Array:
     _, _, model, noise = known
     present = np.isfinite(bias)
     count = np.maximum(present.sum(axis=0), 1)
-    limit = _LARGEST_DEVIATION * np.sqrt(noise + model)
+    limit = THRESHOLDS.largest_deviation * np.sqrt(noise + model)
     clipped = np.clip(np.where(present, bias, 0.0), -limit, limit)
     mean = clipped.sum(axis=0) / count
     square = (clipped**2).sum(axis=0) / count
@@ -290,10 +283,7 @@ def variance_ratio(
     Returns
     -------
     (profile, difference) float64
-        Of more than 256 differences, some are calculated and the others interpolated.
     """
-    stride = -(-upper.size // _MOST_ROWS)
-    chosen = np.unique(np.append(np.arange(0, upper.size, stride), upper.size - 1))
     known = sandwich(
         calibration.bands,
         calibration.information,
@@ -301,18 +291,9 @@ def variance_ratio(
         calibration.correlation,
         calibration.stiffness,
         calibration.smoothing,
-        upper[chosen],
-        lower[chosen],
+        upper,
+        lower,
     )
-    if stride > 1:
-        known = _interpolated(known, chosen, upper.size)
     smoothing_error = calibration.scale[:, np.newaxis] * _smoothing_square(bias, known)
     factor: Array = (known[1] + smoothing_error) / known[0]
     return factor
-
-
-def _interpolated(known: Array, chosen: Integers, size: int) -> Array:
-    index = np.arange(size)
-    logarithms = np.log(np.maximum(known, np.finfo(np.float64).tiny))
-    rows: Array = np.exp(np.array([np.interp(index, chosen, row) for row in logarithms]))
-    return rows

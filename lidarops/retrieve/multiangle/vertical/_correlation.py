@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
 
 LAGS: Final = 3
 """Largest distance of residuals that are multiplied, in altitudes."""
-LARGEST: Final = 0.97
-"""Limit of the correlation."""
-_NONE_BELOW: Final = 0.05
-"""Ratio at the first lag below which the correlation is taken as zero."""
-_SIMPLE_BELOW: Final = 0.1
-"""Ratio at the first lag below which the decay cannot be estimated."""
-_AMPLITUDES: Final = (0.5, 1.05)
-"""Limits of the amplitude of the correlation."""
-_LINKED: Final = 0.5
-"""Correlated share, over the largest of the neighbours, at or above which an altitude is linked."""
+_LINKED: Final = THRESHOLDS.linked
 _CANDIDATES: Final = np.arange(99) / 100.0
 """Correlations to choose from."""
 
@@ -51,6 +45,10 @@ class ResidualMoments:
     """(profile,): whether samples are missing between others, so that neighbouring altitudes come
     from different beams."""
 
+    def of(self, profiles: Integers) -> ResidualMoments:
+        """Return the moments of some profiles."""
+        return ResidualMoments(*(getattr(self, field.name)[profiles] for field in fields(self)))
+
 
 @_compiled
 def lag_sums(
@@ -64,7 +62,7 @@ def lag_sums(
     Parameters
     ----------
     residual, weight, leverage : (profile, beam, altitude) float64
-    variance : (profile, altitude) float64
+    variance : (altitude,) float64
         Of the inhomogeneity.
 
     Returns
@@ -81,7 +79,7 @@ def lag_sums(
         for beam in range(beams):
             for k in range(altitudes):
                 w = weight[t, beam, k]
-                share = w * variance[t, k] * (1.0 - leverage[t, beam, k])
+                share = w * variance[k] * (1.0 - leverage[t, beam, k])
                 u = residual[t, beam, k] * np.sqrt(w)
                 used = w > 0.0 and np.isfinite(u) and share > 0.0
                 freedom[t, k] += 1.0 if w > 0.0 and np.isfinite(u) else 0.0
@@ -121,14 +119,18 @@ def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     if not np.all(norm > 0.0):
         return 0.0, 1.0
     ratio = products.sum(axis=0) / norm
-    if ratio[0] < _SIMPLE_BELOW:
-        return (float(ratio[0]) if ratio[0] >= _NONE_BELOW else 0.0), 1.0
+    if ratio[0] < THRESHOLDS.simple_below:
+        return (float(ratio[0]) if ratio[0] >= THRESHOLDS.none_below else 0.0), 1.0
     shape = _CANDIDATES[:, np.newaxis] ** np.arange(1, LAGS + 1)
     square = np.maximum((shape**2).sum(axis=1), np.finfo(np.float64).tiny)
-    amplitude = np.clip((shape * ratio).sum(axis=1) / square, *_AMPLITUDES)
+    amplitude = np.clip(
+        (shape * ratio).sum(axis=1) / square,
+        THRESHOLDS.least_amplitude,
+        THRESHOLDS.largest_amplitude,
+    )
     misfit = ((ratio - amplitude[:, np.newaxis] * shape) ** 2).sum(axis=1)
     best = int(np.argmin(misfit))
-    return min(float(_CANDIDATES[best]), LARGEST), float(amplitude[best])
+    return min(float(_CANDIDATES[best]), THRESHOLDS.largest_correlation), float(amplitude[best])
 
 
 @_compiled

@@ -8,24 +8,17 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 
-OUTLYING: Final = 4.5
-"""Standard errors from the solution beyond which an estimate starts the robust pass."""
-BISQUARE: Final = 6.0
-"""Standard errors at which the bisquare ends."""
-LEAST_WEIGHT: Final = 1e-3
-"""Share of its information that an estimate at the end of the bisquare keeps."""
-SMALLEST_WEIGHT: Final = 1e-9
-"""The least share; a smaller one would cost the solution its digits."""
-HALF: Final = 0.5
-"""Share of weight, and of estimates, that is regarded as a majority."""
+BISQUARE: Final = THRESHOLDS.bisquare
+LEAST_WEIGHT: Final = THRESHOLDS.least_kept
+SMALLEST_WEIGHT: Final = THRESHOLDS.smallest_kept
 USUAL_WEIGHT: Final = 1.0 - 2.0 / BISQUARE**2 + 3.0 / BISQUARE**4
 """Mean of the bisquare for normal deviates, by which weights are normalised."""
-_HALF_WINDOW: Final = 7
-"""Altitudes to either side of the window of the median."""
-_JUMP: Final = 5.0
-"""Standard errors between neighbouring estimates at or above which a profile is screened."""
+_HALF_WINDOW: Final = THRESHOLDS.half_window
+_JUMP: Final = THRESHOLDS.jump
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -103,7 +96,7 @@ def downweight_outliers(
     # correlated noise, not the rest.
     left = np.maximum(left, (1.0 - share) * total)
     deviation = np.where(used, np.abs(estimates - depth) / np.sqrt(left), 0.0)
-    if not np.any(deviation > OUTLYING):
+    if not np.any(deviation > THRESHOLDS.outlying_estimate):
         return None
     square = (deviation / BISQUARE) ** 2
     weight = (1.0 - np.minimum(square, 1.0)) ** 2 / USUAL_WEIGHT
@@ -114,7 +107,7 @@ def downweight_outliers(
 
 def reduce_information(information: Array, reduced: Array) -> Array:
     """Return the reduced information, but the whole one if most of a profile would lose weight."""
-    kept = (reduced > HALF * information).sum(axis=1)
-    most = kept >= HALF * (information > 0.0).sum(axis=1)
+    kept = (reduced > THRESHOLDS.majority * information).sum(axis=1)
+    most = kept >= THRESHOLDS.majority * (information > 0.0).sum(axis=1)
     result: Array = np.where(most[:, np.newaxis], reduced, information)
     return result

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import _banded
 
 Array = npt.NDArray[np.float64]
@@ -16,20 +17,9 @@ Integers = npt.NDArray[np.int64]
 PER_DECADE: Final = 6
 GRID: Final = 10.0 ** (np.arange(11 * PER_DECADE + 1) / PER_DECADE - 10.0)
 """Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
-LEAST_FREEDOM: Final = 2.0
-"""Degrees of freedom below which a weight is not allowed."""
-FEWEST_TO_CHOOSE: Final = 8
-"""Profiles in a block at or above which one weight is chosen; with fewer, solutions are
-averaged."""
 _SCORED_PROFILES: Final = 64
 _SCORED_VALUES: Final = 25_600
 """A block is scored on at most so many profiles, or profiles with so many values together."""
-_SWITCH: Final = 1.2
-"""Ratio of degrees of freedom at or above which Cp is preferred to the likelihood."""
-_STRANGE: Final = 3.0
-"""Cp of a profile, in medians, beyond which it is left out of the sum."""
-_NEGLIGIBLE: Final = 1e-6
-"""Relative likelihood below which a weight is left out of the average."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +34,6 @@ class SmoothingChoice:
     """Mean over the scored profiles and the candidates."""
     saturated: bool
     """Whether the best weight is the largest that is allowed."""
-
-    @property
-    def mean_smoothing(self) -> float:
-        """Geometric mean of the candidates."""
-        return float(np.exp((self.share * np.log(self.smoothing)).sum()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +57,9 @@ def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: floa
 
     .. math::
         J = \sum [t'\Omega(t - x) + \ln|\Omega + \lambda K|] - r \ln\lambda, \quad
-        C_p = \sum [(t - x)'\Omega(t - x) + 2 tr C\Omega],
+        C_p = \sum [(t - x)'\Omega(t - x) + 2 tr C\Omega].
 
-    where profiles unlike the others are left out of Cp: those with more than 3 times the median at
-    the weight with the least median. A long block is scored on every n-th profile.
+    A long block is scored on every n-th profile.
 
     Parameters
     ----------
@@ -102,10 +86,7 @@ def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: floa
     # Where a pivot lost all its digits, the weight is too large.
     likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)
     risk = misfit + 2.0 * freedom
-    typical = np.median(risk, axis=0)
-    best = int(np.argmin(typical))
-    typical_profiles = risk[:, best] <= _STRANGE * typical[best]
-    return Scores(likelihood, risk[typical_profiles].sum(axis=0), freedom.mean(axis=0), profiles)
+    return Scores(likelihood, risk.sum(axis=0), freedom.mean(axis=0), profiles)
 
 
 def choose_smoothing(scores: Scores) -> SmoothingChoice:
@@ -115,14 +96,16 @@ def choose_smoothing(scores: Scores) -> SmoothingChoice:
     clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
     gives 1.2 times the degrees of freedom, and lowers the weight by at most a factor of 10.
     """
-    admitted = np.flatnonzero((scores.freedom >= LEAST_FREEDOM) & np.isfinite(scores.likelihood))
+    admitted = np.flatnonzero(
+        (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
+    )
     last = int(admitted[-1]) if admitted.size else 0
     likely = int(np.argmin(scores.likelihood[: last + 1]))
-    if scores.profiles < FEWEST_TO_CHOOSE:
+    if scores.profiles < THRESHOLDS.fewest_to_choose:
         return _average(scores, last)
     risky = int(np.argmin(scores.risk[: last + 1]))
     risky = max(risky, likely - PER_DECADE)
-    rougher = scores.freedom[risky] > _SWITCH * scores.freedom[likely]
+    rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
     best = risky if rougher else likely
     return SmoothingChoice(
         GRID[best : best + 1], np.ones(1), float(scores.freedom[best]), best == last
@@ -132,7 +115,7 @@ def choose_smoothing(scores: Scores) -> SmoothingChoice:
 def _average(scores: Scores, last: int) -> SmoothingChoice:
     likelihood = scores.likelihood[: last + 1]
     share = np.exp(-0.5 * (likelihood - likelihood.min()))
-    kept = np.flatnonzero(share > _NEGLIGIBLE)
+    kept = np.flatnonzero(share > THRESHOLDS.negligible_likelihood)
     share = share[kept] / share[kept].sum()
     freedom = float((share * scores.freedom[kept]).sum())
     saturated = int(kept[np.argmax(share)]) == last

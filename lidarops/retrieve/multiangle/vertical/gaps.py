@@ -8,17 +8,16 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 
-_HALF_WINDOW: Final = 7
-"""Altitudes to either side over which the noise of single altitudes is averaged."""
-_LINKED: Final = 0.5
-"""Correlated share, over the largest of the neighbours, at or above which an altitude is linked."""
+_HALF_WINDOW: Final = THRESHOLDS.half_window
+_LINKED: Final = THRESHOLDS.linked
 _FARTHEST: Final = 2
 """Largest distance of linked altitudes."""
-_LEAST_SHARE: Final = 1e-6
-"""Correlated share up to which noise counts as uncorrelated."""
+_LEAST_SHARE: Final = THRESHOLDS.least_correlated
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 

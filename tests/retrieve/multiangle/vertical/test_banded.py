@@ -25,7 +25,7 @@ def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
         information, rng.uniform(0.3, 1.0, (profiles, heights)), correlation
     )
     altitude = STATION + 120.0 + 30.0 * np.arange(heights)
-    stiffness = _banded.penalty(altitude, STATION)
+    stiffness = _banded.penalty(altitude - STATION)
     return bands, estimates, stiffness, 10.0 ** rng.uniform(3.0, 8.0, profiles)
 
 
@@ -82,7 +82,7 @@ def test_solution_keeps_8_digits_of_60(smoothing, correlation):
     truth = 1e-4 * altitude
     estimates = (truth + rng.normal(size=heights) / np.sqrt(information[0]))[np.newaxis]
     bands = correlated_precision(information, np.full((1, heights), 0.9), correlation)
-    stiffness = _banded.penalty(altitude, 0.0)
+    stiffness = _banded.penalty(altitude)
     lam = np.array([smoothing * information.mean() * altitude[-1] ** 3])
     right = _banded.multiply_rows(bands, estimates)
     out = np.empty((4, 1, heights))
@@ -134,7 +134,7 @@ def test_penalty_is_the_integral_of_the_squared_slope_of_extinction():
     extinction = np.diff(np.concatenate([[0.0], depth])) / np.diff(levels)
     middle = 0.5 * (levels[1:] + levels[:-1])
     expected = (np.diff(extinction) ** 2 / np.diff(middle)).sum()
-    stiffness = dense(_banded.penalty(altitude, STATION))
+    stiffness = dense(_banded.penalty(altitude - STATION))
     assert depth @ stiffness @ depth == pytest.approx(expected, rel=1e-12)
     constant = altitude - STATION
     assert np.abs(stiffness @ constant).max() < 1e-12 * np.abs(stiffness).max() * constant.max()

@@ -21,7 +21,7 @@ def calibration(correlation=0.6, profiles=1, heights=HEIGHTS):
     information[7] = 0.0
     share = rng.uniform(0.2, 1.0, heights)
     bands = correlated_precision(information[np.newaxis], share[np.newaxis], correlation)
-    stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1), 0.0)
+    stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1))
     return _calibration.Calibration(
         np.ascontiguousarray(bands[:, 0]),
         information,
@@ -105,34 +105,6 @@ def test_one_broken_profile_is_limited():
     bias[0] = 1e9
     known = np.array([[2.0], [1.0], [1.0], [4.0]])
     assert _calibration._smoothing_square(bias, known)[0] < 1.5
-
-
-def test_skipped_rows_are_interpolated():
-    rows = np.arange(600)
-    c = replace(
-        calibration(heights=600),
-        bias=np.tile(np.sin(rows / 60.0), (20, 1)),
-        information=np.geomspace(80.0, 2.0, 600),
-        share=np.linspace(1.0, 0.2, 600),
-        scale=np.linspace(0.3, 3.0, 20),
-    )
-    bands = correlated_precision(c.information[np.newaxis], c.share[np.newaxis], c.correlation)
-    c = replace(c, bands=np.ascontiguousarray(bands[:, 0]))
-    for lower in (np.full(600, -1), rows - 1):
-        bias = c.bias - np.where(lower >= 0, c.bias[:, np.maximum(lower, 0)], 0.0)
-        thinned = _calibration.variance_ratio(c, rows, lower, bias)
-        exact = np.array(
-            [
-                _calibration.variance_ratio(
-                    c, rows[k : k + 1], lower[k : k + 1], bias[:, k : k + 1]
-                )[:, 0]
-                for k in rows
-            ]
-        ).T
-        error = np.abs(thinned / exact - 1.0)
-        assert np.median(error) < 0.003
-        assert np.percentile(error, 95) < 0.04
-        assert np.ptp(exact) > 0.1
 
 
 def test_typical_profile_leaves_out_altitudes_of_few_profiles():

@@ -6,7 +6,6 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.optimize import isotonic_regression
 
 from lidarops.retrieve.multiangle.vertical.monotone import project
 
@@ -15,14 +14,6 @@ ROWS = arrays(
     st.tuples(st.integers(1, 3), st.integers(1, 30)),
     elements=st.floats(-5.0, 5.0, allow_subnormal=False),
 )
-
-
-@settings(deadline=None)
-@given(ROWS)
-def test_equals_isotonic_regression_cut_at_zero(profiles):
-    for row, projection in zip(profiles, project(profiles), strict=True):
-        expected = np.maximum(isotonic_regression(row).x, 0.0)
-        np.testing.assert_allclose(projection, expected, atol=1e-12)
 
 
 @settings(deadline=None)

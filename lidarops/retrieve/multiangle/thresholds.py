@@ -1,0 +1,190 @@
+"""Thresholds of the multi-angle retrieval, in one place; compiled modules (numba) build them in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Numbers of the multi-angle retrieval, dimensionless unless stated.
+
+    The last words of each entry state what set the number; "assumed" where nothing is recorded.
+    """
+
+    # Directions and cycles (`scan_cycles`, `slant_paths`).
+    same_direction: float = 0.25
+    """degree by which readings of one direction may differ; assumed."""
+    widest_direction: float = 3.0
+    """Largest spread of the profiles of one direction, in `same_direction`: a wider group is a
+    slow sweep; assumed."""
+    finest_direction: float = 0.01
+    """degree, smallest tolerance of a direction; resolution of encoders, assumed."""
+    same_plane: float = 1.0
+    """degree by which azimuths in one vertical plane may differ; assumed."""
+    longest_pause: float = 3.0
+    """Median intervals between profiles beyond which a pause starts a cycle: more than two
+    profiles are lost; assumed."""
+    lost_dwell: float = 1.5
+    """Longest dwells beyond which a pause is longer than one lost file; assumed."""
+    spherical_beyond: float = 75.0
+    """degree beyond which the path follows the curvature of the Earth; below, the secant errs by
+    less than 0.3 percent of the optical depth, by the formula."""
+    longest_path: float = 10.0
+    """Slant over vertical path beyond which a beam is left out, for refraction; assumed."""
+
+    # Samples (`_common_altitude`, `_sample_mask`).
+    clear_bin: float = 30.0
+    """Signal over noise from which the logarithm is interpolated; below, the error of
+    interpolating the signal is far less than its noise; assumed."""
+    lowest_snr: float = 3.0
+    """Mean signal over noise of the altitudes around, below which a beam ends; assumed."""
+    around: int = 15
+    """Altitudes of that mean, so many that a sample has little influence on its own selection;
+    assumed."""
+    swallowed_snr: float = 2.0
+    """The same of the altitudes from one upwards: the wide window would accept samples behind a
+    cloud that swallows the beam; assumed."""
+    ahead: int = 5
+    """Altitudes of that mean; assumed."""
+    least_noise: float = 1e-6
+    """Smallest noise over signal; no lidar has less; assumed."""
+    farthest_expected: float = 3.0
+    """Standard deviations by which the expected signal may differ from the sample; assumed."""
+
+    # Fit at single altitudes (`_block`, `_methods`).
+    pooled: int = 15
+    """Altitudes over which the inhomogeneity is pooled; assumed."""
+    first_guess: float = 0.03**2
+    """Variance of the inhomogeneity with which the first fit is weighted; assumed."""
+    least_guess: float = 0.01
+    """Smallest variance of the second fit, over the largest of all altitudes; assumed."""
+    fewest_freedom: float = 4.1
+    """Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2;
+    assumed."""
+    least_span: float = 0.1
+    """Span of slant paths below which LOW_LEVERAGE is raised: 0 to 25 degrees; assumed."""
+    least_share: float = 0.9
+    """Data share below which smoothness or a prior determines extinction; assumed."""
+    largest_share: float = 1.1
+    """Data share above which they do; assumed."""
+
+    # Outlying beams (`_block`, `robust_weights`).
+    outlying_residual: float = 4.5
+    """Least limit in standard errors beyond which a residual starts the robust passes; assumed."""
+    false_alarm: float = 0.01
+    """Probability that chance starts them in a block; chosen."""
+    fewest_beams: int = 4
+    """Beams from which one outlier can be identified: two unknowns and two residuals."""
+    start_width: float = 5.0
+    """Standard errors from the start beyond which a sample has no weight; assumed."""
+    pass_width: float = 7.0
+    """Standard errors from a weighted fit beyond which a sample has no weight; assumed."""
+    closest_paths: float = 1e-3
+    """Distance of two slant paths, over their span, below which they define no slope; assumed."""
+    kept_weight: float = 0.3
+    """Weight above which a beam counts as kept; assumed."""
+    fewest_kept: int = 3
+    """Beams that must be kept; with fewer, all keep their full weight; assumed."""
+    clear_variance: float = 0.01
+    """Variance of a logarithm up to which its noise is well known: signal 10 times its noise;
+    assumed."""
+    median_of: int = 100_000
+    """Residuals that suffice for the median of their sizes; assumed."""
+
+    # Horizontal gradient (`_block`, `_methods`).
+    gradient_window: float = 1000.0
+    """m, window in which the residuals are tested for a gradient; assumed."""
+    gradient_limit: float = 4.0
+    """Standard errors beyond which a gradient is flagged; assumed."""
+    gradient_noise: float = 0.02
+    """Variance of a logarithm (signal 7 times its noise) above which its skew, averaged over many
+    profiles, looks like a gradient; assumed."""
+    harmless_gradient: float = 0.02
+    """Share of the declared gradient that raises no flag, however certain it is; assumed."""
+
+    # Stratification (`_path_variation`).
+    growth: float = 1.5**2
+    """Ratio of the variances in the upper and the lower third up to which they count as equal;
+    assumed."""
+    growth_certainty: float = 2.5
+    """Standard errors by which the logarithm of that ratio must exceed zero: with `growth`, 0.3
+    percent false alarms; simulations."""
+    fewest_profiles: int = 4
+    """Profiles below which growth is not tested over profiles; assumed."""
+    fewest_altitudes: int = 6
+    """Altitudes below which growth is not tested; assumed."""
+    clipped: float = 3.0
+    """Standard errors to which the residuals of that test are clipped; assumed."""
+    least_weight: float = 1e-3
+    """Robust weight up to which a sample is left out of the test of growth; assumed."""
+
+    # Correlation along altitude (`vertical`).
+    none_below: float = 0.05
+    """Ratio at the first lag below which the correlation is taken as zero; assumed."""
+    simple_below: float = 0.1
+    """Ratio at the first lag below which the decay cannot be estimated; assumed."""
+    least_amplitude: float = 0.5
+    """Least amplitude of the correlation; assumed."""
+    largest_amplitude: float = 1.05
+    """Largest amplitude of the correlation; assumed."""
+    largest_correlation: float = 0.97
+    """Limit of the correlation; assumed."""
+    highest_correlation: float = 0.85
+    """Correlation beyond which HIGH_CORRELATION is raised. In random scenes standard errors remain
+    right beyond it; if the laser energy varies from file to file they do not; simulations."""
+    linked: float = 0.5
+    """Correlated share, over the largest of the neighbours, from which an altitude is linked;
+    assumed."""
+    least_correlated: float = 1e-6
+    """Correlated share up to which noise counts as uncorrelated; assumed."""
+
+    # Outlying estimates (`vertical`).
+    jump: float = 5.0
+    """Standard errors between neighbouring estimates from which a profile is screened; assumed."""
+    outlying_estimate: float = 4.5
+    """Standard errors from the solution beyond which an estimate starts the robust pass;
+    assumed."""
+    bisquare: float = 6.0
+    """Standard errors at which the bisquare ends; assumed."""
+    least_kept: float = 1e-3
+    """Share of its information that an estimate at the end of the bisquare keeps; assumed."""
+    smallest_kept: float = 1e-9
+    """The least share; a smaller one would cost the solution its digits."""
+    majority: float = 0.5
+    """Share of weight, and of estimates, that is regarded as a majority; assumed."""
+    half_window: int = 7
+    """Altitudes to either side of windows of medians and means; assumed."""
+
+    # Smoothness and its errors (`vertical`).
+    least_smooth_freedom: float = 2.0
+    """Degrees of freedom below which a weight of smoothness is not allowed; assumed."""
+    fewest_to_choose: int = 8
+    """Profiles from which one weight of smoothness is chosen, and errors are calibrated; with
+    fewer, solutions are averaged; assumed."""
+    rougher: float = 1.2
+    """Ratio of degrees of freedom from which Cp is preferred to the likelihood; assumed."""
+    negligible_likelihood: float = 1e-6
+    """Relative likelihood below which a weight is left out of the average; assumed."""
+    largest_information: float = 1e6
+    """Limit of information, in medians of the block; assumed."""
+    usual_information: float = 100.0
+    """Limit of the mean information, in medians of the block; assumed."""
+    negligible_information: float = 1e-4
+    """Information of a profile, in medians, below which it is treated as empty; assumed."""
+    pilot: float = 0.01
+    """Weight of smoothness of the pilot solution over that of the solution; assumed."""
+    largest_deviation: float = 3.0
+    """Standard deviations to which the smoothing errors of the pilot are clipped; assumed."""
+    least_scale: float = 0.7
+    """Least scale of the smoothing error of a profile, because a thin haze may still have a sharp
+    layer. With 1, errors would be too large where profiles differ by noise alone; simulations."""
+    most_freedom: float = 10.0
+    """Degrees of freedom from which a profile may be undersmoothed; assumed."""
+    roughest: float = 0.4
+    """Degrees of freedom per estimate beyond which smoothing has little effect. With fewer, no
+    more values are false in random scenes than among all unflagged ones; benchmark of stability."""
+
+
+THRESHOLDS: Final = Thresholds()
