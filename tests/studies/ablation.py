@@ -17,16 +17,20 @@ from lidarops.bench.stability.random_scenes import FALSE, ScoredValues
 from lidarops.flags import Quality, rejecting
 
 BASE: Final = "all guards"
+COVERED: Final = 1.96
+"""Stated errors within which 95 percent of the values should be."""
 RATES: Final = {
     "false, model holds": ("false where satisfied", "usable where satisfied"),
     "false, model violated": ("false where violated", "usable where violated"),
     "false, no bit": ("false without bit", "without bit"),
+    "covered, model holds": ("covered where satisfied", "usable where satisfied"),
+    "covered, model violated": ("covered where violated", "usable where violated"),
     "needless": ("solvable and flagged", "solvable"),
     "lost, model holds": ("lost where satisfied", "scored where satisfied"),
     "lost, model violated": ("lost where violated", "scored where violated"),
 }
 """Rate -> numerator and denominator. `false`: beyond 4 stated errors though not rejected,
-or though no bit is raised, whether it rejects or not.
+or though no bit is raised, whether it rejects or not. `covered`: within 1.96 stated errors.
 `needless`: flagged or withheld though determinable. `lost`: flagged or withheld."""
 
 Counts = dict[str, float]
@@ -85,11 +89,13 @@ def _count(values: ScoredValues) -> Counts:
         usable &= ~values.uncertain
     stated = np.hypot(np.broadcast_to(values.random, shape), values.systematic)
     false = usable & ~(np.abs(values.error) <= FALSE * stated)
+    covered = np.abs(values.error) <= COVERED * stated
     holds = values.failure.satisfied
     kind = "satisfied" if holds else "violated"
     counts = {
         f"false where {kind}": np.count_nonzero(false),
         f"usable where {kind}": np.count_nonzero(usable),
+        f"covered where {kind}": np.count_nonzero(usable & covered),
         "without bit": np.count_nonzero(usable & (bits == 0)),
         "false without bit": np.count_nonzero(false & (bits == 0)),
         f"lost where {kind}": np.count_nonzero(~usable),
