@@ -27,6 +27,7 @@ lint: .venv/.dev
 golden: .venv/.dev
 	PYTHONPATH=tests $(BIN)/python -m golden.regenerate
 	$(BIN)/python docs/products_table.py
+	PYTHONPATH=tests $(BIN)/python docs/stiff_cases_table.py
 	$(BIN)/python docs/api_page.py
 	$(BIN)/python docs/architecture_picture.py
 

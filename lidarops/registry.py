@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import entry_points
-from typing import Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from lidarops.errors import LidarOpsError
+
+RAW_FORMATS: Final = "lidarops.raw_formats"
+"""Group of entry points of raw formats."""
 
 
 class _Named(Protocol):

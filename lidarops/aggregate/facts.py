@@ -19,6 +19,7 @@ from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
+from lidarops.system.files import sha256_of
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""
@@ -269,7 +270,7 @@ def read_facts(root: Path, path: str) -> Facts:
             latitude=_middle(product, "latitude"),
             longitude=_middle(product, "longitude"),
             altitude=_middle(product, height),
-            sha256=_sha256(file),
+            sha256=sha256_of(file),
             size=file.stat().st_size,
             profiles=product.sizes["time"],
             values=flags.size,
@@ -445,8 +446,3 @@ def _moment(text: str) -> datetime:
 def _middle(product: xr.Dataset, name: str) -> float:
     """Return a coordinate of the station, or its mean over a network; NaN if missing."""
     return float(product[name].values.mean()) if name in product else float("nan")
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -25,10 +25,10 @@ from lidarops.aggregate.means_variables import (
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.build import bitround
-from lidarops.netcdf.code_version import code_version
 from lidarops.netcdf.provenance import NAMESPACE, package_versions
 from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
 from lidarops.records import DetectionMode
+from lidarops.system.code_version import code_version
 
 _MOVING: Final = ("zenith_angle", "azimuth")
 

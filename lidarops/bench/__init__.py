@@ -1,7 +1,8 @@
 """Benchmarks of ``lidarops bench``: accuracy, stability and throughput.
 
-`registry` maps names to benchmarks and writes their results. `accuracy` compares retrievals with
-a known truth, `stability` counts crashes and false values without a flag, `throughput` measures
-time. `harness` holds what they share. `all_retrievals` and `overview` put error against run time
-of all retrievals on one page.
+A benchmark is a function that returns a `Study`: rows of (case, method, quantity, value) in
+chapters with texts and charts, of which `harness` makes page and JSON. `registry` maps names to
+benchmarks. `accuracy` compares retrievals with a known truth, `stability` counts false values
+without a flag, `throughput` measures time. `all_retrievals` puts error against run time of all
+retrievals on one page.
 """

@@ -2,55 +2,44 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from lidarops.bench import overview
-from lidarops.bench.accuracy import (
-    elastic,
-    elastic_report,
-    homogeneous,
-    homogeneous_report,
-    multiangle_report,
-    multiangle_scores,
-    network,
-    network_report,
+from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import (
+    CPU_TIME,
+    Chapter,
+    Results,
+    Row,
+    Scores,
+    Study,
+    Work,
+    cpu_time,
+    error_against_time,
+    rows_of,
+    rows_of_scores,
+    share,
 )
-from lidarops.bench.accuracy.elastic import Elastic
-from lidarops.bench.accuracy.homogeneous import Accuracy
-from lidarops.bench.accuracy.multiangle_scores import MultiAngle
-from lidarops.bench.accuracy.network_scores import NetworkAccuracy
-from lidarops.bench.harness.benchmark import Effort, study_page
-from lidarops.bench.harness.timing import Machine, least_times, machine
-from lidarops.bench.overview import Baseline, WorkPrecision
-from lidarops.reports.benchmark_page import BenchmarkReport, Part
+from lidarops.bench.harness.timing import least_times
+from lidarops.figures.charts import Chart
 
 _PROFILES: Final = 500
 _BINS: Final = 4096
 _CHANNELS: Final = 12
 _ROUNDS: Final = 9
+_RMSE: Final = "RMSE"
+_SHOWN: Final = frozenset({"background of 100000 counts", "3 x 2 beams, plume, noise 5 %"})
+"""Settings shown for a retrieval, if not its first."""
 
 
-@dataclass(frozen=True, slots=True)
-class AllRetrievals:
-    """Accuracy results of all retrievals."""
-
-    date: str
-    machine: Machine
-    baselines: tuple[Baseline, ...]
-    works: tuple[WorkPrecision, ...]
-    homogeneous: Accuracy
-    elastic: Elastic
-    multiangle: MultiAngle
-    network: NetworkAccuracy
-
-
-def measure_all(effort: Effort, *, data: Path | None = None) -> AllRetrievals:
+def measure_all(effort: Effort, *, data: Path | None = None) -> Study:
     """Measure error against run time of all retrievals.
 
     Parameters
@@ -66,55 +55,141 @@ def measure_all(effort: Effort, *, data: Path | None = None) -> AllRetrievals:
     RawFormatError
         If a published file cannot be read.
     """
-    paths = homogeneous.measure_homogeneous(effort)
-    vertical = elastic.measure_elastic_accuracy(effort, data=data)
-    scans = multiangle_scores.measure_multiangle(effort)
-    networks = network.measure_network(effort)
-    return AllRetrievals(
-        date=effort.date,
-        machine=machine(),
-        baselines=tuple(_baselines()),
-        works=overview.work_precision_rows(paths, vertical, scans, networks),
-        homogeneous=paths,
-        elastic=vertical,
-        multiangle=scans,
-        network=networks,
+    studies = {
+        "homogeneous path": homogeneous.measure_homogeneous(effort),
+        "elastic inversion": elastic.measure_elastic_accuracy(effort, data=data),
+        "scans over zenith angle": multiangle.measure_multiangle(effort),
+        "networks of lidars": network.measure_network(effort),
+    }
+    chapters = [
+        _prefixed(chapter, name) for name, study in studies.items() for chapter in study.chapters
+    ]
+    works = {name: study.works for name, study in studies.items()}
+    return Study(
+        "All retrievals: error against run time",
+        effort.date,
+        [_overview(works), *chapters],
+        [work for group in works.values() for work in group],
     )
 
 
-def _baselines() -> Iterator[Baseline]:
+def _prefixed(chapter: Chapter, name: str) -> Chapter:
+    """Return a chapter with the retrieval in its titles and file names, which makes them unique."""
+    word = name.split(maxsplit=1)[0]
+    return replace(
+        chapter,
+        title=f"{word.capitalize()}: {chapter.title}",
+        results=[replace(r, title=f"{word.capitalize()}: {r.title}") for r in chapter.results],
+        charts=[replace(chart, name=f"{word}-{chart.name}") for chart in chapter.charts],
+    )
+
+
+def _minimal_operations() -> Scores:
     profiles = np.random.default_rng(0).random((_PROFILES, _BINS), np.float32)
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         file = Path(folder) / "counts"
         file.write_bytes(np.zeros((_CHANNELS, _BINS), np.int32).tobytes())
         times = least_times({"memory": lambda: np.max(profiles), "file": file.read_bytes}, _ROUNDS)
-    yield Baseline(
-        f"read a profile of {_BINS} float32 in memory (np.max)", 1e9 * times["memory"] / _PROFILES
-    )
-    yield Baseline(
-        f"read a file of {_CHANNELS} channels of {_BINS} bins from the page cache",
-        1e9 * times["file"],
-    )
-
-
-def all_retrievals_report(result: AllRetrievals) -> BenchmarkReport:
-    """Return the page of all retrievals."""
-    reports = {
-        "homogeneous": homogeneous_report.homogeneous_accuracy_report(result.homogeneous),
-        "elastic": elastic_report.elastic_accuracy_report(result.elastic),
-        "multiangle": multiangle_report.multiangle_accuracy_report(result.multiangle),
-        "network": network_report.network_accuracy_report(result.network),
+    memory = f"read a profile of {_BINS} float32 in memory (np.max)"
+    files = f"read a file of {_CHANNELS} channels of {_BINS} bins from the page cache"
+    return {
+        ("", memory): {CPU_TIME: cpu_time(1e9 * times["memory"] / _PROFILES)},
+        ("", files): {CPU_TIME: cpu_time(1e9 * times["file"])},
     }
-    chapters = [_prefixed(part, name) for name, report in reports.items() for part in report.parts]
-    return study_page(
-        "All retrievals: error against run time",
-        result,
-        overview.overview(result.works, result.baselines),
-        *chapters,
+
+
+def _overview(works: Mapping[str, Sequence[Work]]) -> Chapter:
+    return Chapter(
+        "Error against run time, all retrievals",
+        "All methods of all retrievals, with common baselines and iterative peers, on "
+        "simulated profiles with known truth. Root mean square error over the profiles that a "
+        "method does not reject; CPU time per profile on one core. The chapters below describe "
+        "the simulations and give bias, coverage and flags.",
+        [
+            Results(
+                "The most accurate of our methods and of the peers",
+                best_methods(works),
+                "Of methods whose errors differ by less than 2 Monte Carlo errors, the fastest. "
+                "One setting of each retrieval; the tables below list all. 95 %: share of truths "
+                "in the stated interval. In brackets: Monte Carlo standard error.",
+                case="error of",
+            ),
+            Results(
+                "Minimal operations, measured in the same run",
+                rows_of_scores(_minimal_operations()),
+                method="operation",
+            ),
+            *(
+                Results(
+                    f"{retrieval.capitalize()}: all methods",
+                    [
+                        row
+                        for work in group
+                        for row in _rows(work, f"{work.quantity}; {work.setting}")
+                    ],
+                    case="error of",
+                    folded=True,
+                )
+                for retrieval, group in works.items()
+            ),
+        ],
+        [_chart(retrieval, group) for retrieval, group in works.items()],
     )
 
 
-def _prefixed(chapter: Part, name: str) -> Part:
-    """Return a chapter with the retrieval in its title and file names, which makes them unique."""
-    charts = tuple(replace(chart, name=f"{name}-{chart.name}") for chart in chapter.charts)
-    return replace(chapter, title=f"{name.capitalize()}: {chapter.title}", charts=charts)
+def _rows(work: Work, case: str) -> list[Row]:
+    method = work.method if work.ours else f"peer: {work.method}"
+    coverage = None if work.coverage is None else share(work.coverage)
+    return rows_of(case, method, {_RMSE: work.error, "95 %": coverage, CPU_TIME: work.time})
+
+
+def _shown(settings: Sequence[str]) -> str:
+    return next((setting for setting in settings if setting in _SHOWN), settings[0])
+
+
+def best_methods(works: Mapping[str, Sequence[Work]]) -> list[Row]:
+    """Return the best of our methods and of the peers for each retrieval and quantity.
+
+    Of methods whose errors differ by less than 2 Monte Carlo errors, the best is the fastest.
+    """
+    rows: list[Row] = []
+    for retrieval, every in works.items():
+        for quantity in dict.fromkeys(work.quantity for work in every):
+            group = [w for w in every if w.quantity == quantity and not w.informed]
+            setting = _shown([work.setting for work in group])
+            for ours in (True, False):
+                rivals = [work for work in group if work.ours is ours and work.setting == setting]
+                if rivals:
+                    rows += _rows(_best(rivals), f"{retrieval}, {setting}: {quantity}")
+    return rows
+
+
+def _best(works: Sequence[Work]) -> Work:
+    least = min((work.error for work in works), key=lambda error: error.value)
+    equal = [
+        work
+        for work in works
+        if work.error.value - least.value <= 2.0 * math.hypot(work.error.error, least.error)
+    ]
+    return min(equal, key=lambda work: work.time.value)
+
+
+def _chart(retrieval: str, works: Sequence[Work]) -> Chart:
+    quantity = works[0].quantity
+    drawn = [work for work in works if work.quantity == quantity]
+    settings = list(dict.fromkeys(work.setting for work in drawn))
+    last = _shown(settings)
+    chosen = {settings[0], last if last != settings[0] else settings[-1]}
+    chart = error_against_time(
+        "all-" + retrieval.replace(" ", "-"),
+        [
+            row
+            for work in drawn
+            if work.setting in chosen
+            for row in rows_of(work.setting, work.method, {_RMSE: work.error, CPU_TIME: work.time})
+        ],
+        _RMSE,
+        hollow={work.method for work in drawn if not work.ours or work.informed},
+        gain=1.0,
+    )
+    return replace(chart, title=f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time")

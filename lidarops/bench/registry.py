@@ -2,42 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from lidarops.bench import all_retrievals
-from lidarops.bench.accuracy import (
-    elastic,
-    elastic_report,
-    homogeneous,
-    homogeneous_report,
-    multiangle_report,
-    multiangle_scores,
-    network,
-    network_report,
-)
-from lidarops.bench.harness import results
+from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
 from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
-from lidarops.bench.harness.timing import machine
-from lidarops.bench.throughput import (
-    archives,
-    campaigns,
-    memory,
-    networks,
-    readers,
-    retrieval_reports,
-    retrievals,
-    scan_kernels,
-)
+from lidarops.bench.harness.rows import Study
+from lidarops.bench.throughput import archives, campaigns, memory, readers, retrievals
 from lidarops.errors import CampaignError
-from lidarops.reports.benchmark_page import BenchmarkReport, build_benchmark_page
+from lidarops.reports.benchmark_page import build_benchmark_page
+from lidarops.system.files import write_atomically
 
 STABILITY: Final = "stability"
 """The benchmark that is no `BenchmarkKind`, because it has no cases to choose from."""
-_REPEATS: Final = 7
 
 _Names = TypeVar("_Names", bound=StrEnum)
 
@@ -95,69 +76,40 @@ def run_benchmark(
         raise CampaignError(
             "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
         )
-    if benchmark is Benchmark.READER and kind is BenchmarkKind.THROUGHPUT:
-        return _reader(files, effort)
     if benchmark is Benchmark.MEMORY:
         return memory.run_memory(kind, effort=effort)
-    studies = _accuracy(data) if kind is BenchmarkKind.ACCURACY else _throughput()
+    studies = _accuracy(data) if kind is BenchmarkKind.ACCURACY else _throughput(files)
     if benchmark not in studies:
         raise CampaignError(
             f"the case {benchmark.value!r} has no {kind.value}",
             remedy=f"choose: {' or '.join(studies)}",
         )
-    measure, report = studies[benchmark]
-    result = measure(effort)
-    return BenchmarkOutput(result, report(result))
+    return studies[benchmark](effort).output()
 
 
-_Study = tuple[Callable[..., Any], Callable[[Any], BenchmarkReport]]
-"""Measures with an `Effort`, and makes the page of the result."""
+_Studies = Mapping[Benchmark, Callable[[Effort], Study]]
 
 
-def _accuracy(data: Path | None) -> dict[Benchmark, _Study]:
-    measure_all = partial(all_retrievals.measure_all, data=data)
-    measure_elastic = partial(elastic.measure_elastic_accuracy, data=data)
+def _accuracy(data: Path | None) -> _Studies:
     return {
-        Benchmark.ALL: (measure_all, all_retrievals.all_retrievals_report),
-        Benchmark.ELASTIC: (measure_elastic, elastic_report.elastic_accuracy_report),
-        Benchmark.HOMOGENEOUS: (
-            homogeneous.measure_homogeneous,
-            homogeneous_report.homogeneous_accuracy_report,
-        ),
-        Benchmark.MULTIANGLE: (
-            multiangle_scores.measure_multiangle,
-            multiangle_report.multiangle_accuracy_report,
-        ),
-        Benchmark.NETWORK: (network.measure_network, network_report.network_accuracy_report),
+        Benchmark.ALL: partial(all_retrievals.measure_all, data=data),
+        Benchmark.ELASTIC: partial(elastic.measure_elastic_accuracy, data=data),
+        Benchmark.HOMOGENEOUS: homogeneous.measure_homogeneous,
+        Benchmark.MULTIANGLE: multiangle.measure_multiangle,
+        Benchmark.NETWORK: network.measure_network,
     }
 
 
-def _throughput() -> dict[Benchmark, _Study]:
+def _throughput(files: Sequence[Path]) -> _Studies:
     return {
-        Benchmark.ARCHIVE: (archives.measure_archives, archives.archives_report),
-        Benchmark.CAMPAIGNS: (campaigns.measure_campaigns, campaigns.campaigns_report),
-        Benchmark.ELASTIC: (
-            retrievals.measure_elastic,
-            retrieval_reports.elastic_throughput_report,
-        ),
-        Benchmark.HOMOGENEOUS: (
-            retrievals.measure_solvers,
-            retrieval_reports.homogeneous_throughput_report,
-        ),
-        Benchmark.MULTIANGLE: (
-            scan_kernels.measure_scan_kernels,
-            retrieval_reports.multiangle_throughput_report,
-        ),
-        Benchmark.NETWORK: (
-            networks.measure_network_throughput,
-            retrieval_reports.network_throughput_report,
-        ),
+        Benchmark.ARCHIVE: archives.measure_archives,
+        Benchmark.CAMPAIGNS: campaigns.measure_campaigns,
+        Benchmark.ELASTIC: retrievals.measure_elastic,
+        Benchmark.HOMOGENEOUS: retrievals.measure_solvers,
+        Benchmark.MULTIANGLE: retrievals.measure_scans,
+        Benchmark.NETWORK: retrievals.measure_networks,
+        Benchmark.READER: partial(readers.measure_readers, paths=files),
     }
-
-
-def _reader(files: Sequence[Path], effort: Effort) -> BenchmarkOutput:
-    rates = readers.measure_readers(files, repeats=effort.repeats or _REPEATS)
-    return BenchmarkOutput(rates, retrieval_reports.reader_report(rates, effort.date, machine()))
 
 
 def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
@@ -168,8 +120,9 @@ def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
     CatalogError
         If the folder cannot be written.
     """
-    results.save(output.result, folder / RESULT)
-    return build_benchmark_page(output.report, folder)
+    page = build_benchmark_page(output.report, folder)
+    write_atomically(folder / RESULT, output.json().encode())
+    return page
 
 
 def _member(names: type[_Names], value: str, what: str, *other_choices: str) -> _Names:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
@@ -89,20 +89,15 @@ class Granules(Database):
 
     def forget(self, paths: Collection[str]) -> None:
         """Remove the rows of files that are no longer in the archive."""
-        if paths:
-            with self.transaction() as connection:
-                self._remove(connection, paths)
-
-    def _remove(self, connection: sa.Connection, paths: Collection[str]) -> None:
         gone = sa.delete(GRANULE).where(
             _C.campaign == self.campaign, _C.path == sa.bindparam("gone")
         )
-        connection.execute(gone, [{"gone": path} for path in paths])
+        if paths:
+            with self.transaction() as connection:
+                connection.execute(gone, [{"gone": path} for path in paths])
 
     def store_digests(self, digests: Mapping[str, str]) -> None:
         """Enter the SHA-256 of files, by path."""
-        if not digests:
-            return
         with self.transaction() as connection:
             self._enter_digests(connection, digests)
 
@@ -241,14 +236,7 @@ class Granules(Database):
         return paths
 
 
-_GRANULE_COLUMNS: Final = tuple(
-    _C[name]
-    for name in (
-        "path", "size", "mtime_ns", "instrument", "role", "status", "reason", "notes", "start",
-        "stop", "zenith_angle", "azimuth", "latitude", "longitude", "altitude", "layout", "sha256",
-        "format", "header_digest",
-    )
-)  # fmt: skip
+_GRANULE_COLUMNS: Final = tuple(_C[field.name] for field in fields(Granule))
 _ROLES: Final = {role.value: role for role in Role}
 _STATUSES: Final = {status.value: status for status in Status}
 
@@ -263,28 +251,13 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
     (
         path, size, mtime_ns, instrument, role, status, reason, notes, start, stop,
-        zenith_angle, azimuth, latitude, longitude, altitude, layout, sha256, format_name,
-        header_digest,
+        zenith_angle, azimuth, latitude, longitude, altitude, layout, *others,
     ) = row  # fmt: skip
     return Granule(
-        path=path,
-        size=size,
-        mtime_ns=mtime_ns,
-        instrument=instrument,
-        role=_ROLES[role],
-        status=_STATUSES[status],
-        reason=reason,
+        path, size, mtime_ns, instrument, _ROLES[role], _STATUSES[status], reason,
         # Skip the parsing for most of the millions of granules.
-        notes=() if notes == "[]" else tuple(json.loads(notes)),
-        start=None if start is None else start.replace(tzinfo=UTC),
-        stop=None if stop is None else stop.replace(tzinfo=UTC),
-        zenith_angle=zenith_angle,
-        azimuth=azimuth,
-        latitude=latitude,
-        longitude=longitude,
-        altitude=altitude,
-        layout=layouts[layout],
-        sha256=sha256,
-        format=format_name,
-        header_digest=header_digest,
-    )
+        () if notes == "[]" else tuple(json.loads(notes)),
+        None if start is None else start.replace(tzinfo=UTC),
+        None if stop is None else stop.replace(tzinfo=UTC),
+        zenith_angle, azimuth, latitude, longitude, altitude, layouts[layout], *others,
+    )  # fmt: skip

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import groupby
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
@@ -110,8 +111,7 @@ class SceneEntry:
     """SHA-256 of raw files by path, as far as the catalog does not have them yet."""
 
 
-@dataclass(frozen=True, slots=True)
-class LastTry:
+class LastTry(NamedTuple):
     """Result of the last try of a scene."""
 
     key: str
@@ -121,6 +121,24 @@ class LastTry:
     final: bool
     crashes: int
     day: int
+
+
+class Verdict(NamedTuple):
+    """That all requested products of a day were fresh."""
+
+    signature: str
+    """State of the day; see `lidarops.run.staleness.Signature`."""
+    empty_scenes: int
+    """Number of scenes of the day without product."""
+    set_aside: int
+    """Number of good granules of the day that belong to no scene."""
+    files: Mapping[str, str]
+    """Ancillary files that the steps of the day read -> SHA-256."""
+
+    @property
+    def unused(self) -> int:
+        """Number of empty scenes and of granules set aside."""
+        return self.empty_scenes + self.set_aside
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,17 +194,12 @@ class Ledger(Granules):
                 .where(RUN.c.campaign == self.campaign, RUN.c.status == RunStatus.RUNNING.value)
                 .values(status=RunStatus.DIED.value)
             )
-            values = {
-                "id": run.id,
+            values = asdict(run) | {
                 "campaign": self.campaign,
                 "started": naive(run.started),
-                "finished": naive(run.finished),
                 "status": run.status.value,
-                "holder": run.holder,
-                "version": run.version,
-                "code_version": run.code_version,
-                **dict.fromkeys(("scenes", "products", "granules", "failed", "refused"), 0),
             }
+            del values["seconds"]
             connection.execute(sa.insert(RUN), values)
 
     def end_run(self, run: str, status: RunStatus, *, refused: int, token: str) -> None:
@@ -290,23 +303,15 @@ class Ledger(Granules):
         self._enter_inputs(connection, entry.products)
 
     def _product_row(self, new: NewProduct, entry: SceneEntry, run: str) -> dict[str, Any]:
-        record, depends_on = new.record, new.depends_on
+        stated = ("path", "kind", "channel", "sha256", "size", "usable")
         return {
             "campaign": self.campaign,
-            "path": record.path,
             "scene": entry.outcome.scene,
             "day": entry.day,
-            "kind": record.kind,
-            "channel": record.channel,
-            "sha256": record.sha256,
-            "size": record.size,
             "mtime_ns": new.mtime_ns,
-            "plan_hash": depends_on.plan_hash,
-            "settings_hash": depends_on.settings_hash,
-            "inputs_hash": depends_on.inputs_hash,
-            "code_version": depends_on.code_version,
             "run": run,
-            "usable": record.usable,
+            **{name: getattr(new.record, name) for name in stated},
+            **asdict(new.depends_on),
         }
 
     def _enter_inputs(self, connection: sa.Connection, products: Sequence[NewProduct]) -> None:
@@ -383,10 +388,6 @@ class Ledger(Granules):
         with self.transaction() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
 
-    def product_inputs(self, product: str) -> dict[str, str]:
-        """Return input path -> sha256 of one product."""
-        return {used.path: used.sha256 for used in self.inputs_of(product)}
-
     def inputs_of(self, product: str) -> list[InputRecord]:
         """Return the files that a product was made from."""
         link = PRODUCT_INPUT.c
@@ -450,11 +451,9 @@ class Ledger(Granules):
     def superseded(self) -> list[SupersededVersion]:
         """Return the replaced versions of products, ordered by path."""
         old = SUPERSEDED.c
-        query = (
-            sa.select(old.path, old.sha256, old.run, old.replaced_by, old.kept)
-            .where(old.campaign == self.campaign)
-            .order_by(old.path, old.run)
-        )
+        columns = (old[field.name] for field in fields(SupersededVersion))
+        query = sa.select(*columns).where(old.campaign == self.campaign)
+        query = query.order_by(old.path, old.run)
         with self.transaction() as connection:
             return [SupersededVersion(*row) for row in connection.execute(query)]
 
@@ -463,15 +462,10 @@ class Ledger(Granules):
     def last_tries(self, first: int, last: int) -> dict[str, LastTry]:
         """Return the result of the last try of every scene on days `first` to `last`."""
         known = SCENE.c
-        query = sa.select(
-            known.scene,
-            known.key,
-            known.error,
-            known.internal,
-            known.final,
-            known.crashes,
-            known.day,
-        ).where(known.campaign == self.campaign, known.day.between(first, last))
+        columns = (known[name] for name in ("scene", *LastTry._fields))
+        query = sa.select(*columns).where(
+            known.campaign == self.campaign, known.day.between(first, last)
+        )
         with self.transaction() as connection:
             return {row[0]: LastTry(*row[1:]) for row in connection.execute(query)}
 
@@ -487,21 +481,18 @@ class Ledger(Granules):
 
     def failures(self) -> dict[str, str]:
         """Return scene -> error of the scenes whose last try failed."""
-        known = SCENE.c
-        query = sa.select(known.scene, known.error).where(
-            known.campaign == self.campaign, known.error != ""
-        )
-        with self.transaction() as connection:
-            return {row.scene: row.error for row in connection.execute(query)}
+        return self._said_of_scenes(SCENE.c.error)
 
     def internal_errors(self) -> dict[str, str]:
         """Return scene -> traceback of the scenes whose last try ended with an internal error."""
-        known = SCENE.c
-        query = sa.select(known.scene, known.internal).where(
-            known.campaign == self.campaign, known.internal != ""
+        return self._said_of_scenes(SCENE.c.internal)
+
+    def _said_of_scenes(self, column: sa.Column[str]) -> dict[str, str]:
+        query = sa.select(SCENE.c.scene, column).where(
+            SCENE.c.campaign == self.campaign, column != ""
         )
         with self.transaction() as connection:
-            return {row.scene: row.internal for row in connection.execute(query)}
+            return dict(connection.execute(query).tuples().all())
 
     def unusable_scenes(self, *, without: Collection[str] = ()) -> list[str]:
         """Return the scenes whose retrievals gave no usable value; see `SceneOutcome.unusable`.
@@ -538,26 +529,30 @@ class Ledger(Granules):
                     )
                 )
 
-    def verdicts(self) -> dict[int, tuple[str, int, int]]:
-        """Return settled day -> signature, number of empty scenes, of granules set aside."""
-        verdict = VERDICT.c
-        query = sa.select(
-            verdict.day, verdict.signature, verdict.empty_scenes, verdict.set_aside
-        ).where(verdict.campaign == self.campaign)
+    def verdicts(self) -> dict[int, Verdict]:
+        """Return the verdicts on settled days."""
+        query = sa.select(*(VERDICT.c[name] for name in ("day", *Verdict._fields))).where(
+            VERDICT.c.campaign == self.campaign
+        )
         with self.transaction() as connection:
-            return {row[0]: (row[1], row[2], row[3]) for row in connection.execute(query)}
+            return {
+                day: Verdict(signature, empty_scenes, set_aside, json.loads(files))
+                for day, signature, empty_scenes, set_aside, files in connection.execute(query)
+            }
 
-    def store_verdicts(self, verdicts: Mapping[int, tuple[str, int, int]]) -> None:
+    def store_verdicts(self, verdicts: Mapping[int, Verdict]) -> None:
         """Note that all requested products of these days are fresh."""
         if not verdicts:
             return
         rows = [
             {
-                "campaign": self.campaign, "day": day, "signature": signature,
-                "empty_scenes": empty_scenes, "set_aside": set_aside,
+                "campaign": self.campaign,
+                "day": day,
+                **verdict._asdict(),
+                "files": json.dumps(verdict.files),
             }
-            for day, (signature, empty_scenes, set_aside) in verdicts.items()
-        ]  # fmt: skip
+            for day, verdict in verdicts.items()
+        ]
         with self.transaction() as connection:
             connection.execute(self.upsert(VERDICT), rows)
 
@@ -570,18 +565,8 @@ def _set_id(files: Sequence[InputRecord]) -> str:
 
 
 def _made_from(row: Any) -> RecordedProduct:
-    return RecordedProduct(
-        path=row.path,
-        scene=row.scene,
-        day=row.day,
-        kind=row.kind,
-        channel=row.channel,
-        sha256=row.sha256,
-        size=row.size,
-        mtime_ns=row.mtime_ns,
-        depends_on=Dependence(row.plan_hash, row.settings_hash, row.inputs_hash, row.code_version),
-        run=row.run,
-    )
+    # In the order of `_MADE`.
+    return RecordedProduct(*(*row[:8], Dependence(*row[8:12]), row.run))
 
 
 def _stages(connection: sa.Connection, run: str) -> dict[str, float]:
@@ -595,18 +580,13 @@ def _stages(connection: sa.Connection, run: str) -> dict[str, float]:
 
 
 def _run_from(row: Any, seconds: Mapping[str, float]) -> Run:
+    values = {field.name: getattr(row, field.name) for field in fields(Run)[:-1]}
     return Run(
-        id=row.id,
-        started=row.started.replace(tzinfo=UTC),
-        finished=aware(row.finished),
-        status=RunStatus(row.status),
-        holder=row.holder,
-        version=row.version,
-        code_version=row.code_version,
-        scenes=row.scenes,
-        products=row.products,
-        granules=row.granules,
-        failed=row.failed,
-        refused=row.refused,
-        seconds=seconds,
+        **values
+        | {
+            "started": row.started.replace(tzinfo=UTC),
+            "finished": aware(row.finished),
+            "status": RunStatus(row.status),
+            "seconds": seconds,
+        }
     )

@@ -148,15 +148,8 @@ class Lock:
             row = connection.execute(query).one_or_none()
         if row is None:
             return None
-        return Holder(
-            row.token,
-            row.holder,
-            row.machine,
-            row.process,
-            row.process_started,
-            row.acquired,
-            row.silent,
-        )
+        _campaign, *known, _heartbeat, silent = row
+        return Holder(*(*known, silent))
 
     def _own_row(self) -> tuple[sa.ColumnElement[bool], ...]:
         return _L.campaign == self._database.campaign, _L.token == self.token

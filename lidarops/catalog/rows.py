@@ -17,6 +17,11 @@ from lidarops.records import ChannelLayout, Granule
 RETRY: Final = ""
 """Scan key of a file that could not be read: every scan tries it again."""
 
+_AS_THEY_ARE: Final = (
+    "path", "size", "mtime_ns", "instrument", "reason", "zenith_angle", "azimuth", "latitude",
+    "longitude", "altitude", "sha256", "format", "header_digest",
+)  # fmt: skip
+"""Fields of a granule that are columns."""
 _HALF: Final = (1 << 31) - 1
 _EPOCH: Final = date(1970, 1, 1).toordinal()
 
@@ -93,27 +98,15 @@ def _layout_row(layout: tuple[ChannelLayout, ...]) -> tuple[str, str]:
 def _values(granule: Granule, campaign: str, scan_key: str, layout: str) -> dict[str, Any]:
     low, high = _stamp(granule, scan_key, layout)
     return {
+        **{name: getattr(granule, name) for name in _AS_THEY_ARE},
         "campaign": campaign,
-        "path": granule.path,
-        "size": granule.size,
-        "mtime_ns": granule.mtime_ns,
         "scan_key": scan_key,
-        "instrument": granule.instrument,
         "role": granule.role.value,
         "status": granule.status.value,
-        "reason": granule.reason,
         "notes": json.dumps(granule.notes) if granule.notes else "[]",
         "start": naive(granule.start),
         "stop": naive(granule.stop),
-        "zenith_angle": granule.zenith_angle,
-        "azimuth": granule.azimuth,
-        "latitude": granule.latitude,
-        "longitude": granule.longitude,
-        "altitude": granule.altitude,
         "layout": layout,
-        "sha256": granule.sha256,
-        "format": granule.format,
-        "header_digest": granule.header_digest,
         "day": None if granule.start is None else day_of(granule.start),
         "stamp_low": low,
         "stamp_high": high,

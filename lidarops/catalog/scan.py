@@ -18,11 +18,11 @@ from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Role, Status
+from lidarops.system.code_version import reading_version
 from lidarops.system.processes import Processes
 from lidarops.system.stores import without_keys
 
 _BATCH = 2000
-_SCAN_VERSION = 1
 _TOGETHER = 250
 """Headers in one batch for a process."""
 _WORTH_PROCESSES = 5000
@@ -70,11 +70,11 @@ def scan_archive(
 ) -> ScanSummary:
     """Update the catalog from the archive.
 
-    Only files whose size, modification time or campaign settings changed are opened. Of these, only
-    the header is read; the whole file is read only if a product was made from it or it may have
-    moved, to compare the content. An unusable file becomes a refused granule with a reason. If
-    nothing changed, nothing is written. Memory grows with the number of changed files, not with the
-    archive.
+    Only files whose size, modification time or campaign settings changed are opened, or all if the
+    code that reads them changed. Of these, only the header is read; the whole file is read only if
+    a product was made from it or it may have moved, to compare the content. An unusable file
+    becomes a refused granule with a reason. If nothing changed, nothing is written. Memory grows
+    with the number of changed files, not with the archive.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ class _Scan:
         self._archive = campaign.archive
         self._store = store
         self._progress = progress
-        self._before_write = before_write
+        self._write = before_write or (lambda: None)
         self._claims = _claims(campaign)
         self._folder: str | None = None
         self._near: list[_Claim] = []
@@ -237,10 +237,6 @@ class _Scan:
         self._store.replace(self._pending)
         self._pending.clear()
 
-    def _write(self) -> None:
-        if self._before_write is not None:
-            self._before_write()
-
     def _report_progress(self) -> None:
         if self._progress and self._files > self._reported:
             self._progress(self._files - self._reported)
@@ -314,6 +310,7 @@ def scan_keys(campaign: Campaign) -> dict[tuple[str, Role], str]:
 
 def _claims(campaign: Campaign) -> list[_Claim]:
     claims: list[_Claim] = []
+    version = reading_version()
     for key, instrument in campaign.instruments.items():
         station = campaign.stations[instrument.station]
         for role, patterns in (
@@ -321,7 +318,7 @@ def _claims(campaign: Campaign) -> list[_Claim]:
             (Role.SIGNAL, instrument.files),
         ):
             settings = [
-                _SCAN_VERSION,
+                version,
                 key,
                 role.value,
                 patterns,

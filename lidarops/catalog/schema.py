@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 6
+SCHEMA_VERSION: Final = 7
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -41,11 +41,10 @@ GRANULE = sa.Table(
     sa.Column("notes", sa.Text, nullable=False),
     sa.Column("start", sa.DateTime),
     sa.Column("stop", sa.DateTime),
-    sa.Column("zenith_angle", sa.Float),
-    sa.Column("azimuth", sa.Float),
-    sa.Column("latitude", sa.Float),
-    sa.Column("longitude", sa.Float),
-    sa.Column("altitude", sa.Float),
+    *(
+        sa.Column(name, sa.Float)
+        for name in ("zenith_angle", "azimuth", "latitude", "longitude", "altitude")
+    ),
     sa.Column("layout", sa.ForeignKey("layout.hash")),
     sa.Column("sha256", _DIGEST),
     # Name of the raw format; empty where the file is refused.
@@ -60,6 +59,8 @@ GRANULE = sa.Table(
     sqlite_with_rowid=False,
 )
 
+RUN_COUNTS: Final = ("scenes", "products", "granules", "failed", "refused")
+
 RUN = sa.Table(
     "run",
     METADATA,
@@ -71,11 +72,7 @@ RUN = sa.Table(
     sa.Column("holder", sa.Text, nullable=False),
     sa.Column("version", _NAME, nullable=False),
     sa.Column("code_version", _NAME, nullable=False),
-    sa.Column("scenes", sa.Integer, nullable=False),
-    sa.Column("products", sa.Integer, nullable=False),
-    sa.Column("granules", sa.Integer, nullable=False),
-    sa.Column("failed", sa.Integer, nullable=False),
-    sa.Column("refused", sa.Integer, nullable=False),
+    *(sa.Column(name, sa.Integer, nullable=False) for name in RUN_COUNTS),
     sa.Index("run_by_time", "campaign", "started"),
 )
 
@@ -177,6 +174,8 @@ VERDICT = sa.Table(
     sa.Column("empty_scenes", sa.Integer, nullable=False),
     # Good granules of the day that belong to no scene.
     sa.Column("set_aside", sa.Integer, nullable=False),
+    # JSON of the ancillary files that the steps of the day read -> SHA-256.
+    sa.Column("files", sa.Text, nullable=False),
     sqlite_with_rowid=False,
 )
 

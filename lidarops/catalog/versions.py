@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -86,21 +85,11 @@ def sweep(output: Path) -> list[str]:
         Paths of the removed files.
     """
     swept = []
-    for folder in ("products", FOLDER, "report"):
-        for path in _temporaries(str(output / folder)):
-            with suppress(OSError):
-                Path(path).unlink()
-                swept.append(path)
+    for kept in ("products", FOLDER, "report"):
+        for folder, _, names in os.walk(output / kept):
+            for name in names:
+                if name.startswith(".") and name.endswith(".tmp"):
+                    with suppress(OSError):
+                        Path(folder, name).unlink()
+                        swept.append(str(Path(folder, name)))
     return swept
-
-
-def _temporaries(folder: str) -> Iterator[str]:
-    try:
-        entries = list(os.scandir(folder))
-    except OSError:
-        return
-    for entry in entries:
-        if entry.is_dir(follow_symlinks=False):
-            yield from _temporaries(entry.path)
-        elif entry.name.startswith(".") and entry.name.endswith(".tmp"):
-            yield entry.path

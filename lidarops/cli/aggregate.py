@@ -12,22 +12,18 @@ import typer
 
 from lidarops.cli.app import (
     JsonOption,
-    add_row,
-    app,
+    command,
     exit_with_status,
-    make_table,
     progress_bar,
-    show,
+    show_rows,
     utc,
-    with_plain_errors,
 )
 
 if TYPE_CHECKING:
     from lidarops.aggregate.aggregates import AggregateResult
 
 
-@app.command()
-@with_plain_errors
+@command()
 def aggregate(
     out: Annotated[
         Path,
@@ -73,8 +69,8 @@ def aggregate(
         parse_choice(Weights, weights, "weights"),
         stac,
     )
-    with progress_bar("aggregate", None) as advance:
-        made = make_aggregates(_root(out), options, progress=advance)
+    with progress_bar("aggregate", None) as bar:
+        made = make_aggregates(_root(out), options, progress=bar.advance)
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
@@ -91,17 +87,12 @@ def _root(out: Path) -> Path:
 
 
 def _tell(made: AggregateResult) -> None:
-    views = make_table("Views", "file", "products", "profiles", "parts")
-    for view in made.views:
-        add_row(views, view.path, view.products, view.profiles, view.parts)
-    means = make_table("Means", "file", "products", "periods")
-    for file in made.means:
-        add_row(means, file.path, file.products, file.periods)
-    refused = make_table("Refused", "file", "reason")
-    for product in made.refused:
-        add_row(refused, product.path, product.reason)
-    for table in (views, means, refused):
-        show(table)
+    views = ((view.path, view.products, view.profiles, view.parts) for view in made.views)
+    show_rows("Views", ("file", "products", "profiles", "parts"), views)
+    means = ((file.path, file.products, file.periods) for file in made.means)
+    show_rows("Means", ("file", "products", "periods"), means)
+    refused = ((product.path, product.reason) for product in made.refused)
+    show_rows("Refused", ("file", "reason"), refused)
     for sentence in made.notes:
         typer.echo(f"note: {sentence}")
     for sentence in made.failed:

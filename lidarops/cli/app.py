@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, ParamSpec
 
 import typer
 
@@ -67,7 +67,6 @@ WaitOption = Annotated[
 ]
 
 _P = ParamSpec("_P")
-_R = TypeVar("_R")
 
 _LEAST_COLUMN_WIDTH = 12
 """Least width of a table column, in characters."""
@@ -81,18 +80,21 @@ def show_error(error: LidarOpsError) -> None:
     typer.secho(f"error: {error}", fg="red", err=True)
 
 
-def with_plain_errors(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a command to show a lidarops error as one line, not as a traceback."""
+def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
+    """Register a function as a command that shows a lidarops error as a line, not a traceback."""
 
-    @wraps(command)
-    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        try:
-            return command(*args, **kwargs)
-        except LidarOpsError as error:
-            show_error(error)
-            raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
+    def registered(function: Callable[_P, None]) -> Callable[_P, None]:
+        @wraps(function)
+        def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> None:
+            try:
+                function(*args, **kwargs)
+            except LidarOpsError as error:
+                show_error(error)
+                raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
 
-    return wrapped
+        return app.command(name)(wrapped)
+
+    return registered
 
 
 @app.callback()
@@ -124,75 +126,51 @@ def exit_with_status(*, failed: bool) -> None:
         raise typer.Exit(REFUSED)
 
 
-class Bar:
-    """A progress bar whose total grows while it advances."""
+class Bar(NamedTuple):
+    """A progress bar: adds to its total, and advances."""
 
-    def __init__(self, grow: Callable[[int], None], advance: Callable[[int], None]) -> None:
-        self.grow = grow
-        self.advance = advance
+    grow: Callable[[int], None]
+    advance: Callable[[int], None]
 
 
 @contextmanager
-def growing_bar(name: str, unit: str) -> Iterator[Bar]:
-    """Show progress, throughput and remaining time on standard error if that is a terminal."""
+def progress_bar(name: str, total: int | None, unit: str = "") -> Iterator[Bar]:
+    """Show progress on standard error if that is a terminal.
+
+    Parameters
+    ----------
+    name : str
+    total : int or None
+        None where it is not known, or grows.
+    unit : str, optional
+        What is counted, to show throughput and remaining time.
+    """
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
     from rich.text import Text
 
-    class Speed(TextColumn):
-        def render(self, task: Task) -> Text:
+    class Speed(progress.TextColumn):
+        def render(self, task: progress.Task) -> Text:
             return Text(f"{task.speed or 0.0:.0f} {unit}/s")
 
+    columns: list[progress.ProgressColumn] = [
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        *([Speed("")] if unit else []),
+        progress.TimeElapsedColumn(),
+    ]
+    if unit:
+        columns += [progress.TextColumn("remaining"), progress.TimeRemainingColumn()]
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        Speed(""),
-        TimeElapsedColumn(),
-        TextColumn("remaining"),
-        TimeRemainingColumn(),
-    )
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task(name, total=None)
-        total = 0
+    hidden = not console.is_terminal
+    with progress.Progress(*columns, console=console, transient=True, disable=hidden) as bar:
+        task = bar.add_task(name, total=total)
 
         def grow(number: int) -> None:
-            nonlocal total
-            total += number
-            bar.update(task, total=total)
+            bar.update(task, total=(bar.tasks[0].total or 0) + number)
 
         yield Bar(grow, lambda done: bar.advance(task, done))
-
-
-@contextmanager
-def progress_bar(name: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show progress on standard error if that is a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task(name, total=total)
-        yield lambda done: bar.advance(task, done)
 
 
 def show(table: Table) -> None:
@@ -205,19 +183,15 @@ def show(table: Table) -> None:
         Console(width=max(Console().width, least_width)).print(table)
 
 
-def make_table(title: str, *columns: str) -> Table:
-    """Return an empty table whose cells fold."""
+def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Print a table of plain text whose cells fold, unless it has no rows."""
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title=title, title_justify="left")
     for column in columns:
         table.add_column(column, overflow="fold")
-    return table
-
-
-def add_row(table: Table, *cells: Any) -> None:
-    """Add a row of plain text."""
-    from rich.text import Text
-
-    # Text, because rich would read brackets in a path or reason as markup.
-    table.add_row(*(Text(str(cell)) for cell in cells))
+    for row in rows:
+        # Text, because rich would read brackets in a path or reason as markup.
+        table.add_row(*(Text(str(cell)) for cell in row))
+    show(table)

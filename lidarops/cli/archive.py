@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -24,31 +24,26 @@ from lidarops.cli.app import (
     StationOption,
     UntilOption,
     WaitOption,
-    add_row,
-    app,
+    command,
     exit_with_status,
-    growing_bar,
-    make_table,
     progress_bar,
-    show,
     show_error,
+    show_rows,
     utc,
-    with_plain_errors,
 )
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterator
     from contextlib import AbstractContextManager
 
     from distributed import Client
-    from rich.table import Table
 
     from lidarops.campaign.model import Campaign
     from lidarops.plan.cost_estimate import RunTime
-    from lidarops.records import Granule, Plan, RunRecord
+    from lidarops.records import Granule, LeftOut, Plan, PlannedStep, RunRecord, SceneOutcome
     from lidarops.run.archive import Result
     from lidarops.run.selection import Selection
     from lidarops.run.staleness import Judgement
@@ -56,7 +51,6 @@ if TYPE_CHECKING:
 _LEAST_MEMORY = 2**20
 """Bytes; a smaller size probably lacks its unit."""
 
-_UNUSABLE = "its retrievals gave no usable value"
 _NO_SCENE = "nothing to do: the selection contains no scene of the archive"
 
 AllStepsOption = Annotated[
@@ -84,8 +78,7 @@ def _size(text: str | None) -> str | None:
     return text
 
 
-@app.command()
-@with_plain_errors
+@command()
 def catalog(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -99,21 +92,19 @@ def catalog(
 
     Example: lidarops catalog catalogs/demo.yaml
     """
-    from dataclasses import asdict
-
     from lidarops.catalog.store import Store
     from lidarops.run.archive import update_catalog
 
     settings = _loaded(campaign, archive, out, catalog)
-    with progress_bar("catalog", None) as advance:
-        summary = update_catalog(settings, progress=advance, wait=wait, workers=workers)
+    with progress_bar("catalog", None) as bar:
+        summary = update_catalog(settings, progress=bar.advance, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
     if as_json:
         reasons = [{"path": granule.path, "reason": granule.reason} for granule in refused]
         typer.echo(json.dumps({**asdict(summary), "refused_files": reasons}, indent=2))
     else:
-        show(_refused_table(refused))
+        _show_refused(refused)
         typer.echo(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
@@ -122,8 +113,7 @@ def catalog(
     exit_with_status(failed=bool(refused))
 
 
-@app.command("plan")
-@with_plain_errors
+@command("plan")
 def show_plan(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -143,7 +133,8 @@ def show_plan(
 ) -> None:
     """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
 
-    Also shows the estimated CPU time, and the memory that a process needs for each scene.
+    Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
+    code 1 if a scene cannot be planned.
 
     Example: lidarops plan catalogs/demo.yaml
     """
@@ -158,8 +149,10 @@ def show_plan(
     making, everything = RunTime(), RunTime()
     scenes = []
     no_scene = True
+    failed = False
     for judged in judgements:
         no_scene = False
+        failed |= not judged.planned
         scene, whole = judged.scene, settings.all_steps
         times = {
             "to_be_made": making.add(scene, judged.needed(), whole=whole),
@@ -179,8 +172,8 @@ def show_plan(
             for name in times
         }
         if not stale:
-            show(_plan_table(f"{title}, {needs['everything']}", judged.requested))
-        show(_stale_table(f"{title}, {needs['to_be_made']}", judged))
+            _show_plan(f"{title}, {needs['everything']}", judged.requested)
+        _show_stale(f"{title}, {needs['to_be_made']}", judged)
     no_scene = no_scene and selects_no_scene(settings, selection)
     # With --stale, fresh scenes were not judged.
     runs = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
@@ -191,14 +184,14 @@ def show_plan(
         no_scene_found = {"no_scene_selected": no_scene}
         document = {"scenes": scenes, **no_scene_found, "estimated_cpu_seconds": estimate}
         typer.echo(json.dumps(document, indent=2))
-        return
-    if no_scene:
-        typer.echo(_NO_SCENE)
-    show(_time_table(runs))
+    else:
+        if no_scene:
+            typer.echo(_NO_SCENE)
+        _show_times(runs)
+    exit_with_status(failed=failed)
 
 
-@app.command()
-@with_plain_errors
+@command()
 def reprocess(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -275,7 +268,7 @@ def reprocess(
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     selection = _selection(instrument, station, product, since, until)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
-    with growing_bar("reprocess", "granules") as bar:
+    with progress_bar("reprocess", None, "granules") as bar:
         options = pipeline.Options(
             force=force,
             workers=workers or 1,
@@ -288,13 +281,11 @@ def reprocess(
         )
         result = pipeline.bring_up_to_date(settings, selection=selection, options=options)
     no_scene = result.record is None and selects_no_scene(settings, selection)
-    if no_scene and not as_json:
-        _print_without_scene(settings, result, removing=remove_orphans)
-    elif not as_json:
-        _print_result(settings, result, removing=remove_orphans)
     report_note = missing_report(settings) if result.record is None else ""
-    if report_note and not as_json:
-        typer.echo(report_note)
+    if not as_json:
+        _print_result(settings, result, no_scene=no_scene, removing=remove_orphans)
+        if report_note:
+            typer.echo(report_note)
     page, removed = None, None
     try:
         if result.record is not None:
@@ -310,7 +301,7 @@ def reprocess(
         else:
             _print_places(result, page)
     if removed is not None and not as_json:
-        show(_orphans_table(result, removed))
+        _show_orphans(result, removed)
     if result.signal:
         raise typer.Exit(128 + result.signal)
     left = result if removed is None else replace(result, orphans=())
@@ -391,45 +382,57 @@ def _selection(
     )
 
 
-def _refused_table(refused: list[Granule]) -> Table:
-    table = make_table("Refused", "file", "instrument", "reason")
-    for granule in refused:
-        add_row(table, granule.path, granule.instrument, granule.reason)
-    return table
+def _show_refused(refused: list[Granule]) -> None:
+    rows = ((granule.path, granule.instrument, granule.reason) for granule in refused)
+    show_rows("Refused", ("file", "instrument", "reason"), rows)
 
 
-def _plan_table(title: str, plan: Plan) -> Table:
+def _show_plan(title: str, plan: Plan) -> None:
+    from lidarops.steps.dependence import needed_places
+
+    taken = [", ".join(str(place + 1) for place in places) for places in needed_places(plan)]
+    steps = zip(plan.steps, taken, strict=True)
+    show_rows(
+        f"{title}, plan {plan.hash[:12]}",
+        ("", "channel", "step", "needs", "does", "reason", "rule, number"),
+        [
+            *((number, *_cells(step, needs, _effect(step, plan)))
+              for number, (step, needs) in enumerate(steps, 1)),
+            *(("", *_cells(omission, "", "left out")) for omission in plan.left_out),
+        ],
+    )  # fmt: skip
+
+
+def _cells(entry: PlannedStep | LeftOut, needs: str, does: str) -> tuple[str, ...]:
     from lidarops.figures.wording import decided_on
+
+    rule = f"{entry.rule} {decided_on(entry.number)}"
+    return entry.channel, entry.name, needs, does, entry.reason, rule
+
+
+def _effect(step: PlannedStep, plan: Plan) -> str:
     from lidarops.steps.reading import idle_window
 
-    table = make_table(title, "channel", "step", "does", "reason", "rule", "number")
-    for step in plan.steps:
-        settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-        idle = idle_window(step, plan.steps)
-        done = f"no effect: {idle}" if idle else settings or "yes"
-        cells = (step.channel, step.name, done, step.reason)
-        add_row(table, *cells, step.rule, decided_on(step.number))
-    for omission in plan.left_out:
-        cells = (omission.channel, omission.name, "left out", omission.reason)
-        add_row(table, *cells, omission.rule, decided_on(omission.number))
-    return table
+    idle = idle_window(step, plan.steps)
+    settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
+    return f"no effect: {idle}" if idle else settings or "yes"
 
 
-def _time_table(runs: Mapping[str, RunTime]) -> Table:
-    title = "Estimated CPU time in s on a common server core"
-    table = make_table(title, "", "scenes", "processing", "start", "report", "all")
-    for name, run in runs.items():
-        add_row(table, name, run.count, *(f"{seconds:.2g}" for seconds in run.parts.values()))
-    return table
+def _show_times(runs: Mapping[str, RunTime]) -> None:
+    rows = (
+        (name, run.count, *(f"{seconds:.2g}" for seconds in run.parts.values()))
+        for name, run in runs.items()
+    )
+    columns = ("", "scenes", "processing", "start", "report", "all")
+    show_rows("Estimated CPU time in s on a common server core", columns, rows)
 
 
-def _stale_table(title: str, judged: Judgement) -> Table:
-    table = make_table(f"{title}: to be made", "product", "channel", "reason")
-    for product in judged.stale:
-        add_row(table, product.kind, product.channel, product.reason)
-    if judged.held:
-        add_row(table, "none", "", f"not tried again, because nothing has changed: {judged.held}")
-    return table
+def _show_stale(title: str, judged: Judgement) -> None:
+    rows = [(product.kind, product.channel, product.reason) for product in judged.stale]
+    if judged.failure:
+        unchanged = "not tried again, because nothing has changed: " if judged.held else ""
+        rows.append(("none", "", f"{unchanged}{judged.failure.error}"))
+    show_rows(f"{title}: to be made", ("product", "channel", "reason"), rows)
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
@@ -447,16 +450,16 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     ]
     return {
         **plan.as_dict(),
+        "hash": plan.hash,
         "steps": steps,
         "stale": stale,
         "fresh": judged.fresh,
+        "failure": asdict(judged.failure) if judged.failure else None,
         "held": judged.held,
     }
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
-    from dataclasses import asdict
-
     record = result.record
     scenes = () if record is None else record.scenes
     return {
@@ -514,106 +517,76 @@ def _refused(campaign: Campaign, result: Result) -> list[Granule]:
         return store.refused()
 
 
-def _print_result(campaign: Campaign, result: Result, *, removing: bool) -> None:
-    table = make_table("Products", "scene", "kind", "channel", "values", "unflagged", "flags")
-    for scene in () if result.record is None else result.record.scenes:
-        for product in scene.products:
-            flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
-            name = (scene.scene, product.kind, product.channel)
-            add_row(table, *name, product.values, product.unflagged, flags)
-        if scene.error:
-            add_row(table, scene.scene, "none", "", "", "", scene.error)
-    show(table)
+def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removing: bool) -> None:
+    scenes = () if result.record is None else result.record.scenes
+    columns = ("scene", "kind", "channel", "values", "unflagged", "flags")
+    show_rows("Products", columns, (row for scene in scenes for row in _product_rows(scene)))
     refused = _refused(campaign, result)
-    show(_refused_table(refused))
-    show(_unused_table(result, {granule.path for granule in refused}))
-    show(_unmet_table(result))
+    _show_refused(refused)
+    _show_unused(result, {granule.path for granule in refused})
+    _show_unmet(result)
     if not removing:
-        show(_orphans_table(result, None))
-    show(_kept_table(result))
-    show(_unusable_table(result))
-    show(_failures_table(result))
-    if result.record is not None:
+        _show_orphans(result, None)
+    kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
+    title = "Requested products that could not be made again (kept)"
+    show_rows(title, ("file", "reason"), kept)
+    _show_scenes_with_problems(result)
+    if no_scene:
+        typer.echo(_NO_SCENE)
+    elif result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
         typer.echo(f"products: {campaign.products_root}{ended}")
-        return
-    typer.echo("nothing to do: every requested product is fresh or cannot be made")
+    else:
+        typer.echo("nothing to do: every requested product is fresh or cannot be made")
 
 
-def _unused_table(result: Result, listed: Collection[str]) -> Table:
-    title = "Not used" + (
-        f" ({result.more_unused} more on other days)" if result.more_unused else ""
-    )
-    table = make_table(title, "file or scene", "reason")
-    for path, reason in result.set_aside.items():
-        if path not in listed:
-            add_row(table, path, reason)
-    for scene, reason in result.empty_scenes.items():
-        add_row(table, scene, reason)
-    return table
+def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
+    for product in scene.products:
+        flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
+        numbers = (product.values, product.unflagged)
+        yield scene.scene, product.kind, product.channel, *numbers, flags
+    if scene.error:
+        yield scene.scene, "none", "", "", "", scene.error
 
 
-def _unmet_table(result: Result) -> Table:
+def _show_unused(result: Result, listed: Collection[str]) -> None:
+    more = f" ({result.more_unused} more on other days)" if result.more_unused else ""
+    set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
+    rows = (*set_aside, *result.empty_scenes.items())
+    show_rows(f"Not used{more}", ("file or scene", "reason"), rows)
+
+
+def _show_unmet(result: Result) -> None:
     from lidarops.figures.wording import lacking
 
-    title = "Requested, but not in the files"
-    table = make_table(title, "instrument", "channel", "requested by", "reason", "missing in")
-    for request in result.unmet:
-        cells = (request.instrument, request.channel, request.requested_by, request.reason)
-        add_row(table, *cells, lacking(request))
-    return table
+    columns = ("instrument", "channel", "requested by", "reason", "missing in")
+    rows = (
+        (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
+        for unmet in result.unmet
+    )
+    show_rows("Requested, but not in the files", columns, rows)
 
 
-def _print_without_scene(campaign: Campaign, result: Result, *, removing: bool) -> None:
-    refused = _refused(campaign, result)
-    show(_refused_table(refused))
-    show(_unused_table(result, {granule.path for granule in refused}))
-    show(_unmet_table(result))
-    if not removing:
-        show(_orphans_table(result, None))
-    show(_kept_table(result))
-    show(_failures_table(result))
-    typer.echo(_NO_SCENE)
-
-
-def _orphans_table(result: Result, removed: int | None) -> Table:
+def _show_orphans(result: Result, removed: int | None) -> None:
     fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
-    table = make_table(f"Products that the campaign no longer requests ({fate})", "file", "reason")
-    for orphan in result.orphans:
-        if not orphan.requested:
-            add_row(table, orphan.path, orphan.reason)
-    return table
+    rows = ((orphan.path, orphan.reason) for orphan in result.orphans if not orphan.requested)
+    title = f"Products that the campaign no longer requests ({fate})"
+    show_rows(title, ("file", "reason"), rows)
 
 
-def _kept_table(result: Result) -> Table:
-    title = "Requested products that could not be made again (kept)"
-    table = make_table(title, "file", "reason")
-    for orphan in result.orphans:
-        if orphan.requested:
-            add_row(table, orphan.path, orphan.reason)
-    return table
-
-
-def _unusable_table(result: Result) -> Table:
-    table = make_table("Without a usable value", "scene", "problem")
+def _show_scenes_with_problems(result: Result) -> None:
     processed = _processed_scenes(result)
-    for scene in result.unusable_scenes:
-        if scene in processed:
-            add_row(table, scene, _UNUSABLE)
-    return table
+    unusable = dict.fromkeys(result.unusable_scenes, "its retrievals gave no usable value")
+    columns = ("scene", "problem")
+    now = ((scene, problem) for scene, problem in unusable.items() if scene in processed)
+    show_rows("Without a usable value", columns, now)
+    earlier = (*result.failures.items(), *unusable.items())
+    show_rows(
+        "From earlier runs, unchanged since",
+        columns,
+        ((scene, problem) for scene, problem in earlier if scene not in processed),
+    )
 
 
 def _processed_scenes(result: Result) -> set[str]:
     return {scene.scene for scene in (() if result.record is None else result.record.scenes)}
-
-
-def _failures_table(result: Result) -> Table:
-    processed = _processed_scenes(result)
-    table = make_table("From earlier runs, unchanged since", "scene", "problem")
-    for scene, error in result.failures.items():
-        if scene not in processed:
-            add_row(table, scene, error)
-    for scene in result.unusable:
-        if scene not in processed:
-            add_row(table, scene, _UNUSABLE)
-    return table

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from lidarops.cli.app import (
     JsonOption,
-    add_row,
-    app,
-    exit_with_status,
-    make_table,
+    command,
     no_url,
     progress_bar,
-    show,
-    with_plain_errors,
+    show_rows,
 )
 from lidarops.errors import CampaignError
 
-if TYPE_CHECKING:
-    from lidarops.bench.harness.benchmark import BenchmarkOutput, Effort
 
-
-@app.command()
-@with_plain_errors
+@command()
 def bench(
     what: Annotated[str, typer.Argument(help="accuracy, throughput or stability", metavar="WHAT")],
     files: Annotated[
@@ -58,8 +49,8 @@ def bench(
     """Measure accuracy, throughput or stability.
 
     Accuracy compares errors with the least possible errors; throughput compares times with a floor
-    measured in the same run; stability shows the results of stiff and extreme cases, and how often
-    a wrong value has no flag.
+    measured in the same run; stability shows how often a wrong value
+    has no flag.
 
     Example: lidarops bench accuracy --case homogeneous --quick --out bench
 
@@ -70,31 +61,26 @@ def bench(
     Example: lidarops bench stability --quick --out bench
     """
     from lidarops.bench import registry
-    from lidarops.bench.harness import results
     from lidarops.bench.harness.benchmark import Effort
+    from lidarops.bench.stability import study
 
     today = datetime.now(UTC).date().isoformat()
-    with progress_bar("bench", None) as advance:
-        effort = Effort(quick=quick, repeats=repeats, date=today, progress=advance)
+    with progress_bar("bench", None) as bar:
+        effort = Effort(quick=quick, repeats=repeats, date=today, progress=bar.advance)
         if what == registry.STABILITY:
             _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
-            output = _stability(effort)
+            output = study.measure_stability(effort).output()
         else:
             output = registry.run_benchmark(what, case, files or [], effort, data=data)
     page = None if out is None else registry.write_benchmark(output, Path(out))
     if as_json:
-        typer.echo(json.dumps(results.plain(output.result), indent=1))
-        exit_with_status(failed=_failed(output))
-        return
-    for chapter in output.report.parts:
-        for contents in chapter.tables:
-            table = make_table(contents.title, *contents.columns)
-            for cells in contents.rows:
-                add_row(table, *cells)
-            show(table)
-    if page is not None:
-        typer.echo(f"report: {page}")
-    exit_with_status(failed=_failed(output))
+        typer.echo(output.json())
+    else:
+        for chapter in output.report.parts:
+            for table in chapter.tables:
+                show_rows(table.title, table.columns, table.rows)
+        if page is not None:
+            typer.echo(f"report: {page}")
 
 
 def _refuse(options: dict[str, object]) -> None:
@@ -104,14 +90,3 @@ def _refuse(options: dict[str, object]) -> None:
             raise CampaignError(
                 "is no option of the benchmark 'stability'", field=name, remedy="leave it out"
             )
-
-
-def _stability(effort: Effort) -> BenchmarkOutput:
-    from lidarops.bench.stability import study
-
-    return study.run_stability(effort)
-
-
-def _failed(output: BenchmarkOutput) -> bool:
-    """Return whether a case gave another result than expected."""
-    return bool(getattr(output.result, "failed", False))

@@ -1,18 +1,18 @@
-"""Commands that show one file or one run."""
+"""Commands on one file or one run: show it, or make it again."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import JsonOption, app, show, with_plain_errors
+from lidarops.cli.app import JsonOption, command, exit_with_status, show
 
 
-@app.command()
-@with_plain_errors
+@command()
 def report(
     run: Annotated[
         Path, typer.Argument(help="Report folder of a run, or its run.json.", metavar="RUN")
@@ -31,8 +31,7 @@ def report(
     )
 
 
-@app.command()
-@with_plain_errors
+@command()
 def inspect(
     file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
     provenance: Annotated[
@@ -54,3 +53,36 @@ def inspect(
         return
     for table in inspection.tables(file):
         show(table)
+
+
+@command()
+def reproduce(
+    product: Annotated[Path, typer.Argument(help="A product.", metavar="PRODUCT")],
+    archive: Annotated[
+        str | None,
+        typer.Option("--archive", help="Folder or URL of the raw files; searched for by default."),
+    ] = None,
+    ancillary: Annotated[
+        Path | None,
+        typer.Option("--ancillary", help="Folder of soundings and overlap functions."),
+    ] = None,
+    catalog: Annotated[
+        str | None,
+        typer.Option(
+            "--catalog",
+            help="SQLAlchemy URL of a catalog that knows where raw files were moved;"
+            " searched for by default.",
+            metavar="URL",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a product again from its provenance. Exit code 0 if every byte is the same.
+
+    Example: lidarops reproduce demo/products/hill/hill-vertical/elastic/2024/*355o*0922*.nc
+    """
+    from lidarops.run.reproduction import explain_difference, reproduce_product
+
+    result = reproduce_product(product, archive=archive, ancillary=ancillary, catalog=catalog)
+    typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
+    exit_with_status(failed=not result.identical)

@@ -11,18 +11,14 @@ import typer
 
 from lidarops.cli.app import (
     JsonOption,
-    add_row,
-    app,
+    command,
     exit_with_status,
-    make_table,
     progress_bar,
-    show,
-    with_plain_errors,
+    show_rows,
 )
 
 
-@app.command()
-@with_plain_errors
+@command()
 def site(
     out: Annotated[
         Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
@@ -39,24 +35,12 @@ def site(
     """
     from lidarops.site.build import build_site
 
-    with progress_bar("site", None) as advance:
-        made = build_site(out, workers=workers, progress=advance)
+    with progress_bar("site", None) as bar:
+        made = build_site(out, workers=workers, progress=bar.advance)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "index": str(made.index),
-                    "products": made.products,
-                    "made": made.made,
-                    "problems": [asdict(problem) for problem in made.problems],
-                },
-                indent=2,
-            )
-        )
+        typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
-        table = make_table("Cannot be shown completely", "file", "reason")
-        for problem in made.problems:
-            add_row(table, problem.path, problem.reason)
-        show(table)
+        rows = ((problem.path, problem.reason) for problem in made.problems)
+        show_rows("Cannot be shown completely", ("file", "reason"), rows)
         typer.echo(f"{made.products} products, {made.made} pages made\nsite: {made.index}")
     exit_with_status(failed=bool(made.problems))

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from lidarops.records import Plan, Scene
-from lidarops.steps.dependence import is_product, plan_closure, planned_products
+from lidarops.steps.dependence import is_product, planned_products, workloads
 from lidarops.steps.registry import definition
-from lidarops.steps.workload import Workload
 
 _START: Final = 9.0
 """s for the process, its imports, compiled code and the ledger."""
@@ -43,11 +42,8 @@ def scene_cpu_time(scene: Scene, plan: Plan, *, whole: bool = False) -> float:
     """
     if not planned_products(plan):
         return 0.0
-    members = {member.instrument: member for member in scene.members}
     times = [_SCENE]
-    for step in plan.steps:
-        own = plan_closure(plan, [(step.name, step.channel)]) if is_product(step) else plan
-        work = Workload(members.get(step.instrument, scene), step.channel, own)
+    for step, work in workloads(scene, plan):
         known = definition(step)
         times.append(known.cpu_time(known.typed(step), work))
     files = (*scene.granules, *scene.dark)

@@ -22,7 +22,7 @@ from lidarops.steps.registry import (
     product_step,
     with_needs,
 )
-from lidarops.steps.step import NOT_REQUESTED, Leave
+from lidarops.steps.step import NOT_REQUESTED, REQUEST, Leave
 
 Entries = Iterator[PlannedStep | LeftOut]
 
@@ -120,7 +120,7 @@ def _product_entries(case: ChannelCase, kind: str) -> Entries:
     """Yield the entries of a product; its other steps only where the product is made."""
     of_product = case.of_product(kind, case.requests.get(kind))
     if of_product.request is None:
-        yield of_product.entry(kind, Leave(NOT_REQUESTED))
+        yield of_product.entry(kind, Leave(NOT_REQUESTED, rule=REQUEST))
         return
     making = product_step(kind)
     product = list(making.entries(of_product))

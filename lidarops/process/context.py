@@ -6,12 +6,12 @@ from typing import Any
 
 from lidarops.campaign.model import Campaign, Station, as_settings
 from lidarops.netcdf import provenance
-from lidarops.netcdf.code_version import code_version
 from lidarops.netcdf.context import Context
 from lidarops.process.job import Job
 from lidarops.raw.formats import raw_format
 from lidarops.records import ChannelLayout, DetectionMode, InputRecord, Plan, Provenance, Scene
 from lidarops.steps import dependence
+from lidarops.system.code_version import code_version
 
 
 def product_context(
@@ -95,7 +95,9 @@ def _campaign_settings(job: Job, plan: Plan, kind: str, channel: str) -> dict[st
             ),
         }
     return {
-        "network": as_settings(campaign.networks[scene.instrument]),
+        "network": dependence.single_kind_settings(
+            as_settings(campaign.networks[scene.instrument]), kind
+        ),
         "members": {
             member.instrument: {
                 "station": as_settings(campaign.stations[member.station]),

@@ -81,11 +81,13 @@ def streams_of(
     }
 
 
-def profiles_of(source: Source, steps: Sequence[PlannedStep], channel: str) -> xr.Dataset:
-    """Return power, variance and quality of all profiles of a source."""
+def profiles_of(
+    source: Source, steps: Sequence[PlannedStep], channel: str, profiles: int
+) -> Iterator[xr.Dataset]:
+    """Yield power, variance and quality of all profiles of a source, some profiles at a time."""
     data = channel_data(source, [step for step in steps if not step.product], channel)[""]
-    counts = loaded(source.archive, file_channels(channel), slice(None))
-    return data[PROFILES].of(counts)
+    for chunk in chunks(source, channel, (), profiles):
+        yield data[PROFILES].of(chunk.counts)
 
 
 def refined_plan(plan: Plan, scene: Scene, profiles: Sample) -> Plan:
@@ -97,7 +99,7 @@ def refined_plan(plan: Plan, scene: Scene, profiles: Sample) -> Plan:
     scene : Scene
         With usable granules only.
     profiles : callable
-        Returns power, variance and quality of a channel in some granules.
+        Yields power, variance and quality of a channel in some granules.
     """
     steps: list[PlannedStep] = []
     left_out: list[LeftOut] = list(plan.left_out)

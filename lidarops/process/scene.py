@@ -6,7 +6,6 @@ A scene is the unit of work. It gives its product files, or an outcome that stat
 from __future__ import annotations
 
 import time
-import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
@@ -16,11 +15,11 @@ import dask.config
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
-from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.netcdf.context import Context, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.process import execution
 from lidarops.process.context import product_context
+from lidarops.process.guard import Failure, guarded
 from lidarops.process.input_files import check_files, local_files, open_granules
 from lidarops.process.job import Job
 from lidarops.raw.archive import count_bytes_read
@@ -36,13 +35,12 @@ from lidarops.records import (
 )
 from lidarops.steps.channels import channel_ranges, file_channels, member_channel
 from lidarops.steps.conditioning import DARK
-from lidarops.steps.data import Chunk, ProductStream, RowProduct, Source, WholeProduct, in_one_batch
+from lidarops.steps.data import Chunk, ProductStream, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
-from lidarops.steps.reading import ARCHIVE, NO_PRODUCT, WAVELENGTH, read_windows
+from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
 from lidarops.steps.registry import gives, network_step
-from lidarops.steps.step import NOT_REQUESTED
-from lidarops.system.stores import without_keys
+from lidarops.steps.step import REQUEST
 
 
 def process_scene(job: Job) -> SceneOutcome:
@@ -71,62 +69,26 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         False where a disk, a network or memory failed, so that a retry may succeed.
     """
     begin = time.thread_time()
-    try:
+
+    def process() -> SceneOutcome:
         with local_files(job.campaign.archive, job.scene) as root:
-            outcome = _process(job, root)
-    except LidarOpsError as error:
-        may_pass = isinstance(error, CatalogError | ProductError) and not error.wrong_use
-        return failed_outcome(job, str(error)), not may_pass
-    except MemoryError as error:
-        return failed_outcome(job, str(_too_large(error))), False
-    except Exception as error:  # noqa: BLE001 - a bug in one scene must not stop the others
-        # A disk may have failed where its error is not expected.
-        return internal_error(job, error), not isinstance(error, OSError)
+            return _process(job, root)
+
+    outcome = guarded(process)
+    if isinstance(outcome, Failure):
+        return outcome.outcome(job.scene, job.plan), outcome.final
     return replace(outcome, cpu_seconds=time.thread_time() - begin), True
-
-
-def failed_outcome(job: Job, error: str) -> SceneOutcome:
-    """Return the outcome of a scene that gave no product."""
-    scene = job.scene
-    return SceneOutcome(
-        scene=scene.id,
-        station=scene.station,
-        instrument=scene.instrument,
-        start=scene.start,
-        granules=len(scene.granules),
-        plan=job.plan,
-        error=error,
-    )
-
-
-def internal_error(job: Job, error: BaseException) -> SceneOutcome:
-    """Return the outcome of a scene that was ended by a bug of lidarops, with its traceback."""
-    words = _storable("".join(traceback.format_exception_only(error)).strip())
-    outcome = failed_outcome(job, f"internal error: {words} (a bug of lidarops, not of the data)")
-    return replace(outcome, internal=_storable("".join(traceback.format_exception(error))))
-
-
-def _storable(text: str) -> str:
-    """Return a text without keys, and with escapes for what a database cannot hold."""
-    return without_keys(text).encode("utf-8", "backslashreplace").decode().replace("\0", r"\0")
-
-
-def _too_large(error: MemoryError) -> SceneError:
-    return SceneError(
-        f"the scene does not fit in memory: {error or 'no memory left'}",
-        remedy="process fewer profiles at a time with a smaller --profiles-per-chunk, or give each"
-        " process more memory",
-    )
 
 
 def _process(job: Job, root: Path) -> SceneOutcome:
     clock = _Clock()
     if not any(is_product(step) for step in job.plan.steps):
-        return failed_outcome(job, nothing_to_do(job.plan))
+        return Failure(nothing_to_do(job.plan)).outcome(job.scene, job.plan)
     read_all = job.campaign.all_steps
     usable, inputs, refused, read = check_files(job.scene, root, read_all=read_all)
     clock.lap("digest")
-    failure = replace(failed_outcome(job, ""), refused=refused, inputs=inputs, bytes_read=read)
+    failure = Failure("").outcome(job.scene, job.plan)
+    failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
     if not usable.granules:
         return replace(failure, error="no granule of the scene can be read")
     with dask.config.set(scheduler="synchronous"), count_bytes_read() as tally:
@@ -145,11 +107,7 @@ def _process(job: Job, root: Path) -> SceneOutcome:
 
 def nothing_to_do(plan: Plan) -> str:
     """Return why a plan makes no product: omissions of requested steps, those of products first."""
-    requested = [
-        omission
-        for omission in plan.left_out
-        if not any(words in omission.reason for words in (NOT_REQUESTED, NO_PRODUCT))
-    ]
+    requested = [omission for omission in plan.left_out if omission.rule != REQUEST]
     omissions = sorted(requested or plan.left_out, key=lambda omission: not is_product(omission))
     reasons = dict.fromkeys(
         f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
@@ -263,13 +221,15 @@ class _Instrument(_Work):
         for channel in channels:
             yield from self._channel_products(source, channel)
 
-    def _sample(self, channel: str, granules: Sequence[Granule]) -> xr.Dataset:
-        """Return power, variance and quality of a channel in some granules."""
+    def _sample(self, channel: str, granules: Sequence[Granule]) -> Iterator[xr.Dataset]:
+        """Yield power, variance and quality of a channel in some granules."""
         channels = (channel, *file_channels(channel))
         steps = [step for step in self.job.plan.steps if step.channel in channels]
         few = replace(self._scene, granules=tuple(granules))
         # The signal is compared with bins beyond the sections.
-        return execution.profiles_of(self._source(few, steps), steps, channel)
+        source = self._source(few, steps)
+        profiles = self._chunk_profiles(source, channel)
+        return execution.profiles_of(source, steps, channel, profiles)
 
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
         steps = self.job.plan.steps
@@ -283,34 +243,30 @@ class _Instrument(_Work):
             for kind in streams
         }
         with ExitStack() as until_written:
-            writers = {
-                kind: until_written.enter_context(self._writer(stream.frame(), contexts[kind]))
-                for kind, stream in streams.items()
-                if isinstance(stream, RowProduct)
-            }
+            writers: dict[str, ProductWriter] = {}
             profiles = self._chunk_profiles(source, channel)
             for chunk in execution.chunks(source, channel, streams.values(), profiles):
-                self._take(chunk, streams, writers)
+                for kind, rows in _taken(chunk, streams):
+                    self._clock.lap("retrieve")
+                    if kind in writers:
+                        writers[kind].add(rows)
+                        self._clock.lap("write")
+                    else:
+                        writer = self._writer(rows, contexts[kind])
+                        writers[kind] = until_written.enter_context(writer)
         yield from (_record(contexts[kind], writer) for kind, writer in writers.items())
         for kind, stream in streams.items():
             if isinstance(stream, WholeProduct):
                 yield self._written(contexts[kind], stream.results())
 
-    def _take(
-        self,
-        chunk: Chunk,
-        streams: Mapping[str, ProductStream],
-        writers: Mapping[str, ProductWriter],
-    ) -> None:
-        """Give a chunk to all products, and write the rows that are complete."""
-        for kind, stream in streams.items():
-            if isinstance(stream, WholeProduct):
-                stream.add(chunk)
-            else:
-                rows = stream.rows(chunk)
-                self._clock.lap("retrieve")
-                writers[kind].add(rows)
-                self._clock.lap("write")
+
+def _taken(chunk: Chunk, streams: Mapping[str, ProductStream]) -> Iterator[tuple[str, xr.Dataset]]:
+    """Give a chunk to all products, and yield the rows that are complete, with their kinds."""
+    for kind, stream in streams.items():
+        if isinstance(stream, WholeProduct):
+            stream.add(chunk)
+        else:
+            yield from ((kind, rows) for rows in stream.rows(chunk))
 
 
 class _Network(_Work):

@@ -21,10 +21,7 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.header import RawHeader, Stretches
-from lidarops.registry import by_name, registered
-
-GROUP: Final = "lidarops.raw_formats"
-"""Group of entry points."""
+from lidarops.registry import RAW_FORMATS, by_name, registered
 
 UNKNOWN_FORMAT: Final = "is of no known raw format"
 """What is wrong with a file that no format recognises."""
@@ -60,7 +57,7 @@ def raw_formats() -> Mapping[str, RawFormat]:
     LidarOpsError
         If an entry point cannot be loaded, or two have one name.
     """
-    formats = registered(GROUP, RawFormat, "raw format")
+    formats = registered(RAW_FORMATS, RawFormat, "raw format")
     return MappingProxyType(dict(sorted(formats.items())))
 
 

@@ -7,6 +7,6 @@
 - `executor`: processes scenes, in this process or on dask workers (`worker`); `clusters` starts or
   reaches such workers on this machine, Slurm or Kubernetes (`kubernetes`).
 - `session`: enters one run in the ledger, scene by scene.
-- `reproduction`: makes one product again from its provenance.
+- `reproduction`: makes one product again from its provenance, which `recipe` reads.
 - `publication`: copies products to an object store.
 """

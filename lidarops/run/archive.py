@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Final
 from dask.utils import parse_bytes
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.ledger import RunStatus, Verdict
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.process.job import Job
-from lidarops.process.scene import failed_outcome
 from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import run_page, run_record
 from lidarops.run.executor import (
@@ -167,7 +166,7 @@ def assess(
         days = _days_to_judge(judge, store, selection, force=force or everything)
         for batch in judge.batches(days):
             for judged in judge.days(batch).judgements:
-                if everything or judged.stale or judged.held:
+                if everything or judged.due or judged.held:
                     yield judged
 
 
@@ -180,35 +179,20 @@ def update_catalog(
 ) -> ScanSummary:
     """Update the catalog from the archive; see `lidarops.catalog.scan.scan_archive`."""
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
-        return _scan(campaign, store, lock, progress, workers)
+        write = partial(_acquire, lock)
+        while True:
+            try:
+                return scan_archive(
+                    campaign, store, progress=progress, before_write=write, workers=workers
+                )
+            except _OvertakenError:
+                continue
 
 
-def _scan(
-    campaign: Campaign,
-    store: Store,
-    lock: Lock,
-    progress: Callable[[int], None] | None,
-    workers: int,
-) -> ScanSummary:
-    write = _Writer(lock)
-    while True:
-        try:
-            return scan_archive(
-                campaign, store, progress=progress, before_write=write, workers=workers
-            )
-        except _OvertakenError:
-            continue
-
-
-class _Writer:
-    """Takes the lock before the first write."""
-
-    def __init__(self, lock: Lock) -> None:
-        self._lock = lock
-
-    def __call__(self) -> None:
-        if self._lock.acquire():
-            raise _OvertakenError
+def _acquire(lock: Lock) -> None:
+    """Take the lock before the first write."""
+    if lock.acquire():
+        raise _OvertakenError
 
 
 def _days_to_judge(judge: Judge, store: Store, selection: Selection, *, force: bool) -> list[int]:
@@ -217,11 +201,7 @@ def _days_to_judge(judge: Judge, store: Store, selection: Selection, *, force: b
     days = selection.days(sorted(signatures))
     if force:
         return days
-    return [
-        day
-        for day in days
-        if not signatures[day].whole or verdicts.get(day, ("",))[0] != signatures[day].whole
-    ]
+    return [day for day in days if not judge.is_settled(signatures[day], verdicts.get(day))]
 
 
 @dataclass(slots=True)
@@ -233,53 +213,48 @@ class _Gathered:
     set_aside: list[Granule] = field(default_factory=list)
     held: list[Judgement] = field(default_factory=list)
     empty_scenes: list[Judgement] = field(default_factory=list)
-    unused: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """Days -> numbers of empty scenes and of granules set aside. These days are settled; those in
-    `open` only once all their scenes succeed."""
+    verdicts: dict[int, Verdict] = field(default_factory=dict)
+    """Of days that are settled, without signature; of those in `open` only once all their scenes
+    succeed."""
     open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
     """Days with stale products -> scenes."""
 
 
+@dataclass(slots=True)
 class _Pass:
     """One pass: update the catalog, judge, process what is stale, enter it in the ledger."""
 
-    def __init__(
-        self,
-        campaign: Campaign,
-        store: Store,
-        lock: Lock,
-        selection: Selection,
-        options: Options,
-    ) -> None:
-        self._campaign = campaign
-        self._store = store
-        self._lock = lock
-        self._selection = selection
-        self._options = options
-        self._write = _Writer(lock)
-        self._gathered = _Gathered()
-        self._judgements: dict[str, Judgement] = {}
-        self._suspects: list[Job] = []
-        self._session: Session | None = None
-        self._failing = 0
+    campaign: Campaign
+    store: Store
+    lock: Lock
+    selection: Selection
+    options: Options
+    judge: Judge = field(init=False)
+    gathered: _Gathered = field(default_factory=_Gathered)
+    judgements: dict[str, Judgement] = field(default_factory=dict)
+    """Of the scenes that are yet to end."""
+    suspects: list[Job] = field(default_factory=list)
+    session: Session | None = None
+    failing: int = 0
+    """Number of scenes in a row that failed for a cause that may pass."""
 
     def carry_out(self, client: Client | None) -> Result:
-        self._summary = scan_archive(
-            self._campaign, self._store, before_write=self._write, workers=self._options.workers
-        )
-        self._judge = self._new_judge()
-        signatures = self._judge.signatures()
-        verdicts = self._store.verdicts()
-        days = _days_to_judge(self._judge, self._store, self._selection, force=self._options.force)
+        write = partial(_acquire, self.lock)
+        workers = self.options.workers
+        summary = scan_archive(self.campaign, self.store, before_write=write, workers=workers)
+        self.judge = self._new_judge()
+        signatures = self.judge.signatures()
+        verdicts = self.store.verdicts()
+        days = _days_to_judge(self.judge, self.store, self.selection, force=self.options.force)
         clean = [
             day
             for day in sorted(signatures.keys() - set(days))
-            if day in verdicts and any(verdicts[day][1:])
+            if day in verdicts and verdicts[day].unused
         ]
-        self._forget(self._store.scenes_of_other_days(signatures))
+        self._forget(self.store.scenes_of_other_days(signatures))
         status, caught = RunStatus.FINISHED, 0
         if days:
-            if self._options.workers > 1 and not self._options.cluster and client is None:
+            if workers > 1 and not self.options.cluster and client is None:
                 # The modules load while this process judges the scenes.
                 preload_modules(_WORKER_MODULES)
             with StopRequest() as stop:
@@ -288,54 +263,54 @@ class _Pass:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
-        unmet = unmet_requests(self._campaign, self._store, self._selection)
+        unmet = unmet_requests(self.campaign, self.store, self.selection)
         record = self._conclude(status, unmet)
-        gathered = self._gathered
+        gathered = self.gathered
         self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])
         return Result(
             record=record,
             status=status,
-            summary=self._summary,
+            summary=summary,
             fresh=gathered.fresh,
             orphans=tuple(gathered.orphans),
-            failures=self._store.failures(),
-            internal=self._store.internal_errors(),
+            failures=self.store.failures(),
+            internal=self.store.internal_errors(),
             # Orphans are never made again, so they would be reported for ever.
             unusable=tuple(
-                self._store.unusable_scenes(without={orphan.path for orphan in gathered.orphans})
+                self.store.unusable_scenes(without={orphan.path for orphan in gathered.orphans})
             ),
             empty_scenes={judged.scene.id: judged.empty_reason for judged in gathered.empty_scenes},
             set_aside={granule.path: granule.reason for granule in gathered.set_aside},
-            more_unused=sum(sum(verdicts[day][1:]) for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
+            more_unused=sum(verdicts[day].unused for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
             unmet=unmet,
             signal=caught,
         )
 
     def _collect_unused(self, days: Sequence[int]) -> None:
         """Collect the unused scenes and files of settled days."""
-        judge = Judge(self._campaign, self._store)
+        judge = Judge(self.campaign, self.store)
         for batch in judge.batches(days):
             judged = judge.days(batch)
-            self._gathered.set_aside += judged.set_aside
-            self._gathered.empty_scenes += _empty_scenes(judged)
+            self.gathered.set_aside += judged.set_aside
+            self.gathered.empty_scenes += _empty_scenes(judged)
 
     def _new_judge(self, *, again: bool = False) -> Judge:
-        force = self._options.force and not again
-        return Judge(self._campaign, self._store, selection=self._selection, force=force)
+        force = self.options.force and not again
+        return Judge(self.campaign, self.store, selection=self.selection, force=force)
 
     # Processing
 
     def _process(self, days: Sequence[int], client: Client | None, stop: StopRequest) -> None:
-        jobs = self._jobs(days, client)
+        jobs = self._jobs(days, client, stop)
         first = next(jobs, None)
-        if first is None and not self._suspects:
+        if first is None and not self.suspects:
             return
-        options = self._options
+        options = self.options
         with ExitStack() as stack:
             used_client = client
             if client is None and (options.cluster or options.workers > 1):
                 # Take the lock first: another run may leave nothing to do.
-                self._write()
+                _acquire(self.lock)
                 used_client = self._reached(self._started, stack, stop)
             taken = partial(self._take, note=used_client is None)
             if first is not None:
@@ -345,7 +320,7 @@ class _Pass:
                     others, client=used_client, stop=stop, taken=taken, memory=memory
                 )
                 self._enter(ended, stop)
-            if self._suspects and not stop:
+            if self.suspects and not stop:
                 if used_client is None:
                     own = partial(local_client, 1, memory=options.memory)
                     used_client = self._reached(own, stack, stop)
@@ -353,9 +328,9 @@ class _Pass:
                     self._enter_suspects(used_client, stop)
 
     def _enter_suspects(self, client: Client, stop: StopRequest) -> None:
-        for job in self._suspects:
+        for job in self.suspects:
             self._take(job)
-        self._enter(process_one_by_one(self._suspects, client=client, stop=stop), stop)
+        self._enter(process_one_by_one(self.suspects, client=client, stop=stop), stop)
 
     def _reached(
         self,
@@ -374,135 +349,141 @@ class _Pass:
         return client
 
     def _started(self) -> AbstractContextManager[Client]:
-        options = self._options
+        options = self.options
         if options.cluster:
             return options.cluster()
         return local_client(options.workers, memory=options.memory)
 
-    def _enter(self, ended: Iterator[EndedScene], stop: StopRequest) -> None:
+    def _enter(self, ended: Iterable[EndedScene], stop: StopRequest) -> None:
         session = self._running()
         for scene in ended:
-            judged = self._judgements.pop(scene.job.scene.id)
+            judged = self.judgements.pop(scene.outcome.scene)
             outcome = session.end(judged, scene.outcome, final=scene.final)
             if not scene.refused:
-                self._failing = self._failing + 1 if outcome.error and not scene.final else 0
-            if self._failing >= MOST_FAILURES_IN_A_ROW:
+                self.failing = self.failing + 1 if outcome.error and not scene.final else 0
+            if self.failing >= MOST_FAILURES_IN_A_ROW:
                 stop.now(
                     f"{MOST_FAILURES_IN_A_ROW} scenes in a row failed, the last: {outcome.error}"
                 )
-            if self._options.progress:
-                self._options.progress(outcome)
+            if self.options.progress:
+                self.options.progress(outcome)
 
     def _judged(self, days: Sequence[int], client: Client | None) -> Iterator[DaysJudged]:
-        judged = map(self._judge.days, self._judge.batches(days))
-        on_workers = client is not None or self._options.cluster or self._options.workers > 1
+        judged = map(self.judge.days, self.judge.batches(days))
+        on_workers = client is not None or self.options.cluster or self.options.workers > 1
         # Judge ahead, so that workers do not wait.
         return prefetch_one(judged) if on_workers else judged
 
-    def _jobs(self, days: Sequence[int], client: Client | None) -> Iterator[Job]:
+    def _jobs(self, days: Sequence[int], client: Client | None, stop: StopRequest) -> Iterator[Job]:
         """Yield the jobs of stale scenes, the largest of each group of days first."""
         for judged in self._judged(days, client):
             self._note(judged)
-            stale_scenes = [scene for scene in judged.judgements if scene.stale]
+            due = [scene for scene in judged.judgements if scene.due]
             jobs = [
-                Job(self._campaign, stale.scene, stale.needed(), self._options.profiles_per_chunk)
-                for stale in stale_scenes
+                Job(self.campaign, scene.scene, scene.needed(), self.options.profiles_per_chunk)
+                for scene in due
+                if scene.stale
             ]
-            self._judgements.update((stale.scene.id, stale) for stale in stale_scenes)
-            for stale in stale_scenes:
-                self._gathered.open[stale.day].add(stale.scene.id)
-            if self._options.expect:
-                self._options.expect(sum(len(stale.scene.granules) for stale in stale_scenes))
-            suspects = {stale.scene.id for stale in stale_scenes if stale.suspect}
-            self._suspects += [job for job in jobs if job.scene.id in suspects]
+            self.judgements.update((scene.scene.id, scene) for scene in due)
+            for scene in due:
+                self.gathered.open[scene.day].add(scene.scene.id)
+            if self.options.expect:
+                self.options.expect(sum(len(scene.scene.granules) for scene in due))
+            unplanned = [scene for scene in due if not scene.planned]
+            if unplanned:
+                self._enter(
+                    (
+                        EndedScene.failed(scene.failure, scene.scene, scene.plan)
+                        for scene in unplanned
+                        if scene.failure
+                    ),
+                    stop,
+                )
+            suspects = {scene.scene.id for scene in due if scene.stale and scene.suspect}
+            self.suspects += [job for job in jobs if job.scene.id in suspects]
             # A large scene at the end would keep one worker busy while the others idle.
             for job in sorted(jobs, key=read_bytes, reverse=True):
                 if job.scene.id not in suspects:
                     yield job
 
     def _note(self, judged: DaysJudged) -> None:
-        gathered = self._gathered
+        gathered = self.gathered
         gathered.fresh += sum(scene.fresh for scene in judged.judgements)
         gathered.orphans += judged.orphans
         gathered.set_aside += judged.set_aside
-        gathered.unused.update(judged.unused)
+        gathered.verdicts.update(judged.verdicts)
         gathered.empty_scenes += _empty_scenes(judged)
         gathered.held += [scene for scene in judged.judgements if scene.held]
         if judged.digests or judged.touched or judged.gone:
-            self._write()
-            self._store.store_digests(judged.digests)
-            self._store.touch_products(judged.touched)
+            _acquire(self.lock)
+            self.store.store_digests(judged.digests)
+            self.store.touch_products(judged.touched)
             self._forget(judged.gone)
 
     def _forget(self, scenes: Collection[str]) -> None:
         if scenes:
-            self._write()
-            self._store.forget_scenes(scenes)
+            _acquire(self.lock)
+            self.store.forget_scenes(scenes)
 
     def _take(self, job: Job, *, note: bool = False) -> None:
-        self._running().take(self._judgements[job.scene.id], note=note)
+        self._running().take(self.judgements[job.scene.id], note=note)
 
     def _running(self) -> Session:
-        if self._session is None:
-            self._write()
-            self._session = Session(self._campaign, self._store, self._lock, self._judge)
-            self._session.begin()
-        return self._session
+        if self.session is None:
+            _acquire(self.lock)
+            self.session = Session(self.campaign, self.store, self.lock, self.judge)
+            self.session.begin()
+        return self.session
 
     # The end
 
     def _settle(self, signatures: Mapping[int, Signature]) -> None:
         """Record the days on which everything is fresh; they are not judged again until changed."""
-        gathered = self._gathered
-        settled = _verdicts(
-            signatures, gathered.unused, gathered.unused.keys() - gathered.open.keys()
-        )
-        if gathered.open and self._selection.everything:
+        gathered = self.gathered
+        settled = _signed(signatures, gathered.verdicts, gathered.open)
+        if gathered.open and self.selection.everything:
             judge = self._new_judge(again=True)
             signatures_after = judge.signatures(gathered.open)
-            fresh_days = {
+            changed_days = {
                 day
                 for day, now in signatures_after.items()
-                # Files may have come or gone, or a profile changed, after its scenes ended.
-                if now.sources == signatures[day].sources and self._went_as_planned(day)
+                # Files may have come or gone after its scenes ended.
+                if now.sources != signatures[day].sources or not self._went_as_planned(day)
             }
-            settled |= _verdicts(
-                signatures_after, gathered.unused, fresh_days & gathered.unused.keys()
-            )
+            settled |= _signed(signatures_after, gathered.verdicts, changed_days)
             # A day with scenes that were not tried stays open.
-            waiting = {judged.day for judged in self._judgements.values()}
-            for batch in judge.batches(signatures_after.keys() - fresh_days - waiting):
+            waiting = {judged.day for judged in self.judgements.values()}
+            for batch in judge.batches(changed_days - waiting):
                 judged = judge.days(batch)
-                settled |= _verdicts(
-                    signatures_after, judged.unused, judged.unused.keys() - judged.open
-                )
-        known = self._store.verdicts()
+                settled |= _signed(signatures_after, judged.verdicts, judged.open)
+        known = self.store.verdicts()
         new = {
             day: verdict
             for day, verdict in settled.items()
-            if verdict[0] and known.get(day) != verdict
+            if verdict.signature and known.get(day) != verdict
         }
         if new:
-            self._write()
-            self._store.store_verdicts(new)
+            _acquire(self.lock)
+            self.store.store_verdicts(new)
 
     def _went_as_planned(self, day: int) -> bool:
         """Return whether every product that was stale on a day is now fresh."""
-        done = self._session.settled if self._session else set()
-        return self._gathered.open[day] <= done
+        done = self.session.settled if self.session else set()
+        return self.gathered.open[day] <= done
 
     def _conclude(self, status: RunStatus, unmet: tuple[Unmet, ...]) -> RunRecord | None:
-        if self._session is None:
+        if self.session is None:
             return None
-        for judged in self._gathered.held:
-            job = Job(self._campaign, judged.scene, judged.plan)
-            error = f"{judged.held} (not tried again, because nothing has changed)"
-            self._session.add(replace(failed_outcome(job, error), internal=judged.internal))
+        for held in self.gathered.held:
+            if held.failure:
+                error = f"{held.failure.error} (not tried again, because nothing has changed)"
+                outcome = held.failure.outcome(held.scene, held.plan)
+                self.session.add(replace(outcome, error=error))
         empty_scenes = {
-            judged.scene.id: judged.empty_reason for judged in self._gathered.empty_scenes
+            judged.scene.id: judged.empty_reason for judged in self.gathered.empty_scenes
         }
-        return self._session.finish(
-            status, self._gathered.set_aside, empty_scenes=empty_scenes, unmet=unmet
+        return self.session.finish(
+            status, self.gathered.set_aside, empty_scenes=empty_scenes, unmet=unmet
         )
 
 
@@ -510,10 +491,15 @@ def _empty_scenes(judged: DaysJudged) -> list[Judgement]:
     return [scene for scene in judged.judgements if scene.empty_reason]
 
 
-def _verdicts(
-    signatures: Mapping[int, Signature], unused: Mapping[int, tuple[int, int]], days: Iterable[int]
-) -> dict[int, tuple[str, int, int]]:
-    return {day: (signatures[day].whole, *unused[day]) for day in days}
+def _signed(
+    signatures: Mapping[int, Signature], verdicts: Mapping[int, Verdict], without: Collection[int]
+) -> dict[int, Verdict]:
+    """Return verdicts with the signatures of their days, without those on some days."""
+    return {
+        day: verdict._replace(signature=signatures[day].whole)
+        for day, verdict in verdicts.items()
+        if day in signatures and day not in without
+    }
 
 
 def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> int:

@@ -150,7 +150,19 @@ def choose_cluster(
     ClusterError
         If options contradict each other or the description is invalid (wrong use).
     """
-    chosen = _choose(workers, scheduler, cluster)
+    if scheduler is not None:
+        if cluster is not None or workers is not None:
+            raise ClusterError(
+                "a running scheduler has its own workers",
+                field="--scheduler",
+                remedy="give --scheduler alone, or --cluster and --workers",
+                wrong_use=True,
+            )
+        chosen = _validate({"kind": "scheduler", "address": scheduler}, None)
+    else:
+        settings = {"kind": "local"} if cluster is None else _read_description(cluster)
+        settings |= {} if workers is None else {"workers": workers}
+        chosen = _validate(settings, None if cluster in (None, *_KINDS) else cluster)
     if memory is None:
         return chosen
     if not isinstance(chosen, Local):
@@ -161,22 +173,6 @@ def choose_cluster(
             wrong_use=True,
         )
     return chosen.model_copy(update={"memory": memory})
-
-
-def _choose(workers: int | None, scheduler: str | None, cluster: str | None) -> Cluster:
-    if scheduler is not None:
-        if cluster is not None or workers is not None:
-            raise ClusterError(
-                "a running scheduler has its own workers",
-                field="--scheduler",
-                remedy="give --scheduler alone, or --cluster and --workers",
-                wrong_use=True,
-            )
-        return _validate({"kind": "scheduler", "address": scheduler}, None)
-    settings: dict[str, Any] = {"kind": "local"} if cluster is None else _read_description(cluster)
-    if workers is not None:
-        settings["workers"] = workers
-    return _validate(settings, None if cluster in (None, *_KINDS) else cluster)
 
 
 def _read_description(cluster: str) -> dict[str, Any]:

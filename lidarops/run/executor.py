@@ -19,12 +19,13 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
-from lidarops.netcdf.code_version import joint_code_version
+from lidarops.process.guard import Failure, guarded
 from lidarops.process.job import Job
-from lidarops.process.scene import attempt, failed_outcome, internal_error
-from lidarops.records import SceneOutcome
+from lidarops.process.scene import attempt
+from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.run import worker
 from lidarops.run.memory import fitted
+from lidarops.system.code_version import joint_code_version
 from lidarops.system.processes import keep_memory, start_method
 
 if TYPE_CHECKING:
@@ -70,12 +71,16 @@ _LOG = logging.getLogger(__name__)
 class EndedScene:
     """A scene that has ended."""
 
-    job: Job
     outcome: SceneOutcome
     final: bool
     """Whether another try on the same inputs would end the same way."""
     refused: bool = False
     """Whether it was not read, because it does not fit into the memory limit."""
+
+    @classmethod
+    def failed(cls, failure: Failure, scene: Scene, plan: Plan) -> Self:
+        """Return a scene that gave no product."""
+        return cls(failure.outcome(scene, plan), failure.final)
 
 
 class StopRequest:
@@ -239,19 +244,16 @@ def _process_here(
             return
         if taken:
             taken(job)
-        yield EndedScene(job, *_attempt(job, memory))
+        yield EndedScene(*_attempt(job, memory))
 
 
 def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:
     """Process a scene within a memory limit; return the outcome as `EndedScene` states it."""
-    try:
-        job = fitted(job, memory)
-    except SceneError as error:
+    fit = guarded(lambda: fitted(job, memory))
+    if isinstance(fit, Failure):
         # With a larger limit it may be processed.
-        return failed_outcome(job, str(error)), False, True
-    except Exception as error:  # noqa: BLE001 - a bug in one scene must not stop the others
-        return internal_error(job, error), True, False
-    return *attempt(job), False
+        return fit.outcome(job.scene, job.plan), bool(fit.internal), not fit.internal
+    return *attempt(fit), False
 
 
 def process_one_by_one(
@@ -285,7 +287,7 @@ def process_one_by_one(
                 break
         else:
             reason = f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
-            yield EndedScene(job, failed_outcome(job, reason), final=True)
+            yield EndedScene.failed(Failure(reason), job.scene, job.plan)
 
 
 def _submit(client: Client, job: Job) -> Future:
@@ -431,15 +433,16 @@ def _outcome_of(future: Future, job: Job) -> EndedScene | None:
     error = None if future.status == "finished" else _error_of(future)
     if error is None:
         result = future.result()
-        if isinstance(result, str):
-            return EndedScene(job, failed_outcome(job, result), final=False)
-        return EndedScene(job, *result)
-    if isinstance(error, KilledWorker):
+        if not isinstance(result, str):
+            return EndedScene(*result)
+        failure = Failure(result, final=False)
+    elif isinstance(error, KilledWorker):
         return None
-    if isinstance(error, OSError | ImportError | MemoryError):
-        return EndedScene(job, failed_outcome(job, f"the worker failed: {error!r}"), final=False)
-    error = error.with_traceback(future.traceback())
-    return EndedScene(job, internal_error(job, error), final=False)
+    elif isinstance(error, OSError | ImportError | MemoryError):
+        failure = Failure(f"the worker failed: {error!r}", final=False)
+    else:
+        failure = Failure.of_bug(error.with_traceback(future.traceback()), final=False)
+    return EndedScene.failed(failure, job.scene, job.plan)
 
 
 def _error_of(future: Future) -> BaseException | None:

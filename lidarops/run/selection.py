@@ -44,12 +44,10 @@ class Selection:
 
     def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
         """Return whether a product is selected; its scene may no longer exist."""
-        instrument, start = parse_scene_id(made.scene)
-        owner = campaign.instruments.get(instrument)
+        owner, start = parse_scene_id(made.scene)
         return (
             (not self.kinds or made.kind in self.kinds)
-            and (not self.instruments or instrument in self.instruments)
-            and (not self.stations or (owner.station if owner else instrument) in self.stations)
+            and self.owner(owner, _station(campaign, owner))
             and (self.since is None or scene_stop(made.scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
@@ -59,8 +57,13 @@ class Selection:
         return tuple(
             scene
             for scene in select_scenes(scenes, since=self.since, until=self.until)
-            if (not self.instruments or scene.instrument in self.instruments)
-            and (not self.stations or scene.station in self.stations)
+            if self.owner(scene.instrument, scene.station)
+        )
+
+    def owner(self, name: str, station: str) -> bool:
+        """Return whether an instrument or network, and its station, are selected."""
+        return (not self.instruments or name in self.instruments) and (
+            not self.stations or station in self.stations
         )
 
 
@@ -84,7 +87,7 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
                     f"the campaign has no {word} {name!r}",
                     remedy=f"known: {', '.join(sorted(set(names)))}",
                 )
-    requested = _requested_kinds(campaign)
+    requested = requested_kinds(campaign)
     for kind in selection.kinds:
         if kind not in requested:
             raise CampaignError(
@@ -100,7 +103,7 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
         )
 
 
-def _requested_kinds(campaign: Campaign) -> list[str]:
+def requested_kinds(campaign: Campaign) -> list[str]:
     """Return the kinds of product that a campaign requests."""
     requested: set[str] = set()
     for instrument in campaign.instruments.values():
@@ -176,8 +179,7 @@ def unmet_requests(campaign: Campaign, store: Store, selection: Selection) -> tu
         member
         for name, members in owners.items()
         for member in members
-        if (not selection.instruments or name in selection.instruments)
-        and (not selection.stations or _station(campaign, name) in selection.stations)
+        if selection.owner(name, _station(campaign, name))
     }
     return availability.unavailable_channels(
         campaign,

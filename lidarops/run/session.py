@@ -17,10 +17,10 @@ from lidarops.catalog import versions
 from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.netcdf.code_version import joint_code_version
 from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps.dependence import ProductKey
+from lidarops.system.code_version import joint_code_version
 
 MOST_INPUTS: Final = 100_000
 """Granules that the record of a run names; the ledger names all."""

@@ -9,29 +9,30 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import ceil
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign, as_settings
-from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct
+from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdict
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.netcdf.code_version import code_version, joint_code_version, source_version
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
+from lidarops.process.guard import Failure, guarded
 from lidarops.records import Granule, InputRecord, Plan, Role, Scene
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
-from lidarops.run.selection import Selection
+from lidarops.run.selection import Selection, requested_kinds
 from lidarops.steps import dependence
 from lidarops.steps.dependence import ProductKey, ancillary_files
+from lidarops.system.code_version import code_version, joint_code_version, source_version
+from lidarops.system.files import sha256_of
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
@@ -65,19 +66,32 @@ class Judgement:
     """Plan of all products that the campaign requests."""
     requested: Plan
     """Part of the plan that the selection requests."""
-    day: int
-    key: str
-    """Digest of everything that may change the outcome."""
+    ancillaries: tuple[InputRecord, ...]
+    """Present ancillary files that the steps of the plan read."""
     stale: tuple[Stale, ...]
-    fresh: int
-    held: str = ""
-    """Why the scene is not tried again although products are missing."""
-    internal: str = ""
-    """Traceback if it is not tried again because of an internal error; else empty."""
+    fresh: int = 0
+    key: str = ""
+    """Digest of everything that may change the outcome."""
+    failure: Failure | None = None
+    """Why the scene cannot be planned, or how its last try failed if it is held."""
+    held: bool = False
+    """Whether nothing has changed since the failure, so that the scene is not tried again."""
+    planned: bool = True
+    """Whether it could be planned; if not, its plan is empty."""
     suspect: bool = False
     """Whether an earlier try killed its process."""
     empty_reason: str = ""
     """Why the scene gives no product of its own and is used by no network; else empty."""
+
+    @property
+    def day(self) -> int:
+        """Day of the start, in days since 1970-01-01."""
+        return day_of(self.scene.start)
+
+    @property
+    def due(self) -> bool:
+        """Whether the run must enter an outcome of the scene."""
+        return bool(self.stale) or (self.failure is not None and not self.held)
 
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
@@ -87,7 +101,7 @@ class Judgement:
 
 
 class Signature(NamedTuple):
-    """State of one day: if it is unchanged, no product of the day can have become stale."""
+    """State of one day without ancillary files: if it and they are unchanged, nothing is stale."""
 
     sources: str
     """Digest of what its products are made from."""
@@ -102,8 +116,8 @@ class DaysJudged:
     judgements: tuple[Judgement, ...]
     orphans: tuple[Orphan, ...]
     set_aside: tuple[Granule, ...]
-    unused: Mapping[int, tuple[int, int]]
-    """Days that may be settled -> numbers of empty scenes and of granules set aside."""
+    verdicts: Mapping[int, Verdict]
+    """Of days that may be settled, without signature."""
     open: frozenset[int]
     """Days with stale products; they may be settled after processing."""
     gone: frozenset[str]
@@ -139,7 +153,7 @@ class Judge:
         self._selection = selection or Selection()
         self._force = force
         self._settings = dependence.Settings(campaign)
-        self._profiles: dict[str, str] = {}
+        self._ancillaries: dict[str, str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
 
@@ -185,21 +199,20 @@ class Judge:
 
     def _base(self) -> str:
         settings = as_settings(self._campaign)
-        names = sorted(
-            {
-                name
-                for instrument in self._campaign.instruments.values()
-                for facts in instrument.facts
-                for name in (facts.molecular_profile, facts.overlap_profile)
-                if name
-            }
-        )
         return dependence.digest(
             [
                 {key: value for key, value in settings.items() if key not in _OPERATION},
-                joint_code_version(_requested_kinds(self._campaign), *_PLANNING),
-                [[name, self._profile(name)] for name in names],
+                joint_code_version(requested_kinds(self._campaign), *_PLANNING),
             ]
+        )
+
+    def is_settled(self, signature: Signature, verdict: Verdict | None) -> bool:
+        """Return whether nothing has changed on a day since its verdict."""
+        return (
+            verdict is not None
+            and bool(signature.whole)
+            and signature.whole == verdict.signature
+            and all(self._ancillary(name) == known for name, known in verdict.files.items())
         )
 
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
@@ -232,11 +245,15 @@ class Judge:
         products = self._store.products_of_days(first, last)
         made = {product.key: product for product in products if product.day in judged_days}
         touched: dict[str, int] = {}
-        judgements = [self._scene(scene, made, tried, touched) for scene in cut.scenes]
+        judgements = [
+            self._judged(scene, made, tried.get(scene.id), touched) for scene in cut.scenes
+        ]
         planned = [(judged.scene, judged.plan) for judged in judgements]
         empty_reasons = leftovers.scenes_without_product(planned, self._campaign)
         judgements = [
             replace(judged, empty_reason=empty_reasons.get(judged.scene.id, ""))
+            if judged.planned
+            else judged
             for judged in judgements
         ]
         selected = {scene.id for scene in self._selection.scenes(cut.scenes)}
@@ -244,11 +261,16 @@ class Judge:
         orphans = leftovers.orphaned_products(
             planned, made.values(), self._campaign, self._other_files, fates.of
         )
+        unplanned = {judged.scene.id for judged in judgements if not judged.planned}
+        orphans = [orphan for orphan in orphans if orphan[0].scene not in unplanned]
         unsettled = {product.day for product, _ in orphans}
         # The signature of a day does not hold all that may end an internal error.
-        unsettled |= {judged.day for judged in judgements if judged.internal}
+        unsettled |= {
+            judged.day
+            for judged in judgements
+            if not judged.planned or (judged.failure and judged.failure.internal)
+        }
         digests, self._digests = self._digests, {}
-        counts = _counts(judgements, cut.set_aside)
         gone = {judged.scene.id for judged in judgements if self._healed(judged, tried)}
         present = {scene.id for scene in cut.scenes}
         gone |= {
@@ -264,10 +286,12 @@ class Judge:
                 if self._selection.product(product, self._campaign)
             ),
             set_aside=cut.set_aside,
-            unused={day: counts[day] for day in days if day not in unsettled}
+            verdicts=_unsigned(
+                [day for day in days if day not in unsettled], judgements, cut.set_aside
+            )
             if self._selection.everything
             else {},
-            open=frozenset(judged.day for judged in judgements if judged.stale),
+            open=frozenset(judged.day for judged in judgements if judged.due),
             gone=frozenset(gone),
             touched=touched,
             digests=digests,
@@ -276,7 +300,7 @@ class Judge:
     def _healed(self, judged: Judgement, tried: Mapping[str, LastTry]) -> bool:
         """Return whether a failed scene is complete again, e.g. because a file came back."""
         last = tried.get(judged.scene.id)
-        complete = not (judged.stale or judged.held or self._selection.kinds)
+        complete = not (judged.stale or judged.failure or self._selection.kinds)
         return last is not None and bool(last.error) and complete
 
     def _cut(self, first: int, last: int, days: set[int]) -> Cut:
@@ -292,45 +316,56 @@ class Judge:
 
     # One scene
 
-    def _scene(
+    def _judged(
         self,
         scene: Scene,
         made: Mapping[tuple[str, str, str], RecordedProduct],
-        tried: Mapping[str, LastTry],
+        last: LastTry | None,
         touched: dict[str, int],
     ) -> Judgement:
-        whole = plan_scene(scene, self._campaign)
-        judged = self.judgement(scene, whole)
-        last = tried.get(scene.id)
-        stale = []
-        requested = dependence.plan_of_kinds(whole, self._selection.kinds)
-        for kind, channel in dependence.planned_products(requested):
-            known = made.get((scene.id, kind, channel))
-            reason = self._reason(scene, whole, (kind, channel), known, touched)
-            if reason:
-                stale.append(Stale(kind, channel, reason, known))
-        judged = replace(
-            judged,
-            requested=requested,
-            key=self.key(judged),
-            stale=tuple(stale),
-            fresh=len(dependence.planned_products(requested)) - len(stale),
-            suspect=last is not None and last.crashes > 0,
-        )
-        if last is None or self._force or not stale:
-            return judged
-        if not (last.final and last.error):
+        """Return the judgement of a scene, also if a bug prevents its plan."""
+        judged = guarded(lambda: self._planned(scene, made, touched))
+        if isinstance(judged, Failure):
+            failure, plan = judged, Plan(scene.id, (), ())
+            judged = replace(self.judgement(scene, plan), failure=failure, planned=False)
+        suspect = last is not None and last.crashes > 0
+        judged = replace(judged, key=self.key(judged), suspect=suspect)
+        if last is None or self._force or not (judged.due and last.final and last.error):
             return judged
         key = self.key(judged, internal=True) if last.internal else judged.key
         if last.key != key:
             return judged
-        return replace(judged, stale=(), held=last.error, internal=last.internal)
+        failure = Failure(last.error, last.internal)
+        return replace(judged, stale=(), failure=failure, held=True)
+
+    def _planned(
+        self,
+        scene: Scene,
+        made: Mapping[tuple[str, str, str], RecordedProduct],
+        touched: dict[str, int],
+    ) -> Judgement:
+        whole = plan_scene(scene, self._campaign)
+        judged = self.judgement(scene, whole)
+        stale = []
+        requested = dependence.plan_of_kinds(whole, self._selection.kinds)
+        products = dependence.planned_products(requested)
+        for kind, channel in products:
+            known = made.get((scene.id, kind, channel))
+            reason = self._reason(judged, (kind, channel), known, touched)
+            if reason:
+                stale.append(Stale(kind, channel, reason, known))
+        fresh = len(products) - len(stale)
+        return replace(judged, requested=requested, stale=tuple(stale), fresh=fresh)
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement by which every product of a scene is stale."""
         products = dependence.planned_products(whole)
         stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
-        return Judgement(scene, whole, whole, day_of(scene.start), "", stale, 0)
+        ancillaries = tuple(
+            InputRecord(name, role, self._ancillary(name))
+            for name, role in sorted(ancillary_files(whole.steps).items())
+        )
+        return Judgement(scene, whole, whole, ancillaries, stale)
 
     def key(self, judged: Judgement, *, internal: bool = False) -> str:
         """Return the digest of everything that may change the outcome of a scene.
@@ -346,18 +381,19 @@ class Judge:
             or in another package, so the key depends on all of them.
         """
         scene, whole = judged.scene, judged.plan
+        products = dependence.planned_products(whole)
         software = [source_version(), package_versions()] if internal else []
         return dependence.digest(
             [
                 *software,
-                whole.hash,
-                joint_code_version(_kinds(whole)),
-                [self._settings.of(scene, whole, channel) for channel in _channels(whole)],
+                whole.hash if judged.planned else self._base(),
+                joint_code_version({kind for kind, _ in products}),
+                [self._settings.of(scene, whole, product) for product in products],
                 [
                     [granule.path, granule.size, granule.mtime_ns]
                     for granule in (*scene.granules, *scene.dark)
                 ],
-                [[name, self._profile(name)] for name in sorted(ancillary_files(whole.steps))],
+                [[used.path, used.sha256] for used in judged.ancillaries],
             ]
         )
 
@@ -367,7 +403,7 @@ class Judge:
         """Return what a product depends on, and the files that it was made from."""
         closure = dependence.plan_closure(whole, [product])
         used = dependence.product_inputs(closure, files)
-        settings = self._settings.of(scene, closure, product[1])
+        settings = self._settings.of(scene, closure, product)
         depends_on = Dependence(
             plan_hash=closure.hash,
             settings_hash=dependence.digest(settings),
@@ -395,9 +431,7 @@ class Judge:
             # Other products may have been judged fresh by a digest that is no longer valid.
             if granule.sha256 and contents.get(granule.path, granule.sha256) != granule.sha256:
                 return False
-        now = self._files(
-            scene, whole, lambda granule: contents.get(granule.path) or granule.sha256 or ""
-        )
+        now = _files(judged, lambda granule: contents.get(granule.path) or granule.sha256 or "")
         for stale in judged.stale:
             product = (stale.kind, stale.channel)
             used = dependence.product_inputs(dependence.plan_closure(whole, [product]), now)
@@ -409,8 +443,7 @@ class Judge:
 
     def _reason(
         self,
-        scene: Scene,
-        whole: Plan,
+        judged: Judgement,
         product: ProductKey,
         known: RecordedProduct | None,
         touched: dict[str, int],
@@ -419,8 +452,8 @@ class Judge:
         if self._force or known is None:
             return "forced" if self._force else "not made yet"
         recorded = known.depends_on
-        closure = dependence.plan_closure(whole, [product])
-        settings = dependence.digest(self._settings.of(scene, closure, product[1]))
+        closure = dependence.plan_closure(judged.plan, [product])
+        settings = dependence.digest(self._settings.of(judged.scene, closure, product))
         code = code_version(product[0])
         if (recorded.code_version, recorded.plan_hash, recorded.settings_hash) != (
             code,
@@ -429,7 +462,7 @@ class Judge:
         ):
             return _changed(recorded, closure.hash, code)
         # Last, because files may have to be read for it.
-        used = dependence.product_inputs(closure, self._files(scene, whole, self._content))
+        used = dependence.product_inputs(closure, _files(judged, self._content))
         if recorded.inputs_hash != dependence.inputs_digest(used):
             return _difference(self._store.inputs_of(known.path), used)
         return self._file_reason(known, touched)
@@ -440,32 +473,14 @@ class Judge:
             status = path.stat()
             if (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns):
                 return ""
-            if status.st_size == made.size:
-                with path.open("rb") as stream:
-                    if hashlib.file_digest(stream, "sha256").hexdigest() == made.sha256:
-                        touched[made.path] = status.st_mtime_ns
-                        return ""
+            if status.st_size == made.size and sha256_of(path) == made.sha256:
+                touched[made.path] = status.st_mtime_ns
+                return ""
         except FileNotFoundError:
             return "its file is missing"
         except OSError as error:
             return f"its file cannot be read: {error.strerror or error}"
         return "its file differs from the recorded one"
-
-    def _files(
-        self, scene: Scene, whole: Plan, content: Callable[[Granule], str]
-    ) -> tuple[InputRecord, ...]:
-        """Return the present inputs of a scene."""
-        raw = [
-            InputRecord(granule.path, granule.role, content(granule))
-            for granule in (*scene.granules, *scene.dark)
-        ]
-        return (
-            *raw,
-            *(
-                InputRecord(name, role, self._profile(name))
-                for name, role in sorted(ancillary_files(whole.steps).items())
-            ),
-        )
 
     def _content(self, granule: Granule) -> str:
         """Return the SHA-256 of a granule; if it cannot be read, a text that equals no SHA-256."""
@@ -486,15 +501,25 @@ class Judge:
         """Return the signal files that a product was made from."""
         return [used for used in self._store.inputs_of(made.path) if used.role is Role.SIGNAL]
 
-    def _profile(self, name: str) -> str:
-        if name not in self._profiles:
+    def _ancillary(self, name: str) -> str:
+        """Return the SHA-256 of an ancillary file when it was first needed."""
+        if name not in self._ancillaries:
             try:
-                with (Path(self._campaign.folder) / name).open("rb") as stream:
-                    self._profiles[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+                self._ancillaries[name] = sha256_of(self._campaign.folder / name)
             except (OSError, ValueError):
                 # The processing of the scene reports the problem.
-                self._profiles[name] = "unreadable"
-        return self._profiles[name]
+                self._ancillaries[name] = "unreadable"
+        return self._ancillaries[name]
+
+
+def _files(judged: Judgement, content: Callable[[Granule], str]) -> tuple[InputRecord, ...]:
+    """Return the present inputs of a scene."""
+    scene = judged.scene
+    raw = (
+        InputRecord(granule.path, granule.role, content(granule))
+        for granule in (*scene.granules, *scene.dark)
+    )
+    return (*raw, *judged.ancillaries)
 
 
 def _looks_right(root: str, made: RecordedProduct) -> bool:
@@ -505,36 +530,16 @@ def _looks_right(root: str, made: RecordedProduct) -> bool:
     return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
 
 
-def _requested_kinds(campaign: Campaign) -> set[str]:
-    """Return the kinds of product that a campaign requests of any instrument or network."""
-    instruments, networks = campaign.instruments.values(), campaign.networks.values()
-    return {
-        *(kind for instrument in instruments for kind in instrument.products.requested()),
-        *(kind for network in networks for kind in network.requested()),
-    }
-
-
-def _kinds(whole: Plan) -> set[str]:
-    return {kind for kind, _ in dependence.planned_products(whole)}
-
-
-def _channels(whole: Plan) -> list[str]:
-    return sorted({channel for _, channel in dependence.planned_products(whole)})
-
-
-def _counts(
-    judgements: Sequence[Judgement], set_aside: Sequence[Granule]
-) -> dict[int, tuple[int, int]]:
-    empty: dict[int, int] = defaultdict(int)
-    aside: dict[int, int] = defaultdict(int)
+def _unsigned(
+    days: Iterable[int], judgements: Iterable[Judgement], set_aside: Iterable[Granule]
+) -> dict[int, Verdict]:
+    """Return the verdicts on some days, without signature."""
+    empty = Counter(judged.day for judged in judgements if judged.empty_reason)
+    aside = Counter(day_of(_moment(granule)) for granule in set_aside)
+    files: dict[int, dict[str, str]] = defaultdict(dict)
     for judged in judgements:
-        empty[judged.day] += bool(judged.empty_reason)
-    for granule in set_aside:
-        aside[day_of(_moment(granule))] += 1
-    return defaultdict(
-        lambda: (0, 0),
-        {day: (empty[day], aside[day]) for day in empty.keys() | aside.keys()},
-    )
+        files[judged.day] |= {used.path: used.sha256 for used in judged.ancillaries}
+    return {day: Verdict("", empty[day], aside[day], files[day]) for day in days}
 
 
 def _changed(recorded: Dependence, plan_hash: str, code: str) -> str:

@@ -38,7 +38,7 @@ from lidarops.site.paths import (
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
-from lidarops.system.files import write_atomically
+from lidarops.system.files import sha256_of, write_atomically
 
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
@@ -182,8 +182,7 @@ def _page(task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
     try:
         file = inside(task.products, task.path)
-        with file.open("rb") as stream:
-            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        sha256 = sha256_of(file)
         if task.known is not None and _is_kept(task.known, sha256, task.site):
             return task.known, False
         return _make(task, file, sha256), True

@@ -104,9 +104,17 @@ class Averages(ABC):
     def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
         """Add the next profiles: all of a chunk, or some of its rows."""
 
+    @property
     @abstractmethod
-    def result(self) -> xr.Dataset:
-        """Return the means, with power, variance and quality over (time, range)."""
+    def times(self) -> xr.Dataset:
+        """``time`` and ``time_bnds`` of all means."""
+
+    @abstractmethod
+    def completed(self) -> Iterator[xr.Dataset]:
+        """Yield the means that are complete, in batches, and forget them.
+
+        They have power, variance and quality over (time, range).
+        """
 
 
 class WholeProduct(ABC):
@@ -127,7 +135,7 @@ class WholeProduct(ABC):
 
     @abstractmethod
     def results(self) -> Iterator[xr.Dataset]:
-        """Yield the frame of the product, as `RowProduct.frame`, then its rows in batches."""
+        """Yield the frame of the product, then its rows in batches; see `RowProduct.rows`."""
 
 
 def in_one_batch(product: xr.Dataset) -> Iterator[xr.Dataset]:
@@ -137,15 +145,15 @@ def in_one_batch(product: xr.Dataset) -> Iterator[xr.Dataset]:
 
 
 class RowProduct(ABC):
-    """A product of which each profile gives its own rows, written as they come."""
+    """A product whose rows are written as soon as their profiles are known."""
 
     @abstractmethod
-    def frame(self) -> xr.Dataset:
-        """Return the coordinates of all profiles, and what does not depend on time."""
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Take the next profiles, and yield the rows that are complete, in batches.
 
-    @abstractmethod
-    def rows(self, chunk: Chunk) -> xr.Dataset:
-        """Return the variables of the product for the next profiles."""
+        Before the first of them comes the frame: the coordinates of all rows, and what does not
+        depend on time.
+        """
 
 
 ProductStream = WholeProduct | RowProduct

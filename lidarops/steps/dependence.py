@@ -14,12 +14,14 @@ from dataclasses import replace
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
+from lidarops.kinds import Scope, kinds_of
 from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
 from lidarops.steps.channels import READ_STEP
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.reading import ARCHIVE, required_by
 from lidarops.steps.registry import definition, gives
 from lidarops.steps.step import Definition
+from lidarops.steps.workload import Workload
 
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
@@ -31,7 +33,6 @@ _OF_CAMPAIGN: Final = frozenset(
 _OF_INSTRUMENT: Final = frozenset({"files", "dark_files", "header_position", "facts", "products"})
 """Settings that affect products only through plan, scene and inputs. All others count."""
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
-_PROFILES: Final = ("molecular_profile", "overlap_profile")
 
 
 def is_product(entry: PlannedStep | LeftOut) -> bool:
@@ -60,9 +61,7 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         The same for a product, whatever else the whole plan holds.
     """
     entries: Sequence[PlannedStep | LeftOut] = (*plan.steps, *plan.left_out)
-    places: dict[tuple[str, str], list[PlannedStep | LeftOut]] = defaultdict(list)
-    for entry in entries:
-        places[entry.channel, entry.name].append(entry)
+    places = _places(entries)
     waiting = [
         entry for entry in entries if is_product(entry) and (entry.name, entry.channel) in products
     ]
@@ -79,6 +78,23 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         steps=tuple(_with_requesters(step, steps) for step in steps),
         left_out=tuple(entry for entry in kept if isinstance(entry, LeftOut)),
     )
+
+
+def needed_places(plan: Plan) -> list[list[int]]:
+    """Return, for each step of a plan, the places of the steps whose outputs it takes."""
+    places = _places(plan.steps)
+    numbers = {id(step): number for number, step in enumerate(plan.steps)}
+    return [sorted(numbers[id(other)] for other in _needed(step, places)) for step in plan.steps]
+
+
+def _places(
+    entries: Iterable[PlannedStep | LeftOut],
+) -> Mapping[tuple[str, str], Sequence[PlannedStep | LeftOut]]:
+    """Return the entries of a plan by channel and name."""
+    places: dict[tuple[str, str], list[PlannedStep | LeftOut]] = defaultdict(list)
+    for entry in entries:
+        places[entry.channel, entry.name].append(entry)
+    return places
 
 
 def _needed(
@@ -104,6 +120,14 @@ def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> Planned
     of_part = f"{step.channel}/"
     glued = sorted({s.channel for s in steps if any(n.startswith(of_part) for n in s.needs)})
     return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
+
+
+def workloads(scene: Scene, plan: Plan) -> Iterator[tuple[PlannedStep, Workload]]:
+    """Yield the planned steps of a scene, with what each has to process."""
+    members = {member.instrument: member for member in scene.members}
+    for step in plan.steps:
+        own = plan_closure(plan, [(step.name, step.channel)]) if is_product(step) else plan
+        yield step, Workload(members.get(step.instrument, scene), step.channel, own)
 
 
 def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
@@ -142,7 +166,7 @@ class Settings:
             for name, known in settings["instruments"].items()
         }
 
-    def of(self, scene: Scene, plan: Plan, channel: str) -> dict[str, Any]:
+    def of(self, scene: Scene, plan: Plan, product: ProductKey) -> dict[str, Any]:
         """Return what a product depends on besides its inputs, as plain JSON types.
 
         Parameters
@@ -150,13 +174,18 @@ class Settings:
         scene : Scene
         plan : Plan
             Plan of the product, from `plan_closure`.
-        channel : str
-            Channel of the product.
+        product : (str, str)
+            Its kind and channel.
         """
+        kind, channel = product
         members = scene.members or (scene,)
         return {
             "campaign": self._common,
-            "network": self._networks.get(scene.instrument) if scene.members else None,
+            "network": (
+                single_kind_settings(self._networks[scene.instrument], kind)
+                if scene.members
+                else None
+            ),
             "scene": [scene.id, scene.start.isoformat(), scene.stop.isoformat()],
             "members": [
                 {
@@ -195,11 +224,13 @@ def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str
     settings = as_settings(known)
     channels = {step.channel for step in plan.steps} | {channel}
     read = ancillary_files(plan.steps)
-    for name in _PROFILES:
-        if settings.get(name) not in read:
-            settings = {**settings, name: None}
     return {
-        **{key: value for key, value in settings.items() if key not in _EDGES},
+        **{
+            # Facts that are texts name files.
+            key: None if isinstance(value, str) and value not in read else value
+            for key, value in settings.items()
+            if key not in _EDGES
+        },
         "channels": {name: fact for name, fact in settings["channels"].items() if name in channels},
     }
 
@@ -209,6 +240,12 @@ def single_channel_settings(
 ) -> dict[str, Any] | None:
     """Return the settings of a kind of product as if only one channel were requested."""
     return None if products is None else {**products, "channels": [channel]}
+
+
+def single_kind_settings(network: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """Return the settings of a network as if only one kind of product were requested."""
+    others = {other.name for other in kinds_of(Scope.NETWORK)} - {kind}
+    return {key: value for key, value in network.items() if key not in others}
 
 
 def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:

@@ -9,9 +9,8 @@ from typing import Final
 from lidarops.records import Plan, PlannedStep, Scene
 from lidarops.steps.channels import file_channels
 from lidarops.steps.data import CHUNK_BYTES
-from lidarops.steps.dependence import is_product, plan_closure
-from lidarops.steps.registry import making_step
-from lidarops.steps.workload import Workload
+from lidarops.steps.dependence import is_product, workloads
+from lidarops.steps.registry import definition
 
 PROCESS: Final = 420_000_000
 """Bytes of a process with the code of all kinds loaded. ``lidarops bench throughput --case memory``
@@ -35,6 +34,8 @@ class SceneMemory:
     """Raw counts of one profile of the widest channel."""
     profiles: int
     """Number of profiles."""
+    together: int = 1
+    """Largest number of profiles that a chunk must not part."""
     process: float = PROCESS
 
     @property
@@ -44,7 +45,8 @@ class SceneMemory:
 
     def of(self, profiles: int) -> float:
         """Return the bytes with chunks of some profiles."""
-        return self.process + self.held + OF_A_COUNT * self.profile * min(profiles, self.profiles)
+        together = min(max(profiles, self.together), self.profiles)
+        return self.process + self.held + OF_A_COUNT * self.profile * together
 
     def profiles_within(self, limit: float) -> int:
         """Return the largest number of profiles of a chunk within a limit; 0 where none fits."""
@@ -64,19 +66,21 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
         Before it is refined in the worker.
     """
     held: defaultdict[str, float] = defaultdict(float)
-    for step in plan.steps:
-        if is_product(step):
-            closure = plan_closure(plan, [(step.name, step.channel)])
-            # Channels are processed one after the other.
-            work = Workload(scene, step.channel, closure)
-            making = making_step(step.name)
-            held[step.channel] += making.held(making.typed(step), work)
+    together = 1
+    for step, work in workloads(scene, plan):
+        known = definition(step)
+        settings = known.typed(step)
+        held[step.channel] += known.held(settings, work)
+        together = max(together, known.together(settings, work))
     files = len(scene.granules) + len(scene.dark)
+    products = [step for step in plan.steps if is_product(step)]
+    # Channels are processed one after the other.
+    channels = [{step.channel, *file_channels(step.channel)} for step in products]
+    most = max((sum(held[name] for name in names) for names in channels), default=0.0)
     return SceneMemory(
-        held=OF_A_FILE * files + max(held.values(), default=0.0),
-        profile=float(
-            _COUNT * _most_bins(scene, [step for step in plan.steps if is_product(step)])
-        ),
+        held=OF_A_FILE * files + most,
+        profile=float(_COUNT * _most_bins(scene, products)),
+        together=together,
         profiles=max((len(member.granules) for member in scene.members or (scene,)), default=0),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final, TypedDict
 
 import numpy as np
@@ -94,9 +95,14 @@ class _FileAverages(Averages):
         conditioned = chunk.profiles(self._profiles)
         self._means.add(conditioned if rows is None else conditioned.isel(time=rows))
 
-    def result(self) -> xr.Dataset:
-        """Return the means."""
-        return self._means.result()
+    @property
+    def times(self) -> xr.Dataset:
+        """``time`` and ``time_bnds`` of all means."""
+        return self._means.times
+
+    def completed(self) -> Iterator[xr.Dataset]:
+        """Yield the means that are complete."""
+        return self._means.completed()
 
 
 class GluedProfiles(Profiles):
@@ -141,7 +147,7 @@ class GluedProfiles(Profiles):
 
 
 class _GluedAverages(Averages):
-    """Means of both parts of a glued channel, which are glued at the end."""
+    """Means of both parts of a glued channel, which are glued when they are complete."""
 
     def __init__(self, analog: Averages, photon: Averages, lag: float) -> None:
         self._analog, self._photon, self._lag = analog, photon, lag
@@ -151,12 +157,17 @@ class _GluedAverages(Averages):
         self._analog.add(chunk, rows)
         self._photon.add(chunk, rows)
 
-    def result(self) -> xr.Dataset:
-        """Return the glued means."""
-        analog, photon = self._analog.result(), self._photon.result()
-        glued = labeled_gluing.glue(analog[[*_PARTS]], photon[[*_PARTS]], lag=self._lag)
-        bins = slice(glued.sizes["range"])
-        return photon.isel(range=bins).drop_vars(_PARTS).assign(glued.variables)
+    @property
+    def times(self) -> xr.Dataset:
+        """``time`` and ``time_bnds`` of all means."""
+        return self._photon.times
+
+    def completed(self) -> Iterator[xr.Dataset]:
+        """Yield the glued means that are complete."""
+        for analog, photon in zip(self._analog.completed(), self._photon.completed(), strict=True):
+            glued = labeled_gluing.glue(analog[[*_PARTS]], photon[[*_PARTS]], lag=self._lag)
+            bins = slice(glued.sizes["range"])
+            yield photon.isel(range=bins).drop_vars(_PARTS).assign(glued.variables)
 
 
 def gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:

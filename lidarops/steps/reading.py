@@ -24,7 +24,7 @@ from lidarops.steps.channels import (
     wavelength,
 )
 from lidarops.steps.data import Data
-from lidarops.steps.step import Datum, Decisions, Definition, Leave, Run, Step
+from lidarops.steps.step import REQUEST, Datum, Decisions, Definition, Leave, Run, Step
 from lidarops.steps.workload import Workload
 
 ARCHIVE: Final = Datum[xr.Dataset]("archive")
@@ -32,7 +32,6 @@ ARCHIVE: Final = Datum[xr.Dataset]("archive")
 WAVELENGTH: Final = Datum[float]("wavelength")
 """m."""
 
-NO_PRODUCT: Final = "no product of the campaign uses this channel"
 NO_WAVELENGTH: Final = "the wavelength in the header is implausible, and no facts give one"
 ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its bins"
 
@@ -55,11 +54,12 @@ class Read(Step[ChannelCase, ReadSettings]):
         """Read a channel that a product needs, at a known wavelength."""
         requesters = [*case.requests, *case.requesters]
         if not requesters:
-            reason = NO_PRODUCT
             if case.networks:
                 word = "networks" if len(case.networks) > 1 else "network"
                 reason = f"used only by {word} {' and '.join(case.networks)}"
-            yield Leave(reason, rule="channel")
+                yield Leave(reason, rule="channel")
+            else:
+                yield Leave("no product of the campaign uses this channel", rule=REQUEST)
             return
         facts = channel_facts(case.facts, range_channel(case.channel.name))
         metres = wavelength(case.channel, facts)

@@ -29,6 +29,8 @@ C_contra = TypeVar("C_contra", bound="ChannelCase", contravariant=True)
 ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"
 REQUESTED: Final = "requested by the campaign"
 NOT_REQUESTED: Final = "not requested by the campaign"
+REQUEST: Final = "request"
+"""Name of the rule that leaves out what the campaign does not request."""
 
 
 # No slots: typing sets an attribute of generic instances, where it can.
@@ -92,6 +94,14 @@ class Definition(ABC, Generic[S]):
         """Return the estimated CPU time on a common server core, s."""
         return 0.0
 
+    def held(self, settings: S, work: Workload) -> float:  # noqa: ARG002 - most hold little
+        """Return the estimated number of bytes that are held for the whole scene."""
+        return 0.0
+
+    def together(self, settings: S, work: Workload) -> int:  # noqa: ARG002 - most take any profiles
+        """Return the largest number of profiles that a chunk must not part."""
+        return 1
+
 
 class Choice(Definition[S], Generic[C_contra, S]):
     """Something about a channel or a product that is decided from headers and campaign alone."""
@@ -128,10 +138,6 @@ class MakingStep(Definition[S], Generic[R, S]):
     parts: tuple[Definition[Any], ...] = ()
     """Other entries of the kind: steps, and choices by which the product is made."""
 
-    def held(self, settings: S, work: Workload) -> float:  # noqa: ARG002
-        """Return the number of bytes that the product holds for the whole scene."""
-        return 0.0
-
 
 class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):
     """The step that makes a product of one channel."""
@@ -151,8 +157,8 @@ class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):
         return planned, []
 
 
-Sample = Callable[[str, Sequence[Granule]], "xr.Dataset"]
-"""Channel and granules -> power, variance and quality of their profiles."""
+Sample = Callable[[str, Sequence[Granule]], Iterator["xr.Dataset"]]
+"""Channel and granules -> power, variance and quality of their profiles, some at a time."""
 
 
 @dataclass(frozen=True, slots=True)

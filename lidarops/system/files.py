@@ -1,10 +1,23 @@
-"""Local files that are complete or absent, even if a process is killed while it writes."""
+"""Local files: their digest, and writing so that they are complete or absent after a kill."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_atomically(target: Path, content: bytes) -> None:

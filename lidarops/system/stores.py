@@ -20,6 +20,7 @@ from typing import Any, Final
 from urllib.parse import unquote
 
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
+from lidarops.system.files import sha256_of
 
 _READ_ONLY: Final = frozenset({"http", "https"})
 # Schemes by which an object appears only when its upload is complete.
@@ -260,8 +261,8 @@ class RemoteStore:
 
     def _upload(self, root: Path, products: Mapping[str, str]) -> None:
         for path, sha256 in products.items():
-            with _reading(root / path), (root / path).open("rb") as file:
-                if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
+            with _reading(root / path):
+                if sha256_of(root / path) != sha256:
                     raise ProductError(
                         "differs from the ledger", file=root / path, remedy="run lidarops reprocess"
                     )

@@ -2,46 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
 
 import pytest
 
+from lidarops.bench import registry
 from lidarops.bench.harness.rows import (
     CPU_TIME,
-    MonteCarloFigure,
-    Quantity,
+    Chapter,
+    Figure,
+    Results,
     Row,
+    Study,
     Unit,
+    by_method,
+    cpu_time,
     error_against_time,
     panel,
-    rows_of,
+    rows_of_scores,
+    share,
     table,
-    table_of_methods,
     with_error,
 )
-
-
-@dataclass(frozen=True)
-class Score:
-    rmse: MonteCarloFigure
-    coverage: tuple[MonteCarloFigure, ...] | None
-    nanoseconds: float
-    profiles: int = 20
-
-
-OF_SCORE = (
-    Quantity("profiles", "profiles"),
-    Quantity("RMSE", "rmse", factor=1e3),
-    Quantity("95 %", "coverage.1", Unit.SHARE),
-    Quantity(CPU_TIME, "nanoseconds", Unit.TIME),
-)
-WITHIN = (MonteCarloFigure(0.7, 0.01), MonteCarloFigure(0.95, 0.004))
+from lidarops.errors import CatalogError
 
 
 def results():
-    rows = rows_of("clear", "ours", Score(MonteCarloFigure(2e-3, 1e-4), WITHIN, 3e3), OF_SCORE)
-    rows += rows_of("clear", "peer", Score(MonteCarloFigure(1e-3, 1e-4), None, 5e6), OF_SCORE)
-    return rows + rows_of("cloud", "peer", Score(MonteCarloFigure(4.0, 0.0), None, 1e3), OF_SCORE)
+    return rows_of_scores(
+        {
+            (case, method): {
+                "profiles": 20,
+                "RMSE": rmse,
+                "95 %": coverage,
+                CPU_TIME: cpu_time(time),
+            }
+            for case, method, rmse, coverage, time in (
+                ("clear", "ours", Figure(2e-3, 1e-4).times(1e3), share(Figure(0.95, 0.004)), 3e3),
+                ("clear", "peer", Figure(1e-3, 1e-4).times(1e3), None, 5e6),
+                ("cloud", "peer", Figure(4e3), None, 1e3),
+            )
+        }
+    )
 
 
 @pytest.mark.parametrize(
@@ -70,9 +71,9 @@ def test_a_table_has_a_line_for_each_case_and_method():
     )
     assert table("Scores", results()[:8]).columns[0] == "method"
     assert table("Scores", results()[4:]).columns[0] == "case"
-    by_method = table_of_methods("Scores", results(), "RMSE")
-    assert by_method.columns == ("case", "ours", "peer")
-    assert by_method.rows == (("clear", "2.0(1)", "1.0(1)"), ("cloud", "-", "4,000"))
+    turned = table("Scores", by_method(results(), "RMSE"), method="case")
+    assert turned.columns == ("case", "ours", "peer")
+    assert turned.rows == (("clear", "2.0(1)", "1.0(1)"), ("cloud", "-", "4,000"))
 
 
 @pytest.mark.parametrize(
@@ -105,3 +106,33 @@ def test_cases_that_are_numbers_are_an_axis():
         ("b", (1.0, 10.0), (2.0, 20.0)),
     ]
     assert along.x_label == "number of files"
+
+
+def test_a_study_has_one_json_and_one_page(tmp_path):
+    chapter = Chapter(
+        "Errors",
+        "About them.",
+        [Results("Shown", results()), Results("Folded", results()[:4], folded=True)],
+    )
+    study = Study("Title", "2024-01-01", [chapter])
+    assert study.figures("Shown")["cloud", "peer", "RMSE"].value == 4e3
+    output = study.output()
+    (part,) = output.report.parts
+    assert [table.title for table in part.tables] == ["Shown"]
+    assert [table.title for table in part.details] == ["Folded"]
+    page = registry.write_benchmark(output, tmp_path / "sub")
+    content = json.loads((page.parent / "result.json").read_text())
+    assert (content["title"], content["date"]) == ("Title", "2024-01-01")
+    row = content["tables"]["Folded"][1]
+    assert (row["case"], row["method"], row["quantity"]) == ("clear", "ours", "RMSE")
+    assert (row["value"], row["error"], row["unit"]) == (2.0, 0.1, "")
+    with pytest.raises(CatalogError, match="cannot be written"):
+        registry.write_benchmark(output, page / "sub")
+
+
+@pytest.mark.parametrize(
+    ("nanoseconds", "text"), [(3.21, "3.21 ns"), (4.2e3, "4.2 µs"), (5e6, "5 ms"), (2e9, "2 s")]
+)
+def test_times_have_a_suitable_unit(nanoseconds, text):
+    (line,) = table("Times", [Row("", "m", "time", nanoseconds, unit=Unit.TIME)]).rows
+    assert line == ("m", text)

@@ -121,7 +121,7 @@ def test_every_good_file_is_in_a_product(demo: tuple[Campaign, RunRecord]) -> No
     store = Store(campaign.catalog_url, campaign.name)
     good = {granule.path for granule in store.granules(status=Status.GOOD)}
     used = {
-        path for product in store.products() for path in store.product_inputs(str(product["path"]))
+        used.path for product in store.products() for used in store.inputs_of(str(product["path"]))
     }
     store.close()
     assert used == good

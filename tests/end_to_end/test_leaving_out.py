@@ -338,7 +338,7 @@ def sky(light, *, saturated=()):
         quality = np.zeros(power.shape, np.int32)
         quality[[minute in saturated for minute in minutes], 200] = int(Quality.SATURATED)
         pair = ("time", "range")
-        return xr.Dataset(
+        sample = xr.Dataset(
             {
                 "power": (pair, power),
                 "variance": (pair, np.full(power.shape, 0.01)),
@@ -346,6 +346,7 @@ def sky(light, *, saturated=()):
             },
             coords={"range": RANGE},
         )
+        return (sample.isel(time=[place]) for place in range(len(minutes)))
 
     return profiles, seen
 

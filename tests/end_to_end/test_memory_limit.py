@@ -119,10 +119,16 @@ def test_the_memory_of_a_process_does_not_grow_with_its_scene() -> None:
 
 @pytest.mark.slow
 def test_a_worker_of_700_mib_processes_a_scene_of_101_mb(tmp_path: Path) -> None:
-    campaign = peaks.campaign_of(tmp_path / "raw", "signal and elastic", tmp_path / "out")
+    campaign = peaks.campaign_of(
+        tmp_path / "raw", "signal, homogeneous and elastic", tmp_path / "out"
+    )
     peaks.write_files(tmp_path / "raw", 101)
     with local_client(1, memory="700MiB") as client:
         record = reprocess(campaign, client=client)
     assert record is not None
     assert [scene.error for scene in record.scenes] == [""]
-    assert {product.kind for product in record.scenes[0].products} == {"signal", "elastic"}
+    assert {product.kind for product in record.scenes[0].products} == {
+        "signal",
+        "homogeneous",
+        "elastic",
+    }

@@ -25,11 +25,11 @@ import lidarops
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
-from lidarops.netcdf import code_version as versions
-from lidarops.netcdf.code_version import sources_in
 from lidarops.raw import licel
 from lidarops.run.archive import assess, reprocess
 from lidarops.simulate.campaign import simulate_campaign
+from lidarops.system import code_version as versions
+from lidarops.system.code_version import sources_in
 
 KIND = "integrated"
 WINDOWS = [[1500, 3000], [3900, 6000], [9000, 9500]]
@@ -262,6 +262,18 @@ def test_a_changed_setting_makes_it_stale_and_no_other(copied: Campaign) -> None
     record = reprocess(changed)
     assert record is not None
     assert {made.kind for scene in record.scenes for made in scene.products} == {KIND}
+
+
+def test_changed_bytes_of_a_file_in_its_settings_make_it_stale(copied: Campaign) -> None:
+    file = copied.folder / "overlap.csv"
+    file.write_text("range,overlap\n0,0.2\n600,1.0\n")
+    settings = tree()
+    settings["instruments"]["coast-lidar"]["products"][KIND]["overlap_profile"] = file.name
+    changed = campaign_in(copied.folder, settings)
+    reprocess(changed)
+    assert not stale(changed)
+    file.write_text("range,overlap\n0,0.1\n600,1.0\n")
+    assert stale(changed) == {KIND: "changed: overlap overlap.csv"}
 
 
 @pytest.fixture(scope="module")

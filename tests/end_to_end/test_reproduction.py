@@ -305,7 +305,7 @@ def test_a_product_that_names_raw_files_elsewhere_is_refused(
         each for each in document["entity"].values() if "/h" in each.get("lidarops:path", "")
     )
     raw["lidarops:path"] = escape.format(outside=outside)
-    monkeypatch.setattr("lidarops.run.reproduction.read_provenance", lambda _: document)
+    monkeypatch.setattr("lidarops.run.recipe.read_provenance", lambda _: document)
     with pytest.raises(ProductError, match="outside its archive"):
         reproduce_product(product, archive=campaign.archive, catalog=campaign.catalog_url)
     assert outside.read_bytes() == b"of somebody else"

@@ -149,23 +149,19 @@ def carry_out(
     for chunk in execution.chunks(source, channel, streams.values(), profiles):
         for kind, stream in streams.items():
             if isinstance(stream, RowProduct):
-                rows[kind].append(stream.rows(chunk))
+                rows[kind] += stream.rows(chunk)
             else:
                 stream.add(chunk)
     return {
-        kind: joined(stream.frame(), rows[kind]) if kind in rows else retrieved(stream)
-        for kind, stream in streams.items()
+        kind: product_of(rows.get(kind) or [*stream.results()]) for kind, stream in streams.items()
     }
 
 
-def retrieved(stream):
-    """Return a product that is retrieved when all profiles are known."""
-    frame, *batches = stream.results()
-    return batches[0] if len(batches) == 1 else joined(frame, batches)
-
-
-def joined(frame, rows):
-    """Return a product of which each profile gives its own rows."""
+def product_of(batches):
+    """Return a product from its frame and the batches of its rows."""
+    frame, *rows = batches
+    if len(rows) == 1:
+        return rows[0]
     whole = xr.concat(rows, "time", data_vars="minimal", coords="minimal", compat="override")
     return frame.assign(whole.variables)
 

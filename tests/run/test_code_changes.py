@@ -10,9 +10,9 @@ from support.archives.small_archive import Archive, made
 from support.sources import Copy
 
 from lidarops.catalog.store import Store
-from lidarops.netcdf import code_version as versions
-from lidarops.run.archive import assess, reprocess
+from lidarops.run.archive import assess, reprocess, update_catalog
 from lidarops.run.staleness import Judge, Signature
+from lidarops.system import code_version as versions
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -75,6 +75,18 @@ def test_changed_code_makes_its_kinds_stale(
     assert {name.split()[2] for name in products} == kinds
     assert len(products) == len(stale)
     assert reprocess(campaign) is None
+
+
+def test_files_are_read_again_if_their_parser_changed(
+    archive: Archive, installed: Installed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = archive.write()
+    for statement, read in (("# A comment.", False), ("_UNHEARD_OF = 1", True)):
+        installed.change("raw/licel_header.py", statement)
+        installed.reload(monkeypatch)
+        summary = update_catalog(campaign)
+        assert summary.changed == (summary.files if read else 0)
+        assert not update_catalog(campaign).changed
 
 
 def test_a_day_is_judged_again_if_the_planning_changed(

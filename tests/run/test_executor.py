@@ -21,7 +21,8 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
-from lidarops.process.scene import Job, failed_outcome
+from lidarops.process.guard import Failure
+from lidarops.process.job import Job
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
 from lidarops.run.executor import (
@@ -151,7 +152,9 @@ def test_jobs_are_consumed_one_by_one(archive: Archive, monkeypatch: pytest.Monk
             taken += 1
             yield job
 
-    monkeypatch.setattr(executor, "attempt", lambda job: (failed_outcome(job, "no"), True))
+    monkeypatch.setattr(
+        executor, "attempt", lambda job: (Failure("no").outcome(job.scene, job.plan), True)
+    )
     ended: list[EndedScene] = []
     for each in process_jobs(counted()):
         ended.append(each)
@@ -234,7 +237,7 @@ def test_workers_that_join_later_get_scenes_before_any_has_ended(
     monkeypatch.setattr(
         executor,
         "_outcome_of",
-        lambda _, job: EndedScene(job, failed_outcome(job, "no"), final=True),
+        lambda _, job: EndedScene.failed(Failure("no"), job.scene, job.plan),
     )
     jobs = scene_jobs(archive.write()) * 4
     assert len(list(process_jobs(jobs, client=GrowingCluster()))) == len(jobs)

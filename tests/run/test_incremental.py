@@ -18,7 +18,7 @@ from support import quick
 from support.archives.small_archive import DAY, Archive, made
 from typer.testing import CliRunner
 
-from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.ledger import RunStatus, Verdict
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.scan import scan_archive
@@ -272,6 +272,24 @@ def test_a_plan_marks_a_range_window_without_effect(archive: Archive) -> None:
     assert shown.stdout.count("no effect: signal needs all bins") == 4
 
 
+def test_a_plan_shows_its_hash_and_what_each_step_needs(archive: Archive) -> None:
+    archive.write()
+    selection = ["--instrument", "poor", "--until", "2026-03-02T00:00:00"]
+    (scene,) = _planned(archive, *selection)["scenes"]
+    command = ["plan", str(archive.file), *selection]
+    shown = CliRunner().invoke(app, command, env={"COLUMNS": "100"}).stdout
+    assert f"plan {scene['hash'][:12]}" in " ".join(shown.split())
+    rows = [[cell.strip() for cell in line.split("│")] for line in shown.splitlines()]
+    needs = {row[1]: (row[3], row[4]) for row in rows if len(row) > 4 and row[1].isdecimal()}
+    names = {
+        number: {name for name, _ in (needs[n] for n in taken.split(", ") if n)}
+        for number, (_, taken) in needs.items()
+    }
+    for number, step in enumerate(scene["steps"], 1):
+        planned = {other["name"] for other in scene["steps"]}
+        assert names[str(number)] == set(step.get("needs", ())) & planned
+
+
 def test_a_kind_that_nothing_requests_is_wrong_use(archive: Archive) -> None:
     archive.write()
     for command in ("plan", "reprocess"):
@@ -475,31 +493,32 @@ def test_a_new_day_is_processed_alone(archive: Archive) -> None:
     assert made(reprocess(archive.write())) == _all(range(10, 11))
 
 
-def _expected_verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
-    """Return day -> signature, empty scenes and granules set aside, where nothing is stale."""
+def _expected_verdicts(archive: Archive) -> dict[int, Verdict]:
+    """Return the verdicts on days on which nothing is stale."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store)
         signatures = judge.signatures()
         judged = [judge.days(batch) for batch in judge.batches(signatures)]
     return {
-        day: (signatures[day].whole, *unused)
+        day: verdict._replace(signature=signatures[day].whole)
         for days in judged
-        for day, unused in days.unused.items()
+        for day, verdict in days.verdicts.items()
         if day not in days.open
     }
 
 
-def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
+def _verdicts(archive: Archive) -> dict[int, Verdict]:
     """Return the verdicts of days whose state is unchanged."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
-        now = Judge(campaign, store).signatures()
+        judge = Judge(campaign, store)
+        now = judge.signatures()
         known = store.verdicts()
     return {
         day: verdict
         for day, verdict in known.items()
-        if day in now and verdict[0] == now[day].whole
+        if day in now and judge.is_settled(now[day], verdict)
     }
 
 
@@ -568,7 +587,8 @@ def test_only_days_with_failures_are_judged_again(
     record = reprocess(archive.write())
     failed = {day_of(scene.start) for scene in record.scenes if scene.error}
     assert len(failed) == 2
-    assert looked == [*every, *sorted(failed)]
+    # Only these days use the sounding; they are judged before and after.
+    assert looked == sorted(failed) * 2
 
 
 def _elsewhere(archive: Archive) -> None:

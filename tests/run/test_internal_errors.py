@@ -88,6 +88,54 @@ def test_a_bug_is_met_again_only_after_the_code_has_changed(
     assert not healed.failures
 
 
+def test_a_bug_in_planning_ends_its_scene_only(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    campaign = archive.write()
+    with monkeypatch.context() as patch:
+        bugs.insert_in_planning(KeyError("no such thing"), DAY, patch)
+        first = bring_up_to_date(campaign)
+        assert _made_in(first.record) == OTHERS
+        assert (set(first.internal_errors), first.failed_scenes) == ({SCENE}, {})
+        assert "internal error: KeyError: 'no such thing'" in first.internal_errors[SCENE]
+        assert "in decide_with_a_bug" in first.internal[SCENE]
+        assert first.internal[SCENE] in caplog.text
+        with Store(campaign.catalog_url, "small") as store:
+            assert store.internal_errors() == first.internal
+        again = bring_up_to_date(campaign)
+        assert again.record is None
+        assert again.internal == first.internal
+        run = CliRunner().invoke(app, ["reprocess", str(archive.file)])
+        assert run.exit_code == 1
+        assert "1 scene ended with an internal error" in run.stdout
+    healed = bring_up_to_date(campaign)
+    assert _made_in(healed.record) == {SCENE}
+    assert not healed.failures
+
+
+def test_a_bug_in_planning_keeps_the_products_of_its_scene(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = archive.write()
+    reprocess(campaign)
+    archive.flip("raw/rich/h10")
+    with monkeypatch.context() as patch:
+        bugs.insert_in_planning(KeyError("no such thing"), DAY, patch)
+        result = bring_up_to_date(campaign)
+        assert set(result.internal) == {SCENE}
+        assert not result.orphans
+        shown = CliRunner().invoke(app, ["plan", str(archive.file), "--json"])
+        assert shown.exit_code == 1
+        failures = {
+            scene["scene"]: scene["failure"]["internal"]
+            for scene in json.loads(shown.stdout)["scenes"]
+            if scene["failure"]
+        }
+        assert "in decide_with_a_bug" in failures.pop(SCENE)
+        assert not failures
+        assert "KeyError" in CliRunner().invoke(app, ["plan", str(archive.file)]).stdout
+
+
 def test_a_changed_input_is_tried_again(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         bugs.insert(TypeError("no such thing"), DAY, patch)

@@ -53,6 +53,34 @@ def network() -> Plan:
 PLANS = {**{name: planned(name) for name in SCENES}, "network": network()}
 
 
+def test_settings_of_one_kind_concern_no_other_product_of_the_network() -> None:
+    (scene,) = (s for s in cut_scenes(network_campaign(), network_granules()).scenes if s.members)
+    changed = network_campaign({"average": "30min"})
+    before, after = (
+        [
+            dependence.Settings(campaign).of(scene, PLANS["network"], (kind, "photon_532o"))
+            for kind in ("visibility", "of_another_package")
+        ]
+        for campaign in (network_campaign(), changed)
+    )
+    assert before[0] != after[0]
+    assert before[1] == after[1]
+
+
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_the_places_of_needed_steps_are_those_that_the_plan_names(plan: Plan) -> None:
+    for step, places in zip(plan.steps, dependence.needed_places(plan), strict=True):
+        taken = [plan.steps[place] for place in places]
+        names = {
+            other.name if other.channel == step.channel else f"{other.channel}/{other.name}"
+            for other in taken
+        }
+        assert names <= set(step.needs)
+        left_out = {omission.name for omission in plan.left_out}
+        assert {need.rpartition("/")[2] for need in set(step.needs) - names} <= left_out
+        assert all(other.product in ("", step.product) for other in taken)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(sorted(SCENES)), st.sets(st.sampled_from(sorted(REQUESTS)), min_size=1))
 def test_the_plan_of_a_product_does_not_depend_on_other_products(scene, kinds):

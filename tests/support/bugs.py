@@ -7,8 +7,11 @@ from typing import Any
 import pytest
 import xarray as xr
 
+from lidarops.products.homogeneous import steps
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.run import executor
+from lidarops.steps.case import ChannelCase
+from lidarops.steps.step import Decisions
 
 
 def insert(error: BaseException, day: str, patch: pytest.MonkeyPatch | None = None) -> None:
@@ -30,6 +33,18 @@ def insert(error: BaseException, day: str, patch: pytest.MonkeyPatch | None = No
         return fit(power, **settings)
 
     (patch or pytest.MonkeyPatch()).setattr(labeled, "fit_homogeneous_path", fit_with_a_bug)
+
+
+def insert_in_planning(error: BaseException, day: str, patch: pytest.MonkeyPatch) -> None:
+    """Make the step ``homogeneous`` raise an error when the scenes of a day are planned."""
+    decide = steps.Homogeneous.decide
+
+    def decide_with_a_bug(self: steps.Homogeneous, case: ChannelCase) -> Decisions:
+        if f"{case.scene.start:%Y-%m-%d}" == day:
+            raise error
+        return decide(self, case)
+
+    patch.setattr(steps.Homogeneous, "decide", decide_with_a_bug)
 
 
 def insert_in_the_worker(error: BaseException, day: str) -> None:

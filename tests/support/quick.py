@@ -9,9 +9,9 @@ from pathlib import Path
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
+from lidarops.process.guard import Failure
 from lidarops.process.input_files import check_files
 from lidarops.process.job import Job
-from lidarops.process.scene import failed_outcome
 from lidarops.records import ProductRecord, SceneOutcome
 from lidarops.steps import dependence
 
@@ -26,13 +26,13 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
             job.campaign.folder, dependence.ancillary_files(job.plan.steps)
         ).inputs
     except LidarOpsError as error:
-        return failed_outcome(job, str(error)), True
+        return Failure(str(error)).outcome(job.scene, job.plan), True
     settings = dependence.Settings(job.campaign)
     products = []
     for kind, channel in dependence.planned_products(job.plan):
         closure = dependence.plan_closure(job.plan, [(kind, channel)])
         used = sorted(record.sha256 for record in dependence.product_inputs(closure, inputs))
-        fields = [closure.as_dict(), settings.of(job.scene, closure, channel), used]
+        fields = [closure.as_dict(), settings.of(job.scene, closure, (kind, channel)), used]
         content = json.dumps(fields, sort_keys=True).encode()
         path = f"{scene.instrument}/{scene.id}_{kind}_{channel}.nc"
         target = job.campaign.products_root / path
@@ -43,7 +43,10 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         sha256 = hashlib.sha256(content).hexdigest()
         products.append(ProductRecord(path, kind, channel, sha256, len(content), 1, {}, 1))
     outcome = replace(
-        failed_outcome(job, ""), products=tuple(products), inputs=inputs, refused=refused,
+        Failure("").outcome(job.scene, job.plan),
+        products=tuple(products),
+        inputs=inputs,
+        refused=refused,
         seconds={"digest": 0.5, "retrieve": 1.0, "write": 0.25},
-    )  # fmt: skip
+    )
     return outcome, True

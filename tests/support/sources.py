@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from lidarops.kinds import kinds
-from lidarops.netcdf.code_version import source_roots, sources_in, version_of
+from lidarops.system.code_version import source_roots, sources_in, version_of
 from lidarops.system.source_closure import Sources
 
 

@@ -7,33 +7,38 @@ background. The files of the intercomparison are read if given.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.bench.harness.rows import Array, Mask
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
+from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
+from lidarops.retrieve.background.known_shape import KnownShapeResult
 from lidarops.retrieve.elastic import inversion, layers, reference_window
 from lidarops.retrieve.homogeneous import path_fit
-
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
+from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 WAVELENGTH: Final = 532e-9
 LIDAR_RATIO: Final = 39.0
 SHOTS: Final = 1000.0
 BRIGHTEST: Final = 1.9093e7
 """Counts in the brightest bin, as in the intercomparison."""
-RANGE: Final = 15.0 * (np.arange(1005, dtype=np.float64) + 0.5)
+_BIN_WIDTH: Final = 15.0
+RANGE: Final = bin_centres(1005, _BIN_WIDTH)
+_CELLS: Final = 9
+"""Cells of a bin, over which the optical depth is summed."""
 LEVELS: Final = tuple(10.0**power for power in range(9))
 """Backgrounds in counts per bin and shot."""
 CLEAN_FROM: Final = 6000.0
@@ -73,12 +78,12 @@ class SimulatedSky:
     """m-1 sr-1, true backscatter of the particles."""
 
     @property
-    def compared(self) -> npt.NDArray[np.bool_]:
+    def compared(self) -> Mask:
         """Bins whose backscatter is compared with the truth."""
         return (self.range >= COMPARED[0]) & (self.range <= COMPARED[1])
 
     @property
-    def inverted(self) -> npt.NDArray[np.bool_]:
+    def inverted(self) -> Mask:
         """Bins that the inversion uses."""
         return self.range > OVERLAP
 
@@ -127,22 +132,37 @@ def particles(height: npt.ArrayLike) -> Array:
     return np.asarray(np.where(z < CLEAN_FROM, mixed + aloft, 0.0))
 
 
+def clean_signal(
+    extinction: Callable[[Array], Array], backscatter: Callable[[Array], Array]
+) -> Array:
+    """Return the signal of a short pulse in the bins of `RANGE`, in any unit.
+
+    The optical depth is summed over cells of a ninth of a bin, not by the trapezoids of the
+    inversion. The error of these is therefore part of the measured error.
+
+    Parameters
+    ----------
+    extinction, backscatter : callable
+        Return m-1 and m-1 sr-1 at ranges in m.
+    """
+    cells = bin_centres(_CELLS * RANGE.size, _BIN_WIDTH / _CELLS)
+    signal = backscatter_signal(
+        cells,
+        extinction=extinction(cells),
+        backscatter=backscatter(cells),
+        system_constant=1.0,
+    )
+    return signal[_CELLS // 2 :: _CELLS]
+
+
 @cache
 def simulated_sky() -> SimulatedSky:
-    """Return the simulated set.
-
-    The optical depth is integrated by Gauss quadrature with 8 nodes from bin to bin, not by the
-    trapezoids of the inversion. The error of these is therefore part of the measured error.
-    """
+    """Return the simulated set."""
     air = MolecularProfile.us_standard()
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    edges = np.concatenate([[0.0], RANGE])
-    half = 0.5 * np.diff(edges)[:, np.newaxis]
-    z = edges[:-1, np.newaxis] + half * (1.0 + nodes)
-    extinction = LIDAR_RATIO * particles(z) + air.extinction(z, WAVELENGTH)
-    depth = np.cumsum(np.sum(extinction * weights * half, axis=-1))
-    molecular = air.backscatter(RANGE, WAVELENGTH)
-    signal = (particles(RANGE) + molecular) * np.exp(-2.0 * depth) / RANGE**2
+    signal = clean_signal(
+        lambda z: LIDAR_RATIO * particles(z) + air.extinction(z, WAVELENGTH),
+        lambda z: particles(z) + air.backscatter(z, WAVELENGTH),
+    )
     signal *= np.minimum((np.arange(RANGE.size) + 1.0) / _RAMP, 1.0) ** 3
     return _sky(air, signal, particles(RANGE))
 
@@ -156,7 +176,7 @@ class BackgroundEstimates:
 
     background: Array
     standard_error: Array
-    rejected: npt.NDArray[np.bool_]
+    rejected: Mask
     """Whether a quality bit rejects the value."""
 
 
@@ -177,47 +197,48 @@ def background_methods() -> dict[str, BackgroundMethod]:
     """
     return {
         KNOWN_SHAPE: _known_shape,
-        KNOWN_CLEAN_RANGE: _known_clean_range,
-        TAIL_MEAN: _tail_mean,
+        KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
+        TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
         HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
     }
 
 
-def _known_shape(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    fit = known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS)
-    return _estimates(fit.background, fit.background_standard_error, fit.quality)
-
-
-def _known_clean_range(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    fit = known_shape.fit_known_shape(
-        counts, sky.range, sky.shape, exposure=SHOTS, start=CLEAN_FROM
+def _known_shape(
+    counts: Array, sky: SimulatedSky, start: float | None = None
+) -> BackgroundEstimates:
+    return _estimates(
+        known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS, start=start)
     )
-    return _estimates(fit.background, fit.background_standard_error, fit.quality)
-
-
-def _tail_mean(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    result = cubic_and_tail.tail_mean(counts, sky.range)
-    return _estimates(result.background, result.background_standard_error, result.quality)
 
 
 def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
     variance = photon_counts.mean_profile_variance(counts[:, far], SHOTS)
     fit = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
-    return _estimates(fit.background, fit.background_standard_error, fit.quality)
+    return _estimates(fit)
 
 
 def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
-    result = cubic_and_tail.cubic(
-        counts[:, far], sky.range[far], statistics=cubic_and_tail.Statistics.POISSON, shots=SHOTS
+    return _estimates(
+        cubic_and_tail.cubic(
+            counts[:, far],
+            sky.range[far],
+            statistics=cubic_and_tail.Statistics.POISSON,
+            shots=SHOTS,
+        )
     )
-    return _estimates(result.background, result.background_standard_error, result.quality)
 
 
-def _estimates(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> BackgroundEstimates:
-    return BackgroundEstimates(value, error, (quality & rejecting(Quality)) != 0)
+def _estimates(
+    result: KnownShapeResult | HomogeneousResult | BackgroundResult,
+) -> BackgroundEstimates:
+    return BackgroundEstimates(
+        result.background,
+        result.background_standard_error,
+        (result.quality & rejecting(Quality)) != 0,
+    )
 
 
 def least_error(sky: SimulatedSky, level: float) -> float:
@@ -238,18 +259,6 @@ def least_error(sky: SimulatedSky, level: float) -> float:
 # Inversion ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Inverted:
-    """Retrieved backscatter of particles of each profile."""
-
-    backscatter: Array
-    """m-1 sr-1, (profile, range); NaN where withheld."""
-    standard_error: Array
-    """m-1 sr-1."""
-    calibrated: npt.NDArray[np.bool_]
-    """Profiles with a reference window."""
-
-
 def count_variance(counts: Array) -> Array:
     """Return the variance of mean counts, estimated from the counts."""
     # A bin without counts is treated as one count.
@@ -267,7 +276,7 @@ def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
 
 
 def choose_window(
-    power: Array, noise: Array, sky: SimulatedSky, exclude: npt.NDArray[np.bool_] | None = None
+    power: Array, noise: Array, sky: SimulatedSky, exclude: Mask | None = None
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows chosen from `CANDIDATES`."""
     return reference_window.choose_reference(
@@ -328,8 +337,8 @@ def chains() -> dict[str, Chain]:
 
 def invert(
     counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates, chain: Chain
-) -> Inverted:
-    """Return the backscatter of particles.
+) -> inversion.ElasticResult:
+    """Return the particles of profiles.
 
     Parameters
     ----------
@@ -341,22 +350,18 @@ def invert(
     """
     power, noise = subtract_background(counts, sky, estimates), count_variance(counts)
     edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
-    calibrated = np.ones(len(counts), dtype=np.bool_)
     hidden: npt.ArrayLike = 0.0
     if chain.choose:
         window = choose_window(power, noise, sky, find_clouds(power, noise, sky).mask)
-        edges, calibrated = window.edges, window.chosen
+        edges = window.edges
         hidden = np.nan_to_num(chain.carried * window.scale_standard_error / window.scale)
-    solved = invert_particles(
+    return invert_particles(
         power,
         sky,
         edges,
         noise=noise,
         background_error=estimates.standard_error,
         reference_error=hidden,
-    )
-    return Inverted(
-        solved.backscatter, solved.backscatter_standard_error, calibrated & solved.calibrated
     )
 
 
@@ -376,45 +381,11 @@ def lstsq_backgrounds(counts: Array, sky: SimulatedSky) -> Array:
     return backgrounds
 
 
-def klett_python(power: Array, sky: SimulatedSky) -> Array:
-    """Return the backscatter of particles by loops over profiles and bins, without errors.
+def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
+    """Return the backscatter of particles profile by profile, without errors.
 
     fernald1984, backward and forward from the middle of `GIVEN_WINDOW`, by trapezoids.
     """
-    distance = sky.range.tolist()
-    air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
-    inside = [k for k, r in enumerate(distance) if GIVEN_WINDOW[0] <= r <= GIVEN_WINDOW[1]]
-    rows = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
-    return np.asarray(rows)
-
-
-def _klett(
-    power: list[float],
-    distance: list[float],
-    air: list[float],
-    loss: list[float],
-    inside: list[int],
-) -> list[float]:
-    start, size = inside[len(inside) // 2], len(power)
-    excess = [a - LIDAR_RATIO * b for a, b in zip(loss, air, strict=True)]
-    corrected, integral = [0.0] * size, [0.0] * size
-    for step in (1, -1):
-        depth = total = 0.0
-        last = start
-        corrected[start] = power[start] * distance[start] ** 2
-        for k in range(start + step, size if step > 0 else -1, step):
-            width = distance[k] - distance[last]
-            depth += 0.5 * width * (excess[k] + excess[last])
-            corrected[k] = power[k] * distance[k] ** 2 * math.exp(2.0 * depth)
-            total += 0.5 * width * LIDAR_RATIO * (corrected[k] + corrected[last])
-            integral[k] = total
-            last = k
-    ratio = sum(corrected[k] / air[k] for k in inside) / len(inside)
-    return [q / (ratio - 2.0 * i) - b for q, i, b in zip(corrected, integral, air, strict=True)]
-
-
-def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
-    """Return the backscatter of `klett_python` by cumulative sums, profile by profile."""
     inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
     start = inside[inside.size // 2]
     excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter

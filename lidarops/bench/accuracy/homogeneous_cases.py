@@ -10,12 +10,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.bench.harness.rows import Array, Mask
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
-
-Array = npt.NDArray[np.float64]
+from lidarops.simulate.signal import backscatter_signal
 
 BINS: Final = 225
 BACKGROUND: Final = 370.0
@@ -71,10 +71,11 @@ class Scenario:
     @property
     def mean(self) -> Array:
         """Noise-free power."""
-        depth = 2 * self.extinction * (self.range - self.start)
-        return np.asarray(
-            self.background + self.signal * (self.start / self.range) ** 2 * np.exp(-depth)
+        air = np.ones(self.bins)
+        signal = backscatter_signal(
+            self.range, extinction=self.extinction * air, backscatter=air, system_constant=1.0
         )
+        return np.asarray(self.background + self.signal * signal / signal[0])
 
     @property
     def label(self) -> str:
@@ -164,9 +165,9 @@ class Estimates:
 
     values: Mapping[str, Array]
     standard_errors: Mapping[str, Array]
-    flagged: npt.NDArray[np.bool_]
+    flagged: Mask
     """Any quality bit."""
-    rejected: npt.NDArray[np.bool_]
+    rejected: Mask
     """A rejecting quality bit."""
 
 
@@ -206,7 +207,7 @@ def _solver(method: HomogeneousMethod) -> PathSolver:
             scenario.range,
             variance=1.0,
             method=method.value,
-            **method_arguments(method, scenario),  # type: ignore[arg-type]
+            **method_arguments(method, scenario),
         )
         return estimates(fit)
 

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
+from lidarops.bench.harness.rows import Array
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
     Regularisation,
     retrieve_optical_depth,
 )
-
-Array = npt.NDArray[np.float64]
 
 NOISELESS: Final = 1e7
 """Signal over noise at which only the scatter of the air matters."""
@@ -323,49 +321,36 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
 
 def scan_methods() -> Mapping[str, ScanSolver]:
     """Return the methods of lidarops that are compared, by name."""
+    choices = {
+        "mld 0, discrepancy": Regularisation(0, "discrepancy"),
+        "mld 0, Cp": Regularisation(0, "cp"),
+        "mld 0, GCV": Regularisation(0, "gcv"),
+        "mld 0, sum over angles": Regularisation(average="angles"),
+        "mld 1, discrepancy": Regularisation(1, "discrepancy"),
+        "mld 1, GCV": Regularisation(1, "gcv"),
+    }
     return {
-        TWO_ANGLE: partial(_own_method, method=TWO_ANGLE),
-        KANO_HAMILTON: partial(_own_method, method=KANO_HAMILTON),
-        "mld 0, discrepancy": partial(_mld, regularisation=Regularisation(0, "discrepancy")),
-        "mld 0, Cp": partial(_mld, regularisation=Regularisation(0, "cp")),
-        "mld 0, GCV": partial(_mld, regularisation=Regularisation(0, "gcv")),
-        "mld 0, sum over angles": partial(_mld, regularisation=Regularisation(average="angles")),
-        "mld 1, discrepancy": partial(_mld, regularisation=Regularisation(1, "discrepancy")),
-        "mld 1, GCV": partial(_mld, regularisation=Regularisation(1, "gcv")),
-        MLD_PRIOR: partial(_own_method, method=MLD_PRIOR),
-        JOINT: partial(_own_method, method=JOINT),
+        **{name: partial(estimate, method=name) for name in (TWO_ANGLE, KANO_HAMILTON)},
+        **{n: partial(estimate, method=MLD, regularisation=c) for n, c in choices.items()},
+        **{name: partial(estimate, method=name) for name in (MLD_PRIOR, JOINT)},
     }
 
 
-def retrieve(scan: Scan, method: str, *, robust: bool = True) -> MultiAngleResult:
-    """Solve all profiles of a scan as one block."""
-    scene = scan.scene
+def retrieve(scan: Scan, method: str, **options: Any) -> MultiAngleResult:
+    """Solve all profiles of a scan as one block, with options of `retrieve_optical_depth`."""
     return retrieve_optical_depth(
         scan.signal,
-        scene.zenith_angle,
-        scene.altitude,
+        scan.scene.zenith_angle,
+        scan.scene.altitude,
         variance=scan.variance,
         method=method,
-        robust=robust,
+        **options,
     )
 
 
-def with_prior(scan: Scan, prior: Array) -> ScanEstimates:
-    """Retrieve by "mld_prior" with a given prior of optical depth."""
-    return _to_estimates(
-        retrieve_optical_depth(
-            scan.signal,
-            scan.scene.zenith_angle,
-            scan.scene.altitude,
-            variance=scan.variance,
-            method=MLD_PRIOR,
-            prior_optical_depth=prior,
-        )
-    )
-
-
-def _to_estimates(result: MultiAngleResult) -> ScanEstimates:
-    """Return the values of a result that are compared."""
+def estimate(scan: Scan, method: str, **options: Any) -> ScanEstimates:
+    """Return the values of `retrieve` that are compared."""
+    result = retrieve(scan, method, **options)
     return ScanEstimates(
         optical_depth=result.optical_depth,
         standard_error=result.optical_depth_standard_error,
@@ -373,23 +358,6 @@ def _to_estimates(result: MultiAngleResult) -> ScanEstimates:
         extinction_standard_error=result.extinction_standard_error,
         data_share=result.data_share,
         freedom=result.effective_degrees_of_freedom,
-    )
-
-
-def _own_method(scan: Scan, *, method: str) -> ScanEstimates:
-    return _to_estimates(retrieve(scan, method))
-
-
-def _mld(scan: Scan, *, regularisation: Regularisation) -> ScanEstimates:
-    return _to_estimates(
-        retrieve_optical_depth(
-            scan.signal,
-            scan.scene.zenith_angle,
-            scan.scene.altitude,
-            variance=scan.variance,
-            method=MLD,
-            regularisation=regularisation,
-        )
     )
 
 
@@ -401,11 +369,7 @@ def scan_peers() -> Mapping[str, ScanSolver]:
 
     They know the true scatter, and use samples of more than 3 times their noise.
     """
-    return {
-        LSTSQ: lstsq,
-        TIKHONOV: tikhonov,
-        BOUNDED: bounded,
-    }
+    return {LSTSQ: lstsq, TIKHONOV: tikhonov, BOUNDED: bounded}
 
 
 _Line = tuple[Array, Array, Array]

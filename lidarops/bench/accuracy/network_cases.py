@@ -19,6 +19,7 @@ from lidarops.retrieve.network.extinction_field import (
     NetworkResult,
     retrieve_network,
 )
+from lidarops.simulate.signal import backscatter_signal
 
 Array = npt.NDArray[np.float64]
 
@@ -41,7 +42,8 @@ _BEYOND: Final = 60.0
 """m, length of a signal after the last crossing."""
 _LEAST_SLOPE: Final = 1e-6
 """m-1, smallest extinction at the start of a fit."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+_CELLS: Final = 5
+"""Cells of a bin, over which the optical depth is summed."""
 
 
 # Networks -------------------------------------------------------------------------------------
@@ -174,7 +176,7 @@ class Signals:
 
 
 def signals(net: geometry.Network, air: Air, first_bin: float = _FIRST_BIN) -> Signals:
-    """Return signals, with optical depth by Gauss quadrature with 4 nodes from bin to bin."""
+    """Return signals, with optical depth summed over cells of a fifth of a bin."""
     bins = np.arange(first_bin, float(net.passages.range.max()) + _BEYOND, STEP)
     fields = air.fields()
     return Signals(
@@ -186,21 +188,18 @@ def signals(net: geometry.Network, air: Air, first_bin: float = _FIRST_BIN) -> S
 
 
 def _power(net: geometry.Network, bins: Array, extinction: Extinction) -> Array:
-    edges = np.concatenate([np.linspace(0.0, bins[0], 40, endpoint=False), bins])
-    half_width = 0.5 * np.diff(edges)
-    nodes = edges[:-1] + half_width * (1.0 + _NODES[:, np.newaxis])
-    out = np.empty((net.beams, bins.size))
+    cell = STEP / _CELLS
+    before = int(bins[0] // cell)
+    cells = bins[0] + cell * np.arange(-before, _CELLS * (bins.size - 1) + 1)
+    power = np.empty((net.beams, bins.size))
     for beam in range(net.beams):
-        at_nodes = extinction(*_points(net, beam, nodes))
-        depth = np.cumsum(np.sum(at_nodes * _WEIGHTS[:, np.newaxis], axis=0) * half_width)
-        at_bins = extinction(*_points(net, beam, bins))
-        out[beam] = at_bins * np.exp(-2.0 * depth[-bins.size :]) / bins**2
-    return out
-
-
-def _points(net: geometry.Network, beam: int, distance: Array) -> tuple[Array, Array]:
-    origin, direction = net.origin[beam], net.direction[beam]
-    return origin[0] + direction[0] * distance, origin[2] + direction[2] * distance
+        origin, direction = net.origin[beam], net.direction[beam]
+        east, up = (origin[axis] + direction[axis] * cells for axis in (0, 2))
+        scattering = extinction(east, up)
+        power[beam] = backscatter_signal(
+            cells, extinction=scattering, backscatter=scattering, system_constant=1.0
+        )[before::_CELLS]
+    return power
 
 
 # Solvers --------------------------------------------------------------------------------------
@@ -322,62 +321,6 @@ def _finite(value: float) -> float | None:
 
 
 # Peers ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RandomRows:
-    """Well-conditioned random cycles: (cycle, row) input of `lidarops.retrieve.network.cycles`."""
-
-    start: Array
-    end: Array
-    integral: Array
-    variance: Array
-    """(cycle, row, 3) relative variances."""
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """All arrays that a solution reads."""
-        return self.start, self.end, self.integral, self.variance
-
-    def first(self, count: int) -> RandomRows:
-        """Return the first cycles."""
-        return RandomRows(*(array[:count] for array in self.arrays))
-
-    def last(self, count: int) -> RandomRows:
-        """Return the last cycles."""
-        return RandomRows(*(array[-count:] for array in self.arrays))
-
-
-def random_rows(cycles: int, beams: int) -> RandomRows:
-    """Return random cycles whose beams all lead away from their lidars."""
-    random = np.random.default_rng((cycles, beams))
-    start = random.uniform(1.0, 2.0, (cycles, beams))
-    return RandomRows(
-        start,
-        start * random.uniform(0.6, 0.9, start.shape),
-        random.uniform(0.1, 0.3, start.shape),
-        np.full((*start.shape, 3), 1e-4),
-    )
-
-
-def solve_by_lu(rows: RandomRows) -> Array:
-    """Return (cycle,) reciprocal extinction at the first crossing, by `numpy.linalg.solve`."""
-    return np.asarray(np.linalg.solve(_matrices(rows), rows.integral[..., np.newaxis])[:, 0, 0])
-
-
-def solve_by_lu_one_by_one(rows: RandomRows) -> Array:
-    """Return the same with one call of `numpy.linalg.solve` per cycle."""
-    pairs = zip(_matrices(rows), rows.integral, strict=True)
-    return np.array([np.linalg.solve(matrix, side)[0] for matrix, side in pairs])
-
-
-def _matrices(rows: RandomRows) -> Array:
-    cycles, k = rows.start.shape
-    matrix = np.zeros((cycles, k, k))
-    rows_index = np.arange(k)
-    matrix[:, rows_index, rows_index] = rows.start
-    matrix[:, rows_index, (rows_index + 1) % k] -= rows.end
-    return matrix
 
 
 def network_by_scipy(power: Array, variance: Array, signals: Signals) -> Array:

@@ -1,1 +1,1 @@
-"""Shared by all benchmarks: `benchmark` (effort, page), `rows` (tables, charts), `timing`, JSON."""
+"""Shared by all benchmarks: `rows` (results, tables, page), `statistics`, `costs`, `timing`."""

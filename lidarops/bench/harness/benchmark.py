@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final
 
 from lidarops.bench.harness.timing import Machine
-from lidarops.reports.benchmark_page import BenchmarkReport, Part
+from lidarops.reports.benchmark_page import BenchmarkReport
 
 RESULT: Final = "result.json"
 """Name of the JSON file with the results, beside the page."""
@@ -28,8 +29,12 @@ class BenchmarkOutput:
     """Result and report page of a benchmark."""
 
     result: object
-    """A frozen dataclass, or a list of them."""
+    """Lists and dicts, or a dataclass."""
     report: BenchmarkReport
+
+    def json(self) -> str:
+        """Return the result as JSON."""
+        return json.dumps(self.result, indent=1, allow_nan=False, default=asdict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,23 +48,6 @@ class Effort:
     """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
-
-
-class Study(Protocol):
-    """Result of a study, which states when and on which machine it was made."""
-
-    @property
-    def date(self) -> str:
-        """Date of the run."""
-
-    @property
-    def machine(self) -> Machine:
-        """Machine and software of the run."""
-
-
-def study_page(title: str, study: Study, *parts: Part) -> BenchmarkReport:
-    """Return the page of a study, with these chapters."""
-    return BenchmarkReport(title, facts(study.date, study.machine), parts, RESULT)
 
 
 def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:

@@ -1,31 +1,30 @@
-"""Results of all studies as rows of (case, method, quantity, value), with tables and charts."""
+"""Results of all studies as rows of (case, method, quantity, value), with tables, charts, page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
-from typing import Any, Final
+from typing import Final
 
-from lidarops.bench.harness.timing import READ, StepCost
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, facts
+from lidarops.bench.harness.timing import Machine, machine
 from lidarops.figures.charts import Chart, ChartPanel, Ladder, Series, pareto
-from lidarops.figures.wording import counted, percent
-from lidarops.reports.benchmark_page import Part, Table
+from lidarops.figures.wording import percent
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 CPU_TIME: Final = "CPU time"
 """Quantity against which errors are drawn."""
 _NONE: Final = "-"
 _ROUNDING: Final = 1e-12
 """Relative error of sums of equal values, which is no Monte Carlo error."""
-
-
-@dataclass(frozen=True, slots=True)
-class MonteCarloFigure:
-    """Statistic of random profiles, with its Monte Carlo standard error."""
-
-    value: float
-    error: float
 
 
 class Unit(StrEnum):
@@ -42,14 +41,32 @@ _DRAWN: Final[Mapping[Unit, float]] = {Unit.NUMBER: 1.0, Unit.SHARE: 100.0, Unit
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
-    """A column of a table: its heading, and where a score holds the value."""
+class Figure:
+    """A number with its Monte Carlo standard error, which is 0 without one."""
 
-    name: str
-    path: str
-    """Attributes, keys and indices from the score to the value, joined by dots."""
+    value: float
+    error: float = 0.0
     unit: Unit = Unit.NUMBER
-    factor: float = 1.0
+
+    def times(self, factor: float) -> Figure:
+        """Return the figure in another unit of the same kind."""
+        return replace(self, value=factor * self.value, error=factor * self.error)
+
+
+def share(value: Figure | float) -> Figure:
+    """Return a figure that is written in percent."""
+    return replace(value if isinstance(value, Figure) else Figure(value), unit=Unit.SHARE)
+
+
+def cpu_time(nanoseconds: float) -> Figure:
+    """Return the figure of a time."""
+    return Figure(nanoseconds, unit=Unit.TIME)
+
+
+Score = dict[str, "Figure | float | str | None"]
+"""Values of one method in one case, by quantity; None where it has none."""
+Scores = dict[tuple[str, str], Score]
+"""Scores by case and method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,34 +82,28 @@ class Row:
     unit: Unit = Unit.NUMBER
 
 
-def rows_of(case: str, method: str, score: object, quantities: Iterable[Quantity]) -> list[Row]:
-    """Return a row for each quantity of a score; without value where the score holds None."""
+def rows_of(case: str, method: str, score: Score) -> list[Row]:
+    """Return a row for each quantity of a score."""
     return [
-        figure_row(case, method, quantity, _follow(score, quantity.path)) for quantity in quantities
+        Row(case, method, quantity, value.value, value.error, value.unit)
+        if isinstance(value, Figure)
+        else Row(case, method, quantity, value)
+        for quantity, value in score.items()
     ]
 
 
-def figure_row(case: str, method: str, quantity: Quantity, value: Any) -> Row:
-    """Return the row of a value, with its Monte Carlo error if it has one."""
-    error = 0.0
-    if isinstance(value, MonteCarloFigure):
-        value, error = quantity.factor * value.value, quantity.factor * value.error
-    elif isinstance(value, float):
-        value = quantity.factor * value
-    return Row(case, method, quantity.name, value, error, quantity.unit)
+def rows_of_scores(scores: Scores) -> list[Row]:
+    """Return the rows of scores by case and method."""
+    return [row for names, score in scores.items() for row in rows_of(*names, score)]
 
 
-def _follow(value: Any, path: str) -> Any:
-    for step in path.split("."):
-        if value is None:
-            return None
-        if isinstance(value, Mapping):
-            value = value.get(step)
-        elif isinstance(value, tuple):
-            value = value[int(step)]
-        else:
-            value = getattr(value, step)
-    return value
+def by_method(rows: Iterable[Row], quantity: str) -> list[Row]:
+    """Return the rows of one quantity turned, so that each method is a column."""
+    return [
+        Row("", row.case, row.method, row.value, row.error, row.unit)
+        for row in rows
+        if row.quantity == quantity
+    ]
 
 
 # Text ------------------------------------------------------------------------------------------
@@ -168,16 +179,6 @@ def table(
         ),
         note,
     )
-
-
-def table_of_methods(title: str, rows: Sequence[Row], quantity: str, note: str = "") -> Table:
-    """Return a table of one quantity with a line for each case and a column for each method."""
-    turned = [
-        Row("", row.case, row.method, row.value, row.error, row.unit)
-        for row in rows
-        if row.quantity == quantity
-    ]
-    return table(title, turned, note, method="case")
 
 
 # Charts ----------------------------------------------------------------------------------------
@@ -352,49 +353,89 @@ def error_against_time(
     )
 
 
-OF_TIMES: Final = (
-    Quantity("profiles", "profiles"),
-    Quantity(CPU_TIME, "nanoseconds", Unit.TIME),
-    Quantity("reads", "reads"),
-)
-"""Quantities of a cost; reads are multiples of the read of the same array."""
+# Studies ---------------------------------------------------------------------------------------
 
 
-def step_rows(costs: Iterable[StepCost]) -> list[Row]:
-    """Return the rows of the costs of steps, with a case for each number of profiles per call."""
-    quantities = (Quantity("lidarops", "ours"), *OF_TIMES)
-    return [
-        row
-        for cost in costs
-        for row in rows_of(f"{counted(cost.batch, 'profile')} a call", cost.step, cost, quantities)
-    ]
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Rows under a heading."""
+
+    title: str
+    rows: Sequence[Row]
+    note: str = ""
+    case: str = "case"
+    """Heading of the column of cases."""
+    method: str = "method"
+    folded: bool = False
+    """Whether the table is folded on the page and left out in a terminal."""
 
 
-def cost_part(name: str, text: str, rows: Sequence[Row]) -> Part:
-    """Return the chapter on the CPU time of methods, with a chart of all cases."""
-    times = {(row.case, row.method): _height(row) for row in rows if row.quantity == CPU_TIME}
-    cases, methods = (tuple(dict.fromkeys(key[number] for key in times)) for number in (0, 1))
-    return Part(
-        title="CPU time per profile",
-        text=f"{text} {READ} is a vectorised maximum of the same array in the same run: the floor.",
-        charts=(
-            Ladder(
-                name,
-                "CPU time per profile",
-                "A mark for each case.",
-                _axis(CPU_TIME, Unit.TIME),
-                methods,
-                tuple(
-                    (case, tuple(times.get((case, method)) for method in methods)) for case in cases
-                ),
-            ),
-        ),
-        tables=tuple(
-            table(
-                case,
-                [row for row in rows if row.case == case],
-                "Reads: multiples of the read. Profiles: of a call, fewer for slow methods.",
-            )
-            for case in cases
-        ),
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """A part of a study."""
+
+    title: str
+    text: str
+    results: Sequence[Results]
+    charts: Sequence[Chart | Ladder] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Error and run time of one method in one setting, for the page of all retrievals."""
+
+    setting: str
+    quantity: str
+    """With its unit."""
+    method: str
+    error: Figure
+    """Root mean square."""
+    coverage: Figure | None
+    """Share of truths in the stated 95 percent interval; None if the method states none."""
+    time: Figure
+    """CPU time per profile."""
+    ours: bool = True
+    """Whether a method of lidarops; else a peer."""
+    informed: bool = False
+    """Whether the method knows more than the profile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """All results of one benchmark."""
+
+    title: str
+    date: str
+    chapters: Sequence[Chapter]
+    works: Sequence[Work] = ()
+    machine: Machine = field(default_factory=machine)
+
+    def figures(self, title: str) -> dict[tuple[str, str, str], Row]:
+        """Return the rows under a heading by case, method and quantity."""
+        return {
+            (row.case, row.method, row.quantity): row
+            for chapter in self.chapters
+            for results in chapter.results
+            if results.title == title
+            for row in results.rows
+        }
+
+    def output(self) -> BenchmarkOutput:
+        """Return all rows for JSON, and the page."""
+        tables = {r.title: [asdict(w) for w in r.rows] for c in self.chapters for r in c.results}
+        about = {"title": self.title, "date": self.date, "machine": asdict(self.machine)}
+        parts = tuple(_part(chapter) for chapter in self.chapters)
+        page = BenchmarkReport(self.title, facts(self.date, self.machine), parts, RESULT)
+        return BenchmarkOutput({**about, "tables": tables}, page)
+
+
+def _part(chapter: Chapter) -> Part:
+    tables, details = (
+        tuple(
+            table(r.title, r.rows, r.note, case=r.case, method=r.method)
+            for r in chapter.results
+            if r.folded is folded
+        )
+        for folded in (False, True)
     )
+    return Part(chapter.title, chapter.text, tuple(chapter.charts), tables, details)

@@ -18,7 +18,7 @@ _SHORTEST: Final = 1e-9
 _TRIED: Final = 16
 _LONGEST: Final = 0.06
 """Longest time of one round of a solver, s; slower solvers get fewer profiles."""
-_PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy", "jax")
+_PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,22 +29,6 @@ class Machine:
     python: str
     packages: Mapping[str, str]
     """Versions of installed packages by name."""
-
-
-@dataclass(frozen=True, slots=True)
-class StepCost:
-    """CPU time of one step of a retrieval, or of a peer."""
-
-    step: str
-    batch: int
-    """Profiles per call."""
-    profiles: int
-    """Profiles actually used: fewer for slow steps."""
-    nanoseconds: float
-    """Per profile, least of the repeats."""
-    reads: float
-    """The same as a multiple of the read of the same array in the same run."""
-    ours: bool
 
 
 def machine() -> Machine:

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, ScoredValues
-from lidarops.bench.stability.stiff_cases import Array
+from lidarops.bench.harness.rows import Array, Mask
+from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.products.elastic.settings import ReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -32,6 +32,8 @@ _CLEAN_FROM: Final = 6000.0
 """m; no particles above."""
 _COMPARED: Final = (500.0, 6000.0)
 """m; ranges whose values are compared with the truth."""
+_CLOUD_RATIO: Final = 20.0
+"""sr, lidar ratio of clouds."""
 _STEPS: Final = 30
 """Most iterations of Newton's method."""
 _SHOTS: Final = elastic_cases.SHOTS
@@ -70,52 +72,6 @@ def _sky(rng: Random) -> RandomSky:
     return RandomSky(particles, elastic_cases.LIDAR_RATIO)
 
 
-def _ratio(sky: RandomSky, rng: Random) -> RandomSky:
-    deviate = np.clip(rng.normal(), -3.0, 3.0)
-    return replace(sky, lidar_ratio=sky.lidar_ratio * (1.0 + _RATIO_ERROR * deviate))
-
-
-def _as_is(sky: RandomSky, _: Random) -> RandomSky:
-    return sky
-
-
-def _hazy(sky: RandomSky, rng: Random, *, least: float = 1e-9) -> RandomSky:
-    haze = np.exp(rng.uniform(np.log(least), np.log(100.0 * least)))
-    return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
-
-
-def _hazier(sky: RandomSky, rng: Random) -> RandomSky:
-    return _hazy(sky, rng, least=1e-8)
-
-
-def _with_density_error(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, density=1.0 + _AIR_ERROR * float(np.clip(rng.normal(), -3.0, 3.0)))
-
-
-def _drifting(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, background=rng.uniform(0.0, 3.0))
-
-
-def _clouded(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, cloud=float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))))
-
-
-def _with_overlap(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, overlap=rng.uniform(50.0, 300.0))
-
-
-def _with_gaps(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, gaps=rng.uniform(0.0, 0.2))
-
-
-def _with_outliers(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, outlying=rng.uniform(0.0, 0.02))
-
-
-def _factor_two(sky: RandomSky, rng: Random) -> RandomSky:
-    return replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0])))
-
-
 _STATED: Final = (
     "an elastic signal contains no information on the lidar ratio: the stated error has to cover it"
 )
@@ -124,39 +80,76 @@ _ALIKE: Final = (
     " error of the scattering ratio there can cover it"
 )
 _NEAR: Final = "a signal that is too low near the lidar looks like less haze"
-FAILURES: Final[tuple[tuple[Failure, Callable[[RandomSky, Random], RandomSky]], ...]] = (
-    (Failure("none", satisfied=True), _as_is),
-    (Failure("gaps", satisfied=True), _with_gaps),
-    (Failure("lidar ratio off as stated", unseen=_STATED), _ratio),
-    (Failure("lidar ratio off by a factor of 2", unseen=_STATED), _factor_two),
-    (Failure("density of the air off as stated"), _with_density_error),
-    (Failure("haze at all heights", unseen=_ALIKE), _hazy),
-    (Failure("slow baseline"), _drifting),
-    (Failure("cloud in the far range"), _clouded),
-    (Failure("overlap error", unseen=_NEAR), _with_overlap),
-    (Failure("more haze than stated", unseen=_ALIKE), _hazier),
-    (Failure("outliers"), _with_outliers),
+_Change = Callable[[RandomSky, Random], RandomSky]
+
+
+def _hazy(least: float) -> _Change:
+    """Return the change that adds haze of `least` to 100 times as much, m-1 sr-1 at the ground."""
+
+    def change(sky: RandomSky, rng: Random) -> RandomSky:
+        haze = np.exp(rng.uniform(np.log(least), np.log(100.0 * least)))
+        return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
+
+    return change
+
+
+def _off(rng: Random, error: float) -> float:
+    """Return a factor that deviates by this standard error, at most by 3 of them."""
+    return 1.0 + error * float(np.clip(rng.normal(), -3.0, 3.0))
+
+
+FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
+    (Failure("none", satisfied=True), lambda sky, _: sky),
+    (Failure("gaps", satisfied=True), lambda sky, rng: replace(sky, gaps=rng.uniform(0.0, 0.2))),
+    (
+        Failure("lidar ratio off as stated", unseen=_STATED),
+        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * _off(rng, _RATIO_ERROR)),
+    ),
+    (
+        Failure("lidar ratio off by a factor of 2", unseen=_STATED),
+        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0]))),
+    ),
+    (
+        Failure("density of the air off as stated"),
+        lambda sky, rng: replace(sky, density=_off(rng, _AIR_ERROR)),
+    ),
+    (Failure("haze at all heights", unseen=_ALIKE), _hazy(1e-9)),
+    (Failure("slow baseline"), lambda sky, rng: replace(sky, background=rng.uniform(0.0, 3.0))),
+    (
+        Failure("cloud in the far range"),
+        lambda sky, rng: replace(sky, cloud=float(np.exp(rng.uniform(np.log(0.01), np.log(3.0))))),
+    ),
+    (
+        Failure("overlap error", unseen=_NEAR),
+        lambda sky, rng: replace(sky, overlap=rng.uniform(50.0, 300.0)),
+    ),
+    (Failure("more haze than stated", unseen=_ALIKE), _hazy(1e-8)),
+    (Failure("outliers"), lambda sky, rng: replace(sky, outlying=rng.uniform(0.0, 0.02))),
 )
 
 
 def _signal(sky: RandomSky) -> Array:
-    """Return noise-free counts of a shot; optical depth by trapezoids of a fifth of a bin."""
-    air = MolecularProfile.us_standard()
-    r = elastic_cases.RANGE
-    fine = np.linspace(0.0, r[-1], 5 * (2 * r.size - 1) + 1)
-    wavelength = elastic_cases.WAVELENGTH
-    molecules = sky.density * air.extinction(fine, wavelength)
-    cirrus = sky.cloud * np.exp(-0.5 * ((fine - 9000.0) / 150.0) ** 2) / (150.0 * 2.5066282746)
-    haze = np.interp(fine, r, sky.particles)
-    total = molecules + sky.lidar_ratio * haze + cirrus
-    depth = np.concatenate([[0.0], np.cumsum(0.5 * (total[1:] + total[:-1]) * np.diff(fine))])
-    cloud = np.interp(r, fine, cirrus) / 20.0
-    scattered = sky.particles + cloud + sky.density * air.backscatter(r, wavelength)
-    signal = scattered * np.exp(-2.0 * np.interp(r, fine, depth)) / r**2
+    """Return the noise-free signal, 1 in the brightest bin that the inversion uses."""
+    air, r = MolecularProfile.us_standard(), elastic_cases.RANGE
+
+    def haze(z: Array) -> Array:
+        return np.interp(z, r, sky.particles)
+
+    def cirrus(z: Array) -> Array:
+        return sky.cloud * np.exp(-0.5 * ((z - 9000.0) / 150.0) ** 2) / (150.0 * 2.5066282746)
+
+    def extinction(z: Array) -> Array:
+        molecules = sky.density * air.extinction(z, elastic_cases.WAVELENGTH)
+        return molecules + sky.lidar_ratio * haze(z) + cirrus(z)
+
+    def backscatter(z: Array) -> Array:
+        molecules = sky.density * air.backscatter(z, elastic_cases.WAVELENGTH)
+        return np.asarray(haze(z) + cirrus(z) / _CLOUD_RATIO + molecules)
+
+    signal = elastic_cases.clean_signal(extinction, backscatter)
     if sky.overlap:
         signal = signal * (1.0 - np.exp(-((r / sky.overlap) ** 2)))
-    bright = signal[r > elastic_cases.OVERLAP].max()
-    return np.asarray(signal / bright)
+    return np.asarray(signal / signal[r > elastic_cases.OVERLAP].max())
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,11 +170,8 @@ def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _
     counts, noise = np.asarray(bridged.power, dtype=np.float64), bridged.variance
     fit = known_shape.fit_known_shape(counts, r, base.shape, variance=noise)
     power = np.where(base.inverted, counts - fit.background[:, np.newaxis], np.nan)
-    clouds = layers.find_layers(power, r, noise, molecular_attenuated=base.shape)
-    window = reference_window.choose_reference(
-        power, r, noise, molecular_attenuated=base.shape,
-        candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
-    )  # fmt: skip
+    clouds = elastic_cases.find_clouds(power, noise, base)
+    window = elastic_cases.choose_window(power, noise, base, clouds.mask)
     solved = _solve(power, noise, base, window.edges, _input_errors(fit, window))
     return _Processed(fit, clouds, window, solved)
 

@@ -10,8 +10,8 @@ import numpy as np
 from scipy import stats
 
 from lidarops.bench.accuracy.multiangle_cases import correlated
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, ScoredValues
-from lidarops.bench.stability.stiff_cases import Array
+from lidarops.bench.harness.rows import Array, Mask
+from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS

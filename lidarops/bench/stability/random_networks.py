@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals, signals
+from lidarops.bench.harness.rows import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
-from lidarops.bench.stability.stiff_cases import Array
 from lidarops.errors import LidarOpsError
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.flags import NetworkQuality

@@ -14,11 +14,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import MonteCarloFigure
-from lidarops.bench.stability.stiff_cases import Array
+from lidarops.bench.harness.rows import Array, Figure, Mask, Score, Scores, share_text
+from lidarops.bench.harness.statistics import clustered_share
 from lidarops.flags import FlagBit, Quality, rejecting
-
-Mask = npt.NDArray[np.bool_]
 
 FALSE: Final = 4.0
 """Stated standard errors beyond which a value is false."""
@@ -93,70 +91,6 @@ class ScoredValues:
     """Where the misfit of the violation is below `VISIBLE`; None where unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class FalseValueRate:
-    """Shares of kept, false and flagged values in the scenes of one class."""
-
-    retrieval: str
-    failure: str
-    quantity: str
-    scenes: int
-    values: int
-    kept: MonteCarloFigure
-    """Share of the values that no bit rejects."""
-    false_random: MonteCarloFigure
-    """Share of kept values that differ by more than 4 stated random errors."""
-    false: MonteCarloFigure
-    """Share of kept values that differ by more than 4 combined random and systematic errors."""
-    false_undoubted: MonteCarloFigure
-    """The same share of kept values that no flag marks as uncertain."""
-    false_hidden: MonteCarloFigure | None
-    """Part of `false_undoubted` with violations that no test can reliably detect; None where that
-    is unknown."""
-    false_seen: MonteCarloFigure
-    """`false_undoubted` minus `false_hidden`."""
-    false_of_seen: MonteCarloFigure | None
-    """`false_seen` as a share of the values whose violation is detectable but not flagged; None
-    where that is unknown, or there are none."""
-    false_bare: MonteCarloFigure | None
-    """The same share of the values without any bit; None where there are none."""
-    fine_of_rejected: MonteCarloFigure
-    """Share of the rejected values that differ by less than 2.5 stated errors."""
-    needless: MonteCarloFigure | None
-    """Share of the determinable values that are flagged or withheld; None where the model does
-    not hold, so that a flag is right, or where it is unknown what can be determined."""
-    satisfied: bool
-    """Whether the model holds."""
-    target: float
-    """Upper limit of `limited_share`."""
-    needless_target: float | None
-    unseen: str
-
-    @property
-    def limited_share(self) -> MonteCarloFigure:
-        """The share that the target limits: by random errors alone where the model holds."""
-        return self.false_random if self.satisfied else self.false_seen
-
-    @property
-    def verdict(self) -> Verdict:
-        """Comparison of the false values with their target."""
-        return _compare(self.limited_share, self.target)
-
-    @property
-    def needless_verdict(self) -> Verdict | None:
-        """Comparison of the needless flags with their target; None without one."""
-        if self.needless is None or self.needless_target is None:
-            return None
-        return _compare(self.needless, self.needless_target)
-
-
-def _compare(share: MonteCarloFigure, target: float) -> Verdict:
-    if share.value <= target:
-        return Verdict.MET
-    above = share.value - 2.0 * share.error > target
-    return Verdict.MISSED if above else Verdict.UNDECIDED
-
-
 @dataclass(slots=True)
 class Tally:
     """Counts by class and cluster; scenes of one cluster share their geometry."""
@@ -177,53 +111,64 @@ class Tally:
             if values.hidden is not None:
                 self.measured.add(key)
 
-    def rates(self, retrieval: str, needless: float | None) -> Iterator[FalseValueRate]:
-        """Yield the rates of each class and quantity.
+    def rates(self, needless: float | None) -> Scores:
+        """Return the shares of kept, false and flagged values by quantity and class.
 
         Parameters
         ----------
-        retrieval : str
         needless : float, optional
             Largest share of needless flags where the model holds.
         """
-        for (name, quantity), chunks in self.counts.items():
-            column = {count: np.array([chunk[count] for chunk in chunks]) for count in _COUNTS}
-            failure = self.failures.get(name, Failure(name))
-            yield FalseValueRate(
-                retrieval=retrieval,
-                failure=name,
-                quantity=quantity,
-                scenes=self.scenes[name, quantity],
-                values=int(column["values"].sum()),
-                kept=clustered_share(column["kept"], column["values"]),
-                false_random=clustered_share(column["false random"], column["kept"]),
-                false=clustered_share(column["false"], column["kept"]),
-                false_undoubted=clustered_share(column["false plain"], column["plain"]),
-                false_hidden=clustered_share(column["false hidden"], column["plain"])
-                if (name, quantity) in self.measured
-                else None,
-                false_seen=clustered_share(
-                    column["false plain"] - column["false hidden"], column["plain"]
-                ),
-                false_of_seen=clustered_share(
-                    column["false plain"] - column["false hidden"],
-                    column["plain"] - column["plain hidden"],
-                )
-                if (name, quantity) in self.measured
-                and (column["plain"] > column["plain hidden"]).any()
-                else None,
-                false_bare=clustered_share(column["false bare"], column["bare"])
-                if column["bare"].any()
-                else None,
-                fine_of_rejected=clustered_share(column["fine rejected"], column["rejected"]),
-                needless=clustered_share(column["solvable rejected"], column["solvable"])
-                if failure.satisfied and column["solvable"].any()
-                else None,
-                satisfied=failure.satisfied,
-                target=SATISFIED if failure.satisfied else VIOLATED,
-                needless_target=needless if failure.satisfied else None,
-                unseen=failure.unseen,
-            )
+        names = sorted(self.counts, key=lambda key: (key[1], key[0] == ALL))
+        return {(quantity, name): self._score(name, quantity, needless) for name, quantity in names}
+
+    def _score(self, name: str, quantity: str, needless: float | None) -> Score:
+        chunks = self.counts[name, quantity]
+        column = {count: np.array([chunk[count] for chunk in chunks]) for count in _COUNTS}
+        failure = self.failures.get(name, Failure(name))
+        measured = (name, quantity) in self.measured
+        plain, seen = column["plain"], column["false plain"] - column["false hidden"]
+        visible = plain - column["plain hidden"]
+        false_random = clustered_share(column["false random"], column["kept"])
+        false_seen = clustered_share(seen, plain)
+        flagged = None
+        if failure.satisfied and column["solvable"].any():
+            flagged = clustered_share(column["solvable rejected"], column["solvable"])
+        # Where the model holds, random errors alone must cover the truth.
+        goal = _goal(*(false_random, SATISFIED) if failure.satisfied else (false_seen, VIOLATED))
+        if needless is not None and flagged is not None:
+            goal += f"; needless {_goal(flagged, needless)}"
+        return {
+            "scenes": self.scenes[name, quantity],
+            "values": int(column["values"].sum()),
+            "not rejected": clustered_share(column["kept"], column["values"]),
+            "false, random error": false_random,
+            "false, with systematic": clustered_share(column["false"], column["kept"]),
+            "and not uncertain": clustered_share(column["false plain"], plain),
+            "of these undetectable": clustered_share(column["false hidden"], plain)
+            if measured
+            else None,
+            "of these detectable": false_seen,
+            "share of the detectable": clustered_share(seen, visible)
+            if measured and (visible > 0).any()
+            else None,
+            "without any flag": clustered_share(column["false bare"], column["bare"])
+            if column["bare"].any()
+            else None,
+            "rejected but accurate": clustered_share(column["fine rejected"], column["rejected"]),
+            "needlessly flagged": flagged,
+            "target": goal,
+            "detectable in the data": f"no: {failure.unseen}" if failure.unseen else "yes",
+        }
+
+
+def _goal(figure: Figure, target: float) -> str:
+    if figure.value <= target:
+        verdict = Verdict.MET
+    else:
+        above = figure.value - 2.0 * figure.error > target
+        verdict = Verdict.MISSED if above else Verdict.UNDECIDED
+    return f"{share_text(target)} {verdict}"
 
 
 SATISFIED: Final = 1e-3
@@ -243,17 +188,6 @@ def collect(generator: Generator, clusters: int, progress: Callable[[int], objec
             tally.add(values, scenes)
         progress(1)
     return tally
-
-
-def clustered_share(count: Array, total_count: Array) -> MonteCarloFigure:
-    """Return a share with the Monte Carlo error of independent clusters."""
-    total = float(total_count.sum())
-    if total == 0.0:
-        return MonteCarloFigure(0.0, 0.0)
-    value = float(count.sum()) / total
-    error = float(np.sqrt(np.sum((count - value * total_count) ** 2))) / total
-    # With a count of 0, the error is that of one count.
-    return MonteCarloFigure(value, max(error, 1.0 / total))
 
 
 def _count(values: ScoredValues) -> dict[str, float]:

@@ -9,9 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
+from lidarops.bench.harness.rows import Array
 from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
-from lidarops.bench.stability.stiff_cases import Array
-from lidarops.bench.stability.stiff_signals import RANGE
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -22,6 +21,7 @@ Random = np.random.Generator
 
 _BINS: Final = 400
 _BIN_WIDTH: Final = 7.5
+_RANGE: Final = _BIN_WIDTH * (np.arange(700, dtype=np.float64) + 0.5)
 _BIN_TIME: Final = 50e-9
 _DEAD_TIME: Final = 4e-9
 _BITS: Final = 12
@@ -77,7 +77,7 @@ def _photon(
     dead_time = _DEAD_TIME * (1.0 + dead_time_error * rng.normal())
     counts = _counts(rng, rate, dead_time, shots, profiles, paralyzable=paralyzable)
     signal = counts_to_signal.photon_signal(
-        counts, np.full(profiles, shots), RANGE[:_BINS], bin_width=_BIN_WIDTH,
+        counts, np.full(profiles, shots), _RANGE[:_BINS], bin_width=_BIN_WIDTH,
         dead_time=_DEAD_TIME,
     )  # fmt: skip
     return _mean(signal, rate, "count rate")
@@ -98,7 +98,7 @@ def _analog(
         sampled = np.rint(level + noise * rng.standard_normal(total.shape, dtype=np.float32))
         total += np.clip(sampled, 0.0, 2**_BITS - 1)
     signal = counts_to_signal.analog_signal(
-        total.astype(np.int32), np.full(profiles, shots), RANGE[:_BINS], adc_bits=_BITS,
+        total.astype(np.int32), np.full(profiles, shots), _RANGE[:_BINS], adc_bits=_BITS,
         input_range=np.full(profiles, 0.5),
     )  # fmt: skip
     return select(signal, level * _STEP, "voltage")
@@ -146,7 +146,7 @@ def _tail(rng: Random, profiles: int) -> Errors:
 
 
 def _cubic(rng: Random, profiles: int) -> Errors:
-    from_range = RANGE[300:700]
+    from_range = _RANGE[300:700]
     extinction, amount = _logarithmic(rng, 1e-6, 3e-3), _logarithmic(rng, 1e-1, 1e5)
     level = _logarithmic(rng, 1.0, 1e6)
     fall = np.exp(-2.0 * extinction * (from_range - from_range[0]))

@@ -1,7 +1,7 @@
-"""Time and memory of kernels, readers, archives and whole campaigns.
+"""Time and memory of retrievals, readers, archives and whole campaigns.
 
-`retrievals`, `scan_kernels`, `networks` and `readers` time single functions; their pages are in
-`retrieval_reports`. `archives` times runs over archives of many scenes, most of them stand-ins
-(`stand_in_archives`). `campaigns` times all stages of simulated campaigns, `memory` measures the
-peak of processes, and `orchestration` workers and flows.
+`retrievals`, with `scan_kernels`, and `readers` time single functions. `archives` times runs over
+archives of many scenes, most of them stand-ins (`stand_in_archives`). `campaigns` times all stages
+of simulated campaigns, `memory` measures the peak of processes, and `orchestration` workers and
+flows.
 """

@@ -15,9 +15,17 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort, study_page
-from lidarops.bench.harness.rows import Row, Unit, chart, panel, table
-from lidarops.bench.harness.timing import Machine, machine
+from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
+from lidarops.bench.harness.rows import (
+    Chapter,
+    Results,
+    Score,
+    Study,
+    chart,
+    cpu_time,
+    panel,
+    rows_of_scores,
+)
 from lidarops.bench.throughput import stand_in_archives
 from lidarops.bench.throughput.campaigns import CampaignSize, simulate_campaign
 from lidarops.bench.throughput.stand_in_archives import StandIns
@@ -25,7 +33,6 @@ from lidarops.campaign.model import load_campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
 from lidarops.figures import wording
-from lidarops.reports.benchmark_page import BenchmarkReport, Part
 from lidarops.run import archive
 from lidarops.run.staleness import Judge
 
@@ -80,15 +87,6 @@ class ArchiveCost:
     spent: Mapping[Pass, ProcessCost]
 
 
-@dataclass(frozen=True, slots=True)
-class Archives:
-    """Result of the throughput benchmark of archives."""
-
-    date: str
-    machine: Machine
-    measured: tuple[ArchiveCost, ...]
-
-
 SIZES: Final = tuple(
     CampaignSize(n, _FILES_PER_SCENE, _BINS, retrieved=False) for n in (2, 20, 200)
 )
@@ -103,7 +101,7 @@ def measure_archives(
     *,
     sizes: Sequence[CampaignSize] | None = None,
     stand_ins: StandIns | None = None,
-) -> Archives:
+) -> Study:
     """Simulate archives in temporary folders, and time the operations on them.
 
     Parameters
@@ -128,7 +126,7 @@ def measure_archives(
         stand_in_archives.write_stand_ins(stand_ins, large / CAMPAIGN_FILE)
         measured.append(_measure(stand_ins.files, _OF_ROWS, (small, large), read=False))
     effort.progress(1)
-    return Archives(effort.date, machine(), tuple(measured))
+    return archives_study(effort.date, measured)
 
 
 @contextmanager
@@ -185,8 +183,9 @@ def _process(file: Path) -> None:
 def _check_nothing_stale(file: Path) -> None:
     campaign = load_campaign(file)
     with Store(campaign.catalog_url, campaign.name) as store:
-        signatures, verdicts = Judge(campaign, store).signatures(), store.verdicts()
-    if any(verdicts.get(day, ("",))[0] != now.whole for day, now in signatures.items()):
+        judge, verdicts = Judge(campaign, store), store.verdicts()
+        days = judge.signatures().items()
+    if not all(judge.is_settled(now, verdicts.get(day)) for day, now in days):
         raise CampaignError("the simulated archive is not up to date", file=file)
 
 
@@ -208,60 +207,57 @@ _OPERATIONS: Final[Mapping[Pass, Callable[[Path], None]]] = {
 # Page -----------------------------------------------------------------------------------------
 
 
-def growth(first: ArchiveCost, last: ArchiveCost, operation: Pass) -> float:
-    """Return the CPU time per file of the last archive over that of the first."""
-    return (last.spent[operation].cpu / last.files) / (first.spent[operation].cpu / first.files)
-
-
-def archives_report(archives: Archives) -> BenchmarkReport:
-    """Return the report page."""
+def archives_study(date: str, measured: Sequence[ArchiveCost]) -> Study:
+    """Return the study of archives, each compared with the first of its sort."""
     rows = {
-        operation: [
-            row
-            for cost in archives.measured
-            if operation in cost.spent
-            for row in _rows(archives.measured, cost, operation)
-        ]
+        operation: rows_of_scores(
+            {
+                (f"{cost.files}" + ("" if cost.read else " rows"), operation.value): _score(
+                    measured, cost, operation
+                )
+                for cost in measured
+                if operation in cost.spent
+            }
+        )
         for operation in Pass
     }
     drawn = [row for group in rows.values() for row in group if row.case.isdecimal()]
-    return study_page(
-        "Archives: cost per file",
-        archives,
-        Part(
-            title="Cost per file, and its growth with the archive",
-            text="Simulated archives of one lidar on a local disk, in one process. The process has "
-            "done the same with a small archive before, so imports and compilation are not "
-            "counted. TMPDIR selects the disk.",
-            charts=(
-                chart(
-                    "archive",
-                    "CPU time per file",
-                    "A horizontal line is a cost that does not grow with the archive.",
-                    (panel("", drawn, _PER_FILE, x="files", joined=True),),
-                ),
+    chapter = Chapter(
+        "Cost per file, and its growth with the archive",
+        "Simulated archives of one lidar on a local disk, in one process. The process has "
+        "done the same with a small archive before, so imports and compilation are not "
+        "counted. TMPDIR selects the disk.",
+        [
+            Results(
+                f"{operation.value}: {_ABOUT[operation]}",
+                group,
+                "Rows: empty files stand in for those of the catalog, and are not read.",
+                case="files",
+            )
+            for operation, group in rows.items()
+        ],
+        [
+            chart(
+                "archive",
+                "CPU time per file",
+                "A horizontal line is a cost that does not grow with the archive.",
+                [panel("", drawn, _PER_FILE, x="files", joined=True)],
             ),
-            tables=tuple(
-                table(
-                    f"{operation.value}: {_ABOUT[operation]}",
-                    group,
-                    "Rows: empty files stand in for those of the catalog, and are not read.",
-                    case="files",
-                )
-                for operation, group in rows.items()
-            ),
-        ),
+        ],
     )
+    return Study("Archives: cost per file", date, [chapter])
 
 
-def _rows(measured: Sequence[ArchiveCost], cost: ArchiveCost, operation: Pass) -> list[Row]:
-    case, spent = f"{cost.files}" + ("" if cost.read else " rows"), cost.spent[operation]
+def _score(measured: Sequence[ArchiveCost], cost: ArchiveCost, operation: Pass) -> Score:
+    spent = cost.spent[operation]
     first = next(c for c in measured if operation in c.spent and c.read is cost.read)
-    larger = None if cost is first else growth(first, cost, operation)
-    return [
-        Row(case, operation, "CPU s", spent.cpu),
-        Row(case, operation, "wall s", spent.wall),
-        Row(case, operation, _PER_FILE, spent.cpu / cost.files * 1e9, unit=Unit.TIME),
-        Row(case, operation, "times the first", larger),
-        Row(case, operation, "peak memory", wording.size(spent.peak)),
-    ]
+    per_file = spent.cpu / cost.files
+    return {
+        "CPU s": spent.cpu,
+        "wall s": spent.wall,
+        _PER_FILE: cpu_time(1e9 * per_file),
+        "times the first": None
+        if cost is first
+        else per_file / (first.spent[operation].cpu / first.files),
+        "peak memory": wording.size(spent.peak),
+    }

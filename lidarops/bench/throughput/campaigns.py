@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -16,15 +16,23 @@ import numpy as np
 import yaml
 from scipy import stats
 
-from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort, study_page
-from lidarops.bench.harness.rows import Row, Unit, chart, panel, table
-from lidarops.bench.harness.timing import Machine, machine
+from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
+from lidarops.bench.harness.rows import (
+    Chapter,
+    Results,
+    Row,
+    Scores,
+    Study,
+    chart,
+    panel,
+    rows_of_scores,
+    share,
+)
 from lidarops.bench.throughput import orchestration
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.netcdf.write import write_plain
 from lidarops.records import RunRecord
-from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
 from lidarops.simulate.campaign import plan_simulation, write_simulation
 
@@ -88,29 +96,6 @@ class CampaignCost:
     seconds: Mapping[Stage, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Growth:
-    """Growth of the CPU time with one property of a campaign."""
-
-    along: str
-    costs: tuple[CampaignCost, ...]
-    slopes: Mapping[Stage, tuple[float, float]]
-    """Log-log slope of the time of each stage, and half of its 95 percent interval."""
-
-
-@dataclass(frozen=True, slots=True)
-class CampaignStudy:
-    """CPU times of simulated campaigns, and how they grow."""
-
-    date: str
-    machine: Machine
-    growths: tuple[Growth, ...]
-    workers: Mapping[int, float]
-    """Wall time of a run in s, by number of worker processes."""
-    modes: tuple[orchestration.RunMode, ...] = ()
-    """Times of whole commands, on campaigns of `COMMAND_SIZES`."""
-
-
 _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     "scenes": tuple(CampaignSize(scenes=n) for n in (2, 4, 8, 16)),
     "profiles": tuple(CampaignSize(profiles=n) for n in (15, 30, 60, 120)),
@@ -129,7 +114,7 @@ def measure_campaigns(
     *,
     along: Mapping[str, Sequence[CampaignSize]] | None = None,
     workers: Sequence[int] | None = None,
-) -> CampaignStudy:
+) -> Study:
     """Simulate campaigns of several sizes in temporary folders, and time their processing.
 
     Parameters
@@ -142,16 +127,20 @@ def measure_campaigns(
         Numbers of processes to compare.
     """
     quick, progress = effort.quick, effort.progress
-    growths = []
     # The first campaign of a process includes imports and compilation; it is not counted.
     _cost(CampaignSize(scenes=1, profiles=15), progress)
-    for name, sizes in (along or (_QUICK if quick else _ALONG)).items():
-        costs = tuple(_cost(size, progress) for size in sizes)
-        growths.append(Growth(name, costs, dict(_slopes(name, costs))))
+    growths = {
+        name: [_cost(size, progress) for size in sizes]
+        for name, sizes in (along or (_QUICK if quick else _ALONG)).items()
+    }
     counts = workers if workers is not None else (() if quick else (1, 2))
     times = {count: _wall(count, progress) for count in counts}
-    commands = _time_commands(progress) if workers is None and not quick else ()
-    return CampaignStudy(effort.date, machine(), tuple(growths), times, commands)
+    chapters = [stages_chapter(growths)]
+    if times:
+        chapters.append(workers_chapter(times))
+    if workers is None and not quick:
+        chapters.append(_commands_chapter(progress))
+    return Study("Campaigns: CPU time by stage", effort.date, chapters)
 
 
 def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
@@ -192,7 +181,7 @@ def _wall(workers: int, progress: Callable[[int], object]) -> float:
     return seconds
 
 
-def _time_commands(progress: Callable[[int], object]) -> tuple[orchestration.RunMode, ...]:
+def _commands_chapter(progress: Callable[[int], object]) -> Chapter:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         files = []
         for size in COMMAND_SIZES:
@@ -202,7 +191,7 @@ def _time_commands(progress: Callable[[int], object]) -> tuple[orchestration.Run
             files.append(directory / CAMPAIGN_FILE)
         modes = orchestration.measure_orchestration(files)
     progress(1)
-    return modes
+    return orchestration.orchestration_chapter(modes, [size.scenes for size in COMMAND_SIZES])
 
 
 def _timed(call: Callable[[], object]) -> float:
@@ -305,101 +294,83 @@ def _recorded(size: CampaignSize) -> dict[str, Any]:
     }
 
 
-def _slopes(
-    along: str, costs: Sequence[CampaignCost]
-) -> Iterator[tuple[Stage, tuple[float, float]]]:
-    sizes = [getattr(cost.size, along) for cost in costs]
-    for stage in Stage:
-        seconds = [cost.seconds[stage] for cost in costs]
-        fit = stats.linregress(np.log(sizes), np.log(seconds))
-        half = stats.t.ppf(0.975, len(sizes) - 2) * fit.stderr if len(sizes) > 2 else math.inf
-        yield stage, (float(fit.slope), float(half) if math.isfinite(half) else 0.0)
+def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
+    """Return the log-log slope of times, and half of its 95 percent interval."""
+    fit = stats.linregress(np.log(sizes), np.log(seconds))
+    half = stats.t.ppf(0.975, len(sizes) - 2) * fit.stderr if len(sizes) > 2 else 0.0
+    return float(fit.slope), float(half) if math.isfinite(half) else 0.0
 
 
 # Page -----------------------------------------------------------------------------------------
 
 
-def campaigns_report(study: CampaignStudy) -> BenchmarkReport:
-    """Return the report page."""
-    parts = [_stages(study)]
-    if study.workers:
-        parts.append(_workers(study))
-    if study.modes:
-        scenes = [size.scenes for size in COMMAND_SIZES]
-        parts.append(orchestration.orchestration_part(study.modes, scenes))
-    return study_page("Campaigns: CPU time by stage", study, *parts)
-
-
-def _stages(study: CampaignStudy) -> Part:
-    return Part(
-        title="Cost of each stage, and its growth",
-        text="Simulated campaigns of one lidar, from raw files on disk to products and report, "
+def stages_chapter(growths: Mapping[str, Sequence[CampaignCost]]) -> Chapter:
+    """Return the chapter on the stages, by the property along which campaigns grow."""
+    return Chapter(
+        "Cost of each stage, and its growth",
+        "Simulated campaigns of one lidar, from raw files on disk to products and report, "
         "in one process. CPU time; that of a run is divided among its stages in proportion to "
         "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
         "interval; 1 is linear.",
-        charts=(
+        [_growth_results(along, costs) for along, costs in growths.items()],
+        [
             chart(
                 "growth",
                 "CPU time of a campaign",
                 "One line per stage; a slope of 1 means a constant cost per item.",
-                tuple(
+                [
                     panel(
-                        growth.along,
+                        along,
                         [
-                            Row(f"{getattr(cost.size, growth.along)}", stage, _CPU, seconds)
-                            for cost in growth.costs
+                            Row(f"{getattr(cost.size, along)}", stage, _CPU, seconds)
+                            for cost in costs
                             for stage, seconds in cost.seconds.items()
                         ],
                         _CPU,
-                        x=f"number of {growth.along}",
+                        x=f"number of {along}",
                         joined=True,
                     )
-                    for growth in study.growths
-                ),
+                    for along, costs in growths.items()
+                ],
             ),
-        ),
-        tables=tuple(_table(growth) for growth in study.growths),
+        ],
     )
 
 
-def _table(growth: Growth) -> Table:
-    size, spent = growth.costs[-1].size, growth.costs[-1].seconds
+def _growth_results(along: str, costs: Sequence[CampaignCost]) -> Results:
+    size, spent = costs[-1].size, costs[-1].seconds
+    sizes = [getattr(cost.size, along) for cost in costs]
     total = sum(seconds for stage, seconds in spent.items() if stage is not Stage.UNCHANGED)
-    rows = []
+    scores: Scores = {}
     for stage, seconds in spent.items():
-        slope, half = growth.slopes[stage]
-        share = None if stage is Stage.UNCHANGED else seconds / total
-        rows += [
-            Row("", stage, "work", _ABOUT[stage]),
-            Row("", stage, _CPU, seconds),
-            Row("", stage, "share", share, unit=Unit.SHARE),
-            Row("", stage, "ms per file", _MILLI * seconds / size.files),
-            Row("", stage, "slope", f"{slope:.2f} ± {half:.2f}"),
-        ]
-    return table(
-        f"By number of {growth.along}; times at {getattr(size, growth.along)}",
-        rows,
+        steepness, half = slope(sizes, [cost.seconds[stage] for cost in costs])
+        scores["", stage] = {
+            "work": _ABOUT[stage],
+            _CPU: seconds,
+            "share": None if stage is Stage.UNCHANGED else share(seconds / total),
+            "ms per file": _MILLI * seconds / size.files,
+            "slope": f"{steepness:.2f} ± {half:.2f}",
+        }
+    return Results(
+        f"By number of {along}; times at {getattr(size, along)}",
+        rows_of_scores(scores),
         f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
         + (f", {size.angles} directions." if size.angles else "."),
         method="stage",
     )
 
 
-def _workers(study: CampaignStudy) -> Part:
-    single = study.workers.get(1)
-    rows = [
-        row
-        for count, seconds in study.workers.items()
-        for row in (
-            Row("", f"{count}", "s", seconds),
-            Row("", f"{count}", "speedup", single / seconds if single else None),
-        )
-    ]
-    size = _WORKER_SIZE
-    wall = table(
+def workers_chapter(times: Mapping[int, float]) -> Chapter:
+    """Return the chapter on the wall time in s, by the number of processes."""
+    single, size = times.get(1), _WORKER_SIZE
+    scores: Scores = {
+        ("", f"{count}"): {"s": seconds, "speedup": single / seconds if single else None}
+        for count, seconds in times.items()
+    }
+    results = Results(
         "Wall time by number of processes",
-        rows,
+        rows_of_scores(scores),
         f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
         method="processes",
     )
-    return Part(title="Processes", text="The same campaign on one machine.", tables=(wall,))
+    return Chapter("Processes", "The same campaign on one machine.", [results])

@@ -42,37 +42,110 @@ _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _BIN_WIDTH: Final = 3.75
 _VARIANTS: Final = 4
 """Number of different profiles; files repeat them."""
-_ELASTIC: Final[Mapping[str, Any]] = {"channels": ["analog_532o"], "lidar_ratio": 50}
-_HOMOGENEOUS: Final[Mapping[str, Any]] = {
-    "channels": ["photon_532o"],
-    "sections": [[750, 6000], [1500, 9000]],
+_ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
+"""degree, in the headers of consecutive files: one cycle of a scan."""
+_SLANTED: Final = 85.0
+"""degree; sections may be retrieved, and the beam reaches the reference window of ``elastic``."""
+_DARK_SHARE: Final = 0.1
+"""Dark files for each file of the scene."""
+_DARK: Final = {"dark_files": "d*"}
+_ANALOG: Final = ["analog_532o"]
+_PHOTON: Final = ["photon_532o"]
+_HOMOGENEOUS: Final[Mapping[str, Any]] = {"channels": _PHOTON, "sections": [[750, 6000]]}
+_NETWORK: Final = {
+    "west": ("012", 47.25, 11.3, 70.0),
+    "east": ("345", 47.25, 11.353, 310.0),
+    "north": ("6789", 47.2811, 11.3265, 190.0),
 }
-KINDS: Final[Mapping[str, tuple[int, Mapping[str, Any]]]] = {
-    "signal": (0, {"signal": {}}),
-    "elastic": (0, {"elastic": _ELASTIC}),
-    "homogeneous": (90, {"homogeneous": _HOMOGENEOUS}),
-    "signal and elastic": (0, {"signal": {}, "elastic": _ELASTIC}),
-    "signal and homogeneous": (90, {"signal": {}, "homogeneous": _HOMOGENEOUS}),
+"""Last digits of the files, latitude, longitude and azimuth of each lidar; all are level."""
+
+
+def _of_one(
+    zenith_angle: float | None, products: Mapping[str, Any], **instrument: Any
+) -> dict[str, Any]:
+    """Return the part of a campaign file with one lidar; without an angle, it scans."""
+    facts: dict[str, float] = {"full_overlap_range": 300}
+    if zenith_angle is not None:
+        facts |= {"zenith_angle": zenith_angle}
+    return {
+        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
+        "instruments": {
+            "lidar": {
+                "station": "here",
+                "files": "h*",
+                "facts": [facts],
+                "products": dict(products),
+                **instrument,
+            }
+        },
+    }
+
+
+def _network() -> dict[str, Any]:
+    """Return the part of a campaign file with a network."""
+    return {
+        "stations": {
+            name: {"name": name, "latitude": latitude, "longitude": longitude, "altitude": 600}
+            for name, (_, latitude, longitude, _) in _NETWORK.items()
+        },
+        "instruments": {
+            name: {
+                "station": name,
+                "files": [f"h*{digit}" for digit in digits],
+                "facts": [{"full_overlap_range": 150, "zenith_angle": 90.0, "azimuth": azimuth}],
+                "products": {},
+            }
+            for name, (digits, _, _, azimuth) in _NETWORK.items()
+        },
+        "networks": {
+            "valley": {
+                "instruments": list(_NETWORK),
+                "visibility": {"channel": "photon_532o"},
+            }
+        },
+    }
+
+
+CASES: Final[Mapping[str, Mapping[str, Any]]] = {
+    "signal": _of_one(0, {"signal": {}}),
+    "signal, dark files": _of_one(0, {"signal": {"channels": _ANALOG}}, **_DARK),
+    "homogeneous": _of_one(90, {"homogeneous": _HOMOGENEOUS}),
+    "elastic": _of_one(0, {"elastic": {"channels": _ANALOG}}),
+    "elastic, 1 min": _of_one(0, {"elastic": {"channels": _ANALOG, "average": "1min"}}),
+    "elastic, 1 min, dark files": _of_one(
+        0, {"elastic": {"channels": _ANALOG, "average": "1min"}}, **_DARK
+    ),
+    "elastic, glued": _of_one(0, {"elastic": {"channels": ["glued_532o"]}}),
+    "signal, homogeneous and elastic": _of_one(
+        _SLANTED,
+        {
+            "signal": {},
+            "homogeneous": {"channels": _PHOTON, "sections": [[750, 1750]]},
+            "elastic": {"channels": _PHOTON, "reference": {"lowest": 1000, "highest": 4000}},
+        },
+    ),
+    "multiangle": _of_one(None, {"multiangle": {"channels": _PHOTON, "step": 15}}),
+    "visibility": _network(),
 }
-"""Zenith angle and products of each campaign; all have the same files."""
+"""Part of the campaign file of each row of the table; all have the same files."""
 
 
 @dataclass(frozen=True, slots=True)
 class Peak:
     """Peak memory of one process."""
 
-    kinds: str
+    case: str
     raw: float
     """MB of raw counts of the scene."""
     base: float
-    """MB at the peak of a tiny scene of the same kinds."""
+    """MB at the peak of a tiny scene of the same case."""
     above: float
     """MB above the base at the peak of the scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryStudy:
-    """Peak memory of processes, by size of the scene and kinds of products."""
+    """Peak memory of processes, by size of the scene and products."""
 
     date: str
     machine: Machine
@@ -91,74 +164,63 @@ def run_memory(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
         raise CampaignError("the case 'memory' has no accuracy", remedy="choose throughput")
     sizes = SIZES[:2] if effort.quick else SIZES
     peaks = []
-    for peak in measure_peaks(sizes, tuple(KINDS)):
+    for peak in measure_peaks(sizes, tuple(CASES)):
         peaks.append(peak)
         effort.progress(1)
     study = MemoryStudy(effort.date, machine(), tuple(peaks))
     return BenchmarkOutput(study, memory_report(study))
 
 
-def measure_peaks(sizes: Sequence[int], kinds: Sequence[str]) -> Iterator[Peak]:
-    """Yield the peak memory of a fresh process for each kind and size, MB of raw counts."""
+def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
+    """Yield the peak memory of a fresh process for each case and size, MB of raw counts."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         root = Path(folder)
         for size in (_TINY, *sizes):
             write_files(root / str(size), size)
-        for name in kinds:
+        for name in cases:
             # The first process compiles what is not cached, which takes memory of its own.
             _in_fresh_process(root, name, _TINY)
             for size in sizes:
                 yield _in_fresh_process(root, name, size)
 
 
-def _in_fresh_process(root: Path, kinds: str, size: int) -> Peak:
+def _in_fresh_process(root: Path, case: str, size: int) -> Peak:
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_peak, root, kinds, size).result()
+        return pool.submit(_peak, root, case, size).result()
 
 
-def _peak(root: Path, kinds: str, size: int) -> Peak:
+def _peak(root: Path, case: str, size: int) -> Peak:
     with tempfile.TemporaryDirectory(dir=root) as out:
-        base = _peak_of_scene(root / str(_TINY), kinds, Path(out) / "tiny")
-        above = _peak_of_scene(root / str(size), kinds, Path(out) / "scene") - base
-    return Peak(kinds, float(size), base, above)
+        base = _peak_of_scene(root / str(_TINY), case, Path(out) / "tiny")
+        above = _peak_of_scene(root / str(size), case, Path(out) / "scene") - base
+    return Peak(case, float(size), base, above)
 
 
-def _peak_of_scene(folder: Path, kinds: str, out: Path) -> float:
+def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
     """Process a scene; return the peak memory of this process so far, MB."""
-    record = archive.reprocess(campaign_of(folder, kinds, out))
+    record = archive.reprocess(campaign_of(folder, case, out))
     if record is None or any(scene.error for scene in record.scenes):
-        raise CampaignError("a scene of the benchmark gave no product", field=kinds)
+        raise CampaignError("a scene of the benchmark gave no product", field=case)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def campaign_of(folder: Path, kinds: str, out: Path) -> Campaign:
-    """Write the campaign file of some `KINDS` for a folder of raw files; return the campaign."""
+def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
+    """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
     out.mkdir()
     file = out / CAMPAIGN_FILE
-    file.write_text(yaml.safe_dump(_settings(*KINDS[kinds])), encoding="utf-8")
-    return load_campaign(file, archive=str(folder), output=str(out))
-
-
-def _settings(zenith_angle: int, products: Mapping[str, Any]) -> dict[str, Any]:
-    return {
+    settings = {
         "name": "memory",
         "title": "Campaign of a benchmark",
         "archive": "raw",
         "output": "out",
-        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
-        "instruments": {
-            "lidar": {
-                "station": "here",
-                "files": "h*",
-                "facts": [{"full_overlap_range": 300, "zenith_angle": zenith_angle}],
-                "products": {name: dict(settings) for name, settings in products.items()},
-            }
-        },
+        **CASES[case],
     }
+    file.write_text(yaml.safe_dump(settings), encoding="utf-8")
+    return load_campaign(file, archive=str(folder), output=str(out))
 
 
 def write_files(folder: Path, size: float) -> int:
-    """Write the raw files of a scene of `size` MB of counts; return their number."""
+    """Write raw files with `size` MB of counts, and dark files; return the number without these."""
     folder.mkdir(parents=True)
     layout: dict[str, Any] = {
         "wavelength": 532e-9,
@@ -170,22 +232,25 @@ def write_files(folder: Path, size: float) -> int:
     datasets = [licel_write.new_dataset(kind=kind, **layout) for kind in kinds]
     counts = _counts()
     number = round(size * 1e6 / (4 * BINS * len(kinds)))
-    for index in range(number):
+    dark = max(1, round(_DARK_SHARE * number))
+    for index in range(-dark, number):
         start = _DAY + index * _INTERVAL
+        name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
         header = licel_write.new_header(
-            name=f"h{index:06d}",
+            name=name,
             site="Here",
             start=start,
             stop=start + _INTERVAL,
             altitude=100,
             longitude=10,
             latitude=50,
+            zenith_angle=_ZENITH_ANGLES[index % len(_ZENITH_ANGLES)],
             datasets=datasets,
             lasers=[Laser(_SHOTS, 20), Laser(0, 0)],
         )
-        signal = counts[index % _VARIANTS]
+        signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
         values = {dataset.name: signal for dataset in header.datasets}
-        (folder / f"h{index:06d}").write_bytes(licel_write.encode(header, values))
+        (folder / name).write_bytes(licel_write.encode(header, values))
     return number
 
 
@@ -209,7 +274,7 @@ def memory_report(study: MemoryStudy) -> BenchmarkReport:
                 title="Peak memory above the base of a process",
                 text="Scenes of one analog and one photon-counting channel with "
                 f"{BINS:,} bins, each in a fresh process. The base is the peak after a tiny scene "
-                "of the same kinds, with imports and compiled code.",
+                "of the same case, with imports and compiled code.",
                 tables=(_table(study.peaks),),
             ),
         ),
@@ -218,14 +283,14 @@ def memory_report(study: MemoryStudy) -> BenchmarkReport:
 
 
 def _table(peaks: Sequence[Peak]) -> Table:
-    smallest = {peak.kinds: peak for peak in reversed(peaks)}
+    smallest = {peak.case: peak for peak in reversed(peaks)}
     rows = []
     for peak in peaks:
-        first = smallest[peak.kinds]
+        first = smallest[peak.case]
         growth = (peak.above - first.above) / (peak.raw - first.raw) if peak is not first else None
         rows.append(
             (
-                peak.kinds,
+                peak.case,
                 f"{peak.raw:.0f}",
                 f"{peak.base:.0f}",
                 f"{peak.above:.0f}",
@@ -234,7 +299,7 @@ def _table(peaks: Sequence[Peak]) -> Table:
         )
     return Table(
         title="Peak memory",
-        columns=("products", "raw MB", "base MB", "above base MB", "slope"),
+        columns=("case", "raw MB", "base MB", "above base MB", "slope"),
         rows=tuple(rows),
         note="Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
     )

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from lidarops.bench.harness.rows import Row, Unit, table
+from lidarops.bench.harness.rows import Chapter, Results, Scores, rows_of_scores, share
 from lidarops.errors import SceneError
-from lidarops.reports.benchmark_page import Part
 
 SERIAL: Final = "plain loop"
 _CLI: Final = ("-c", "from lidarops.cli import app; app()", "reprocess")
@@ -27,8 +26,6 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 JOB: Final = 300.0
 """s; CPU time of the plain loop for the job to which the table extrapolates."""
-_EXTRA: Final = f"extra CPU of a job of {JOB:.0f} s"
-_SHARE: Final = Unit.SHARE
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,20 +37,6 @@ class RunMode:
     """s, for each campaign."""
     wall: tuple[float, ...]
     """s, for each campaign."""
-
-
-@dataclass(frozen=True, slots=True)
-class Overhead:
-    """Extra CPU time over the plain loop, as a straight line."""
-
-    fixed: float
-    """s, independent of the size."""
-    share: float
-    """s per s of the plain loop."""
-
-    def of(self, job: float) -> float:
-        """Return the extra share of a job that takes the plain loop `job` s."""
-        return self.fixed / job + self.share
 
 
 def measure_orchestration(
@@ -103,36 +86,38 @@ def _children_cpu() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def overhead(mode: RunMode, serial: RunMode) -> Overhead:
-    """Return the line through the smallest and the largest campaign."""
+def overhead(mode: RunMode, serial: RunMode) -> tuple[float, float]:
+    """Return extra CPU time over the plain loop: s for any size, and s per s of the plain loop.
+
+    The line goes through the smallest and the largest campaign.
+    """
     extra = [cpu - plain for cpu, plain in zip(mode.cpu, serial.cpu, strict=True)]
-    share = (extra[-1] - extra[0]) / (serial.cpu[-1] - serial.cpu[0])
-    return Overhead(fixed=extra[0] - share * serial.cpu[0], share=share)
+    slope = (extra[-1] - extra[0]) / (serial.cpu[-1] - serial.cpu[0])
+    return extra[0] - slope * serial.cpu[0], slope
 
 
-def orchestration_part(modes: Sequence[RunMode], scenes: Sequence[int]) -> Part:
+def orchestration_chapter(modes: Sequence[RunMode], scenes: Sequence[int]) -> Chapter:
     """Return the chapter on workers and flows."""
     serial = next(mode for mode in modes if mode.name == SERIAL)
-    rows = [
-        row
-        for mode in modes
-        for row in (
-            Row("", mode.name, "CPU s", mode.cpu[-1]),
-            Row("", mode.name, "wall s", mode.wall[-1]),
-            Row("", mode.name, "fixed extra CPU s", overhead(mode, serial).fixed),
-            Row("", mode.name, "extra CPU of the rest", overhead(mode, serial).share, unit=_SHARE),
-            Row("", mode.name, _EXTRA, overhead(mode, serial).of(JOB), unit=_SHARE),
-        )
-    ]
-    commands = table(
+    scores: Scores = {}
+    for mode in modes:
+        fixed, slope = overhead(mode, serial)
+        scores["", mode.name] = {
+            "CPU s": mode.cpu[-1],
+            "wall s": mode.wall[-1],
+            "fixed extra CPU s": fixed,
+            "extra CPU of the rest": share(slope),
+            f"extra CPU of a job of {JOB:.0f} s": share(fixed / JOB + slope),
+        }
+    commands = Results(
         f"Whole commands, including the start of all processes, for {scenes[-1]} scenes",
-        rows,
+        rows_of_scores(scores),
         f"Lines through campaigns of {scenes[0]} and {scenes[-1]} scenes. The flow starts its "
         "own Prefect server, which a deployment already has.",
         method="command",
     )
-    return Part(
-        title="Workers and flows",
-        text="The same campaign by the command line and as a flow. CPU time of all processes.",
-        tables=(commands,),
+    return Chapter(
+        "Workers and flows",
+        "The same campaign by the command line and as a flow. CPU time of all processes.",
+        [commands],
     )

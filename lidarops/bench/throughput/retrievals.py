@@ -1,95 +1,41 @@
-"""Time the solvers of a homogeneous path and the steps of an elastic inversion.
-
-Times are compared with a vectorised read of the same array in the same run.
-"""
+"""CPU time of the retrievals per profile, beside peers and a read of the same array."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, Final
 
 import numpy as np
 
-from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.accuracy.elastic_costs import ELASTIC_LEVEL, elastic_costs
+from lidarops.bench.accuracy import multiangle_cases, network_cases
+from lidarops.bench.accuracy.elastic import elastic_cost_chapter, elastic_costs
 from lidarops.bench.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
 from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.timing import (
-    READ,
-    Machine,
-    StepCost,
-    affordable,
-    in_threads,
-    least_times,
-    machine,
-)
+from lidarops.bench.harness.costs import batch_label, cost_chapter, thread_gain, time_methods
+from lidarops.bench.harness.rows import Chapter, Results, Row, Scores, Study, rows_of_scores
+from lidarops.bench.harness.timing import READ, affordable
+from lidarops.bench.throughput.scan_kernels import scan_costs
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)
-THREADED: Final = ("compressed",)
-
-_PROFILES: Final = 40_000
-_QUICK_PROFILES: Final = 8_000
-_REPEATS: Final = 9
-_QUICK_REPEATS: Final = 3
+_THREADED: Final = (HomogeneousMethod.COMPRESSED,)
+_PRECISIONS: Final = ("float32", "float64")
 _MISSING: Final = 0.3
+"""Share of the bins that are NaN, at random."""
+_QUICK_REPEATS: Final = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """Data for which the solvers are timed."""
-
-    dtype: str
-    known_variance: bool
-    missing: float
-    """Share of the bins, at random, that are NaN."""
-
-    @property
-    def label(self) -> str:
-        """Description in words."""
-        gaps = f"{100 * self.missing:.0f} % of bins missing" if self.missing else "dense"
-        variance = "variance given" if self.known_variance else "variance estimated"
-        return f"{self.dtype}, {gaps}, {variance}"
+def _repeats(effort: Effort, most: int) -> int:
+    return effort.repeats or (_QUICK_REPEATS if effort.quick else most)
 
 
-@dataclass(frozen=True, slots=True)
-class Speed:
-    """CPU time of one solver in one setting."""
-
-    method: str
-    setting: Setting
-    profiles: int
-    nanoseconds: float
-    """Per profile, least of the repeats."""
-    reads: float
-    """The same as a multiple of the read of the same array in the same run."""
+# Homogeneous path -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Threads:
-    """Wall time of one thread over that of two, each with half of the profiles."""
-
-    method: str
-    dtype: str
-    gain: float
-
-
-@dataclass(frozen=True, slots=True)
-class SolverThroughput:
-    """Result of the throughput benchmark of the homogeneous path."""
-
-    date: str
-    machine: Machine
-    path: Scenario
-    speeds: tuple[Speed, ...]
-    threads: tuple[Threads, ...]
-
-
-def measure_solvers(effort: Effort, *, profiles: int | None = None) -> SolverThroughput:
+def measure_solvers(effort: Effort, *, profiles: int | None = None) -> Study:
     """Time every method of `fit_homogeneous_path`, and the iterative peers, on one path with noise.
 
     Parameters
@@ -98,64 +44,61 @@ def measure_solvers(effort: Effort, *, profiles: int | None = None) -> SolverThr
     profiles : int, optional
         Most profiles per call.
     """
-    count = profiles or (_QUICK_PROFILES if effort.quick else _PROFILES)
-    rounds = effort.repeats or (_QUICK_REPEATS if effort.quick else _REPEATS)
-    speeds: list[Speed] = []
-    for setting in settings():
-        speeds += _speeds(setting, count, rounds)
+    count = profiles or (8_000 if effort.quick else 40_000)
+    repeats = _repeats(effort, 9)
+    rows: list[Row] = []
+    for missing, variance, dtype in product((0.0, _MISSING), (1.0, None), _PRECISIONS):
+        rows += _solver_costs(dtype, variance, missing, (count, repeats))
         effort.progress(1)
-    threads = [
-        _threads(method, dtype, count, rounds)
-        for method, dtype in product(THREADED, ("float32", "float64"))
-        if method in set(HomogeneousMethod)
-    ]
-    return SolverThroughput(effort.date, machine(), PATH, tuple(speeds), tuple(threads))
+    gains: Scores = {
+        (dtype, method.value): {"gain": _thread_gain(method, dtype, count, repeats)}
+        for method, dtype in product(_THREADED, _PRECISIONS)
+    }
+    threads = Chapter(
+        "Two threads",
+        "Wall time of one thread over that of two threads with half of the profiles each. It is "
+        "meaningful only on a machine with two idle cores.",
+        [Results("Gain of two threads", rows_of_scores(gains), case="data")],
+    )
+    text = (
+        f"Path {PATH.label}, {PATH.bins} bins; all outputs and flags, one thread, least CPU time "
+        "of interleaved repeats. numba is timed once compiled."
+    )
+    chapters = [cost_chapter("time", text, rows), threads]
+    return Study("Homogeneous path: time per profile", effort.date, chapters)
 
 
-def settings() -> list[Setting]:
-    """Return the settings that are timed."""
-    return [
-        Setting(dtype, known_variance, missing)
-        for missing, known_variance, dtype in product(
-            (0.0, _MISSING), (True, False), ("float32", "float64")
-        )
-    ]
-
-
-def _powers(setting: Setting, count: int) -> Any:
-    power = PATH.powers(count, dtype=setting.dtype)
-    if setting.missing:
-        gaps = np.random.default_rng(1).random(power.shape, np.float32) < setting.missing
-        power[gaps] = np.nan
+def _powers(dtype: str, missing: float, count: int) -> Any:
+    power = PATH.powers(count, dtype=dtype)
+    if missing:
+        power[np.random.default_rng(1).random(power.shape, np.float32) < missing] = np.nan
     return power
 
 
-def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
-    power = _powers(setting, count)
-    calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
-    sizes = {READ: count}
-    for name, solver in _solvers(setting).items():
-        sizes[name] = affordable(_first(solver, power), count)
-        calls[name] = partial(solver, power[: sizes[name]], PATH)
-    times = least_times(calls, repeats)
-    read = times[READ] / count
-    for name, seconds in times.items():
-        per_profile = seconds / sizes[name]
-        yield Speed(name, setting, sizes[name], 1e9 * per_profile, per_profile / read)
-
-
-def _solvers(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
-    variance = 1.0 if setting.known_variance else None
-    ours = {
-        str(m): partial(_solve, m, variance)
-        for m in HomogeneousMethod
-        if m is not HomogeneousMethod.AUTO
-    }
-    if setting.missing:
+def _solver_costs(
+    dtype: str, variance: float | None, missing: float, size: tuple[int, int]
+) -> list[Row]:
+    count, repeats = size
+    power = _powers(dtype, missing, count)
+    peers: dict[str, PathSolver] = iterative_peers() if variance and not missing else {}
+    solvers: dict[str, Callable[[Any, Scenario], object]] = {
+        method.value: partial(_solve, method, variance)
+        for method in HomogeneousMethod
         # The cubic allows no gaps: it raises an error at once.
-        return {name: solver for name, solver in ours.items() if name != HomogeneousMethod.CUBIC}
-    others: dict[str, PathSolver] = iterative_peers() if setting.known_variance else {}
-    return {**ours, **others}
+        if method is not HomogeneousMethod.AUTO
+        and not (missing and method is HomogeneousMethod.CUBIC)
+    }
+    calls: dict[str, tuple[Callable[[], object], int]] = {READ: (partial(np.max, power), count)}
+    for name, solver in {**solvers, **peers}.items():
+        profiles = affordable(partial(_first, solver, power), count)
+        calls[name] = (partial(_first, solver, power, profiles), profiles)
+    gaps = f"{100 * missing:.0f} % of bins missing" if missing else "dense"
+    case = f"{dtype}, {gaps}, variance {'given' if variance else 'estimated'}"
+    return time_methods(case, calls, repeats, peers=peers)
+
+
+def _first(solver: Callable[[Any, Scenario], object], power: Any, profiles: int) -> object:
+    return solver(power[:profiles], PATH)
 
 
 def _solve(method: HomogeneousMethod, variance: float | None, power: Any, path: Scenario) -> object:
@@ -164,48 +107,24 @@ def _solve(method: HomogeneousMethod, variance: float | None, power: Any, path: 
         path.range,
         variance=variance,
         method=method.value,
-        **method_arguments(method, path),  # type: ignore[arg-type]
+        **method_arguments(method, path),
     )
 
 
-def _first(solver: Callable[[Any, Scenario], object], power: Any) -> Callable[[int], object]:
-    return lambda few: solver(power[:few], PATH)
-
-
-def _threads(method: str, dtype: str, count: int, repeats: int) -> Threads:
-    power = _powers(Setting(dtype, known_variance=True, missing=0.0), count)
-    call = partial(_solve, HomogeneousMethod(method), 1.0)
+def _thread_gain(method: HomogeneousMethod, dtype: str, count: int, repeats: int) -> float:
+    power = _powers(dtype, 0.0, count)
     halves = np.array_split(power, 2)
-    times = least_times(
-        {
-            "one": lambda: call(power, PATH),
-            "two": lambda: in_threads(lambda half: call(halves[half], PATH), 2),
-        },
+    return thread_gain(
+        lambda: _solve(method, 1.0, power, PATH),
+        lambda half: _solve(method, 1.0, halves[half], PATH),
         repeats,
-        clock="perf_counter",
     )
-    return Threads(method, dtype, times["one"] / times["two"])
 
 
-# Elastic inversion ----------------------------------------------------------------------------
-
-_BATCHES: Final = (1, 100, 2000)
-_QUICK_BATCHES: Final = (1, 400)
+# Elastic inversion, scans and networks --------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ElasticThroughput:
-    """Result of the throughput benchmark of the elastic retrieval."""
-
-    date: str
-    machine: Machine
-    bins: int
-    level: float
-    """Background, counts per shot."""
-    costs: tuple[StepCost, ...]
-
-
-def measure_elastic(effort: Effort, *, batches: Sequence[int] | None = None) -> ElasticThroughput:
+def measure_elastic(effort: Effort, *, batches: Sequence[int] | None = None) -> Study:
     """Time every step from counts to backscatter, and simple peers, on the simulated set.
 
     Parameters
@@ -214,12 +133,64 @@ def measure_elastic(effort: Effort, *, batches: Sequence[int] | None = None) -> 
     batches : sequence of int, optional
         Profiles per call.
     """
-    sizes = batches or (_QUICK_BATCHES if effort.quick else _BATCHES)
-    rounds = effort.repeats or (_QUICK_REPEATS if effort.quick else _REPEATS)
-    costs: list[StepCost] = []
-    for size in sizes:
-        costs += elastic_costs(size, rounds)
+    rows: list[Row] = []
+    for size in batches or ((1, 400) if effort.quick else (1, 100, 2000)):
+        rows += elastic_costs(size, _repeats(effort, 9))
         effort.progress(1)
-    return ElasticThroughput(
-        effort.date, machine(), elastic_cases.RANGE.size, ELASTIC_LEVEL, tuple(costs)
+    chapters = [elastic_cost_chapter(rows)]
+    return Study("Elastic inversion: time per profile", effort.date, chapters)
+
+
+def measure_scans(effort: Effort, *, batches: Sequence[int] | None = None) -> Study:
+    """Time kernels, methods and peers on clear air, beside reading the inputs.
+
+    Parameters
+    ----------
+    effort : Effort
+    batches : sequence of int, optional
+        Profiles per call.
+    """
+    scene = multiangle_cases.clear(3000.0)
+    rows: list[Row] = []
+    for batch in batches or ((1, 64) if effort.quick else (1, 64, 512)):
+        rows += scan_costs(batch_label(batch), scene.draw(batch, batch, 8), _repeats(effort, 5))
+        effort.progress(1)
+    text = (
+        f"Clear air, {scene.path.size} angles, {scene.altitude.size} altitudes, float64, one "
+        "thread, least CPU time of interleaved repeats. make_beams, regress and vertical.smooth "
+        "are steps; the others are complete retrievals, with all errors, residuals and flags. "
+        "Plain: without the robust passes, which a single residual too large for chance starts, "
+        "and which take more time than all other steps. The peers give values without flags, "
+        "lstsq also standard errors."
     )
+    chapters = [cost_chapter("multiangle-time", text, rows)]
+    return Study("Scans: time per profile", effort.date, chapters)
+
+
+def measure_networks(effort: Effort) -> Study:
+    """Time whole profiles of networks with every solver."""
+    rows: list[Row] = []
+    for lidars in network_cases.LIDAR_LINES:
+        rows += _network_costs(lidars, _repeats(effort, 7))
+        effort.progress(1)
+    chapter = Chapter(
+        "Whole profiles",
+        "From signals to extinction with errors, visibility and flags: point values, "
+        "integrals and their covariances, and the solution. One thread.",
+        [Results("CPU time of a profile", rows, f"Reads: multiples of {READ}.", case="beams")],
+    )
+    return Study("Networks of lidars: time per profile", effort.date, [chapter])
+
+
+_TIMED_PROFILES: Final = 250
+
+
+def _network_costs(lidars: network_cases.LidarLine, repeats: int) -> list[Row]:
+    """Return CPU times of profiles of a network with every solver, the read first."""
+    network, size = lidars.network(), _TIMED_PROFILES
+    signals = network_cases.signals(network, network_cases.AIRS[0])
+    power, variance = signals.draw(network_cases.PEER_NOISE, size, 7)
+    calls: dict[str, tuple[Callable[[], object], int]] = {READ: (partial(np.max, power), size)}
+    for solver in network_cases.network_solvers(lidars):
+        calls[solver.name] = (partial(solver, power, variance, signals), size)
+    return time_methods(f"{network.beams}", calls, repeats)

@@ -11,11 +11,12 @@ import xarray as xr
 
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.retrieve.elastic import labeled
+from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
 from lidarops.steps.conditioning import OVERLAP, PROFILES
-from lidarops.steps.data import Chunk, Data, WholeProduct
+from lidarops.steps.data import Chunk, Data, RowProduct
 from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
 from lidarops.steps.profiles import gluing
@@ -158,8 +159,8 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
             ),
         )
 
-    def stream(self, settings: InversionSettings, data: Data) -> WholeProduct:
-        """Return the product, which holds averages only."""
+    def stream(self, settings: InversionSettings, data: Data) -> RowProduct:
+        """Return the product, whose averages are inverted as they become complete."""
         return _Inversion(settings, data)
 
     def cpu_time(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
@@ -167,8 +168,8 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
         return 0.1 + 5e-7 * work.bins * _averages(work)
 
     def held(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the bytes of the averages and of what is retrieved from them."""
-        return _BYTES_OF_A_BIN * work.bins * _averages(work)
+        """Return the bytes of the averages that are completed together, and of their inversion."""
+        return _BYTES_OF_A_BIN * work.bins * min(_averages(work), MEANS_TOGETHER)
 
 
 def _averages(work: Workload) -> int:
@@ -176,14 +177,12 @@ def _averages(work: Workload) -> int:
     return work.intervals(average.seconds) if average else 0
 
 
-_AT_ONCE: Final = 16
-"""Averages that are inverted together."""
-_BYTES_OF_A_BIN: Final = 60.0
-"""Bytes per bin of an average that are held: measured as 178 MB more for 195 more averages of
-16,000 bins."""
+_BYTES_OF_A_BIN: Final = 170.0
+"""Bytes per bin of an average that is open or being inverted. ``lidarops bench throughput --case
+memory`` measured 182 MB above the base for averages of one minute, with those of a chunk."""
 
 
-class _Inversion(WholeProduct):
+class _Inversion(RowProduct):
     """Averages of the profiles of a scene, and their inversion."""
 
     def __init__(self, settings: InversionSettings, data: Data) -> None:
@@ -192,19 +191,16 @@ class _Inversion(WholeProduct):
         self._averages = profiles.averages(
             source.geometry, profiles.shots(source.archive), data[AVERAGE]
         )
+        self._begun = False
 
-    def add(self, chunk: Chunk) -> None:
-        """Add the next profiles to their averages."""
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Add the next profiles to their averages, and yield those that are complete, inverted."""
         self._averages.add(chunk)
-
-    def results(self) -> Iterator[xr.Dataset]:
-        """Yield the frame of the product, then the inverted averages, some at a time."""
-        averages = self._averages.result()
-        for first in range(0, averages.sizes["time"], _AT_ONCE):
-            rows = self._inverted(averages.isel(time=slice(first, first + _AT_ONCE)))
-            if first == 0:
-                times = {name: averages[name].variable for name in ("time", "time_bnds")}
-                yield rows.drop_dims("time").assign_coords(times)
+        for averages in self._averages.completed():
+            rows = self._inverted(averages)
+            if not self._begun:
+                self._begun = True
+                yield rows.drop_dims("time").assign_coords(self._averages.times.coords)
             yield rows
 
     def _inverted(self, averages: xr.Dataset) -> xr.Dataset:

@@ -6,7 +6,7 @@ would set.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Final, Literal
@@ -164,12 +164,14 @@ def _merged_looks(first: LightDetection, second: LightDetection | None) -> Light
 
 
 def _looks(
-    profiles: xr.Dataset, sections: Sequence[tuple[float, float]]
-) -> dict[tuple[float, float], LightDetection]:
-    power, variance, quality, distance = (
-        profiles[name].to_numpy() for name in ("power", "variance", "quality", "range")
-    )
-    return {
-        (near, far): detect_light(power, variance, quality, distance, near, far)
-        for near, far in sections
-    }
+    samples: Iterable[xr.Dataset], sections: Sequence[Section]
+) -> dict[Section, LightDetection]:
+    looks: dict[Section, LightDetection] = {}
+    for profiles in samples:
+        power, variance, quality, distance = (
+            profiles[name].to_numpy() for name in ("power", "variance", "quality", "range")
+        )
+        for near, far in sections:
+            light = detect_light(power, variance, quality, distance, near, far)
+            looks[near, far] = _merged_looks(light, looks.get((near, far)))
+    return looks

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
@@ -68,19 +68,21 @@ class _Signals(RowProduct):
         self._overlap = None if overlap is None else overlap(self._profiles.range)
         self._geometry = data.source.geometry
 
-    def frame(self) -> xr.Dataset:
-        """Return times, pointing and ranges of all profiles."""
-        words = background_words(self._background.method, self._background.range)
-        frame = self._geometry.assign_coords(range=self._profiles.range)
-        return frame.assign_attrs(steps=words)
-
-    def rows(self, chunk: Chunk) -> xr.Dataset:
-        """Return the signals of profiles."""
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Yield the signals of profiles."""
+        if chunk.rows.start == 0:
+            yield self._frame()
         signals = self._profiles.signals(chunk.counts, self._background)
         if self._overlap is not None:
             signals = _without_overlap(signals, self._overlap)
         shots = self._profiles.shots(chunk.counts)
-        return signals.assign(shots=shots).assign_coords(chunk.geometry.variables)
+        yield signals.assign(shots=shots).assign_coords(chunk.geometry.variables)
+
+    def _frame(self) -> xr.Dataset:
+        """Return times, pointing and ranges of all profiles."""
+        words = background_words(self._background.method, self._background.range)
+        frame = self._geometry.assign_coords(range=self._profiles.range)
+        return frame.assign_attrs(steps=words)
 
 
 def _without_overlap(signals: xr.Dataset, overlap: npt.NDArray[np.float64]) -> xr.Dataset:

@@ -28,6 +28,7 @@ from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
+from lidarops.retrieve.signal.labeled_averaging import joined
 from lidarops.settings import VisibilitySettings
 from lidarops.steps.case import ChannelCase, ProductCase
 from lidarops.steps.channels import file_channels, is_glued, member_channel
@@ -406,7 +407,11 @@ class _Beam:
     def signals(self) -> BeamAverages:
         """Return the averages with the geometry and settings of the beam."""
         member, planned, data = self.member, self._planned, self.member.data
-        averages = _no_averages(member.range) if self._averages is None else self._averages.result()
+        averages = (
+            _no_averages(member.range)
+            if self._averages is None
+            else joined(self._averages.completed())
+        )
         distance = averages["range"].to_numpy().astype(np.float64)
         overlap = None if data is None else data.get(OVERLAP)
         return BeamAverages(

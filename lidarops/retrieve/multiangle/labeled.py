@@ -27,7 +27,7 @@ __all__ = ["retrieve_optical_depth"]
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-_QUALITY_OF_FLAG: Final = {
+QUALITY_OF_FLAG: Final = {
     "no_data": MultiAngleQuality.NO_LEVERAGE,
     "extrapolated": MultiAngleQuality.EXTRAPOLATED,
     "interpolated": MultiAngleQuality.INTERPOLATED,
@@ -203,7 +203,7 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     raised = {field.name: getattr(retrieval.flags, field.name) for field in fields(retrieval.flags)}
     raised["extrapolated"] = raised["extrapolated"] & ~raised["no_data"]
     bits = carried & np.int32(CARE)
-    for name, bit in _QUALITY_OF_FLAG.items():
+    for name, bit in QUALITY_OF_FLAG.items():
         bits |= np.where(raised[name], np.int32(bit), np.int32(0))
     # Values missing at single altitudes take their reasons from the signals, below.
     empty = (retrieval.quality & np.int32(Quality.INPUT_MISSING)).all(axis=-1, keepdims=True)

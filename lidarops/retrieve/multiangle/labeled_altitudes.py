@@ -33,7 +33,7 @@ WITHHELD: Final = (
 """A bin with one of these bits is not used."""
 CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
-_BATCH: Final = 64
+BATCH: Final = 64
 """Profiles interpolated together, unless one cycle has more."""
 _BESIDE: Final = 4
 """Bins beside an altitude that an interpolation may need."""
@@ -267,7 +267,7 @@ def _batches(order: _Order) -> Iterator[slice]:
     first = np.append(np.flatnonzero(np.diff(order.cycle, prepend=-1)), order.cycle.size)
     low = 0
     for high in range(1, first.size):
-        if high == first.size - 1 or first[high + 1] - first[low] > _BATCH:
+        if high == first.size - 1 or first[high + 1] - first[low] > BATCH:
             yield slice(int(first[low]), int(first[high]))
             low = high
 

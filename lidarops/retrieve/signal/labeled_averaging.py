@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,8 @@ from lidarops.retrieve.signal.averaging import RunningMean
 
 _PROFILES_IN_CACHE: Final = 32
 """Profiles averaged together; they fit the processor cache."""
+MEANS_TOGETHER: Final = 16
+"""Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
 Shared = Callable[[npt.NDArray[np.datetime64]], npt.NDArray[np.float64]]
@@ -25,7 +27,8 @@ Integers = npt.NDArray[np.intp]
 class ClockAverage:
     """Means of profiles over intervals of the clock (UTC), weighted by their shots.
 
-    Profiles come in chunks, which do not change a bit of the result. Only the means are held.
+    Profiles come in chunks, which do not change a bit of the result. Means are held until they are
+    taken.
 
     Parameters
     ----------
@@ -72,28 +75,50 @@ class ClockAverage:
         self._group = np.repeat(np.arange(first.size), self._counts)
         self._weights = shots.to_numpy().astype(np.float64)
         self._shots = np.add.reduceat(shots.to_numpy(), first).astype(np.int32)
-        self._shared = None if shared_variance is None else shared_variance(self._middles)
-        self._means = RunningMean((first.size, distance.size))
-        self._bits = np.zeros((first.size, distance.size), dtype=np.int32)
+        self._shared_variance = shared_variance
         self._distance = distance
-        self._units: dict[str, dict[str, Any]] = {}
         self._added = 0
+        self._edges = np.append(first[::MEANS_TOGETHER], interval.size)
+        self._completed: list[xr.Dataset] = []
+        self._begin(0)
+
+    @property
+    def times(self) -> xr.Dataset:
+        """``time`` and ``time_bnds`` of all means."""
+        return xr.Dataset(coords=self._times(slice(None)))
+
+    def _times(self, means: slice) -> dict[str, Any]:
+        bounds = np.stack([self._starts[means], self._stops[means]], axis=-1)
+        return {"time": self._middles[means], "time_bnds": (("time", "nv"), bounds)}
+
+    def _begin(self, number: int) -> None:
+        """Begin the means that are completed together."""
+        self._open = slice(number, number + MEANS_TOGETHER)
+        times = self._middles[self._open]
+        shape = times.size, self._distance.size
+        self._sums, self._bits = RunningMean(shape), np.zeros(shape, dtype=np.int32)
+        shared = self._shared_variance
+        self._shared = None if shared is None or not times.size else shared(times)
 
     def add(self, conditioned: xr.Dataset) -> None:
         """Add the next profiles: ``power``, ``variance`` and ``quality`` over (time, range)."""
         arrays = [conditioned[name].to_numpy() for name in ("power", "variance", "quality")]
-        for first in range(0, len(arrays[0]), _PROFILES_IN_CACHE):
-            rows = slice(first, first + _PROFILES_IN_CACHE)
-            self._add(*(array[rows] for array in arrays))
-        self._units = {
-            name: dict(conditioned[name].attrs) for name in ("power", "variance", "range")
-        }
+        units = {name: dict(conditioned[name].attrs) for name in ("power", "variance", "range")}
+        first, count = 0, len(arrays[0])
+        while first < count:
+            left = self._edges[np.searchsorted(self._edges, self._added, side="right")]
+            past = min(first + _PROFILES_IN_CACHE, count, first + int(left) - self._added)
+            self._add(*(array[first:past] for array in arrays))
+            if self._added == left:
+                self._completed.append(self._means(units))
+                self._begin(self._open.stop)
+            first = past
 
     def _add(self, power: Array, variance: Array, quality: npt.NDArray[np.int32]) -> None:
         profiles = slice(self._added, self._added + len(power))
-        group = self._group[profiles]
+        group = self._group[profiles] - self._open.start
         common = None if self._shared is None else self._shared[group]
-        self._means.add(
+        self._sums.add(
             power,
             variance if common is None else np.maximum(variance - common, 0.0),
             groups=group,
@@ -104,11 +129,11 @@ class ClockAverage:
         self._bits[group[first]] |= np.bitwise_or.reduceat(quality & ~_MISSING, first, axis=0)
         self._added += len(power)
 
-    def result(self) -> xr.Dataset:
-        """Return the means of all profiles.
+    def completed(self) -> Iterator[xr.Dataset]:
+        """Yield the means that all their profiles were added to, in batches, and forget them.
 
-        Returns
-        -------
+        Yields
+        ------
         xr.Dataset
             ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
             range), ``shots`` (sum), ``profiles`` (number) over time. ``time`` is the middle of
@@ -116,21 +141,36 @@ class ClockAverage:
             omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
             profile has data.
         """
-        means = self._means.averages()
+        batches, self._completed = self._completed, []
+        yield from batches
+
+    def result(self) -> xr.Dataset:
+        """Return the means of all profiles, as `completed` yields them."""
+        return joined(self.completed())
+
+    def _means(self, units: dict[str, dict[str, Any]]) -> xr.Dataset:
+        means = self._sums.averages()
         self._bits[~np.isfinite(means.values)] |= _MISSING
         plane = ("time", "range")
-        units = self._units
         return xr.Dataset(
             {
-                "power": (plane, means.values, units["power"]),
+                # A copy, because these are part of the sums, which are four times as large.
+                "power": (plane, means.values.copy(), units["power"]),
                 "variance": (plane, means.variance + means.shared_variance, units["variance"]),
                 "quality": (plane, self._bits),
-                "profiles": ("time", self._counts.astype(np.int32)),
-                "shots": ("time", self._shots),
+                "profiles": ("time", self._counts[self._open].astype(np.int32)),
+                "shots": ("time", self._shots[self._open]),
             },
             coords={
-                "time": self._middles,
-                "time_bnds": (("time", "nv"), np.stack([self._starts, self._stops], axis=-1)),
+                **self._times(self._open),
                 "range": ("range", self._distance, units["range"]),
             },
         )
+
+
+def joined(batches: Iterator[xr.Dataset]) -> xr.Dataset:
+    """Return the batches of `ClockAverage.completed` as one Dataset."""
+    whole: xr.Dataset = xr.concat(
+        list(batches), dim="time", data_vars="minimal", coords="minimal", join="override"
+    )
+    return whole

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,13 +11,12 @@ from scipy.integrate import quad
 from typer.testing import CliRunner
 
 from lidarops.bench import registry
-from lidarops.bench.accuracy import elastic, elastic_cases, elastic_report
-from lidarops.bench.accuracy.elastic_costs import ALL_STEPS
-from lidarops.bench.accuracy.homogeneous import background_score, inversion_score
-from lidarops.bench.harness import results
+from lidarops.bench.accuracy import elastic, elastic_cases
+from lidarops.bench.accuracy.elastic import ALL_STEPS, background_score, inversion_score
 from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import CPU_TIME
 from lidarops.bench.harness.timing import READ
-from lidarops.bench.throughput import retrieval_reports, retrievals
+from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.figures.charts import Chart, ChartPanel, Series, draw_chart
@@ -41,7 +39,9 @@ def accuracy():
 
 @pytest.fixture(scope="module")
 def published(data_root):
-    return elastic._published(data_root / "synthetic" / "boeckmann")
+    """Return the accuracy benchmark with the published files, and few profiles."""
+    folder = data_root / "synthetic" / "boeckmann"
+    return elastic.measure_elastic_accuracy(Effort(quick=True), draws=2, data=folder)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +110,35 @@ def test_the_bound_is_that_of_a_weighted_straight_line(sky, level):
 # Peers ----------------------------------------------------------------------------------------
 
 
+def klett_python(power, sky):
+    """Return the backscatter of particles by loops over profiles and bins (fernald1984)."""
+    distance = sky.range.tolist()
+    air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
+    low, high = elastic_cases.GIVEN_WINDOW
+    inside = [k for k, r in enumerate(distance) if low <= r <= high]
+    rows = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
+    return np.asarray(rows)
+
+
+def _klett(power, distance, air, loss, inside):
+    start, size = inside[len(inside) // 2], len(power)
+    excess = [a - elastic_cases.LIDAR_RATIO * b for a, b in zip(loss, air, strict=True)]
+    corrected, integral = [0.0] * size, [0.0] * size
+    for step in (1, -1):
+        depth = total = 0.0
+        last = start
+        corrected[start] = power[start] * distance[start] ** 2
+        for k in range(start + step, size if step > 0 else -1, step):
+            width = distance[k] - distance[last]
+            depth += 0.5 * width * (excess[k] + excess[last])
+            corrected[k] = power[k] * distance[k] ** 2 * math.exp(2.0 * depth)
+            total += 0.5 * width * elastic_cases.LIDAR_RATIO * (corrected[k] + corrected[last])
+            integral[k] = total
+            last = k
+    ratio = sum(corrected[k] / air[k] for k in inside) / len(inside)
+    return [q / (ratio - 2.0 * i) - b for q, i, b in zip(corrected, integral, air, strict=True)]
+
+
 def test_the_peers_agree(sky):
     counts = sky.counts(1e3, 3, 1)
     estimates = elastic_cases.background_methods()[elastic_cases.KNOWN_CLEAN_RANGE](counts, sky)
@@ -117,7 +146,7 @@ def test_the_peers_agree(sky):
     # Their weights follow the noise of the bins, a bias far below the error.
     assert np.abs(difference).max() < 0.1 * elastic_cases.least_error(sky, 1e3)
     clean = sky.signal[np.newaxis]
-    looped, summed = elastic_cases.klett_python(clean, sky), elastic_cases.klett_numpy(clean, sky)
+    looped, summed = klett_python(clean, sky), elastic_cases.klett_numpy(clean, sky)
     assert np.abs(looped - summed).max() < 1e-9 * np.abs(summed).max()
     power = np.where(sky.inverted, clean, np.nan)
     ours = elastic_cases.invert_particles(power, sky, elastic_cases.GIVEN_WINDOW).backscatter
@@ -133,82 +162,102 @@ def test_background_scores_of_known_errors():
     error = np.array([3.0, -1.0, 1.0, 50.0, np.nan])
     rejected = np.array([False, False, False, True, False])
     score = background_score(error, np.array([1.0, 2.0, 0.8, 1.0, 1.0]), rejected)
-    assert score.profiles == 3
-    assert score.bias.value == pytest.approx(1.0)
-    assert score.bias.error == pytest.approx(math.sqrt(8 / 3 / 3))
-    assert score.scatter.value == pytest.approx(math.sqrt(8 / 3))
-    assert score.rmse.value == pytest.approx(math.sqrt(11 / 3))
-    assert score.stated == pytest.approx(1.0)
-    assert score.deviation.value == pytest.approx((3.0 - 0.5 + 1.25) / 3)
-    assert score.spread.value == pytest.approx(math.sqrt((9 + 0.25 + 1.5625) / 3))
-    assert [share.value for share in score.coverage] == pytest.approx([1 / 3, 2 / 3])
-    assert background_score(error[:1], np.ones(1), rejected[:1]) is None
+    assert score["mean error"].value == pytest.approx(1.0)
+    assert score["mean error"].error == pytest.approx(math.sqrt(8 / 3 / 3))
+    assert score["RMSE"].value == pytest.approx(math.sqrt(11 / 3))
+    assert score["stated"] == pytest.approx(1.0)
+    assert score["mean / stated"].value == pytest.approx((3.0 - 0.5 + 1.25) / 3)
+    assert score["RMS / stated"].value == pytest.approx(math.sqrt((9 + 0.25 + 1.5625) / 3))
+    assert score["within 1"].value == pytest.approx(1 / 3)
+    assert score["within 1.96"].value == pytest.approx(2 / 3)
+    assert set(background_score(error[:1], np.ones(1), rejected[:1]).values()) == {None}
 
 
 def test_inversion_scores_of_known_errors():
     error = np.array([[2.0, -1.0], [np.nan, 3.0], [np.nan, np.nan], [1.0, 1.0]])
     stated = np.array([[1.0, 1.5], [1.0, 4.0], [1.0, 1.0], [0.6, np.nan]])
-    score = inversion_score(error, stated, 10.0)
-    assert score.profiles == 3
-    assert score.solved == pytest.approx(4 / 8)
+    score = {name: figure.value for name, figure in inversion_score(error, stated, 10.0).items()}
     biases = np.array([0.05, 0.3, 0.1])
-    assert score.bias.value == pytest.approx(biases.mean())
-    assert score.scatter == pytest.approx(biases.std())
-    assert score.rmse.value == pytest.approx(math.sqrt((2.5 + 9.0 + 1.0) / 3) / 10)
-    assert score.stated == pytest.approx(math.sqrt((3.25 / 2 + 16.0 + 0.36) / 3) / 10)
-    assert [share.value for share in score.coverage] == pytest.approx([0.5, 2.5 / 3])
-    assert inversion_score(error[1:3], stated[1:3], 10.0) is None
-    assert inversion_score(error[1:2], stated[1:2], 10.0).profiles == 1
+    assert score == pytest.approx(
+        {
+            "solved": 4 / 8,
+            "mean error": biases.mean(),
+            "scatter": biases.std(),
+            "RMSE": math.sqrt((2.5 + 9.0 + 1.0) / 3) / 10,
+            "stated": math.sqrt((3.25 / 2 + 16.0 + 0.36) / 3) / 10,
+            "within 1": 0.5,
+            "within 1.96": 2.5 / 3,
+        }
+    )
+    assert set(inversion_score(error[1:3], stated[1:3], 10.0).values()) == {None}
+    assert inversion_score(error[1:2], stated[1:2], 10.0)["solved"].value == 0.5
 
 
 # Results --------------------------------------------------------------------------------------
 
 
+def _backgrounds(study, method):
+    return study.figures(f"Background by {method}, counts per shot")
+
+
+def _backscatter(study, chain):
+    return study.figures(f"Backscatter by {chain}, percent of its mean")
+
+
+LEVELS = {f"1e{power}": 10.0**power for power in range(9)}
+
+
 def test_the_tail_is_biased_by_its_signal_and_the_shape_is_not(accuracy, sky):
     tail = sky.signal[-(sky.range.size // 10) :].mean()
-    assert [level.level for level in accuracy.levels] == list(elastic_cases.LEVELS)
-    for level in accuracy.levels:
-        assert level.profiles == DRAWS
-        known_range = level.backgrounds[elastic_cases.KNOWN_CLEAN_RANGE]
-        assert abs(known_range.bias.value) < 4.5 * known_range.bias.error
-        assert known_range.stated == pytest.approx(level.least_error, rel=0.05)
-        assert known_range.spread.value == pytest.approx(1.0, abs=0.4)
-        mean = level.backgrounds[elastic_cases.TAIL_MEAN]
-        assert abs(mean.bias.value - tail) < 4.5 * mean.bias.error
-        free = level.backgrounds[elastic_cases.KNOWN_SHAPE]
-        assert level.level > 1e6 or abs(free.bias.value) < 4.5 * free.bias.error
-        assert set(level.rejected) == set(elastic_cases.background_methods())
+    known = _backgrounds(accuracy, elastic_cases.KNOWN_CLEAN_RANGE)
+    mean = _backgrounds(accuracy, elastic_cases.TAIL_MEAN)
+    free = _backgrounds(accuracy, elastic_cases.KNOWN_SHAPE)
+    assert {level for level, _, _ in known} == set(LEVELS)
+    for name, level in LEVELS.items():
+        bias, method = known[name, elastic_cases.KNOWN_CLEAN_RANGE, "mean error"], known
+        assert abs(bias.value) < 4.5 * bias.error
+        line = {quantity: row.value for (case, _, quantity), row in method.items() if case == name}
+        assert line["stated"] == pytest.approx(line["bound"], rel=0.05)
+        assert line["RMS / stated"] == pytest.approx(1.0, abs=0.4)
+        bias = mean[name, elastic_cases.TAIL_MEAN, "mean error"]
+        assert abs(bias.value - tail) < 4.5 * bias.error
+        bias = free[name, elastic_cases.KNOWN_SHAPE, "mean error"]
+        assert level > 1e6 or abs(bias.value) < 4.5 * bias.error
 
 
 def test_backscatter_has_the_stated_error_with_a_given_window(accuracy):
-    for level in accuracy.levels:
-        given_window = level.inversions["window given"]
-        if level.level <= 1e5:
-            assert given_window.solved == 1.0
-            assert abs(given_window.bias.value) < 0.01
-            assert given_window.rmse.value == pytest.approx(given_window.stated, rel=0.35)
-            assert given_window.coverage[0].value == pytest.approx(0.68, abs=0.15)
-        if level.level <= 1e3:
-            tail = level.inversions["tail_mean, given"]
-            assert tail.bias.value > 0.03
-            assert tail.coverage[1].value < 0.1
-        if level.level == 1e8:
-            assert given_window.solved < 0.3
-        chosen, carried = (
-            level.inversions.get(name) for name in ("window chosen", "chosen, error carried")
-        )
-        assert (chosen is None) == (carried is None)
-        if chosen is not None:
-            assert carried.bias == chosen.bias
-            assert carried.stated > chosen.stated
+    for name, level in LEVELS.items():
+        score = {
+            chain: {q: row for (case, _, q), row in _backscatter(accuracy, chain).items()
+                    if case == name}
+            for chain in elastic_cases.chains()
+        }  # fmt: skip
+        given_window = {quantity: row.value for quantity, row in score["window given"].items()}
+        if level <= 1e5:
+            assert given_window["solved"] == 1.0
+            assert abs(given_window["mean error"]) < 0.01
+            assert given_window["RMSE"] == pytest.approx(given_window["stated"], rel=0.35)
+            assert given_window["within 1"] == pytest.approx(0.68, abs=0.15)
+        if level <= 1e3:
+            tail = score["tail_mean, given"]
+            assert tail["mean error"].value > 0.03
+            assert tail["within 1.96"].value < 0.1
+        if level == 1e8:
+            assert given_window["solved"] < 0.3
+        chosen, carried = score["window chosen"], score["chosen, error carried"]
+        assert carried["mean error"].value == chosen["mean error"].value
+        if chosen["stated"].value is not None:
+            assert carried["stated"].value > chosen["stated"].value
 
 
 def test_errors_without_noise_are_small(accuracy):
-    assert [loop.level for loop in accuracy.closed] == [None, 1.0, 1e4, 1e8]
-    for loop in accuracy.closed:
-        assert abs(loop.background) < 1e-6
-        assert abs(loop.bias) < 2e-4
-        assert abs(loop.bias) <= loop.largest < 1e-3
+    rows = accuracy.figures("Closed loop without noise")
+    assert list(dict.fromkeys(level for level, _, _ in rows)) == ["none", "1e0", "1e4", "1e8"]
+    for level in ("none", "1e0", "1e4", "1e8"):
+        assert abs(rows[level, "", "its error (counts)"].value) < 1e-6
+        bias, largest = (rows[level, "", f"{name} error"].value for name in ("mean", "largest"))
+        assert abs(bias) < 2e-4
+        assert abs(bias) <= largest < 1e-3
 
 
 def test_published_files_are_reproduced(data_root, published):
@@ -219,40 +268,41 @@ def test_published_files_are_reproduced(data_root, published):
     assert noisiest.background - 1e8 == pytest.approx(250.0, abs=2.0)
     assert noisiest.background_error == pytest.approx(math.sqrt(1e8 / 1000 / 945), rel=0.05)
     assert np.all(np.isfinite(sky.backscatter[sky.inverted]))
-    for score in published:
-        if score.method == elastic_cases.KNOWN_SHAPE:
-            assert score.inversion is None
-            assert abs(score.deviation) < 3.0
-            assert score.level > 1e5 or abs(score.background) < 1.0
-        if score.method == "window given" and score.level <= 1e5:
-            assert abs(score.inversion.bias.value) < 0.01
-        if score.method == elastic_cases.TAIL_MEAN and score.level <= 1e4:
-            assert score.background == pytest.approx(2.75, abs=0.1)
+    backgrounds = published.figures("Background of published files, counts per shot")
+    inversions = published.figures("Backscatter of published files, percent of its mean")
+    for level in truths:
+        name = f"1e{round(math.log10(level))}"
+        assert abs(backgrounds[name, elastic_cases.KNOWN_SHAPE, "error / stated"].value) < 3.0
+        error = backgrounds[name, elastic_cases.KNOWN_SHAPE, "error"].value
+        assert level > 1e5 or abs(error) < 1.0
+        assert level > 1e5 or abs(inversions[name, "window given", "mean error"].value) < 0.01
+        tail = backgrounds[name, elastic_cases.TAIL_MEAN, "error"].value
+        assert level > 1e4 or tail == pytest.approx(2.75, abs=0.1)
 
 
 def test_times_are_multiples_of_the_read_of_their_batch(timed):
-    assert {cost.batch for cost in timed.costs} == {1, 20}
-    for batch in (1, 20):
-        group = {cost.step: cost for cost in timed.costs if cost.batch == batch}
-        read = group[READ]
-        assert (read.reads, read.ours) == (1.0, False)
-        assert {"known_shape", "layers.screen", "reference.choose", "elastic.solve"} <= set(group)
-        assert group[ALL_STEPS].ours
-        assert not group["Klett, Python"].ours
-        for cost in group.values():
-            assert cost.reads == pytest.approx(cost.nanoseconds / read.nanoseconds)
-            assert 1 <= cost.profiles <= batch
+    for batch in ("1 profile a call", "20 profiles a call"):
+        rows = timed.figures(batch)
+        read = rows[batch, READ, CPU_TIME].value
+        steps = {method for _, method, _ in rows}
+        assert (rows[batch, READ, "reads"].value, rows[batch, READ, "lidarops"].value) == (1, False)
+        assert {"known_shape", "layers.screen", "reference.choose", "elastic.solve"} <= steps
+        assert rows[batch, ALL_STEPS, "lidarops"].value
+        assert not rows[batch, "Klett, numpy", "lidarops"].value
+        for step in steps:
+            time = rows[batch, step, CPU_TIME].value
+            assert rows[batch, step, "reads"].value == pytest.approx(time / read)
+            assert 1 <= rows[batch, step, "profiles"].value <= 20
 
 
 # Pages and the command ------------------------------------------------------------------------
 
 
 def test_pages_hold_tables_and_figures(accuracy, timed, published, tmp_path):
-    whole = replace(accuracy, published=published)
-    assert results.load(elastic.Elastic, results.save(whole, tmp_path / "whole.json")) == whole
     reports = {
-        "accuracy": elastic_report.elastic_accuracy_report(whole),
-        "throughput": retrieval_reports.elastic_throughput_report(timed),
+        "accuracy": accuracy.output().report,
+        "published": published.output().report,
+        "throughput": timed.output().report,
     }
     for name, report in reports.items():
         folder = tmp_path / name
@@ -264,21 +314,10 @@ def test_pages_hold_tables_and_figures(accuracy, timed, published, tmp_path):
                 assert table.title in text
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
-        assert "2024-01-01" in text
-    titles = [chapter.title for chapter in reports["accuracy"].parts]
-    assert "Files of the intercomparison" in titles
-    titles_without_files = [
-        chapter.title for chapter in elastic_report.elastic_accuracy_report(accuracy).parts
-    ]
-    assert [title for title in titles if title not in titles_without_files] == [
-        "Files of the intercomparison"
-    ]
-
-
-def test_results_survive_json(accuracy, timed, tmp_path):
-    for result in (accuracy, timed):
-        path = results.save(result, tmp_path / "result.json")
-        assert results.load(type(result), path) == result
+    titles, without_files = (
+        [chapter.title for chapter in reports[name].parts] for name in ("published", "accuracy")
+    )
+    assert [t for t in titles if t not in without_files] == ["Files of the intercomparison"]
 
 
 def test_a_band_is_an_area_between_its_edges():

@@ -12,9 +12,10 @@ import pytest
 from typer.testing import CliRunner
 
 from lidarops.bench import registry
-from lidarops.bench.accuracy import homogeneous, homogeneous_report
+from lidarops.bench.accuracy import homogeneous
 from lidarops.bench.accuracy.homogeneous_cases import (
     QUANTITIES,
+    Estimates,
     Scenario,
     background_bias,
     difficulty,
@@ -23,10 +24,10 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     scenarios,
 )
 from lidarops.bench.accuracy.peers import JIT, iterative_peers
-from lidarops.bench.harness import results
 from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import CPU_TIME, Study
 from lidarops.bench.harness.timing import READ, in_threads, least_times
-from lidarops.bench.throughput import retrieval_reports, retrievals
+from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError, RawFormatError
 from lidarops.figures.charts import pareto
@@ -37,12 +38,12 @@ PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e
 
 
 @pytest.fixture(scope="module")
-def accuracy() -> homogeneous.Accuracy:
+def accuracy() -> Study:
     return homogeneous.measure_homogeneous(Effort(quick=True, date="2024-01-01"), profiles=200)
 
 
 @pytest.fixture(scope="module")
-def timed() -> retrievals.SolverThroughput:
+def timed() -> Study:
     return retrievals.measure_solvers(Effort(repeats=1, date="2024-01-01"), profiles=40)
 
 
@@ -151,7 +152,7 @@ def test_scores_of_known_errors():
     error = np.array([3.0, -1.0, 1.0, 5.0, np.nan])
 
     def solver(power, scenario):
-        return homogeneous.Estimates(
+        return Estimates(
             values={name: scenario.truth[name] + error * bound[name] for name in QUANTITIES},
             standard_errors={
                 "extinction": np.full(5, bound["extinction"]),
@@ -162,54 +163,62 @@ def test_scores_of_known_errors():
             rejected=np.array([False, False, False, True, True]),
         )
 
-    truth = solver(np.empty((5, PATH.bins)), PATH)
-    outcome = homogeneous._outcome("solver", solver, PATH, np.empty((5, PATH.bins)), bound, truth)
-    score = outcome.scores["extinction"]
-    assert score.rmse.value == pytest.approx(math.sqrt(11 / 3), rel=1e-6)
-    assert score.rmse_of_all == pytest.approx(3.0, rel=1e-6)
-    assert score.bias.value == pytest.approx(1.0, rel=1e-6)
-    assert score.bias.error == pytest.approx(math.sqrt(8 / 3 / 3), rel=1e-6)
-    assert score.coverage.value == pytest.approx(2 / 3)
-    assert outcome.scores["background"].coverage.value == pytest.approx(1.0)
-    assert set(outcome.scores) == {"extinction", "background"}, "a given value has no score"
-    assert (outcome.flagged, outcome.rejected) == (0.6, 0.4)
-    assert outcome.distances["extinction"] == 0.0
+    power = np.empty((5, PATH.bins))
+    score = homogeneous.score_path("solver", solver, PATH, power, solver(power, PATH))
+    assert score["extinction: RMSE"].value == pytest.approx(math.sqrt(11 / 3), rel=1e-6)
+    assert score["extinction: bias"].value == pytest.approx(1.0, rel=1e-6)
+    assert score["extinction: bias"].error == pytest.approx(math.sqrt(8 / 3 / 3), rel=1e-6)
+    assert score["extinction: 95 %"].value == pytest.approx(2 / 3)
+    assert score["background: 95 %"].value == pytest.approx(1.0)
+    assert score["log amplitude: RMSE"] is None, "a given value has no score"
+    assert (score["flagged"].value, score["rejected"].value) == (0.6, 0.4)
+    assert score["extinction: distance"] == 0.0
 
 
 def test_least_squares_reaches_the_bound(accuracy):
-    for case in accuracy.cases:
-        for outcome in case.outcomes:
-            if outcome.method in {"compressed", "direct", JIT}:
-                for quantity, score in outcome.scores.items():
-                    assert abs(score.rmse.value - 1) < 5 * score.rmse.error + 0.02, quantity
-                    assert score.coverage.value > 0.85
-                    assert outcome.distances[quantity] < 0.05
-    assert {o.method for o in accuracy.cases[0].outcomes} == set(methods()) | set(iterative_peers())
+    for method in ("compressed", "direct", JIT):
+        rows = accuracy.figures(f"{method}, path by path")
+        assert len({path for path, _, _ in rows}) == 8
+        for (_, _, quantity), row in rows.items():
+            if quantity.endswith("RMSE"):
+                assert abs(row.value - 1) < 5 * row.error + 0.02, quantity
+            elif quantity.endswith("95 %"):
+                assert row.value > 0.85
+            elif quantity.endswith("distance"):
+                assert row.value < 0.05
+    summary = accuracy.figures("All paths")
+    assert {method for _, method, _ in summary} == set(methods()) | set(iterative_peers())
+    assert summary["extinction", "direct", "solved"].value == "all"
+    assert summary["extinction", "known_extinction", "solved"].value == "0"
 
 
 def test_lag_1_is_biased_as_published_and_least_squares_is_not():
-    measured = homogeneous.offsets(1500)
-    single = {o.length: o for o in measured if o.averaged == 1 and o.start < 5e3}
-    for length, expected in {1e3: 10.2, 4e3: 2.7, 6e3: 1.4, 8e3: 0.8}.items():
-        assert single[length].lag_1.value == pytest.approx(expected, abs=0.3)
-    for offset in measured:
-        assert offset.lag_1.value > 50 * offset.lag_1.error
-        if offset.averaged > 1 and offset.start < 5e3 and offset.length >= 2e3:
-            rest = offset.compressed.value - offset.expected
-            assert abs(rest) < 4 * offset.compressed.error
-            assert offset.compressed.error < 0.02 * offset.lag_1.value
+    scores = homogeneous.published_offsets(1500)
+    for length, expected in {1: 10.2, 4: 2.7, 6: 1.4, 8: 0.8}.items():
+        score = scores[f"2.5 + {length} km", "1"]
+        assert score["lag 1"].value == pytest.approx(expected, abs=0.3)
+    for (section, averaged), score in scores.items():
+        assert score["lag 1"].value > 50 * score["lag 1"].error
+        if averaged != "1" and section in {f"2.5 + {length} km" for length in (2, 4, 6, 8)}:
+            rest = score["compressed"].value - score["expected"]
+            assert abs(rest) < 4 * score["compressed"].error
+            assert score["compressed"].error < 0.02 * score["lag 1"].value
 
 
 def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
-    assert {s.setting for s in timed.speeds} == set(retrievals.settings())
-    for setting in retrievals.settings():
-        group = {s.method: s for s in timed.speeds if s.setting == setting}
-        read = group[READ]
-        assert read.reads == 1.0
-        assert set(group) >= {"compressed", "direct"}
-        for speed in group.values():
-            assert speed.reads == pytest.approx(speed.nanoseconds / read.nanoseconds)
-    assert {t.method for t in timed.threads} == set(retrievals.THREADED)
+    settings = [results.title for results in timed.chapters[0].results]
+    assert len(settings) == 8
+    for setting in settings:
+        rows = timed.figures(setting)
+        assert rows[setting, READ, "reads"].value == 1.0
+        read = rows[setting, READ, CPU_TIME].value
+        methods_timed = {method for _, method, _ in rows}
+        assert methods_timed >= {"compressed", "direct"}
+        for method in methods_timed:
+            time = rows[setting, method, CPU_TIME].value
+            assert rows[setting, method, "reads"].value == pytest.approx(time / read)
+    gains = timed.figures("Gain of two threads")
+    assert {method for _, method, _ in gains} == {"compressed"}
 
 
 def test_calls_alternate_and_the_least_time_counts(monkeypatch):
@@ -226,21 +235,10 @@ def test_threads_pass_errors_on():
         in_threads(lambda chapter: 1 / chapter, 2)
 
 
-def test_results_survive_json(accuracy, timed, tmp_path):
-    for result in (accuracy, timed):
-        path = results.save(result, tmp_path / "sub" / "result.json")
-        assert results.load(type(result), path) == result
-    path.write_text("{}")
-    with pytest.raises(CatalogError, match="run the benchmark again"):
-        results.load(homogeneous.Accuracy, path)
-    with pytest.raises(CatalogError, match="cannot be written"):
-        results.save(accuracy, path / "result.json")
-
-
 def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
     reports = {
-        "accuracy": homogeneous_report.homogeneous_accuracy_report(accuracy),
-        "throughput": retrieval_reports.homogeneous_throughput_report(timed),
+        "accuracy": accuracy.output().report,
+        "throughput": timed.output().report,
     }
     for name, report in reports.items():
         folder = tmp_path / name
@@ -275,6 +273,8 @@ def test_the_pareto_front_holds_the_unbeaten_points():
         ("luck", None, [], CampaignError, "throughput"),
         ("accuracy", "weather", [], CampaignError, "network or reader"),
         ("accuracy", "reader", ["file"], CampaignError, "no accuracy"),
+        ("accuracy", "archive", [], CampaignError, "'archive' has no accuracy"),
+        ("accuracy", "campaigns", [], CampaignError, "'campaigns' has no accuracy"),
         ("throughput", "homogeneous", ["file"], CampaignError, "takes no files"),
         ("throughput", "reader", [], RawFormatError, "at least one file"),
     ],

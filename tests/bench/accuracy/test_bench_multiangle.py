@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from lidarops.bench import registry
-from lidarops.bench.accuracy import multiangle_cases, multiangle_report, multiangle_scores
-from lidarops.bench.accuracy.multiangle_scores import StudySize
-from lidarops.bench.harness import results
-from lidarops.bench.harness.benchmark import RESULT, Effort
-from lidarops.bench.harness.rows import MonteCarloFigure
+from lidarops.bench.accuracy import multiangle, multiangle_cases
+from lidarops.bench.accuracy.multiangle import StudySize
+from lidarops.bench.harness import statistics
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import CPU_TIME, Figure
 from lidarops.bench.harness.timing import READ
-from lidarops.bench.throughput import retrieval_reports, scan_kernels
+from lidarops.bench.throughput import retrievals
 from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.multiangle.optical_depth import (
-    MultiAngleFlags,
     Regularisation,
     retrieve_optical_depth,
 )
 
-SMALL = StudySize(blocks=3, profiles=8, slow=1, published=60, random=6)
+SMALL = StudySize(blocks=3, profiles=8, slow=1, published=60)
 SHORT = multiangle_cases.clear(3000.0, bins=25)
 
 
@@ -35,16 +33,16 @@ def study():
     scenes = (SHORT, multiangle_cases.cloud())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
-        result = multiangle_scores.measure_multiangle(
+        result = multiangle.measure_multiangle(
             Effort(date="2024-01-01", progress=steps.append), size=SMALL
         )
-    assert steps == [1] * (len(scenes) + 4)
+    assert steps == [1] * (len(scenes) + 2)
     return result
 
 
 @pytest.fixture(scope="module")
 def timed():
-    return scan_kernels.measure_scan_kernels(Effort(date="2024-01-01", repeats=1), batches=(1, 2))
+    return retrievals.measure_scans(Effort(date="2024-01-01", repeats=1), batches=(1, 2))
 
 
 def without_noise(scene):
@@ -208,137 +206,111 @@ def test_peers_leave_out_samples_in_noise():
 
 
 def test_errors_come_from_independent_blocks():
-    figure = multiangle_scores.over_blocks([1.0, 2.0, math.nan, 6.0])
+    figure = statistics.over_blocks([1.0, 2.0, math.nan, 6.0])
     assert figure.value == pytest.approx(3.0)
     assert figure.error == pytest.approx(np.std([1, 2, 6], ddof=1) / math.sqrt(3))
-    square = multiangle_scores.root(MonteCarloFigure(4.0, 0.4))
+    square = statistics.root(Figure(4.0, 0.4))
     assert (square.value, square.error) == pytest.approx((2.0, 0.1))
-    assert multiangle_scores.root(MonteCarloFigure(0.0, 0.0)) == MonteCarloFigure(0.0, 0.0)
-    share = multiangle_scores.ratio(np.array([1.0, 0.0, 3.0]), np.array([10.0, 10.0, 20.0]))
-    assert share.value == pytest.approx(0.1)
-    assert share.error == pytest.approx(math.sqrt(0 + 1 + 1) / 40)
-    assert multiangle_scores.ratio(np.zeros(2), np.full(2, 5.0)) == MonteCarloFigure(0.0, 0.1)
-    assert multiangle_scores.ratio(np.zeros(2), np.zeros(2)) == MonteCarloFigure(0.0, 0.0)
-
-
-def test_false_values_are_counted_with_and_without_flags():
-    shape = (2, 4)
-    flags = {field.name: np.zeros(shape, np.bool_) for field in fields(MultiAngleFlags)}
-    flags["undersmoothed"][0, 1] = True
-    flags["outlier"][1, 0] = True
-    error = np.array([[0.5, 9.0, 5.0, np.nan], [-9.0, 0.1, 0.1, 0.1]])
-    bound = np.array([[0.0, 0.0, 3.0, 0.0], [0.0, 0.0, 0.0, np.nan]])
-    scene = multiangle_scores._counts(error, np.ones(shape), bound, MultiAngleFlags(**flags))
-    # The last value has no stated error and counts as false.
-    expected = {"values": 7, "random_only": 3, "false": 3, "unflagged": 6, "false_ok": 2}
-    expected |= {"within": 4, "needless": 0, "profiles": 2, "false_ok_profiles": 1}
-    assert scene.counts == expected
-    assert scene.by_flag["undersmoothed"] == (1, 1)
-    assert scene.by_flag["outlier"] == (1, 1)
-    assert scene.by_flag["gradient"] == (0, 0)
+    assert statistics.root(Figure(0.0, 0.0)) == Figure(0.0, 0.0)
+    part = statistics.clustered_share(np.array([1.0, 0.0, 3.0]), np.array([10.0, 10.0, 20.0]))
+    assert part.value == pytest.approx(0.1)
+    assert part.error == pytest.approx(math.sqrt(0 + 1 + 1) / 40)
+    none = statistics.clustered_share(np.zeros(2), np.full(2, 5.0))
+    assert (none.value, none.error) == (0.0, 0.1)
+    empty = statistics.clustered_share(np.zeros(2), np.zeros(2))
+    assert (empty.value, empty.error) == (0.0, 0.0)
 
 
 # Results --------------------------------------------------------------------------------------
 
 
+DEPTH = "RMSE of optical depth"
+SLOPE = "RMSE of extinction (km⁻¹)"
+
+
 def test_every_method_is_scored_in_every_scene(study):
     names = [*multiangle_cases.scan_methods(), *multiangle_cases.scan_peers()]
-    for scene in study.scenes:
-        assert [score.method for score in scene.scores] == names
-        assert scene.profiles == SMALL.blocks * SMALL.profiles
-        by_method = {score.method: score for score in scene.scores}
-        assert by_method["numpy lstsq"].profiles == SMALL.blocks * SMALL.slow
-        line, joint = by_method["kano_hamilton"], by_method["joint"]
-        assert line.solved == 1.0
-        assert joint.rmse.value < 0.6 * line.rmse.value
-        assert joint.extinction_rmse.value < 0.2 * line.extinction_rmse.value
-        assert line.coverage[1].value == pytest.approx(0.95, abs=0.06)
-        assert abs(line.bias.value) < 5.0 * line.bias.error + 1e-3
-        assert by_method["scipy lsq_linear"].coverage is None
-        assert by_method["numpy lstsq"].extinction_coverage is None
-        assert by_method["two_angle"].rmse.value > line.rmse.value
-        assert by_method["mld 0, discrepancy"].bias.value < 0.0
-        assert by_method["mld 0, discrepancy"].data_share < line.data_share == 1.0
-        assert all(score.nanoseconds > 0 for score in scene.scores)
+    for scene in (SHORT.label, multiangle_cases.cloud().label):
+        rows = study.figures(scene)
+        assert list(dict.fromkeys(method for _, method, _ in rows)) == names
+
+        def value(method, quantity, scene=scene, rows=rows):
+            return rows[scene, method, quantity].value
+
+        assert value("kano_hamilton", "profiles") == SMALL.blocks * SMALL.profiles
+        assert value("numpy lstsq", "profiles") == SMALL.blocks * SMALL.slow
+        assert value("kano_hamilton", "solved") == 1.0
+        assert value("joint", DEPTH) < 0.6 * value("kano_hamilton", DEPTH)
+        assert value("joint", SLOPE) < 0.2 * value("kano_hamilton", SLOPE)
+        assert value("kano_hamilton", "within 1.96") == pytest.approx(0.95, abs=0.06)
+        bias = rows[scene, "kano_hamilton", "mean error"]
+        assert abs(bias.value) < 5.0 * bias.error + 1e-3
+        assert value("scipy lsq_linear", "within 1") is None
+        assert value("numpy lstsq", "extinction within 1") is None
+        assert value("two_angle", DEPTH) > value("kano_hamilton", DEPTH)
+        assert value("mld 0, discrepancy", "mean error") < 0.0
+        assert value("mld 0, discrepancy", "data share") < 1.0
+        assert value("kano_hamilton", "data share") == 1.0
+        assert all(value(name, CPU_TIME) > 0 for name in names)
 
 
 def test_the_published_experiment_is_reproduced(study):
-    def central(method, angle):
-        (only,) = [
-            score
-            for score in study.published
-            if (score.method, score.largest_angle, score.beams, score.share)
-            == (method, angle, 6, 0.25)
-        ]
-        return only
+    rows = study.figures("Published experiment: 6 beams, 25 %")
+
+    def central(method, angle, quantity=DEPTH):
+        return rows[f"{angle:g}", method, quantity].value
 
     # Closed form: sigma / (2 sqrt Sxx), sigma / (sqrt 2 (x2 - x1)) for two.
     sigma = multiangle_cases.uniform_deviation(0.25)
     for angle in (15.0, 30.0):
         path = multiangle_cases.published_cloud(angle, 6, sigma).path
         line = sigma / (2.0 * math.sqrt(np.sum((path - path.mean()) ** 2)))
-        assert central("kano_hamilton", angle).rmse.value == pytest.approx(line, rel=0.12)
+        assert central("kano_hamilton", angle) == pytest.approx(line, rel=0.12)
         ends = 0.1 / (math.sqrt(2.0) * (path[-1] - path[0]))
-        two_angle = central(multiangle_scores.TWO_ANGLE_ALONE, angle)
-        assert two_angle.rmse.value == pytest.approx(ends, rel=0.12)
-    mld = central("mld 0, discrepancy", 15.0)
-    assert mld.rmse.value == pytest.approx(2.08, abs=0.25)
-    assert mld.top_bias.value < -1.5
-    assert mld.data_share < 0.4
-    assert central(multiangle_scores.NOTHING, 15.0).rmse.value == pytest.approx(2.737, abs=0.001)
-    settings = {(p.largest_angle, p.beams, p.share) for p in study.published}
-    assert {(15.0, 4, 0.3), (30.0, 4, 0.2), (60.0, 6, 0.25)} <= settings
+        assert central(multiangle.TWO_ANGLE_ALONE, angle) == pytest.approx(ends, rel=0.12)
+    assert central("mld 0, discrepancy", 15.0) == pytest.approx(2.08, abs=0.25)
+    assert central("mld 0, discrepancy", 15.0, "at the top") < -1.5
+    assert central("mld 0, discrepancy", 15.0, "data share") < 0.4
+    assert central(multiangle.NOTHING, 15.0) == pytest.approx(2.737, abs=0.001)
+    assert ("60", "joint", DEPTH) in rows
+    assert ("15", "joint", DEPTH) in study.figures("Published experiment: 4 beams, 30 %")
 
 
 def test_the_prior_determines_the_error_at_15_degrees(study):
-    by_factor = {score.factor: score for score in study.priors}
-    assert by_factor[1.0].alone == 0.0
-    assert by_factor[0.0].alone == pytest.approx(2.737, abs=0.001)
-    assert by_factor[1.0].rmse.value < 0.6 * by_factor[0.0].rmse.value
-    assert by_factor[1.5].rmse.value > 1.2 * by_factor[1.0].rmse.value
-    equal = {score.method: score for score in study.correlations if score.correlation == 1.0}
-    assert equal["joint"].rmse.value < 0.4 * equal["kano_hamilton"].rmse.value
+    rows = study.figures("mld_prior at 15°, 6 beams, 25 %, with a multiple of the truth as prior")
+    assert rows["1", "", "prior alone"].value == 0.0
+    assert rows["0", "", "prior alone"].value == pytest.approx(2.737, abs=0.001)
+    assert rows["1", "", DEPTH].value < 0.6 * rows["0", "", DEPTH].value
+    assert rows["1.5", "", DEPTH].value > 1.2 * rows["1", "", DEPTH].value
+    alike = study.figures("Layers that scatter alike: 15°, 6 beams, 14.7 %")
+    assert alike["1", "joint", DEPTH].value < 0.4 * alike["1", "kano_hamilton", DEPTH].value
 
 
 def test_outliers_hurt_the_plain_method(study):
-    by_method = {(score.method, score.outliers): score for score in study.outliers}
-    assert len(by_method) == 4 * len(multiangle_scores.OUTLIERS)
-    clean = by_method["kano_hamilton, plain", 0.0]
-    assert by_method["kano_hamilton, plain", 0.1].low_rmse.value > 3.0 * clean.low_rmse.value
-    assert by_method["kano_hamilton, robust", 0.1].low_rmse.value < 1.6 * clean.low_rmse.value
-    assert by_method["joint, robust", 0.1].flagged > 0.2
-    assert by_method["joint, robust", 0.1].ran == 1.0
-    assert by_method["joint, plain", 0.1].ran == 0.0
-
-
-def test_random_scenes_are_counted_completely(study):
-    assert [(score.air, score.method, score.quantity) for score in study.safety] == [
-        (air, method, quantity)
-        for air in (multiangle_scores.ANY, multiangle_scores.CALM)
-        for method in ("kano_hamilton", "joint")
-        for quantity in ("optical depth", "extinction")
-    ]
-    for score in study.safety:
-        count = -(-SMALL.random // (4 if score.air == multiangle_scores.CALM else 1))
-        assert score.scenes == count
-        assert score.profiles <= 8 * count
-        assert score.false.value <= score.random_only.value
-        assert score.needless <= score.flagged
-        assert {share.flag for share in score.flags} == {f.name for f in fields(MultiAngleFlags)}
-    values = [score.values for score in study.safety if score.quantity == "optical depth"]
-    assert min(values) > 0
+    rows = study.figures("Optical depth with outliers")
+    low = {key[:2]: row.value for key, row in rows.items() if key[2] == "RMSE below 2 km"}
+    assert len(low) == 4 * len(multiangle.OUTLIERS)
+    clean = low["0 %", "kano_hamilton, plain"]
+    assert low["10 %", "kano_hamilton, plain"] > 3.0 * clean
+    assert low["10 %", "kano_hamilton, robust"] < 1.6 * clean
+    assert rows["10 %", "joint, robust", "flagged"].value > 0.2
+    assert rows["10 %", "joint, robust", "robust passes"].value == 1.0
+    assert rows["10 %", "joint, plain", "robust passes"].value == 0.0
 
 
 def test_times_are_multiples_of_the_read(timed):
-    for batch in (1, 2):
-        group = {cost.step: cost for cost in timed.costs if cost.batch == batch}
-        assert group[READ].reads == 1.0
-        assert not group[READ].ours
-        ours = {"make_beams", "regress", "vertical.smooth", *multiangle_cases.scan_methods()}
-        assert ours <= {name for name, cost in group.items() if cost.ours}
-        assert not any(group[name].ours for name in multiangle_cases.scan_peers())
-        for cost in group.values():
-            assert cost.reads == pytest.approx(cost.nanoseconds / group[READ].nanoseconds)
+    for batch in ("1 profile a call", "2 profiles a call"):
+        rows = timed.figures(batch)
+        ours = {method for _, method, _ in rows if rows[batch, method, "lidarops"].value}
+        assert rows[batch, READ, "reads"].value == 1.0
+        assert READ not in ours
+        assert {"make_beams", "regress", "vertical.smooth"} < ours
+        assert set(multiangle_cases.scan_methods()) < ours
+        assert not ours & set(multiangle_cases.scan_peers())
+        read = rows[batch, READ, CPU_TIME].value
+        for _, method, _ in rows:
+            time = rows[batch, method, CPU_TIME].value
+            assert rows[batch, method, "reads"].value == pytest.approx(time / read)
 
 
 # Pages ----------------------------------------------------------------------------------------
@@ -346,8 +318,8 @@ def test_times_are_multiples_of_the_read(timed):
 
 def test_pages_have_tables_and_figures(study, timed, tmp_path):
     reports = {
-        "accuracy": multiangle_report.multiangle_accuracy_report(study),
-        "throughput": retrieval_reports.multiangle_throughput_report(timed),
+        "accuracy": study.output().report,
+        "throughput": timed.output().report,
     }
     for name, report in reports.items():
         folder = tmp_path / name
@@ -364,28 +336,3 @@ def test_pages_have_tables_and_figures(study, timed, tmp_path):
     assert "this is not so" in published.text
     # 2 numbers of beams, 3 shares; priors and correlations.
     assert len(published.tables) + len(published.details) == 6 + 2
-
-
-def test_results_survive_json(study, timed, tmp_path):
-    for result in (study, timed):
-        path = results.save(result, tmp_path / RESULT)
-        assert results.load(type(result), path) == result
-
-
-def test_both_kinds_run(monkeypatch, study, timed):
-    calls = []
-
-    def accuracy(effort):
-        calls.append(effort)
-        return study
-
-    def throughput(effort):
-        calls.append(effort)
-        return timed
-
-    monkeypatch.setattr(multiangle_scores, "measure_multiangle", accuracy)
-    monkeypatch.setattr(scan_kernels, "measure_scan_kernels", throughput)
-    effort = Effort(quick=True, repeats=2, date="2024-01-01")
-    assert registry.run_benchmark("accuracy", "multiangle", [], effort).result is study
-    assert registry.run_benchmark("throughput", "multiangle", [], effort).result is timed
-    assert calls == [effort, effort]

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from lidarops.bench import registry
-from lidarops.bench.harness.benchmark import BenchmarkOutput, Effort
-from lidarops.bench.harness.timing import machine
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.rows import Study
 from lidarops.bench.throughput import campaigns, orchestration
-from lidarops.bench.throughput.campaigns import CampaignCost, CampaignSize, Growth, Stage
+from lidarops.bench.throughput.campaigns import CampaignCost, CampaignSize, Stage
 from lidarops.errors import SceneError
 from lidarops.run.archive import reprocess
 
@@ -31,9 +31,10 @@ def study():
 
 
 def test_every_stage_has_a_time(study):
-    (growth,) = study.growths
-    assert set(growth.costs[1].seconds) == set(Stage)
-    assert all(seconds > 0 for seconds in growth.costs[1].seconds.values())
+    (results,) = study.chapters[0].results
+    times = {row.method: row.value for row in results.rows if row.quantity == "CPU time (s)"}
+    assert set(times) == set(Stage)
+    assert min(times.values()) > 0
 
 
 @pytest.mark.parametrize("size", [SMALL, CampaignSize(scenes=1, profiles=30, bins=600, angles=5)])
@@ -47,37 +48,37 @@ def test_campaigns_have_the_requested_size(size, tmp_path):
     assert reprocess(campaign) is None
 
 
-def test_slopes_are_those_of_the_times(study, tmp_path):
+def test_slopes_are_those_of_the_times(tmp_path):
     costs = tuple(
         CampaignCost(
             CampaignSize(scenes=n), {stage: 0.01 * n**power for power, stage in enumerate(Stage)}
         )
         for n in (2, 4, 8)
     )
-    slopes = dict(campaigns._slopes("scenes", costs))
-    for power, stage in enumerate(Stage):
-        assert slopes[stage] == pytest.approx((power, 0.0), abs=1e-6)
-    growth = Growth("scenes", costs, slopes)
-    changed = replace(study, growths=(growth,), workers={1: 4.0, 2: 2.5})
-    report = campaigns.campaigns_report(changed)
-    assert report.parts[1].tables[0].rows[1][2] == "1.6"
-    shares = [row[3] for row in report.parts[0].tables[0].rows if row[3] != "-"]
+    for power in range(4):
+        times = [0.01 * n**power for n in (2, 4, 8)]
+        assert campaigns.slope((2, 4, 8), times) == pytest.approx((power, 0.0), abs=1e-6)
+    chapters = [
+        campaigns.stages_chapter({"scenes": costs}),
+        campaigns.workers_chapter({1: 4.0, 2: 2.5}),
+    ]
+    output = Study("Campaigns", "2024-01-01", chapters).output()
+    stages, workers = output.report.parts
+    assert workers.tables[0].rows[1][2] == "1.6"
+    shares = [row[3] for row in stages.tables[0].rows if row[3] != "-"]
     assert math.isclose(
         sum(float(share.split()[0].lstrip("<")) for share in shares), 100.0, abs_tol=0.4
     )
-    page = registry.write_benchmark(BenchmarkOutput(changed, report), tmp_path)
+    page = registry.write_benchmark(output, tmp_path)
     assert "growth.svg" in page.read_text(encoding="utf-8")
-    assert changed.machine == machine()
 
 
 def test_overhead_is_a_line_over_the_plain_loop():
     serial = orchestration.RunMode("plain loop", (10.0, 110.0), (11.0, 120.0))
     flow = orchestration.RunMode("flow", (10.0 + 16.5, 110.0 + 21.5), (30.0, 140.0))
-    line = orchestration.overhead(flow, serial)
-    assert line.fixed == pytest.approx(16.0)
-    assert line.share == pytest.approx(0.05)
-    assert line.of(300.0) == pytest.approx(16.0 / 300.0 + 0.05)
-    (table,) = orchestration.orchestration_part((serial, flow), (2, 22)).tables
+    assert orchestration.overhead(flow, serial) == pytest.approx((16.0, 0.05))
+    chapter = orchestration.orchestration_chapter((serial, flow), (2, 22))
+    (table,) = Study("Flows", "", [chapter]).output().report.parts[0].tables
     assert table.rows[1] == ("flow", "132", "140", "16", "5 %", "10.3 %")
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, quantity
+from lidarops.settings import ChannelProduct, Inside, Metres, quantity
 
 
 class IntegratedSettings(ChannelProduct):
@@ -18,6 +18,7 @@ class IntegratedSettings(ChannelProduct):
     background_range: tuple[Metres, Metres] | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
     )
+    overlap_profile: Inside | None = None
 
     @model_validator(mode="after")
     def _rising(self) -> Self:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -9,6 +10,7 @@ import xarray as xr
 
 from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
+from lidarops.records import Role
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
@@ -26,6 +28,8 @@ class WindowSettings(SettingsModel):
 
     windows: tuple[tuple[float, float], ...]
     """m."""
+    overlap_profile: str | None = None
+    """File of the overlap, in place of that of the facts."""
 
 
 class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
@@ -53,7 +57,14 @@ class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
                 reason = f"window {near:g}-{far:g} m holds no bin; the last ends at {case.last:g} m"
                 yield Leave(reason, number=near, rule="window_inside")
         if kept:
-            yield Run(REQUESTED, WindowSettings(windows=tuple(kept)), number=float(len(kept)))
+            settings = WindowSettings(
+                windows=tuple(kept), overlap_profile=case.request.overlap_profile
+            )
+            yield Run(REQUESTED, settings, number=float(len(kept)))
+
+    def files(self, settings: WindowSettings) -> dict[str, Role]:
+        """Return the file of the overlap."""
+        return {settings.overlap_profile: Role.OVERLAP} if settings.overlap_profile else {}
 
     def stream(self, settings: WindowSettings, data: Data) -> RowProduct:
         """Return the product, which is written as profiles come."""
@@ -74,10 +85,12 @@ class _Integrals(RowProduct):
         self._geometry = data.source.geometry
         self._limits = np.array(settings.windows)
         centres, overlap = self._profiles.range, data.get(OVERLAP)
+        if settings.overlap_profile:
+            overlap = data.source.ancillaries.overlaps[settings.overlap_profile].at
         known = np.ones(centres.size) if overlap is None else overlap(centres)
         self._windows = [Window.of(centres, known, limits) for limits in settings.windows]
 
-    def frame(self) -> xr.Dataset:
+    def _frame(self) -> xr.Dataset:
         """Return times and pointing of all profiles, and the windows."""
         background_range, method = self._background
         frame = self._geometry.assign_coords(
@@ -89,8 +102,10 @@ class _Integrals(RowProduct):
         words = background_words(method, background_range)
         return frame.assign(bins=("window", bins)).assign_attrs(steps=words)
 
-    def rows(self, chunk: Chunk) -> xr.Dataset:
-        """Return the integrals of profiles."""
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Yield the integrals of profiles."""
+        if chunk.rows.start == 0:
+            yield self._frame()
         conditioned = chunk.profiles(self._profiles)
         signals = correct_for_range(conditioned, *self._background)
         sky = signals[["background", "background_standard_error"]]
@@ -113,7 +128,7 @@ class _Integrals(RowProduct):
             quality_flag=(dims, np.stack([part.flags for part in integrals], axis=1)),
             shots=self._profiles.shots(chunk.counts),
         )
-        return values.assign(gluing(conditioned)).assign_coords(chunk.geometry.variables)
+        yield values.assign(gluing(conditioned)).assign_coords(chunk.geometry.variables)
 
 
 STEP: Final = Integrated()

@@ -11,7 +11,10 @@ import numpy as np
 from scipy import special
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.stability.stiff_cases import (
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.elastic import inversion, layers, reference_window
+from lidarops.retrieve.elastic.flags import ElasticQuality
+from support.stiff.cases import (
     Accepted,
     Answer,
     Array,
@@ -24,9 +27,6 @@ from lidarops.bench.stability.stiff_cases import (
     Retrieval,
     StiffCase,
 )
-from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.elastic import inversion, layers, reference_window
-from lidarops.retrieve.elastic.flags import ElasticQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.ELASTIC)
 _LOST: Final = ElasticQuality.UNSTABLE_INVERSION | ElasticQuality.NO_REFERENCE

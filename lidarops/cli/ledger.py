@@ -1,10 +1,11 @@
-"""Commands that read the ledger: list the runs, and verify the recorded files."""
+"""Commands that read the ledger: list the runs, verify the recorded files, publish products."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,21 +15,17 @@ from lidarops.cli.app import (
     CatalogOption,
     JsonOption,
     OutOption,
-    add_row,
-    app,
+    command,
     exit_with_status,
-    make_table,
     progress_bar,
-    show,
-    with_plain_errors,
+    show_rows,
 )
 
 if TYPE_CHECKING:
     from lidarops.catalog.ledger import Run
 
 
-@app.command()
-@with_plain_errors
+@command()
 def runs(
     campaign: CampaignFile,
     out: OutOption = None,
@@ -49,28 +46,21 @@ def runs(
     with Store(settings.catalog_url, settings.name, create=False) as store:
         listed = store.runs(limit=limit)
     if as_json:
-        typer.echo(json.dumps([_plain(run) for run in listed], indent=2))
+        plain = [asdict(run) for run in listed]
+        typer.echo(json.dumps(plain, indent=2, default=datetime.isoformat))
         return
     columns = ("run", "status", "took", "scenes", "products", "failed", "refused", "stages", "by")
-    table = make_table(f"Runs of {settings.name}", *columns)
-    for run in listed:
-        took = "" if run.finished is None else str(run.finished - run.started).partition(".")[0]
-        stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.seconds.items())
-        numbers = (run.scenes, run.products, run.failed, run.refused)
-        add_row(table, run.id, run.status.value, took, *numbers, stages, run.holder)
-    show(table)
+    show_rows(f"Runs of {settings.name}", columns, map(_row, listed))
 
 
-def _plain(run: Run) -> dict[str, Any]:
-    return {
-        **asdict(run),
-        "started": run.started.isoformat(),
-        "finished": run.finished and run.finished.isoformat(),
-    }
+def _row(run: Run) -> tuple[object, ...]:
+    took = "" if run.finished is None else str(run.finished - run.started).partition(".")[0]
+    stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.seconds.items())
+    numbers = (run.scenes, run.products, run.failed, run.refused)
+    return run.id, run.status.value, took, *numbers, stages, run.holder
 
 
-@app.command()
-@with_plain_errors
+@command()
 def verify(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -93,26 +83,48 @@ def verify(
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     if archive and not products_only:
         check_archive_and_catalog(settings, archive=archive)
-    checked = 0
-
     with (
         Store(settings.catalog_url, settings.name, create=False) as store,
-        progress_bar("verify", None) as advance,
+        progress_bar("verify", None) as bar,
     ):
-
-        def count(done: int) -> None:
-            nonlocal checked
-            checked += done
-            advance(done)
-
-        mismatches = list(verify_archive(settings, store, inputs=not products_only, progress=count))
+        checked, mismatches = 0, []
+        for file in verify_archive(settings, store, inputs=not products_only):
+            checked += 1
+            bar.advance(1)
+            mismatches += [file] if file.problem else []
     if as_json:
         summary = {"files": checked, "mismatches": [asdict(file) for file in mismatches]}
         typer.echo(json.dumps(summary, indent=2))
     else:
-        table = make_table("Not as recorded", "what", "file", "problem")
-        for file in mismatches:
-            add_row(table, file.what, file.path, file.problem)
-        show(table)
+        rows = ((file.what, file.path, file.problem) for file in mismatches)
+        show_rows("Not as recorded", ("what", "file", "problem"), rows)
         typer.echo(f"{checked} files read, {len(mismatches)} not as recorded")
     exit_with_status(failed=bool(mismatches))
+
+
+@command()
+def publish(
+    campaign: CampaignFile,
+    url: Annotated[
+        str, typer.Argument(help="Destination, such as s3://bucket/prefix or file:///...")
+    ],
+    out: OutOption = None,
+    catalog: CatalogOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Copy products to an object store: send what it lacks or has outdated; remove nothing.
+
+    Example: lidarops publish catalogs/demo.yaml s3://bucket/demo
+    """
+    from lidarops.campaign.model import load_campaign
+    from lidarops.run.publication import publish_products
+    from lidarops.system.stores import without_keys
+
+    settings = load_campaign(campaign, output=out, catalog=catalog)
+    published = publish_products(settings, url)
+    if as_json:
+        typer.echo(json.dumps(asdict(published), indent=2))
+        return
+    others = f", {published.others} other files left alone" if published.others else ""
+    counts = f"{len(published.uploaded)} sent, {published.unchanged} unchanged{others}"
+    typer.echo(f"{without_keys(url)}: {counts}")

@@ -17,7 +17,12 @@ from lidarops.bench.accuracy.network_cases import (
     Signals,
     signals,
 )
-from lidarops.bench.stability.stiff_cases import (
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.air import visibility
+from lidarops.retrieve.network import cycles, extinction_field, geometry
+from lidarops.retrieve.network.extinction_field import NetworkResult
+from lidarops.retrieve.network.flags import NetworkQuality
+from support.stiff.cases import (
     Accepted,
     Answer,
     Array,
@@ -31,11 +36,6 @@ from lidarops.bench.stability.stiff_cases import (
     Retrieval,
     StiffCase,
 )
-from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.air import visibility
-from lidarops.retrieve.network import cycles, extinction_field, geometry
-from lidarops.retrieve.network.extinction_field import NetworkResult
-from lidarops.retrieve.network.flags import NetworkQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.NETWORK)
 FLAGGED: Final = NetworkQuality.UNSTABLE_INVERSION
@@ -56,7 +56,7 @@ def _answer(result: NetworkResult) -> Answer:
     )
 
 
-def _solve_network(near: bool = True, **arguments: Any) -> Answer:  # noqa: FBT001, FBT002
+def _solve_network(near: bool = True, **arguments: Any) -> Answer:
     """Solve a network; return the near crossings, or all."""
     result = extinction_field.retrieve_network(**arguments)
     answer = _answer(result)

@@ -1,7 +1,8 @@
-"""Commands that simulate: raw files of a campaign, and a first use of all retrievals."""
+"""Commands before a run: the schema of campaign files, simulated raw files, compiled code."""
 
 from __future__ import annotations
 
+import json
 from typing import Annotated
 
 import typer
@@ -10,14 +11,12 @@ from lidarops.cli.app import (
     ArchiveOption,
     CampaignFile,
     OutOption,
-    app,
+    command,
     progress_bar,
-    with_plain_errors,
 )
 
 
-@app.command()
-@with_plain_errors
+@command()
 def simulate(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
@@ -38,14 +37,24 @@ def simulate(
     settings = load_campaign(campaign, archive=archive, output=out)
     planned = plan_simulation(settings)
     cluster = nullcontext() if workers == 1 else local_client(workers)
-    with progress_bar("simulate", len(planned.paths)) as advance, cluster as client:
-        simulated = write_simulation(planned, client=client, progress=advance)
+    with progress_bar("simulate", len(planned.paths)) as bar, cluster as client:
+        simulated = write_simulation(planned, client=client, progress=bar.advance)
     write_plain(simulated.truth, settings.truth_path)
     typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
 
 
-@app.command("compile")
-@with_plain_errors
+@command()
+def schema() -> None:
+    """Print the JSON schema of campaign files, for editors.
+
+    Example: lidarops schema > campaign.schema.json
+    """
+    from lidarops.campaign.model import campaign_schema
+
+    typer.echo(json.dumps(campaign_schema(), indent=2))
+
+
+@command("compile")
 def compile_code() -> None:
     """Compile the retrievals now, so that the first run need not: once after installation.
 

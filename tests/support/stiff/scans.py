@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scene
-from lidarops.bench.stability.stiff_cases import (
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.multiangle import optical_depth
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
+from lidarops.retrieve.multiangle.labeled import QUALITY_OF_FLAG
+from support.stiff.cases import (
     Accepted,
     Answer,
     Array,
@@ -24,35 +29,15 @@ from lidarops.bench.stability.stiff_cases import (
     Retrieval,
     StiffCase,
 )
-from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
-from lidarops.retrieve.multiangle import optical_depth
-from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.MULTIANGLE)
-BITS: Final = {
-    "no_data": MultiAngleQuality.NO_LEVERAGE,
-    "extrapolated": MultiAngleQuality.EXTRAPOLATED,
-    "interpolated": MultiAngleQuality.INTERPOLATED,
-    "no_residual": MultiAngleQuality.NO_RESIDUAL,
-    "low_leverage": MultiAngleQuality.LOW_LEVERAGE,
-    "one_sided": MultiAngleQuality.ONE_SIDED,
-    "gradient": MultiAngleQuality.HORIZONTAL_GRADIENT,
-    "poor_stratification": MultiAngleQuality.POOR_STRATIFICATION,
-    "prior_dominated": MultiAngleQuality.PRIOR_DOMINATED,
-    "saturated": MultiAngleQuality.PRIOR_DOMINATED,
-    "undersmoothed": MultiAngleQuality.UNDERSMOOTHED,
-    "high_correlation": MultiAngleQuality.HIGH_CORRELATION,
-    "outlier": Quality.OUTLIER,
-}
-"""Quality bit of each flag, as in the products."""
 
 
 def _solve_scan(altitudes: slice = slice(None), **arguments: Any) -> Answer:
     """Return some altitudes of the solution; its standard errors include the gradient error."""
     result = optical_depth.retrieve_optical_depth(**arguments)
     bits = np.asarray(result.quality).copy()
-    for name, bit in BITS.items():
+    for name, bit in QUALITY_OF_FLAG.items():
         bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
     values = {
         "optical_depth": result.optical_depth,

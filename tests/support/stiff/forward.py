@@ -8,7 +8,13 @@ from typing import Any, Final
 import numpy as np
 from scipy.special import expn
 
-from lidarops.bench.stability.stiff_cases import (
+from lidarops.constants import SPEED_OF_LIGHT
+from lidarops.errors import LidarOpsError, RetrievalInputError
+from lidarops.retrieve.air import molecular
+from lidarops.simulate import analog, counting, pulse
+from lidarops.simulate import signal as short
+from lidarops.simulate.photoelectrons import release
+from support.stiff.cases import (
     Answer,
     Array,
     Between,
@@ -17,12 +23,6 @@ from lidarops.bench.stability.stiff_cases import (
     Retrieval,
     StiffCase,
 )
-from lidarops.constants import SPEED_OF_LIGHT
-from lidarops.errors import LidarOpsError, RetrievalInputError
-from lidarops.retrieve.air import molecular
-from lidarops.simulate import analog, counting, pulse
-from lidarops.simulate import signal as short
-from lidarops.simulate.photoelectrons import release
 
 _case = partial(StiffCase, retrieval=Retrieval.FORWARD)
 _BIN_TIME: Final = 50e-9

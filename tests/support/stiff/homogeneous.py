@@ -11,7 +11,12 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy.homogeneous_cases import Scenario, least_errors
-from lidarops.bench.stability.stiff_cases import (
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import cubic_and_tail, photon_counts
+from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from support.stiff.cases import (
     Accepted,
     Answer,
     Array,
@@ -26,11 +31,6 @@ from lidarops.bench.stability.stiff_cases import (
     StiffCase,
     Unflagged,
 )
-from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
-from lidarops.retrieve.background import cubic_and_tail, photon_counts
-from lidarops.retrieve.homogeneous import path_fit
-from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 _case = partial(StiffCase, retrieval=Retrieval.HOMOGENEOUS)
 _DIGITS: Final = 60

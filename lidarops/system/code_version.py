@@ -1,4 +1,4 @@
-"""Version of the code that makes a product, one for every kind."""
+"""Versions of code: of what makes a product, for every kind, and of what reads headers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.kinds import Kind, kind_of, kinds
-from lidarops.raw.formats import GROUP as RAW_FORMATS
+from lidarops.registry import RAW_FORMATS
 from lidarops.system.source_closure import Sources
 
 _EVERY_PRODUCT: Final = (
@@ -21,6 +21,8 @@ _EVERY_PRODUCT: Final = (
     "lidarops.netcdf.write",
 )
 """Modules that every product passes through."""
+_CATALOGUES: Final = "lidarops.catalog.headers"
+"""Module that makes an entry of the catalog from the header of a raw file."""
 _OF_KIND: Final = ("settings", "steps", "variables", "flags")
 """Modules of a kind that make its products, as far as it has them."""
 _APART: Final = (
@@ -112,6 +114,17 @@ def sources_in(roots: Mapping[str, Sequence[Path]], cache_folder: Path | None = 
     """
     with_data = (*_WITH_DATA, *(root for root in roots if root != "lidarops"))
     return Sources(roots, apart=_APART, with_data=with_data, cache=cache_folder)
+
+
+def reading_version() -> str:
+    """Return a digest of the sources that decide what the catalog holds of a raw file.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
+    """
+    return _installed().digest((_CATALOGUES, *_formats()))
 
 
 @cache

@@ -9,9 +9,6 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from lidarops.bench.stability import stiff_elastic, stiff_networks, stiff_scans
-from lidarops.bench.stability.stiff_cases import Answer, Near, Refused, Retrieval, StiffCase
-from lidarops.bench.stability.stiff_homogeneous import CLEAR
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.elastic import inversion
@@ -19,6 +16,9 @@ from lidarops.retrieve.homogeneous import labeled, path_fit
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.signal import counts_to_signal
+from support.stiff import elastic, networks, scans
+from support.stiff.cases import Answer, Near, Refused, Retrieval, StiffCase
+from support.stiff.homogeneous import CLEAR
 
 Layout = Callable[[Any], Any]
 Solver = Callable[..., Mapping[str, Any]]
@@ -69,14 +69,14 @@ def _signal(array: Any, layout: Layout) -> Mapping[str, Any]:
 
 
 def _elastic(array: Any, layout: Layout) -> Mapping[str, Any]:
-    arguments = stiff_elastic.elastic_arguments(array.shape[0])
+    arguments = elastic.elastic_arguments(array.shape[0])
     changed = {n: layout(np.asarray(arguments[n])) for n in ("range", "molecular_backscatter")}
     solution = inversion.invert_elastic(**arguments | changed | {"power": layout(array)})
     return {n: getattr(solution, n) for n in ("backscatter", "backscatter_standard_error", "valid")}
 
 
 def _scans(array: Any, layout: Layout) -> Mapping[str, Any]:
-    arguments = stiff_scans.scan_arguments(profiles=array.shape[0])
+    arguments = scans.scan_arguments(profiles=array.shape[0])
     changed = {n: layout(np.asarray(arguments[n])) for n in ("zenith_angle", "altitude")}
     solution = optical_depth.retrieve_optical_depth(
         **arguments | changed | {"signal": layout(array)}
@@ -85,7 +85,7 @@ def _scans(array: Any, layout: Layout) -> Mapping[str, Any]:
 
 
 def _network(array: Any, layout: Layout) -> Mapping[str, Any]:
-    arguments = stiff_networks.network_arguments()
+    arguments = networks.network_arguments()
     changed = {"power": layout(array), "range": layout(arguments["range"])}
     solution = extinction_field.retrieve_network(**arguments | changed)
     return {n: getattr(solution, n) for n in ("extinction", "extinction_standard_error")}
@@ -140,11 +140,11 @@ def _counts() -> Any:
 _SOLVED: Final[dict[Retrieval, tuple[Solver, Callable[[], Any], str]]] = {
     Retrieval.HOMOGENEOUS: (_homogeneous, lambda: CLEAR.noisy(20), "power"),
     Retrieval.SIGNAL: (_signal, _counts, "counts"),
-    Retrieval.ELASTIC: (_elastic, lambda: stiff_elastic.elastic_arguments(5)["power"], "power"),
-    Retrieval.MULTIANGLE: (_scans, lambda: stiff_scans.scan_arguments()["signal"], "signal"),
+    Retrieval.ELASTIC: (_elastic, lambda: elastic.elastic_arguments(5)["power"], "power"),
+    Retrieval.MULTIANGLE: (_scans, lambda: scans.scan_arguments()["signal"], "signal"),
     Retrieval.NETWORK: (
         _network,
-        lambda: stiff_networks.network_arguments()["power"],
+        lambda: networks.network_arguments()["power"],
         "power",
     ),
 }

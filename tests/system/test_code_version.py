@@ -9,8 +9,9 @@ from support.sources import Copy
 
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import Kind, kind_of, kinds
-from lidarops.netcdf import code_version as versions
-from lidarops.netcdf.code_version import (
+from lidarops.settings import ChannelProduct
+from lidarops.system import code_version as versions
+from lidarops.system.code_version import (
     _APART,
     code_version,
     joint_code_version,
@@ -18,7 +19,6 @@ from lidarops.netcdf.code_version import (
     sources_in,
     version_of,
 )
-from lidarops.settings import ChannelProduct
 from lidarops.system.source_closure import Sources
 
 ALL = set(kinds())

@@ -7,7 +7,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.bench.stability.stiff_cases import (
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.signal import averaging, counts_to_signal, gluing, lag
+from lidarops.simulate import counting
+from support.stiff.cases import (
     Accepted,
     Answer,
     Array,
@@ -20,12 +26,6 @@ from lidarops.bench.stability.stiff_cases import (
     Retrieval,
     StiffCase,
 )
-from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
-from lidarops.retrieve.background import cubic_and_tail, known_shape
-from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
-from lidarops.retrieve.signal import averaging, counts_to_signal, gluing, lag
-from lidarops.simulate import counting
 
 _case = partial(StiffCase, retrieval=Retrieval.SIGNAL)
 RANGE: Final = 7.5 * (np.arange(2000, dtype=np.float64) + 0.5)

@@ -1,0 +1,244 @@
+"""The recipe of a product: what its provenance says of campaign, plan and inputs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import xarray as xr
+from pydantic import ValidationError
+
+from lidarops.campaign.model import Campaign
+from lidarops.errors import ProductError
+from lidarops.netcdf.provenance import EPOCH_VARIABLE, read_provenance
+from lidarops.raw.file import RawFile
+from lidarops.raw.formats import read_raw_header
+from lidarops.records import Granule, InputRecord, LeftOut, Plan, PlannedStep, Role, Scene, Status
+
+RAW: Final = (Role.SIGNAL, Role.DARK)
+"""Roles of files in the archive; paths of other inputs start from the campaign folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What a product was made from, and how, according to itself."""
+
+    file: Path
+    kind: str
+    channel: str
+    campaign_name: str
+    settings: Mapping[str, Any]
+    plan: Plan
+    inputs: tuple[InputRecord, ...]
+    code_version: str
+    versions: Mapping[str, str]
+    epoch: str
+    """SOURCE_DATE_EPOCH by which the product was dated; empty if there was none."""
+
+    @classmethod
+    def of(cls, file: Path) -> Recipe:
+        """Read the provenance of a product; raise ProductError if it is insufficient."""
+        document = read_provenance(file)
+        try:
+            entities = document["entity"]
+            attributes = entities["lidarops:product"]
+            software = document["agent"]["lidarops:software"]
+            recipe = cls(
+                file=file,
+                kind=str(attributes["lidarops:kind"]),
+                channel=str(attributes["lidarops:channel"]),
+                campaign_name=str(attributes["lidarops:campaign"]),
+                settings=json.loads(attributes["lidarops:settings"]),
+                plan=_plan(json.loads(entities["lidarops:plan"]["lidarops:json"])),
+                inputs=_inputs(entities, document["used"]),
+                code_version=software["lidarops:code_version"],
+                versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
+                epoch=_epoch(file),
+            )
+        except (KeyError, ValueError, TypeError) as error:
+            raise _insufficient(file, repr(error)) from error
+        for record in recipe.inputs:
+            # Copies are written under this path, which a forged product could choose freely.
+            if record.role in RAW and not stays_inside(record.path):
+                raise ProductError(
+                    f"names a raw file outside its archive: {record.path}",
+                    file=file,
+                    field="provenance",
+                    remedy="lidarops does not write such products: do not trust this one",
+                )
+        return recipe
+
+    def campaign(self, archive: Path, folder: Path, output: Path) -> Campaign:
+        """Return a campaign that gives only this product; its other inputs are in `folder`."""
+        settings = self.settings
+        try:
+            campaign = Campaign.model_validate(
+                {
+                    **settings["campaign"],
+                    "name": self.campaign_name,
+                    "archive": str(archive),
+                    "output": str(output),
+                    "metadata": settings["metadata"],
+                    **self._instruments(),
+                }
+            )
+        except (KeyError, TypeError, ValidationError) as error:
+            raise _insufficient(self.file, str(error)) from error
+        campaign._folder = str(folder)  # noqa: SLF001 - as `load_campaign` sets it
+        return campaign
+
+    def _instruments(self) -> dict[str, Any]:
+        """Return the stations, instruments and network that the product records."""
+        settings = self.settings
+        keys = settings["keys"]
+        if "network" in settings:
+            members = settings["members"]
+            return {
+                "stations": {
+                    member["keys"]["station"]: member["station"] for member in members.values()
+                },
+                "instruments": {name: _instrument(member, {}) for name, member in members.items()},
+                "networks": {keys["instrument"]: settings["network"]},
+            }
+        products = {self.kind: settings["products"]}
+        return {
+            "stations": {keys["station"]: settings["station"]},
+            "instruments": {keys["instrument"]: _instrument(settings, products)},
+        }
+
+    def scene(self, archive: Path) -> Scene:
+        """Return the scene of the product, from the headers of the raw files in a folder."""
+        settings = self.settings
+        try:
+            if "network" not in settings:
+                return self._scene_of(archive, settings["keys"], self.inputs)
+            members = tuple(
+                self._scene_of(archive, member["keys"], self._files_of(member["files"]))
+                # The members of a product are sorted by name; the network defines their order.
+                for name in settings["network"]["instruments"]
+                for member in [settings["members"].get(name)]
+                if member is not None
+            )
+            whole = self._scene_of(archive, settings["keys"], ())
+        except (KeyError, TypeError, ValueError) as error:
+            raise _insufficient(self.file, repr(error)) from error
+        granules = (granule for member in members for granule in member.granules)
+        dark = (granule for member in members for granule in member.dark)
+        return replace(
+            whole,
+            granules=tuple(sorted(granules, key=_order)),
+            dark=tuple(sorted(dark, key=_order)),
+            members=members,
+        )
+
+    def _files_of(self, names: Sequence[str]) -> tuple[InputRecord, ...]:
+        """Return the raw files of one member of a network."""
+        return tuple(record for record in self.inputs if record.path in set(names))
+
+    def _scene_of(
+        self, archive: Path, keys: Mapping[str, str], inputs: Iterable[InputRecord]
+    ) -> Scene:
+        """Return the scene of one instrument with its part of the inputs."""
+        start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
+        raw = (record for record in inputs if record.role in RAW)
+        granules = [_granule(archive, record, keys["instrument"]) for record in raw]
+        granules.sort(key=_order)
+        return Scene(
+            id=self.plan.scene,
+            campaign=self.campaign_name,
+            station=keys["station"],
+            instrument=keys["instrument"],
+            start=start,
+            stop=stop,
+            granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
+            dark=tuple(granule for granule in granules if granule.role is Role.DARK),
+        )
+
+
+def stays_inside(path: str) -> bool:
+    """Return whether a path stays in the folder that it is relative to."""
+    pure = PurePosixPath(path)
+    return not (pure.is_absolute() or ".." in pure.parts)
+
+
+def _insufficient(file: Path, problem: str) -> ProductError:
+    return ProductError(
+        f"its provenance is not sufficient to make the product again: {problem}",
+        file=file,
+        field="provenance",
+        remedy="reprocess the campaign with this version of lidarops",
+    )
+
+
+def _plan(fields: Mapping[str, Any]) -> Plan:
+    return Plan(
+        fields["scene"],
+        tuple(PlannedStep(**step) for step in fields["steps"]),
+        tuple(LeftOut(**left) for left in fields["left_out"]),
+    )
+
+
+def _inputs(
+    entities: Mapping[str, Any], uses: Mapping[str, Mapping[str, Any]]
+) -> tuple[InputRecord, ...]:
+    """Return the inputs of a PROV document, in which files of equal content are one entity."""
+    paths = {
+        name: iter([paths] if isinstance(paths, str) else list(paths))
+        for name, entity in entities.items()
+        for paths in [entity.get("lidarops:path")]
+        if paths is not None
+    }
+    # The writer numbered the uses in sorted order; the paths of an entity have the same order.
+    numbered = [uses[name] for name in sorted(uses, key=lambda name: int(name[len("_:use") :]))]
+    return tuple(
+        InputRecord(
+            next(paths[use["prov:entity"]]),
+            Role(use["prov:role"]),
+            str(entities[use["prov:entity"]]["lidarops:sha256"]),
+        )
+        for use in numbered
+    )
+
+
+def _epoch(file: Path) -> str:
+    with xr.open_dataset(file, decode_cf=False) as product:
+        attributes = product.attrs
+    if f"that of {EPOCH_VARIABLE}" not in str(attributes["comment"]):
+        return ""
+    created = datetime.fromisoformat(str(attributes["date_created"]))
+    return str(round(created.timestamp()))
+
+
+def _instrument(settings: Mapping[str, Any], products: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "station": settings["keys"]["station"],
+        "name": settings["instrument"],
+        "files": "*",
+        "facts": [settings["facts"]],
+        "products": products,
+    }
+
+
+def _order(granule: Granule) -> tuple[bool, datetime | None, str]:
+    return granule.start is not None, granule.start, granule.path
+
+
+def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:
+    with RawFile(root / record.path) as file:
+        header = read_raw_header(file)
+    return Granule(
+        path=record.path,
+        size=header.size,
+        mtime_ns=0,
+        instrument=instrument,
+        role=record.role,
+        status=Status.GOOD,
+        start=header.start,
+        stop=header.stop,
+        layout=header.layout,
+        format=header.format,
+    )
