@@ -78,19 +78,36 @@ def dark_profile(
     RetrievalInputError
         For no dark file, an unknown time, or shapes that do not match.
     """
-    chosen = inputs.choice(method, _DarkMethod, "method")
-    signals = _signals(dark_signals)
-    dark_seconds, seconds = _seconds(dark_times, times)
-    if signals.shape[-2] != dark_seconds.size:
-        raise RetrievalInputError(
-            f"have the shape {signals.shape} for {dark_seconds.size} times",
-            field="dark_signals",
-            remedy="the axis before the last is that of dark_times",
+    return DarkSessions(dark_signals, dark_times).at(times, method=method)
+
+
+class DarkSessions:
+    """Means of the sessions of dark files, from which dark signals at any times follow.
+
+    Parameters and errors are those of `dark_profile`. The files are not kept.
+    """
+
+    def __init__(self, dark_signals: npt.ArrayLike, dark_times: npt.ArrayLike) -> None:
+        signals = _signals(dark_signals)
+        self._times = np.atleast_1d(np.asarray(dark_times))
+        dark_seconds, _ = _seconds(self._times, self._times)
+        if signals.shape[-2] != dark_seconds.size:
+            raise RetrievalInputError(
+                f"have the shape {signals.shape} for {dark_seconds.size} times",
+                field="dark_signals",
+                remedy="the axis before the last is that of dark_times",
+            )
+        self._sessions = _sessions(dark_seconds)
+        self._means, self._variances = _means(signals, self._sessions)
+
+    def at(self, times: npt.ArrayLike, *, method: str) -> DarkProfile:
+        """Return the dark signal of each profile, see `dark_profile`."""
+        chosen = inputs.choice(method, _DarkMethod, "method")
+        dark_seconds, seconds = _seconds(self._times, times)
+        shares = _shares(dark_seconds, self._sessions, seconds, chosen)
+        return DarkProfile(
+            _weighted_sum(shares, self._means), _weighted_sum(shares**2, self._variances)
         )
-    sessions = _sessions(dark_seconds)
-    means, variances = _means(signals, sessions)
-    shares = _shares(dark_seconds, sessions, seconds, chosen)
-    return DarkProfile(_weighted_sum(shares, means), _weighted_sum(shares**2, variances))
 
 
 def _signals(values: npt.ArrayLike) -> Array:

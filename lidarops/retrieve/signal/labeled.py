@@ -21,7 +21,7 @@ from lidarops.retrieve.background.estimate import Background, from_cubic, from_t
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.counts_to_signal import Signal
-from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
+from lidarops.retrieve.signal.dark import DarkProfile, DarkSessions
 
 _Block = npt.NDArray[Any]
 
@@ -269,15 +269,13 @@ class _Source:
 class DarkSignals:
     """The dark files of one analog channel, and the method that gives dark signals at times."""
 
-    signals: npt.NDArray[np.float64]
-    """(dark, range), mV."""
-    times: npt.NDArray[np.datetime64]
-    """(dark,)"""
+    sessions: DarkSessions
+    """mV."""
     method: str
 
     def at(self, times: npt.NDArray[np.datetime64]) -> DarkProfile:
-        """Return dark signal and variance at times (`dark_profile`)."""
-        return dark_profile(self.signals, self.times, times, method=self.method)
+        """Return dark signal and variance at times."""
+        return self.sessions.at(times, method=self.method)
 
     def variance(self, times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.float64]:
         """Return the variance of the dark signal at times, (time, range), mV2."""
@@ -298,11 +296,11 @@ def read_dark(archive: xr.Dataset, channel: str, *, method: str) -> DarkSignals:
 
     Returns
     -------
-    Dark
-        In memory.
+    DarkSignals
+        The means of their sessions, in memory.
     """
     power = condition(archive, channel, noise_variance=0.0)["power"]
-    return DarkSignals(power.to_numpy(), archive["time"].to_numpy(), method)
+    return DarkSignals(DarkSessions(power.to_numpy(), archive["time"].to_numpy()), method)
 
 
 def _conditioned(*inputs: _Block, photon: bool, **settings: Any) -> tuple[_Block, _Block, _Block]:

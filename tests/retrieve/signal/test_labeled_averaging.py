@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.signal.dark import dark_profile
+from lidarops.retrieve.signal.dark import DarkSessions, dark_profile
 from lidarops.retrieve.signal.labeled import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 
@@ -265,7 +265,9 @@ class TestSharedVariance:
         errors, stated = [], []
         for draw in range(100):
             files = sigma * rng.standard_normal((darks, BINS))
-            dark = DarkSignals(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND, "nearest")
+            dark = DarkSignals(
+                DarkSessions(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND), "nearest"
+            )
             conditioned, shots = made(minutes, seed=draw)
             noise = sigma * rng.standard_normal((profiles, BINS))
             conditioned["power"][:] = noise - dark.at(conditioned["time"].to_numpy()).dark
@@ -287,7 +289,7 @@ def test_the_variance_of_a_dark_signal_is_that_of_its_files():
     rng = np.random.default_rng(3)
     files = rng.standard_normal((6, 400))
     times = MIDNIGHT + np.arange(6) * 60 * SECOND
-    dark = DarkSignals(files, times, "nearest")
+    dark = DarkSignals(DarkSessions(files, times), "nearest")
     requested = MIDNIGHT + np.array([0, 3600]) * SECOND
     np.testing.assert_array_equal(
         dark.variance(requested), dark_profile(files, times, requested, method="nearest").variance
