@@ -170,7 +170,6 @@ def test_instruments_are_those_of_the_plan(made):
         beams=[{**beam, "instrument": name} for name in NAMES],
         wavelength=532e-9,
         block_seconds=3600,
-        method="network",
         prior="block",
         tolerance=15,
         smallest_angle=2,

@@ -44,7 +44,6 @@ class TestCampaign:
     def test_a_network_has_defaults(self):
         settings = campaign().networks["valley"].visibility
         assert settings.visibility.threshold == 0.05
-        assert settings.method == "network"
         assert settings.average == timedelta(minutes=10)
 
     @pytest.mark.parametrize(
@@ -57,7 +56,6 @@ class TestCampaign:
             ({"visibility": {"contrast": 1.5}}, "contrast"),
             ({"visibility": {"law": "angstrom"}}, "angstrom_exponent"),
             ({"visibility": {"exponent_standard_error": 0.2}}, "needs a law"),
-            ({"method": "magic"}, "method"),
         ],
     )
     def test_invalid_settings_are_refused(self, visibility, message):
@@ -207,10 +205,6 @@ class TestPlans:
         red = [*granules()[:2], replace(granules()[2], layout=other)]
         assert "different wavelengths: 532, 1064 nm" in reasons(planned(campaign(), red))
 
-    def test_the_method_cycle_takes_one_cycle(self):
-        plan = planned(campaign({"method": "cycle"}))
-        assert plan.steps[-1].settings["method"] == "cycle"
-
     @pytest.mark.parametrize(
         ("rule", "settings", "files", "number"),
         [
@@ -220,9 +214,7 @@ class TestPlans:
             ("some_meet", {}, granules(zenith_angle=0.0), 0.0),
             ("one_wavelength", {}, [*granules()[:2], RED], 532e-9),
             ("few_beams", {}, [g for k in range(180) for g in turned(k)], 540.0),
-            ("cycle", {"visibility": {"method": "cycle"}}, [*granules(), *turned(4)], 6.0),
             ("prior", {"visibility": {"prior": "none"}}, None, None),
-            ("prior", {"visibility": {"method": "klett"}}, None, None),
         ],
     )
     def test_rules_that_leave_out(self, rule, settings, files, number):

@@ -55,9 +55,7 @@ OWN = {
     "visibility": {
         "poorly_determined": 17,
         "poor_fit": 18,
-        "unstable_inversion": 19,
         "prior_dominated": 22,
-        "extrapolated": 23,
         "low_leverage": 26,
     },
 }
@@ -70,7 +68,7 @@ LEFT = {
     "homogeneous": 10,
     "elastic": 11,
     "multiangle": 3,
-    "visibility": 8,
+    "visibility": 10,
 }
 """Places left for new bits."""
 
@@ -142,8 +140,6 @@ BY_FIELD = {
     "MultiAngleQuality.HORIZONTAL_GRADIENT": ("gradient", "test_kano_hamilton"),
     "NetworkQuality.POORLY_DETERMINED": ("ill_conditioned", "test_network_extremes"),
     "NetworkQuality.POOR_FIT": ("outlying", "test_network_outlying_bins"),
-    "NetworkQuality.UNSTABLE_INVERSION": ("pole", "test_network_extremes"),
-    "NetworkQuality.EXTRAPOLATED": ("far_start", "test_network_extremes"),
     "NetworkQuality.LOW_LEVERAGE": ("weak_signal", "test_network_noise"),
 }
 """As above, where the bit is a boolean of a result that the shell `labeled` turns into it."""

@@ -96,7 +96,7 @@ def measure_network(
         signals = {a.name: network_cases.signals(lidars.network(), a) for a in network_cases.AIRS}
         for index, (air, noise) in enumerate(product(network_cases.AIRS, network_cases.NOISES)):
             case = f"{air.name}, noise {_percent(noise)}"
-            scored, results = _measure_case(lidars, noise, signals[air.name], chunks, index)
+            scored, results = _measure_case(noise, signals[air.name], chunks, index)
             scores |= {(case, method): score for method, score in scored.items()}
             if lidars is network_cases.THREE_BY_TWO and air is network_cases.VISIBILITY_AIR:
                 visibilities |= _visibilities(results, signals[air.name], noise)
@@ -121,12 +121,12 @@ def _percent(part: float) -> str:
 
 
 def _measure_case(
-    lidars: LidarLine, noise: float, signals: Signals, chunks: tuple[int, int], seed: int
+    noise: float, signals: Signals, chunks: tuple[int, int], seed: int
 ) -> tuple[dict[str, Score], list[NetworkResult]]:
     """Return the scores of every solver, and the results of the network method."""
     number, size = chunks
     truth, near = signals.truth(size), signals.network.near_crossing
-    solvers = network_cases.network_solvers(lidars)
+    solvers = network_cases.NETWORK_SOLVERS
     errors: dict[str, list[CrossingErrors]] = {solver.name: [] for solver in solvers}
     least_seconds = dict.fromkeys((READ, *errors), math.inf)
     network_results = []

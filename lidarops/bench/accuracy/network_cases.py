@@ -13,12 +13,11 @@ from scipy.optimize import least_squares
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import systematic_error
 from lidarops.retrieve.network.extinction_field import (
-    DEFAULT_BINS,
     FieldPrior,
-    NetworkMethod,
     NetworkResult,
     retrieve_network,
 )
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.simulate.signal import backscatter_signal
 
 Array = npt.NDArray[np.float64]
@@ -34,7 +33,7 @@ PEER_NOISE: Final = NOISES[1]
 ADDITIVE: Final = 0.01
 """Additional standard deviation of every bin, over the power at the first crossing of the beam."""
 BLOCK: Final = 50
-"""Profiles that share a mean field and a multiplier."""
+"""Profiles that share a mean field."""
 
 _FIRST_BIN: Final = 100.3
 """m, range of the first bin."""
@@ -207,54 +206,28 @@ def _power(net: geometry.Network, bins: Array, extinction: Extinction) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class NetworkSolver:
-    """A method, with its settings, to retrieve extinction at the crossings."""
+    """The retrieval with one of its priors."""
 
     name: str
-    method: NetworkMethod
-    multiplier: float | None = None
-    prior: FieldPrior = FieldPrior.BLOCK
+    prior: FieldPrior
 
-    def __call__(
-        self, power: Array, variance: Array, signals: Signals, *, full_overlap: float = FULL_OVERLAP
-    ) -> NetworkResult:
+    def __call__(self, power: Array, variance: Array, signals: Signals) -> NetworkResult:
         """Solve profiles (profile, beam, range), block by block."""
         return retrieve_network(
             power,
             signals.range,
             signals.network,
-            method=self.method.value,
             variance=variance,
-            full_overlap_range=full_overlap,
+            full_overlap_range=FULL_OVERLAP,
             blocks=np.arange(len(power)) // BLOCK,
             prior=self.prior.value,
-            multiplier=self.multiplier,
         )
 
 
-EXACT: Final = NetworkSolver("cycle, exact", NetworkMethod.CYCLE)
-BEST: Final = NetworkSolver("multiplier, best", NetworkMethod.MULTIPLIER)
 PAPER_MULTIPLIER: Final = 0.8
-PAPER: Final = NetworkSolver("multiplier 0.8", NetworkMethod.MULTIPLIER, PAPER_MULTIPLIER)
-UNBIASED: Final = NetworkSolver("unbiased 0.25", NetworkMethod.UNBIASED, 0.25)
-SLOPE: Final = NetworkSolver("slope", NetworkMethod.SLOPE)
-KLETT: Final = NetworkSolver("Klett, far end", NetworkMethod.KLETT)
-NETWORK_WITHOUT_PRIOR: Final = NetworkSolver(
-    "network, no prior", NetworkMethod.NETWORK, prior=FieldPrior.NONE
-)
-NETWORK: Final = NetworkSolver("network", NetworkMethod.NETWORK)
-
-
-def network_solvers(lidars: LidarLine) -> tuple[NetworkSolver, ...]:
-    """Return the solvers for a network: those of cycles need a single cycle of beams."""
-    for_any_network = (SLOPE, KLETT, NETWORK_WITHOUT_PRIOR, NETWORK)
-    if lidars is not TRIANGLE:
-        return for_any_network
-    other_multipliers = (
-        NetworkSolver("multiplier 0.95", NetworkMethod.MULTIPLIER, 0.95),
-        PAPER,
-        NetworkSolver("multiplier 0", NetworkMethod.MULTIPLIER, 0.0),
-    )
-    return (EXACT, BEST, *other_multipliers, UNBIASED, *for_any_network)
+NETWORK_WITHOUT_PRIOR: Final = NetworkSolver("network, no prior", FieldPrior.NONE)
+NETWORK: Final = NetworkSolver("network", FieldPrior.BLOCK)
+NETWORK_SOLVERS: Final = (NETWORK_WITHOUT_PRIOR, NETWORK)
 
 
 # The paper's second figure --------------------------------------------------------------------
@@ -263,7 +236,8 @@ FIGURE_FIRST_LIDARS: Final = (200.0, 300.0, 400.0)
 """m, distance of lidars 1 and 3."""
 FIGURE_ELEVATIONS: Final = tuple(float(angle) for angle in range(15, 80, 5))
 """degree, of the second beam."""
-_FIGURE_FIRST_BIN: Final = 30.3
+_FIGURE_EXTINCTION: Final = 2e-3
+"""m-1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,8 +254,6 @@ class FigurePoint:
     """At crossing 1 with signs; None beyond the pole."""
     near: float | None
     """At a crossing from which the cycle leads away from the lidars."""
-    simulated: float | None
-    """The same from signals without noise; None where no lidar sees the crossing."""
 
 
 def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
@@ -289,24 +261,20 @@ def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     lidars = LidarLine("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
     net = lidars.network()
     lengths = np.array([np.ptp(net.on_beam(beam)[1]) for beam in range(3)])
-    cycle = geometry.build_cycle(net)
-    clean_signals = signals(net, AIRS[0], _FIGURE_FIRST_BIN)
-    truth = float(clean_signals.extinction[0, cycle.crossing[0]])
-    depths = truth * lengths * [1.0, 1.0, -1.0]
+    depths = _FIGURE_EXTINCTION * lengths * [1.0, 1.0, -1.0]
+    # Below the crossing of beams 1 and 3, a cycle in the other direction leads away.
     leads_away = _leads_away(net)
+    near = depths if leads_away else depths[[1, 0, 2]]
 
     def error(optical_depth: Array) -> float | None:
         return _finite(float(systematic_error(optical_depth, PAPER_MULTIPLIER)))
 
-    power = clean_signals.power
-    solved = PAPER(power, 1e-12 * power**2, clean_signals, full_overlap=_FIGURE_FIRST_BIN)
     return FigurePoint(
         first_lidar,
         elevation,
         printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
         signed=error(depths if leads_away else -depths),
-        near=error(truth * (cycle.end_range - cycle.start_range)),
-        simulated=_finite(1.0 - truth / float(solved.extinction[0, cycle.crossing[0]])),
+        near=error(near),
     )
 
 
@@ -347,11 +315,11 @@ def _point_values(power: Array, variance: Array, signals: Signals) -> tuple[Arra
         crossing_ranges, points = signals.network.on_beam(beam)[1], []
         for distance in crossing_ranges:
             middle = int(np.argmin(np.abs(signals.range - distance)))
-            bins = slice(middle - DEFAULT_BINS // 2, middle + DEFAULT_BINS // 2 + 1)
+            bins = slice(middle - THRESHOLDS.fit_bins // 2, middle + THRESHOLDS.fit_bins // 2 + 1)
             fit = np.polynomial.Polynomial.fit(signals.range[bins] - distance, logarithm[bins], 1)
             points.append(float(fit(0.0)))
             noise = np.sqrt(variance[beam, bins]) / power[beam, bins]
-            errors.append(float(noise.mean() / np.sqrt(DEFAULT_BINS)))
+            errors.append(float(noise.mean() / np.sqrt(THRESHOLDS.fit_bins)))
         values += points
         total = 0.0
         for k, distance in enumerate(crossing_ranges):

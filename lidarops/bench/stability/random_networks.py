@@ -18,7 +18,7 @@ from lidarops.retrieve.network.flags import NetworkQuality
 Random = np.random.Generator
 
 _FULL_OVERLAP: Final = 100.0
-_DOUBTED: Final = np.int32(NetworkQuality.UNSTABLE_INVERSION)
+_DOUBTED: Final = np.int32(NetworkQuality.POORLY_DETERMINED)
 """Quality bit that stands for any flag of the retrieval that doubts a value."""
 
 

@@ -191,6 +191,6 @@ def _network_costs(lidars: network_cases.LidarLine, repeats: int) -> list[Row]:
     signals = network_cases.signals(network, network_cases.AIRS[0])
     power, variance = signals.draw(network_cases.PEER_NOISE, size, 7)
     calls: dict[str, tuple[Callable[[], object], int]] = {READ: (partial(np.max, power), size)}
-    for solver in network_cases.network_solvers(lidars):
+    for solver in network_cases.NETWORK_SOLVERS:
         calls[solver.name] = (partial(solver, power, variance, signals), size)
     return time_methods(f"{network.beams}", calls, repeats)

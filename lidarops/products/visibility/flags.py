@@ -14,7 +14,6 @@ FLAGS: Final = Flags(
         Quality.INPUT_MISSING,
         Quality.PILE_UP,
         Quality.LOW_SIGNAL,
-        Quality.NOT_HOMOGENEOUS,
         Quality.OUTLIER,
         Quality.NO_REAL_SOLUTION,
         Quality.BACKGROUND_UNCERTAIN,

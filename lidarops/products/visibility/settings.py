@@ -18,7 +18,6 @@ from lidarops.settings import (
     quantity,
 )
 
-Method = Literal["network", "cycle", "multiplier", "unbiased", "slope", "klett"]
 PriorName = Literal["block", "none"]
 
 
@@ -33,7 +32,6 @@ class VisibilityProductSettings(NetworkProduct):
     block: PartOfDay = Field(
         default=timedelta(hours=6), description="interval of averages that share one mean field"
     )
-    method: Method = "network"
     prior: PriorName = "block"
     visibility: VisibilitySettings = VisibilitySettings()
     tolerance: float = quantity(

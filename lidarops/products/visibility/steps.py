@@ -12,7 +12,6 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.campaign.model import Campaign, ChannelFacts, InstrumentFacts
-from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.products.visibility.network import (
     KIND,
@@ -22,12 +21,13 @@ from lidarops.products.visibility.network import (
     angle_between,
     crossings,
 )
-from lidarops.products.visibility.settings import Method, PriorName, VisibilityProductSettings
+from lidarops.products.visibility.settings import PriorName, VisibilityProductSettings
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
-from lidarops.retrieve.network.labeled import BINS_BEYOND, BeamAverages
+from lidarops.retrieve.network.labeled import BeamAverages
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled_averaging import joined
 from lidarops.settings import VisibilitySettings
 from lidarops.steps.case import ChannelCase, ProductCase
@@ -69,7 +69,7 @@ def _window(case: Case, farthest: float) -> Run | Leave:
         return Leave(ALL_STEPS, rule=rule)
     width, (start, stop) = channel.bin_width, tail(case, case.request.background_range)
     low, high = window_before(start + width)
-    near = bins_with_noise(0.0, farthest + BINS_BEYOND * width, case)
+    near = bins_with_noise(0.0, farthest + THRESHOLDS.bins_beyond * width, case)
     far = (bins_within(low - width, high, case), bins_within(start, stop, case))
     kept = merged((first, min(past, channel.bins)) for first, past in (near, *far))
     number = float(sum(past - first for first, past in kept))
@@ -85,11 +85,9 @@ class Prior(Choice[Case, NoSettings]):
     name = "prior"
 
     def decide(self, case: Case) -> Decisions:
-        """Run for the method ``network`` unless the campaign requests no prior."""
+        """Run unless the campaign requests no prior."""
         settings = case.request
-        if settings.method != "network":
-            yield Leave(f"method {settings.method} uses no prior")
-        elif settings.prior == "none":
+        if settings.prior == "none":
             yield Leave("the campaign requests no prior: gradients along beams mimic attenuation")
         else:
             reason = (
@@ -106,7 +104,6 @@ class NetworkSettings(VisibilitySettings):
     wavelength: float
     """m."""
     block_seconds: float
-    method: Method
     prior: PriorName
     tolerance: float
     """m."""
@@ -252,8 +249,8 @@ class _NetworkPlan:
             listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
             reason = f"the instruments have different wavelengths: {listed} nm"
             return Leave(reason, max(wavelengths) - min(wavelengths), rule="one_wavelength")
-        if len(beams) > geometry.MOST_BEAMS:
-            reason = f"{len(beams)} beams exceed the limit of {geometry.MOST_BEAMS}"
+        if len(beams) > THRESHOLDS.most_beams:
+            reason = f"{len(beams)} beams exceed the limit of {THRESHOLDS.most_beams}"
             return Leave(reason, float(len(beams)), rule="few_beams")
         return None
 
@@ -275,16 +272,10 @@ class _NetworkPlan:
                 return
 
     def _why_no_crossing(self, beams: Sequence[BeamPlan]) -> Leave | None:
-        """Return why the beams with crossings form no network of the requested method."""
+        """Return why the remaining beams form no network."""
         if not beams:
             reason = "no beam has two crossings with other beams, between which it is attenuated"
             return Leave(reason, 0.0, rule="some_meet")
-        method = self._settings.method
-        if method in {"cycle", "multiplier", "unbiased"}:
-            try:
-                geometry.build_cycle(self._crossings(beams))
-            except RetrievalInputError as error:
-                return Leave(f"method {method}: {error}", float(len(beams)), rule="cycle")
         return None
 
     def _joint(
@@ -314,7 +305,6 @@ class _NetworkPlan:
                 beams=tuple(beams),
                 wavelength=wavelength,
                 block_seconds=settings.block.total_seconds(),
-                method=settings.method,
                 prior=settings.prior,
                 tolerance=settings.tolerance,
                 smallest_angle=settings.smallest_angle,
@@ -354,7 +344,6 @@ class _NetworkStream(NetworkStream):
             labeled.NetworkSettings(
                 block_intervals=round(settings.block_seconds / self._seconds),
                 visibility=settings.definition,
-                method=settings.method,
                 prior=settings.prior,
                 exponent_relative_error=settings.exponent_relative_error,
                 lidar_ratio_relative_error=settings.lidar_ratio_relative_error,

@@ -219,13 +219,12 @@ LAYOUT: Final = Layout(
         _time_series(
             "reduced_chi2",
             "reduced chi-square of the network",
-            "From the beams alone, without the prior. Missing for methods that use a single cycle,"
-            " and where there are no degrees of freedom.",
+            "From the beams alone, without the prior. Missing without degrees of freedom.",
         ),
         _time_series(
             "degrees_of_freedom",
             "number of equations of the network minus number of unknowns",
-            "Missing for methods that use a single cycle, and where unknowns outnumber equations.",
+            "Missing where unknowns outnumber equations.",
         ),
         _time_series(
             "prior_deviation",

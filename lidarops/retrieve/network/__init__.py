@@ -12,7 +12,6 @@ The order of the retrieval, and the modules that do it:
 6. `_block_errors`, `_curvature_errors`: the block adds errors that one profile cannot see.
 7. `extinction_field`: `retrieve_network` runs these steps and flags the values.
 
-`cycles` and `_closed_forms` hold the closed forms of a single cycle of beams, and the slope and
-Klett methods for single beams. `labeled` runs the retrieval on xarray data and adds the errors
-that all bins of a beam share.
+`cycles` holds the closed forms of a single cycle of beams. `labeled` runs the retrieval on xarray
+data and adds the errors that all bins of a beam share.
 """

@@ -14,25 +14,14 @@ from lidarops.retrieve.network import _condensed_signals, _fit_layout
 from lidarops.retrieve.network._condensed_signals import CondensedSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.geometry import Network
-from lidarops.retrieve.network.noise import noise_groups
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
-LARGEST_BIN_ERROR: Final = 0.3
-"""Largest relative standard error of a bin at a crossing that is used, from the mean of a block.
-Beyond it, signals that are positive by chance would be selected, and the logarithm would turn
-noise into bias."""
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""
-_NEGATIVE_SIGMAS: Final = 4.0
-"""Standard errors below zero at which a mean signal is significantly negative."""
-NOISY_PROFILE: Final = 10.0
-"""Ratio to the median variance beyond which a profile does not count for its block. Where its
-signal is stronger, and its noise therefore larger, up to this factor more is allowed."""
-_SMOOTHED_BINS: Final = 31
-"""Bins over which the energy of a profile is compared with that of its block."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,15 +33,8 @@ class BeamSignals:
     """(beam,)."""
     data: CondensedSignals
     """Signals of the profiles."""
-    mean: CondensedSignals
-    """Median signals of the blocks."""
     block: Indices
-    """(profile,) block numbers, after blocks were split by noise (`noise.noise_groups`)."""
-    averaged: Indices
-    """(block,) number of profiles in the medians."""
-    noise: Array
-    """(block,) relative standard error of a bin of a single profile: root mean square over the
-    bins around the crossings that are used."""
+    """(profile,) block numbers."""
     weak: Booleans
     """(profile, passage) True where the signal of the block, or of a profile far noisier than
     most of the block, is too weak to be used."""
@@ -82,8 +64,6 @@ def prepare_signals(
     layout = _fit_layout.lay_out_fits(network, ranges, overlap_function, nearest, int(bins))
     block = _blocks(blocks, leading)
     rows, row = _variances(variance, signal.shape, descending=descending)
-    windows = (layout.passages.beam, layout.window, layout.weights.shape[1])
-    block = noise_groups.split_by_noise(signal, rows, row, block, windows, LARGEST_BIN_ERROR)
     count = int(block.max(initial=-1)) + 1
     members = [np.flatnonzero(block == number) for number in range(count)]
     mean, mean_rows, single, averaged = _median_signals(signal, rows, row, members, layout)
@@ -93,28 +73,15 @@ def prepare_signals(
         mean, mean_rows, np.arange(count), exponents, layout, screened=False
     )
     bin_variance, negative = _relative_noise(mean, single, averaged, layout)
-    weak = ~(bin_variance <= LARGEST_BIN_ERROR**2) & (
+    weak = ~(bin_variance <= THRESHOLDS.largest_bin_error**2) & (
         (means.usable == 1) | _faded(means, negative, layout)
     )
-    with np.errstate(invalid="ignore"):
-        usable_variance = np.where(weak | (means.usable == 0), np.nan, bin_variance)
     means.usable[weak] = 0
     # Missing signals already have a reason.
     too_noisy = _noisy_passages(signal, rows, row, single[block], layout)
     too_noisy &= data.usable == 1
     data.usable[(means.usable == 0)[block] | too_noisy] = 0
-    return BeamSignals(
-        layout, exponents, data, means, block, averaged, np.sqrt(_row_means(usable_variance)),
-        weak[block] | too_noisy, leading,
-    )  # fmt: skip
-
-
-def _row_means(values: Array) -> Array:
-    """Return (row,) means of the finite values."""
-    finite = np.isfinite(values)
-    total = np.where(finite, values, 0.0).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(total / finite.sum(axis=1))
+    return BeamSignals(layout, exponents, data, block, weak[block] | too_noisy, leading)
 
 
 def _grids(values: npt.ArrayLike, beams: int) -> tuple[Array, bool]:
@@ -299,12 +266,14 @@ def _typical_variance(variances: Array, signal: Array, median: Array) -> Array:
     median : (bin,) float64
         Median signal.
     """
-    width = min(_SMOOTHED_BINS, median.size)
+    width = min(THRESHOLDS.energy_bins, median.size)
     known = np.isfinite(variances)
     typical = np.median(np.where(known, variances, np.inf), axis=0)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         energy_ratio = (_moving_sum(signal, width) / _moving_sum(median, width)) ** 2
-        allowed = NOISY_PROFILE * np.fmin(np.fmax(energy_ratio, 1.0), NOISY_PROFILE)
+        allowed = THRESHOLDS.noisy_profile * np.fmin(
+            np.fmax(energy_ratio, 1.0), THRESHOLDS.noisy_profile
+        )
         counted = variances <= allowed * typical
         # With few counts, the median of the variances may be zero.
         counted = known & (counted | (typical == 0.0))
@@ -328,8 +297,8 @@ def _noisy_passages(
             spread = rows[row, beam, window].sum(axis=1) / bins
             typical = single[:, beam, window].sum(axis=1) / bins
             level = np.maximum(signal[:, beam, window].sum(axis=1) / bins, 0.0)
-            noisier = (typical > 0.0) & ~(spread <= NOISY_PROFILE * typical)
-            out[:, c] = noisier & ~(spread <= LARGEST_BIN_ERROR**2 * level**2)
+            noisier = (typical > 0.0) & ~(spread <= THRESHOLDS.noisy_profile * typical)
+            out[:, c] = noisier & ~(spread <= THRESHOLDS.largest_bin_error**2 * level**2)
     return out
 
 
@@ -368,5 +337,5 @@ def _relative_noise(
             level = mean[:, beam, window].sum(axis=1) / bins
             spread = single[:, beam, window].sum(axis=1) / bins
             out[:, c] = np.where(level > 0, spread / level**2, np.inf)
-            negative[:, c] = ~(level >= -_NEGATIVE_SIGMAS * np.sqrt(spread / number))
+            negative[:, c] = ~(level >= -THRESHOLDS.negative * np.sqrt(spread / number))
     return out, negative

@@ -16,21 +16,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.network.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
-BEND: Final = 0.15
-"""Standard deviation of ln extinction over the crossings that the curvature of a field may cause:
-the same as for a gradient (`lidarops.retrieve.network._empirical_prior.GRADIENT`)."""
-_HARMLESS: Final = 0.5
-"""Fraction of the reported standard error that a difference may reach without effect."""
-_NONLINEAR_ERROR: Final = 0.1
-"""Typical relative standard error of a block beyond which the error of a profile depends on the
-noise of its value."""
-_LARGEST_DEVIATION: Final = 8.0
-"""Limit of the deviation of a profile from the median, and of its error, in median standard
-errors."""
 _ROUNDING: Final = 1e-9
 """Relative size of a field below which it is rounding."""
 
@@ -38,7 +29,7 @@ _ROUNDING: Final = 1e-9
 def bent_fields(position: Array) -> Array:
     """Return quadratic fields without level and gradient that span curvature in any direction.
 
-    The sum of their squares, averaged over the crossings, is `BEND` squared. The fields of
+    The sum of their squares, averaged over the crossings, is `bend` squared. The fields of
     r_i r_j, i < j, count twice, as in the squares of r' H r with a random symmetric H.
 
     Parameters
@@ -74,7 +65,7 @@ def _cached_bent_fields(position: bytes) -> Array:
     fields = fields - (fields @ linear_axes) @ linear_axes.T
     fields = fields[np.mean(fields * fields, axis=1) > _ROUNDING**2]
     total = float(np.sqrt(np.sum(fields * fields) / len(centred)))
-    return np.ascontiguousarray(fields * (BEND / total if total > 0.0 else 0.0))
+    return np.ascontiguousarray(fields * (THRESHOLDS.bend / total if total > 0.0 else 0.0))
 
 
 def noise_bias_variance(logarithm: Array, variance: Array, mean: Array) -> Array:
@@ -99,13 +90,13 @@ def noise_bias_variance(logarithm: Array, variance: Array, mean: Array) -> Array
     known = np.isfinite(logarithm) & np.isfinite(variance)
     number = np.maximum(known.sum(axis=0), 1)
     median = _median(np.where(known, logarithm, np.nan))
-    largest = _LARGEST_DEVIATION**2 * _median(np.where(known, variance, np.nan))
+    largest = THRESHOLDS.largest_deviation**2 * _median(np.where(known, variance, np.nan))
     # A profile with contradictory beams must not raise the errors of all others.
     with np.errstate(invalid="ignore"):
         typical = np.where(known, np.minimum(variance, largest), 0.0).sum(axis=0) / number
         deviation = np.clip(logarithm - median, -np.sqrt(largest), np.sqrt(largest))
         gap = np.where(known, deviation, 0.0).sum(axis=0) / number + median - mean
-    significant = known.any(axis=0) & (gap * gap > _HARMLESS**2 * typical)
+    significant = known.any(axis=0) & (gap * gap > THRESHOLDS.harmless**2 * typical)
     return np.asarray(np.where(significant, gap * gap, 0.0))
 
 
@@ -169,7 +160,7 @@ def _at_least_median(extinction: Array, variance: Array, rows: Indices, peers: I
     typical, median = _median(variance[peers]), _median(extinction[peers])
     own = variance[rows]
     with np.errstate(invalid="ignore"):
-        large = typical > (_NONLINEAR_ERROR * median) ** 2
+        large = typical > (THRESHOLDS.nonlinear_error * median) ** 2
     return np.asarray(np.where(large & np.isfinite(own), np.fmax(own, typical), own))
 
 

@@ -15,9 +15,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.network import _curvature_errors
+from lidarops.retrieve.network import _curvature_errors, outlying_bins
 from lidarops.retrieve.network._fit_layout import FitLayout
-from lidarops.retrieve.network.noise import outlying_bins, outlying_runs
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -27,8 +27,7 @@ MISSING: Final = 1
 NOT_POSITIVE: Final = 2
 OUTLYING: Final = 3
 """Reasons why a beam ends before its last bin."""
-_SERIES_BELOW: Final = 0.03
-"""Logarithmic step of a cell below which its integral is taken from a series."""
+_SERIES_BELOW: Final = THRESHOLDS.series_below
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -50,8 +49,8 @@ class CondensedSignals:
     covariance: Array
     """(profile, packed) for each beam, covariance of its log values, then its integrals."""
     slope: Array
-    """(profile, passage, 4) m-1: extinction of the segment behind the passage, if homogeneous,
-    from all its bins and from its farther half, each followed by its variance."""
+    """(profile, passage, 2) m-1: extinction of the segment behind the passage, if homogeneous, and
+    its variance."""
     status: Codes
     """(profile, beam) MISSING, NOT_POSITIVE or OUTLYING."""
     bridged: Codes
@@ -102,7 +101,7 @@ def condense(
         np.zeros((profiles, total)),
         np.zeros((profiles, total), dtype=np.uint8),
         np.zeros((profiles, int(layout.offset[-1]))),
-        np.full((profiles, total, 4), np.nan),
+        np.full((profiles, total, 2), np.nan),
         np.zeros((profiles, power.shape[1]), dtype=np.uint8),
         np.zeros((profiles, power.shape[1]), dtype=np.uint8),
         np.zeros((profiles, total, 2)),
@@ -272,12 +271,8 @@ def _integrate_segments(
             2.0 * exponent, gradients[row],
         )  # fmt: skip
         bounds[row, 0], bounds[row, 1] = cell[c], cell[c + 1] + 2
-        middle = (cell[c] + cell[c + 1] + 1) // 2
         slopes[c, 0], slopes[c, 1] = _slope_extinction(
             logs, noise, grid, codes, cell[c], cell[c + 1], exponent
-        )
-        slopes[c, 2], slopes[c, 3] = _slope_extinction(
-            logs, noise, grid, codes, middle, cell[c + 1], exponent
         )
     for row in range(count + max(usable - 1, 0), 2 * count - 1):
         bounds[row, 0], bounds[row, 1] = 0, 0
@@ -348,9 +343,6 @@ def _bridge_outliers(
     if number == outlying_bins.LEFT_IN_PLACE:
         for g in range(first, last):
             without_outliers[0][g], without_outliers[1][g] = logs[g], noise[g]
-        outlying_runs.draw_lines(
-            without_outliers[0], without_outliers[1], grid, without_outliers[2], (first, last)
-        )
         first_unbridged = outlying_bins.replace_outliers(
             without_outliers[0],
             without_outliers[1],
@@ -361,8 +353,11 @@ def _bridge_outliers(
             nodes,
             weights,
         )
-        # Without good neighbours the beam has no value.
-        return (end, number) if first_unbridged == end else (low, 1)
+        if first_unbridged < end:
+            # Without neighbours there is no second reading.
+            for g in range(first, last):
+                without_outliers[0][g], without_outliers[1][g] = logs[g], noise[g]
+        return end, number
     if number > 0:
         end = outlying_bins.replace_outliers(
             logs, noise, exponent, grid, (first, last, end), codes, nodes, weights
@@ -388,10 +383,9 @@ def _add_reading_difference(
         difference[c] = without_outliers[0][first + c] - with_outliers[0][first + c]
     for c in range(usable - 1):
         difference[count + c] = without_outliers[1][first + c] - with_outliers[1][first + c]
-        for k in (0, 2):
-            step = without_outliers[2][first + c, k] - with_outliers[2][first + c, k]
-            if abs(step) < math.inf:
-                with_outliers[2][first + c, k + 1] += step * step
+        step = without_outliers[2][first + c, 0] - with_outliers[2][first + c, 0]
+        if abs(step) < math.inf:
+            with_outliers[2][first + c, 1] += step * step
     for i in range(quantities):
         for j in range(quantities):
             packed[i * quantities + j] += difference[i] * difference[j]
@@ -434,7 +428,7 @@ def _condense(
     work = np.zeros(size), np.zeros(size), np.zeros(size), nodes, np.zeros(nodes.shape)
     without_outliers = np.zeros(size), np.zeros(size), np.zeros(size, dtype=np.uint8)
     total = values.shape[1]
-    other_reading = np.zeros(total), np.zeros(total), np.zeros((total, 4))
+    other_reading = np.zeros(total), np.zeros(total), np.zeros((total, 2))
     unused_codes = np.zeros(total, dtype=np.uint8)
     for n in range(power.shape[0]):
         for beam in range(exponent.size):
@@ -473,9 +467,9 @@ def _condense(
                 gradients, bounds,
             )  # fmt: skip
             smooth_row = (
-                without_outliers
+                (without_outliers[0], without_outliers[1])
                 if outliers == outlying_bins.LEFT_IN_PLACE
-                else (logs, noise, codes)
+                else (logs, noise)
             )
             _curvature_errors.measure_curvature(
                 smooth_row,

@@ -26,27 +26,15 @@ import numpy.typing as npt
 
 from lidarops.retrieve.network import _joint_solution
 from lidarops.retrieve.network._fit_layout import FitLayout
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Codes = npt.NDArray[np.uint8]
 
-DEGREE: Final = 4
-"""Degree of the polynomial. Over 35 m it gives the error from a layer with a standard deviation of
-10 m along the beam to within 10 percent; a parabola, to within 50 percent."""
-_SHARED_NOISE_FACTOR: Final = 4.0
-"""Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08 of
-one variance on average."""
-_PROFILE_NOISE_FACTOR: Final = 9.0
-"""The same for a single profile, whose curvature error is noisier than its value: 0.005 of one."""
-_CHANCE: Final = 3.0
-"""Standard deviations by which a mean square of noise may be larger by chance."""
-_NOISY_PROFILE: Final = 10.0
-"""Ratio to the median variance beyond which a profile does not count."""
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""
-_LEAST_REMAINDER: Final = 1e-3
-"""Smallest fraction of signal / extinction at a crossing that may remain after the integrals."""
+_LEAST_REMAINDER: Final = THRESHOLDS.least_remainder
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -64,14 +52,14 @@ def curvature_weights(layout: FitLayout) -> Array:
     distance = (
         layout.range[passages.beam[:, np.newaxis], bins_at_crossing] - passages.range[:, np.newaxis]
     )
-    order = np.arange(min(DEGREE, bins - 1) + 1)
+    order = np.arange(min(THRESHOLDS.curvature_degree, bins - 1) + 1)
     powers = (distance / np.ptp(distance, axis=1, keepdims=True))[..., np.newaxis] ** order
     return np.ascontiguousarray(layout.weights - np.linalg.pinv(powers)[:, 0])
 
 
 @_compiled
 def measure_curvature(
-    row: tuple[Array, Array, Codes],
+    row: tuple[Array, Array],
     exponent: float,
     passages: tuple[int, int],
     window: Indices,
@@ -82,9 +70,8 @@ def measure_curvature(
 
     Parameters
     ----------
-    row : (bin,) float64, (bin,) float64, (bin,) uint8
-        Logarithms of the signal along a beam, their variances and codes, without bins that may
-        be outlying: the covariance already contains their effect.
+    row : (bin,) float64, (bin,) float64
+        Logarithms of the signal along a beam, and their variances.
     exponent : float
     passages : int, int
         First passage, and the one behind the last.
@@ -94,7 +81,7 @@ def measure_curvature(
         From `curvature_weights`.
     out : (passage, 2) float64
     """
-    logs, noise, _ = row
+    logs, noise = row
     for c in range(passages[0], passages[1]):
         value = spread = 0.0
         for i in range(bin_weights.shape[1]):
@@ -286,13 +273,13 @@ def curvature_variance(shifts: Array) -> Array:
     """
     # Values that overflow have a noise variance that dominates everything else.
     with np.errstate(over="ignore", invalid="ignore"):
-        shared_excess = shifts[..., 0] ** 2 - _SHARED_NOISE_FACTOR * shifts[..., 1]
+        shared_excess = shifts[..., 0] ** 2 - THRESHOLDS.shared_noise * shifts[..., 1]
         profile_square, noise = shifts[..., 2] ** 2, shifts[..., 3]
         # A noisy profile would hide the shift of the others, or imitate one.
-        counted = (noise > 0.0) & (noise <= _NOISY_PROFILE * np.median(noise, axis=0))
+        counted = (noise > 0.0) & (noise <= THRESHOLDS.noisy_profile * np.median(noise, axis=0))
         number = np.maximum(counted.sum(axis=0), 1)
         excess = np.where(
-            counted, profile_square - (1.0 + _CHANCE * np.sqrt(2.0 / number)) * noise, 0.0
+            counted, profile_square - (1.0 + THRESHOLDS.chance * np.sqrt(2.0 / number)) * noise, 0.0
         )
-        largest = np.fmax(shared_excess, profile_square - _PROFILE_NOISE_FACTOR * noise)
+        largest = np.fmax(shared_excess, profile_square - THRESHOLDS.profile_noise * noise)
         return np.asarray(np.fmax(np.fmax(largest, excess.sum(axis=0) / number), 0.0))

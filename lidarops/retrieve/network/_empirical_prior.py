@@ -22,43 +22,15 @@ import numpy.typing as npt
 from scipy import special
 
 from lidarops.retrieve.network import _block_errors, _joint_solution
-from lidarops.retrieve.network._beam_signals import NOISY_PROFILE
 from lidarops.retrieve.network._condensed_signals import CondensedSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 Codes = npt.NDArray[np.uint8]
 
-GRADIENT: Final = 0.15
-"""Prior standard deviation of ln extinction over the crossings from a gradient. With 0.1 to 0.2,
-99 percent of values are within 3 standard errors in gradients, plumes and tilting fields."""
-DEVIATIONS: Final = tuple(float(s) for s in np.geomspace(0.01, 1.0, 9))
-"""Standard deviations of ln extinction at single crossings that are tried."""
-_LIKELIHOOD_TOLERANCE: Final = 4.0
-"""Largest difference in -2 ln likelihood from the minimum: two standard errors."""
-_STRENGTHS: Final = (1.0, 2.0, 4.0)
-"""Factors of the prior's standard deviations that are tried before it is dropped."""
-_WELL_DETERMINED: Final = 0.15
-"""Standard error of ln extinction below which the beams alone determine a crossing well."""
-_CONTRADICTION: Final = 3.5
-"""Standard errors of the difference at which beams contradict a prior."""
-_HARMLESS: Final = 0.5
-"""Fraction of the reported standard error that a difference may reach without effect."""
-_FEWEST_PROFILES: Final = 8
-"""Smallest number of profiles of a beam for a mean."""
-_DETERMINED_BY_MEAN: Final = 0.3
-"""Standard error of ln extinction below which the mean of profiles determines a crossing."""
-_TESTING_QUANTILE: Final = 0.75
-"""Quantile of the degrees of freedom of the profiles that decides whether the prior is tested."""
-_OPEN_IN_MEAN: Final = 1.0
-"""Standard error of ln extinction beyond which the mean leaves a crossing undetermined."""
-_LARGEST_MEAN_GAP: Final = 2.5
-"""Largest difference of the mean of solutions and the solution of the mean, in standard errors
-of both."""
-_LEAST_PROBABILITY: Final = 1e-2
-"""Probability of the chi-square of the mean with the prior below which the prior is rejected."""
 _UNDETERMINED_COST: Final = 1e3
 """-2 ln likelihood of a profile that is not determined."""
 _FIRST_PASSES: Final = 12
@@ -234,7 +206,7 @@ def _mean_profile(data: CondensedSignals, layout: FitLayout) -> CondensedSignals
     usable = np.zeros((1, data.usable.shape[1]), dtype=np.uint8)
     log_value, integral = np.full(usable.shape, np.nan), np.zeros(usable.shape)
     covariance = np.zeros((1, data.covariance.shape[1]))
-    slope = np.full((*usable.shape, 4), np.nan)
+    slope = np.full((*usable.shape, 2), np.nan)
     for beam in range(layout.first_passage.size - 1):
         on_beam = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
         packed = slice(layout.offset[beam], layout.offset[beam + 1])
@@ -245,14 +217,14 @@ def _mean_profile(data: CondensedSignals, layout: FitLayout) -> CondensedSignals
         used = np.flatnonzero(reach >= depth)
         used = used[_not_noisy(data.covariance[used, packed], on_beam.stop - on_beam.start, depth)]
         number = used.size
-        if number < _FEWEST_PROFILES:
+        if number < THRESHOLDS.fewest_profiles:
             continue
         usable[0, on_beam][:depth] = 1
         log_value[0, on_beam] = data.log_value[used, on_beam].sum(axis=0) / number
         integral[0, on_beam] = data.integral[used, on_beam].sum(axis=0) / number
         covariance[0, packed] = data.covariance[used, packed].sum(axis=0) / number / number
         slope[0, on_beam] = data.slope[used, on_beam].sum(axis=0) / number
-        slope[0, on_beam, 1::2] /= number
+        slope[0, on_beam, 1] /= number
     if not usable.any():
         return None
     return CondensedSignals(
@@ -278,7 +250,7 @@ def _not_noisy(covariance: Array, passages: int, depth: int) -> Booleans:
     variances = covariance[:, columns * (quantities + 1)]
     known = np.isfinite(variances)
     typical = np.median(np.where(known, variances, np.inf), axis=0)
-    return np.asarray((known & (variances <= NOISY_PROFILE * typical)).all(axis=1))
+    return np.asarray((known & (variances <= THRESHOLDS.noisy_profile * typical)).all(axis=1))
 
 
 def _mean_depth(reach: Indices) -> int:
@@ -293,7 +265,7 @@ def _mean_depth(reach: Indices) -> int:
     for depth in range(2, int(reach.max(initial=0)) + 1):
         number = int(np.sum(reach >= depth))
         # At the first passage all values are zero.
-        if number >= _FEWEST_PROFILES and (depth - 1) * number > best_count:
+        if number >= THRESHOLDS.fewest_profiles and (depth - 1) * number > best_count:
             best, best_count = depth, (depth - 1) * number
     return best
 
@@ -303,14 +275,18 @@ def _solve_block(problem: _Problem, mean_problem: Callable[[], _Problem | None])
     without_prior = problem.afresh(np.inf)
     # Profiles that determine the crossings well alone need no mean.
     with np.errstate(invalid="ignore"):
-        mean = None if np.all(without_prior.variance < _WELL_DETERMINED**2) else mean_problem()
+        mean = (
+            None
+            if np.all(without_prior.variance < THRESHOLDS.well_determined**2)
+            else mean_problem()
+        )
     mean_without_prior = None if mean is None else mean.afresh(np.inf)
     testable = _can_test_prior(problem, without_prior, mean_without_prior)
-    strengths = _STRENGTHS if testable else _STRENGTHS[-1:]
+    strengths = THRESHOLDS.strengths if testable else THRESHOLDS.strengths[-1:]
     if mean is None or mean_without_prior is None:
         return _strongest_prior(problem, without_prior, strengths)[0]
     result = _solve_with_mean(problem, without_prior, mean, mean_without_prior, strengths)
-    prior_contradicted = not testable and _mean_improbable(mean.afresh(DEVIATIONS[0]))
+    prior_contradicted = not testable and _mean_improbable(mean.afresh(THRESHOLDS.deviations[0]))
     return replace(
         result, prior_contradicted=np.full_like(result.prior_contradicted, prior_contradicted)
     )
@@ -356,12 +332,14 @@ def _can_test_prior(
     if known.any():
         # Some profiles are enough: they share the field with those that lost a beam.
         solved_freedom = without_prior.degrees_of_freedom[known]
-        freedom = float(np.quantile(solved_freedom, _TESTING_QUANTILE, method="higher"))
+        freedom = float(np.quantile(solved_freedom, THRESHOLDS.testing_quantile, method="higher"))
     if mean_without_prior is None:
         return freedom >= 0
     freedom = max(freedom, float(mean_without_prior.degrees_of_freedom[0]))
     crossings = np.unique(problem.geometry[2][(problem.data.usable == 1).any(axis=0)])
-    determined = bool(np.all(mean_without_prior.variance[0, crossings] < _OPEN_IN_MEAN**2))
+    determined = bool(
+        np.all(mean_without_prior.variance[0, crossings] < THRESHOLDS.open_in_mean**2)
+    )
     return freedom > 0 or (freedom == 0 and determined)
 
 
@@ -396,7 +374,10 @@ def _mean_improbable(mean_with_prior: PriorSolution) -> bool:
     )
     if freedom <= 0:
         return False
-    return bool(special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0) < _LEAST_PROBABILITY)
+    return bool(
+        special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0)
+        < THRESHOLDS.least_probability_of_mean
+    )
 
 
 def _add_block_errors(
@@ -416,8 +397,8 @@ def _add_block_errors(
         mean_without_prior.variance[0],
     )
     # Where nothing can contradict a prior, the weakest one may be the true one.
-    doubt = max(_STRENGTHS[-1] / strength, _joint_solution.PRIOR_DOUBT)
-    untested = (doubt**2 - 1.0) / (_joint_solution.PRIOR_DOUBT**2 - 1.0)
+    doubt = max(THRESHOLDS.strengths[-1] / strength, THRESHOLDS.doubt)
+    untested = (doubt**2 - 1.0) / (THRESHOLDS.doubt**2 - 1.0)
     factor = np.where(np.isfinite(mean_without_prior.variance[0]), 1.0, untested)
     prior = (factor - 1.0) * (result.variance - result.prior_true_variance)
     return replace(result, variance=result.variance + (noise + field + prior))
@@ -430,26 +411,28 @@ def _likeliest_deviation(problem: _Problem, strength: float, smallest: float) ->
     deviation that the mean of profiles requires.
     """
     costs, constants = _deviation_costs(problem, strength)
-    index = int(np.flatnonzero(costs <= costs.min() + _LIKELIHOOD_TOLERANCE)[-1])
-    index = max(index, int(np.searchsorted(DEVIATIONS, smallest)))
+    index = int(np.flatnonzero(costs <= costs.min() + THRESHOLDS.likelihood_tolerance)[-1])
+    index = max(index, int(np.searchsorted(THRESHOLDS.deviations, smallest)))
     problem.constants[:] = constants[index]
-    return problem.solve(DEVIATIONS[index], _LAST_PASSES, strength)
+    return problem.solve(THRESHOLDS.deviations[index], _LAST_PASSES, strength)
 
 
 def _least_deviation(mean: _Problem, strength: float) -> float:
     """Return the smallest deviation that is not much less likely than the likeliest one."""
     costs, _ = _deviation_costs(mean, strength)
-    return DEVIATIONS[int(np.flatnonzero(costs <= costs.min() + _LIKELIHOOD_TOLERANCE)[0])]
+    return THRESHOLDS.deviations[
+        int(np.flatnonzero(costs <= costs.min() + THRESHOLDS.likelihood_tolerance)[0])
+    ]
 
 
 def _deviation_costs(problem: _Problem, strength: float) -> tuple[Array, list[Array]]:
     """Return -2 ln likelihood of each deviation, and the constants of its solution."""
     problem.constants[:] = problem.start
-    problem.solve(DEVIATIONS[-1], _FIRST_PASSES, strength)
-    costs = np.empty(len(DEVIATIONS))
+    problem.solve(THRESHOLDS.deviations[-1], _FIRST_PASSES, strength)
+    costs = np.empty(len(THRESHOLDS.deviations))
     constants: list[Array] = []
-    for k in range(len(DEVIATIONS) - 1, -1, -1):
-        problem.solve(DEVIATIONS[k], _NEXT_PASSES, strength)
+    for k in range(len(THRESHOLDS.deviations) - 1, -1, -1):
+        problem.solve(THRESHOLDS.deviations[k], _NEXT_PASSES, strength)
         costs[k] = problem.likelihood
         constants.insert(0, problem.constants.copy())
     return costs, constants
@@ -469,9 +452,13 @@ def _contradicted(result: PriorSolution, without_prior: PriorSolution) -> bool:
     gap = np.where(known, without_prior.logarithm - result.logarithm, 0.0).sum(axis=0) / number
     free_variance = np.where(known, without_prior.variance, 0.0).sum(axis=0) / number
     prior_variance = np.where(known, result.prior_true_variance, 0.0).sum(axis=0) / number
-    allowed = _CONTRADICTION * np.sqrt(np.maximum(free_variance - prior_variance, 0.0) / number)
-    allowed = np.maximum(allowed, _HARMLESS * np.sqrt(prior_variance))
-    determined = (free_variance < _WELL_DETERMINED**2) & (known.sum(axis=0) > 0.9 * len(known))
+    allowed = THRESHOLDS.contradiction * np.sqrt(
+        np.maximum(free_variance - prior_variance, 0.0) / number
+    )
+    allowed = np.maximum(allowed, THRESHOLDS.harmless * np.sqrt(prior_variance))
+    determined = (free_variance < THRESHOLDS.well_determined**2) & (
+        known.sum(axis=0) > THRESHOLDS.determined_share * len(known)
+    )
     return bool(np.any(determined & (np.abs(gap) > allowed + free_variance)))
 
 
@@ -485,7 +472,7 @@ def _off_mean_solution(result: PriorSolution, mean_without_prior: PriorSolution)
     number = np.maximum(known.sum(axis=0), 1)
     average = np.where(known, result.logarithm, 0.0).sum(axis=0) / number
     stated = np.where(known, result.prior_true_variance, 0.0).sum(axis=0) / number
-    determined = mean_without_prior.variance[0] < _DETERMINED_BY_MEAN**2
+    determined = mean_without_prior.variance[0] < THRESHOLDS.determined_by_mean**2
     determined &= (known.sum(axis=0) > 0.5 * len(known)) & (
         mean_without_prior.status[0] == _joint_solution.SOLVED
     )
@@ -493,7 +480,7 @@ def _off_mean_solution(result: PriorSolution, mean_without_prior: PriorSolution)
         spread = np.sqrt(stated + mean_without_prior.variance[0])
         differs = (
             np.abs(mean_without_prior.logarithm[0] - average)
-            > _LARGEST_MEAN_GAP * spread + 0.5 * mean_without_prior.variance[0]
+            > THRESHOLDS.largest_mean_gap * spread + 0.5 * mean_without_prior.variance[0]
         )
     return bool(np.any(determined & differs))
 
@@ -526,7 +513,7 @@ def _precision(gradient: Array, deviation: float, strength: float) -> tuple[Arra
 
 def _free_level(gradient: Array, deviation: float, strength: float = 1.0) -> tuple[Array, float]:
     """Return the precision of the prior with a free level, and -ln |precision|."""
-    covariance = GRADIENT**2 * gradient + deviation**2 * np.eye(len(gradient))
+    covariance = THRESHOLDS.gradient**2 * gradient + deviation**2 * np.eye(len(gradient))
     covariance *= strength**2
     precision = np.linalg.inv(covariance)
     sums = precision.sum(axis=0)

@@ -8,20 +8,17 @@ fit have weights.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network.geometry import Network, Passages
-from lidarops.retrieve.network.noise import outlying_bins
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
-
-LOWEST_OVERLAP: Final = 0.5
-"""Below this overlap, the relative error of the overlap function dominates the signal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +51,7 @@ class FitLayout:
     """(beam, 2) first usable bin, and the one behind the last."""
     neighbours: tuple[Indices, Array, Array]
     """(beam, bin, neighbour) bins that predict a bin, their weights, and (beam, bin) the deviation
-    that air may cause; see `lidarops.retrieve.network.noise.outlying_bins.plan_neighbours`."""
+    that air may cause; see `lidarops.retrieve.network.outlying_bins.plan_neighbours`."""
     offset: Indices
     """(beam + 1,) start of the packed covariance of each beam."""
 
@@ -78,7 +75,7 @@ def lay_out_fits(
     """
     factor = np.ones_like(range_) if overlap is None else overlap
     with np.errstate(invalid="ignore", divide="ignore"):
-        usable = (range_ >= nearest[:, np.newaxis]) & (factor >= LOWEST_OVERLAP)
+        usable = (range_ >= nearest[:, np.newaxis]) & (factor >= THRESHOLDS.lowest_overlap)
         log_factor = 2.0 * np.log(range_) - np.log(factor)
     limits = [_bounds(row) for row in usable]
     keep = np.zeros(net.passages.beam.size, dtype=np.bool_)

@@ -18,6 +18,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.network.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Codes = npt.NDArray[np.uint8]
@@ -33,20 +35,13 @@ COLUMNS: Final = 5
 """Columns of a summary: chi-square and degrees of freedom of the beams alone, then of beams and
 prior; -2 ln of the marginal likelihood, without a constant."""
 
-LONGEST_STEP: Final = 1.5
-"""Largest step of the logarithm of a constant in one pass."""
-_THINNEST_BEAM: Final = 1e-3
-"""Smallest optical depth of a beam for the start constants."""
-_CONVERGED_STEP: Final = 1e-3
-"""Largest change of a logarithm in the last pass of a converged solution."""
-_TINIEST_PIVOT: Final = 1e-13
-"""Smallest pivot of a regular matrix, relative to its diagonal."""
-_WEAK_PRECISION: Final = 1e-2
-"""Precision of ln extinction in place of a prior: a standard deviation of 10."""
-PRIOR_DOUBT: Final = 2.0
-"""Factor of the prior's standard deviation that the stated error allows a field to deviate by."""
-_LARGEST_VARIANCE: Final = 4.0
-"""Variance of ln extinction beyond which it is not determined."""
+LONGEST_STEP: Final = THRESHOLDS.longest_step
+_THINNEST_BEAM: Final = THRESHOLDS.thinnest_beam
+_CONVERGED_STEP: Final = THRESHOLDS.converged_step
+_TINIEST_PIVOT: Final = THRESHOLDS.smallest_pivot
+_WEAK_PRECISION: Final = THRESHOLDS.weak_precision
+PRIOR_DOUBT: Final = THRESHOLDS.doubt
+_LARGEST_VARIANCE: Final = THRESHOLDS.largest_variance
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.network import _cycle_kernels, _multiplier
+from lidarops.retrieve.network import _cycle_kernels
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
@@ -155,30 +155,6 @@ def values_and_variances(
     return value.reshape(shape[:-1]), variance.reshape(shape[:-1])
 
 
-def substitute_back(
-    start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike, first: npt.ArrayLike
-) -> Array:
-    """Return (..., row) reciprocal extinction at all crossings from the first one.
-
-    The substitution goes backwards from crossing to crossing. It amplifies the noise of rows that
-    lead towards their lidar; `solve_cycle` with rotated rows gives the variance elsewhere.
-
-    Parameters
-    ----------
-    start, end, integral : (..., row) float
-        As in `solve_cycle`.
-    first : (...) float
-        Reciprocal extinction at the first crossing.
-    """
-    shape, (starts, ends, integrals) = _rows(start, end, integral)
-    value = inputs.real_array(first, "first").astype(np.float64)
-    if value.shape != shape[:-1]:
-        raise RetrievalInputError(f"has the shape {value.shape}, not {shape[:-1]}", field="first")
-    out = np.empty_like(starts)
-    _cycle_kernels.substitute_cycle(starts, ends, integrals, value.reshape(-1), out)
-    return out.reshape(shape)
-
-
 def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) -> Array:
     r"""Return (true - estimate) / true of reciprocal extinction at the start of a cycle.
 
@@ -206,7 +182,7 @@ def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) ->
     if not np.all((factor >= 0) & (factor <= 1)):
         raise RetrievalInputError("is not between 0 and 1", field="multiplier")
     leading = _common_shape([depths[..., 0], factor], "optical_depth and multiplier")
-    return _multiplier.relative_bias(
+    return _relative_bias(
         np.broadcast_to(depths, (*leading, depths.shape[-1])), np.broadcast_to(factor, leading)
     )
 
@@ -269,3 +245,22 @@ def _common_shape(arrays: list[Array], names: str) -> tuple[int, ...]:
         raise RetrievalInputError(
             f"have the shapes {[array.shape for array in arrays]}", field=names
         ) from None
+
+
+def _relative_bias(depths: Array, multiplier: Array) -> Array:
+    """Return (true - estimate) / true of the reciprocal extinction at the start crossing.
+
+    Parameters
+    ----------
+    depths : (..., row) float64
+        Exponent times optical depth of each row, negative where it runs towards its lidar.
+    multiplier : (...) float64
+    """
+    k = depths.shape[-1]
+    attenuation = np.exp(-2.0 * np.cumsum(depths, axis=-1))
+    powers = multiplier[..., np.newaxis] ** np.arange(k)
+    steps = powers[..., :-1] * (1.0 - multiplier[..., np.newaxis])
+    neglected = np.cumsum(steps * attenuation[..., :-1], axis=-1)[..., -1]
+    determinant = 1.0 - powers[..., -1] * attenuation[..., -1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(determinant > 0, neglected / determinant, np.nan))

@@ -43,49 +43,18 @@ from lidarops.retrieve.common import inputs
 from lidarops.retrieve.network import (
     _beam_signals,
     _block_errors,
-    _closed_forms,
     _curvature_errors,
     _empirical_prior,
     _joint_solution,
 )
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
-from lidarops.retrieve.network.geometry import Cycle, Network, build_cycle
+from lidarops.retrieve.network.geometry import Network
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
-DEFAULT_BINS: Final = 7
-"""Bins of the fit that gives the signal at a crossing."""
-DEFAULT_UNBIASED_MULTIPLIER: Final = 0.25
-"""Multiplier of the unbiased estimate. Its noise is close to the minimum there, in all kinds of
-fields."""
-_LEAST_PROBABILITY: Final = 1e-4
-"""Probability of a chi-square below which a fit is flagged as poor."""
-
-
-class NetworkMethod(StrEnum):
-    """How extinction is retrieved. All methods but the network use one cycle or one beam."""
-
-    NETWORK = "network"
-    """All beams and crossings together, weighted by their full covariance."""
-    CYCLE = "cycle"
-    """The exact closed form of a cycle."""
-    MULTIPLIER = "multiplier"
-    """The closed form with a multiplier below 1: less noise, a known systematic error."""
-    UNBIASED = "unbiased"
-    """The same, with the neglected terms assigned to the start crossing: no systematic error in
-    homogeneous air."""
-    SLOPE = "slope"
-    """Each beam alone, taken as homogeneous from crossing to crossing."""
-    KLETT = "klett"
-    """Each beam alone, from the slope at the far end of a segment."""
-
-
-_HOMOGENEOUS: Final = frozenset(
-    {NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED, NetworkMethod.SLOPE, NetworkMethod.KLETT}
-)
-"""Methods that assume homogeneous air."""
 
 _HARMLESS: Final = frozenset({"weak_signal", "bridged"})
 """Flags that do not reject a value."""
@@ -104,15 +73,10 @@ class CrossingFlags:
     """Reasons to doubt a value: one (..., crossing) array of booleans each."""
 
     ill_conditioned: Booleans
-    """The attenuation around the cycle (or its substitute) or the value itself is less than 3
-    standard errors, in the profile or typically in its block. Or the beams are too few to
-    determine the field, and contradict the prior."""
-    far_start: Booleans
-    """The cycle starts at the far crossing of its first beam."""
-    not_positive: Booleans
-    """The solution is negative."""
+    """The value is less than 3 standard errors, in the profile or typically in its block. Or the
+    beams are too few to determine the field, and contradict the prior."""
     not_finite: Booleans
-    """There is no solution."""
+    """There is no positive solution."""
     uncertain: Booleans
     """The standard error exceeds the value."""
     signal_not_positive: Booleans
@@ -129,21 +93,17 @@ class CrossingFlags:
     valid."""
     outlying: Booleans
     """A beam of the crossing has so many outlying bins before it that it was left out."""
-    pole: Booleans
-    """The multiplier makes the determinant zero or changes its sign: no value."""
     unsettled: Booleans
     """The network solution did not converge."""
     poor_fit: Booleans
     """The beams disagree by more than their noise."""
-    not_homogeneous: Booleans
-    """The method assumes homogeneous air, and the beams show that it is not."""
     not_measured: Booleans
     """Fewer than two beams have full overlap and a signal there."""
 
     @property
     def flagged(self) -> Booleans:
         """Union of all flags except `weak_signal` and `bridged`, which leave a value valid."""
-        union = np.zeros_like(self.far_start)
+        union = np.zeros_like(self.not_finite)
         for field in fields(self):
             if field.name not in _HARMLESS:
                 union = union | getattr(self, field.name)
@@ -162,22 +122,15 @@ class NetworkResult:
     times where the beams are too few to test the prior, and a curvature of the field over the
     network where the mean of the block's beams allows it. In thin air it is at least the typical
     error of the block, and includes the bias that noise gives all its profiles."""
-    visibility: air_visibility.VisibilityResult
-    """(..., crossing) m, at the wavelength of the lidars."""
     flags: CrossingFlags
     near_crossing: Booleans
     """(crossing,) True where extinction is reported."""
     reduced_chi_square: Array
-    """(...) of the beams alone, without the prior; NaN for other methods, and without degrees of
-    freedom."""
+    """(...) of the beams alone, without the prior; NaN without degrees of freedom."""
     degrees_of_freedom: Array
     """(...)."""
     prior_deviation: Array
-    """(...) standard deviation of ln extinction about the mean field; inf without prior, NaN for
-    other methods."""
-    multiplier: Array
-    """(...) of the cycle; NaN for other methods."""
-    method: NetworkMethod
+    """(...) standard deviation of ln extinction about the mean field; inf without prior."""
 
 
 def retrieve_network(
@@ -186,17 +139,12 @@ def retrieve_network(
     network: Network,
     *,
     variance: npt.ArrayLike,
-    method: str = "network",
     overlap: npt.ArrayLike | None = None,
     full_overlap_range: npt.ArrayLike | None = None,
     exponent: npt.ArrayLike = 1.0,
     blocks: npt.ArrayLike | None = None,
     prior: str = "block",
-    cycle: Cycle | None = None,
-    start: int | None = None,
-    multiplier: float | None = None,
-    bins: int = DEFAULT_BINS,
-    contrast: float = air_visibility.MOR_CONTRAST,
+    bins: int = THRESHOLDS.fit_bins,
 ) -> NetworkResult:
     """Retrieve extinction and visibility where the beams of several lidars cross.
 
@@ -214,7 +162,6 @@ def retrieve_network(
     variance : (..., beam, range) float
         Noise variance in the square of the power's unit, broadcast against `power`; bins are
         independent.
-    method : {"network", "cycle", "multiplier", "unbiased", "slope", "klett"}
     overlap : (beam, range) or (range,) float, optional
         Overlap function; power is divided by it. Bins with an overlap below 0.5 are not used.
     full_overlap_range : float or (beam,) float, optional
@@ -222,22 +169,12 @@ def retrieve_network(
     exponent : float or (beam,) float
         m of backscatter ~ extinction^(1/m) along a beam.
     blocks : (...) int or str, optional
-        Labels of the profiles that share a mean field and a multiplier; by default, all. Results
-        of a block depend on its own profiles only. A block in which many profiles are far noisier
-        than many others is split into the quiet and the noisy ones.
+        Labels of the profiles that share a mean field; by default, all. Results
+        of a block depend on its own profiles only.
     prior : {"block", "none"}
-        For the network. "none" solves each profile alone; undetermined crossings are NaN.
-    cycle : Cycle, optional
-        For "cycle", "multiplier" and "unbiased"; by default from `geometry.build_cycle`.
-    start : int, optional
-        The only crossing to solve for: the cycle is rotated to start there. By default, all near
-        crossings in turn.
-    multiplier : float, optional
-        For "multiplier" (default: the best one of each block) and "unbiased" (default: 0.25).
+        "none" solves each profile alone; undetermined crossings are NaN.
     bins : int
         Number of bins of the fit that gives the signal at a crossing.
-    contrast : float
-        Threshold of visibility.
 
     Returns
     -------
@@ -250,12 +187,9 @@ def retrieve_network(
 
     References
     ----------
-    drabenko2021, yegorov2008.
+    drabenko2021.
     """
-    network_method = inputs.choice(method, NetworkMethod, "method")
     field_prior = inputs.choice(prior, FieldPrior, "prior")
-    _check_settings(network_method, multiplier, cycle, start)
-    air_visibility.koschmieder_constant(contrast)
     if network.crossings == 0:
         raise RetrievalInputError(
             "has no crossings: its beams do not meet",
@@ -266,19 +200,23 @@ def retrieve_network(
         power, range, network, variance=variance, overlap=overlap,
         full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, bins=bins,
     )  # fmt: skip
-    if network_method is NetworkMethod.NETWORK:
-        estimate, prior_fit = _solve_network(beams, network.crossing, field_prior)
-    else:
-        walk = None
-        if network_method not in {NetworkMethod.SLOPE, NetworkMethod.KLETT}:
-            walk = cycle if cycle is not None else build_cycle(network, start=start)
-        estimate, prior_fit = _solve_closed(beams, network_method, walk, multiplier, start), None
-    return _flag_result(beams, estimate, prior_fit, network_method, contrast)
+    return _flag_result(beams, *_solve_network(beams, network.crossing, field_prior))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimate:
+    """(profile, crossing) extinction before flags are set; NaN where there is none."""
+
+    extinction: Array
+    """m-1."""
+    variance: Array
+    """m-2."""
+    poorly_determined: Booleans
 
 
 def _solve_network(
     beams: _beam_signals.BeamSignals, position: Array, prior: FieldPrior
-) -> tuple[_closed_forms.CrossingEstimate, _empirical_prior.PriorSolution]:
+) -> tuple[_Estimate, _empirical_prior.PriorSolution]:
     layout = beams.layout
     measured_index = np.cumsum(layout.measured) - 1
     crossing = measured_index[layout.passages.crossing].astype(np.intp)
@@ -306,17 +244,10 @@ def _solve_network(
     with np.errstate(over="ignore", under="ignore"):
         curvature = _curvature_variance(beams, fit, crossing, position)
         variance[:, layout.measured] += extinction[:, layout.measured] ** 2 * curvature
-    no_flag = np.zeros(shape, dtype=np.bool_)
     # The stated doubt in the prior is no noise that makes values unreliable.
-    poorly_determined = (
-        _closed_forms.poorly_determined(extinction, prior_true_variance, beams.block)
-        | fit.prior_contradicted[:, np.newaxis]
-    )
-    estimate = _closed_forms.CrossingEstimate(
-        extinction, variance, poorly_determined, no_flag, np.zeros(shape[1], dtype=np.bool_),
-        np.full(shape[0], np.nan),
-    )  # fmt: skip
-    return estimate, fit
+    poorly_determined = _poorly_determined(extinction, prior_true_variance, beams.block)
+    poorly_determined |= fit.prior_contradicted[:, np.newaxis]
+    return _Estimate(extinction, variance, poorly_determined), fit
 
 
 def _curvature_variance(
@@ -345,62 +276,31 @@ def _curvature_variance(
     return variance
 
 
-def _solve_closed(
-    beams: _beam_signals.BeamSignals,
-    method: NetworkMethod,
-    cycle: Cycle | None,
-    multiplier: float | None,
-    start: int | None,
-) -> _closed_forms.CrossingEstimate:
-    if cycle is None:
-        return _closed_forms.solve_single_beams(beams, far_end=method is NetworkMethod.KLETT)
-    if method is NetworkMethod.CYCLE:
-        multiplier = 1.0
-    elif method is NetworkMethod.UNBIASED and multiplier is None:
-        multiplier = DEFAULT_UNBIASED_MULTIPLIER
-    return _closed_forms.solve_cycle_crossings(
-        beams,
-        cycle,
-        multiplier,
-        unbiased=method is NetworkMethod.UNBIASED,
-        only_start=start is not None,
-    )
-
-
 def _flag_result(
     beams: _beam_signals.BeamSignals,
-    estimate: _closed_forms.CrossingEstimate,
-    fit: _empirical_prior.PriorSolution | None,
-    method: NetworkMethod,
-    contrast: float,
+    estimate: _Estimate,
+    fit: _empirical_prior.PriorSolution,
 ) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
     shape = estimate.extinction.shape
-    near = beams.layout.near_crossing | estimate.far_start
+    near = beams.layout.near_crossing
     with np.errstate(invalid="ignore"):
         finite = np.isfinite(estimate.variance)
         finite &= np.abs(estimate.extinction) < air_visibility.LARGEST_EXTINCTION
-        positive = finite & (estimate.extinction > 0)
+        finite &= estimate.extinction > 0
         uncertain = estimate.variance > estimate.extinction**2
-    extinction = np.where(positive & near, estimate.extinction, np.nan)
-    error = np.sqrt(np.where(positive & near, estimate.variance, np.nan))
-    no_flag = np.zeros(shape[0], dtype=np.bool_)
-    chi_square, freedom = np.full(shape[0], np.nan), np.full(shape[0], np.nan)
-    deviation, not_converged, poor = np.full(shape[0], np.nan), no_flag, no_flag
-    too_weak = beams.weak
-    if fit is not None:
-        freedom, deviation = fit.degrees_of_freedom, fit.deviation
-        with np.errstate(invalid="ignore", divide="ignore"):
-            chi_square = np.where(freedom > 0, fit.chi_square / freedom, np.nan)
-        poor = _improbable(fit.chi_square, freedom)
-        poor |= _improbable(fit.prior_chi_square, fit.prior_degrees_of_freedom)
-        not_converged = fit.status == _joint_solution.UNSETTLED
-        dropped = fit.left_out[:, beams.layout.passages.beam] == 1
-        too_weak = too_weak | (dropped & (beams.data.usable == 1))
+    extinction = np.where(finite & near, estimate.extinction, np.nan)
+    error = np.sqrt(np.where(finite & near, estimate.variance, np.nan))
+    freedom = fit.degrees_of_freedom
+    with np.errstate(invalid="ignore", divide="ignore"):
+        chi_square = np.where(freedom > 0, fit.chi_square / freedom, np.nan)
+    poor = _improbable(fit.chi_square, freedom)
+    poor |= _improbable(fit.prior_chi_square, fit.prior_degrees_of_freedom)
+    not_converged = fit.status == _joint_solution.UNSETTLED
+    dropped = fit.left_out[:, beams.layout.passages.beam] == 1
+    too_weak = beams.weak | (dropped & (beams.data.usable == 1))
     flags = CrossingFlags(
-        ill_conditioned=estimate.weak_attenuation & finite,
-        far_start=np.broadcast_to(estimate.far_start, shape),
-        not_positive=finite & ~positive,
+        ill_conditioned=estimate.poorly_determined & finite,
         not_finite=~finite,
         uncertain=uncertain,
         signal_not_positive=_lost_signal(beams, NOT_POSITIVE),
@@ -408,14 +308,8 @@ def _flag_result(
         weak_signal=_by_crossing(beams, too_weak),
         bridged=_by_crossing(beams, beams.data.bridged[:, beams.layout.passages.beam] == 1),
         outlying=_lost_signal(beams, OUTLYING),
-        pole=estimate.pole,
         unsettled=np.broadcast_to(not_converged[:, np.newaxis], shape),
         poor_fit=np.broadcast_to(poor[..., np.newaxis], shape),
-        not_homogeneous=(
-            _closed_forms.inhomogeneous(beams, estimate)
-            if method in _HOMOGENEOUS
-            else np.zeros(shape, dtype=np.bool_)
-        ),
         not_measured=np.broadcast_to(~beams.layout.measured, shape),
     )
     leading = beams.leading
@@ -425,14 +319,35 @@ def _flag_result(
             for f in fields(CrossingFlags)
         }
     )
-    values = extinction.reshape(*leading, shape[1])
-    errors = error.reshape(*leading, shape[1])
     return NetworkResult(
-        values, errors,
-        air_visibility.visibility_from_extinction(values, errors, contrast=contrast),
-        shaped, near, chi_square.reshape(leading), freedom.reshape(leading),
-        deviation.reshape(leading), estimate.multiplier.reshape(leading), method,
+        extinction.reshape(*leading, shape[1]), error.reshape(*leading, shape[1]), shaped, near,
+        chi_square.reshape(leading), freedom.reshape(leading), fit.deviation.reshape(leading),
     )  # fmt: skip
+
+
+def _poorly_determined(extinction: Array, variance: Array, block: Indices) -> Booleans:
+    """Return where an error exceeds a third of the value, in the profile or its typical block.
+
+    With noise amplified beyond that, values and the errors computed from them are meaningless,
+    so all profiles of such a block are doubted.
+
+    Parameters
+    ----------
+    extinction, variance : (profile, crossing) float
+        m-1 and m-2; NaN where there is none.
+    block : (profile,) int
+    """
+    with np.errstate(invalid="ignore"):
+        doubted = np.asarray(variance > (THRESHOLDS.largest_relative_error * extinction) ** 2)
+    for number in np.unique(block):
+        profiles = np.flatnonzero(block == number)
+        known = np.isfinite(variance[profiles])
+        for crossing in np.flatnonzero(known.any(axis=0)):
+            rows = profiles[known[:, crossing]]
+            error = np.sqrt(np.median(variance[rows, crossing]))
+            typical = np.median(extinction[rows, crossing])
+            doubted[profiles, crossing] |= error > THRESHOLDS.largest_relative_error * typical
+    return doubted
 
 
 def _improbable(chi_square: Array, freedom: Array) -> Booleans:
@@ -441,7 +356,7 @@ def _improbable(chi_square: Array, freedom: Array) -> Booleans:
     probability = special.gammaincc(
         np.where(known, freedom, 1.0) / 2.0, np.where(known, np.maximum(chi_square, 0.0), 0.0) / 2.0
     )
-    return np.asarray(known & (probability < _LEAST_PROBABILITY))
+    return np.asarray(known & (probability < THRESHOLDS.least_probability))
 
 
 def _lost_signal(beams: _beam_signals.BeamSignals, reason: int) -> Booleans:
@@ -457,30 +372,3 @@ def _by_crossing(beams: _beam_signals.BeamSignals, passages: Booleans) -> Boolea
     for c, crossing in enumerate(beams.layout.passages.crossing):
         out[:, crossing] |= passages[:, c]
     return out
-
-
-# Checks -------------------------------------------------------------------------------------
-
-
-def _check_settings(
-    method: NetworkMethod, multiplier: float | None, cycle: Cycle | None, start: int | None
-) -> None:
-    cyclic = method in {NetworkMethod.CYCLE, NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED}
-    if multiplier is not None:
-        if method not in {NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED}:
-            raise RetrievalInputError(
-                f"is not used by the method '{method}'",
-                field="multiplier",
-                remedy="choose 'multiplier' or 'unbiased'",
-            )
-        if not 0.0 <= multiplier <= 1.0:
-            raise RetrievalInputError(f"is {multiplier}, not from 0 to 1", field="multiplier")
-    for value, name in ((cycle, "cycle"), (start, "start")):
-        if value is not None and not cyclic:
-            raise RetrievalInputError(f"is not used by the method '{method}'", field=name)
-    if cycle is not None and start is not None and start != int(cycle.crossing[0]):
-        raise RetrievalInputError(
-            f"is {start}, but the cycle starts at {int(cycle.crossing[0])}",
-            field="start",
-            remedy="give it to geometry.build_cycle",
-        )

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -30,13 +31,6 @@ FLATTENING: Final = 1.0 / 298.257223563
 _ECCENTRICITY_SQUARED: Final = FLATTENING * (2.0 - FLATTENING)
 _BOWRING_PASSES: Final = 6
 """Passes of Bowring's iteration. Below 100 km, 3 passes are exact to rounding."""
-
-DEFAULT_TOLERANCE: Final = 15.0
-"""m, two bins of 7.5 m."""
-SMALLEST_CROSSING_ANGLE: Final = 2.0
-"""degree. At smaller angles, a pointing error of 0.1 degree moves the crossing by more than 5
-percent of its range."""
-MOST_BEAMS: Final = 512
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +69,6 @@ class Network:
     """(beam, 3) unit vectors."""
     crossing: Array
     """(crossing, 3) positions, m, ordered by their nearest range."""
-    miss_distance: Array
-    """(crossing,) m, largest distance of the crossing from a beam that passes through it."""
-    crossing_angle: Array
-    """(crossing,) degree, largest angle between beams that meet there, reduced to 0-90."""
     passages: Passages
     near_crossing: Booleans
     """(crossing,) True where a beam continues from the crossing to a farther one: attenuation
@@ -100,28 +90,6 @@ class Network:
         """Return the crossings on a beam and their ranges, the nearest first."""
         on_this_beam = self.passages.beam == beam
         return self.passages.crossing[on_this_beam], self.passages.range[on_this_beam]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cycle:
-    """A closed path over beams: row j follows beam j from crossing j to crossing j + 1."""
-
-    beam: Indices
-    crossing: Indices
-    start_range: Array
-    """(row,) m, range on the beam of the crossing where the row starts."""
-    end_range: Array
-    """(row,) m, range on the beam of the crossing where the row ends."""
-
-    @property
-    def sign(self) -> Array:
-        """(row,) +1 where the row leads away from its lidar, -1 where it leads towards it."""
-        return np.where(self.end_range > self.start_range, 1.0, -1.0)
-
-    @property
-    def far_start(self) -> bool:
-        """Whether the first crossing is the far one of the two on the first beam."""
-        return bool(self.sign[0] < 0)
 
 
 # Geodesy ------------------------------------------------------------------------------------
@@ -228,10 +196,10 @@ def locate(beams: Sequence[Beam]) -> tuple[Array, Array]:
 def build_network(
     beams: Sequence[Beam],
     *,
-    tolerance: float = DEFAULT_TOLERANCE,
+    tolerance: float = THRESHOLDS.tolerance,
     nearest: float | Sequence[float] = 0.0,
     farthest: float | Sequence[float] = np.inf,
-    smallest_angle: float = SMALLEST_CROSSING_ANGLE,
+    smallest_angle: float = THRESHOLDS.smallest_angle,
 ) -> Network:
     """Find the crossings where beams of stations meet. Results are cached by the arguments.
 
@@ -269,10 +237,10 @@ def network_of_lines(
     origin: npt.ArrayLike,
     direction: npt.ArrayLike,
     *,
-    tolerance: float = DEFAULT_TOLERANCE,
+    tolerance: float = THRESHOLDS.tolerance,
     nearest: float | Sequence[float] = 0.0,
     farthest: float | Sequence[float] = np.inf,
-    smallest_angle: float = SMALLEST_CROSSING_ANGLE,
+    smallest_angle: float = THRESHOLDS.smallest_angle,
 ) -> Network:
     """Find the crossings of beams given in a local frame; otherwise as `build_network`.
 
@@ -316,8 +284,8 @@ def _network_of_beams(
     geodetic = to_geodetic(first + network.crossing @ axes)
     return _freeze(
         Network(
-            network.origin, network.direction, network.crossing, network.miss_distance,
-            network.crossing_angle, network.passages, network.near_crossing, geodetic,
+            network.origin, network.direction, network.crossing, network.passages,
+            network.near_crossing, geodetic,
         )
     )  # fmt: skip
 
@@ -333,9 +301,11 @@ def _find_crossings(
         raise RetrievalInputError(f"is {tolerance} m", field="tolerance")
     if not 0 < smallest_angle < 90:
         raise RetrievalInputError(f"is {smallest_angle} degree", field="smallest_angle")
-    if len(origin) > MOST_BEAMS:
+    if len(origin) > THRESHOLDS.most_beams:
         raise RetrievalInputError(
-            f"are {len(origin)}, more than {MOST_BEAMS}", field="beams", remedy="split the network"
+            f"are {len(origin)}, more than {THRESHOLDS.most_beams}",
+            field="beams",
+            remedy="split the network",
         )
     groups = _beam_groups(origin, direction, tolerance, limits, smallest_angle)
     points = [_closest_point(origin, direction, group) for group in groups]
@@ -363,8 +333,6 @@ def _find_crossings(
             origin,
             direction,
             crossing[order],
-            np.array([_miss_distance(origin, direction, groups[c], points[c]) for c in order]),
-            np.array([_widest_angle(direction, groups[c]) for c in order]),
             passages,
             near,
         )
@@ -438,127 +406,6 @@ def _miss_distance(origin: Array, direction: Array, beams: tuple[int, ...], poin
     return max(float(np.linalg.norm(np.cross(direction[b], point - origin[b]))) for b in beams)
 
 
-def _widest_angle(direction: Array, beams: tuple[int, ...]) -> float:
-    return max(
-        float(
-            np.degrees(
-                np.arctan2(
-                    np.linalg.norm(np.cross(direction[i], direction[j])),
-                    abs(direction[i] @ direction[j]),
-                )
-            )
-        )
-        for i, j in itertools.combinations(beams, 2)
-    )
-
-
-# Cycles -------------------------------------------------------------------------------------
-
-
-def build_cycle(
-    net: Network, beams: Sequence[int] | None = None, *, start: int | None = None
-) -> Cycle:
-    """Return the cycle of beams that meet pairwise, followed in the direction of attenuation.
-
-    The cycle leads away from the lidars over a larger distance than towards them, so that the
-    determinant of a homogeneous field is between 0 and 1. It starts at a crossing where both
-    beams lead away from their lidars, if there is one: from a far start, every multiplier
-    except 1 gives a useless estimate.
-
-    Parameters
-    ----------
-    net : Network
-    beams : sequence of int, optional
-        Beams in their order around the cycle. By default, all beams of a network that is a
-        single cycle.
-    start : int, optional
-        The crossing to solve for. By default, the most suitable one.
-
-    Returns
-    -------
-    Cycle
-
-    Raises
-    ------
-    RetrievalInputError
-        If the beams form no cycle, or the start is not on it.
-    """
-    order = _single_cycle(net) if beams is None else [int(b) for b in beams]
-    if len(order) < 3 or len(set(order)) != len(order) or not set(order) <= set(range(net.beams)):
-        raise RetrievalInputError(
-            f"are {order}", field="beams", remedy="give at least 3 different beams of the network"
-        )
-    k = len(order)
-    shared = [_shared_crossing(net, order[j - 1], order[j]) for j in range(k)]
-    if len(set(shared)) != k:
-        raise RetrievalInputError(f"{order} meet in one place", field="beams")
-    lengths = [
-        _range_on_beam(net, order[j], shared[(j + 1) % k])
-        - _range_on_beam(net, order[j], shared[j])
-        for j in range(k)
-    ]
-    if sum(lengths) < 0:
-        # Backwards, row j follows the same beam from its last crossing to its first.
-        order, shared = order[::-1], [shared[(j + 1) % k] for j in range(k)][::-1]
-        lengths = [-length for length in lengths[::-1]]
-    first = _start_row(lengths, shared, start)
-    order, shared = order[first:] + order[:first], shared[first:] + shared[:first]
-    return Cycle(
-        np.array(order, dtype=np.intp),
-        np.array(shared, dtype=np.intp),
-        np.array([_range_on_beam(net, order[j], shared[j]) for j in range(k)]),
-        np.array([_range_on_beam(net, order[j], shared[(j + 1) % k]) for j in range(k)]),
-    )
-
-
-def _start_row(lengths: list[float], shared: list[int], start: int | None) -> int:
-    if start is None:
-        k = len(lengths)
-        return max(range(k), key=lambda j: (lengths[j] > 0, lengths[j - 1] < 0, lengths[j], -j))
-    if start not in shared:
-        raise RetrievalInputError(
-            f"{start} is not on the cycle", field="start", remedy=f"choose one of {shared}"
-        )
-    return shared.index(start)
-
-
-def _single_cycle(net: Network) -> list[int]:
-    crossings_on_beam = np.bincount(net.passages.beam, minlength=net.beams)
-    beams_at_crossing = np.bincount(net.passages.crossing, minlength=net.crossings)
-    if net.beams < 3 or np.any(crossings_on_beam != 2) or np.any(beams_at_crossing != 2):
-        raise RetrievalInputError(
-            "are not one cycle, with two crossings on every beam and two beams at every crossing",
-            field="beams",
-            remedy="give the beams of a cycle in their order, or use the method 'network'",
-        )
-    order, crossing = [0], int(net.on_beam(0)[0][0])
-    while True:
-        meeting_beams = net.passages.beam[net.passages.crossing == crossing]
-        beam = int(meeting_beams[meeting_beams != order[-1]][0])
-        if beam == order[0]:
-            break
-        order.append(beam)
-        ends = net.on_beam(beam)[0]
-        crossing = int(ends[ends != crossing][0])
-    if len(order) != net.beams:
-        raise RetrievalInputError(
-            "form several cycles", field="beams", remedy="give the beams of one of them"
-        )
-    return order
-
-
-def _shared_crossing(net: Network, first: int, second: int) -> int:
-    shared = np.intersect1d(net.on_beam(first)[0], net.on_beam(second)[0])
-    if shared.size != 1:
-        raise RetrievalInputError(f"{first} and {second} do not meet", field="beams")
-    return int(shared[0])
-
-
-def _range_on_beam(net: Network, beam: int, crossing: int) -> float:
-    crossings, ranges = net.on_beam(beam)
-    return float(ranges[crossings == crossing][0])
-
-
 # Checks -------------------------------------------------------------------------------------
 
 
@@ -596,8 +443,8 @@ def _per_beam(value: float | Sequence[float], beams: int, name: str) -> tuple[fl
 def _freeze(net: Network) -> Network:
     passages = net.passages
     for array in (
-        net.origin, net.direction, net.crossing, net.miss_distance, net.crossing_angle,
-        net.near_crossing, net.geodetic, passages.beam, passages.crossing, passages.range,
+        net.origin, net.direction, net.crossing, net.near_crossing, net.geodetic,
+        passages.beam, passages.crossing, passages.range,
     ):  # fmt: skip
         if array is not None:
             array.setflags(write=False)

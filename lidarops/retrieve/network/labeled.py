@@ -20,6 +20,7 @@ from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -31,28 +32,17 @@ _WARNINGS: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits of bins that are passed on to the values they contribute to."""
 _QUALITY_OF_FLAG: Final = {
     "ill_conditioned": NetworkQuality.POORLY_DETERMINED,
-    "far_start": NetworkQuality.EXTRAPOLATED,
-    "not_positive": Quality.NO_REAL_SOLUTION,
     "uncertain": NetworkQuality.POORLY_DETERMINED,
     "signal_not_positive": Quality.LOW_SIGNAL,
     "signal_missing": Quality.INPUT_MISSING,
     "weak_signal": NetworkQuality.LOW_LEVERAGE,
     "bridged": Quality.OUTLIER,
     "outlying": NetworkQuality.POOR_FIT,
-    "pole": NetworkQuality.UNSTABLE_INVERSION,
     "unsettled": NetworkQuality.POOR_FIT,
     "poor_fit": NetworkQuality.POOR_FIT,
-    "not_homogeneous": Quality.NOT_HOMOGENEOUS,
     "not_measured": Quality.INPUT_MISSING,
 }
 """Quality bits of `CrossingFlags`. `not_finite` is used where no other flag rejects the value."""
-_RELATIVE_CHANGE: Final = 1e-2
-"""Relative change of signals for sensitivities."""
-BINS_BEYOND: Final = 200
-"""Bins kept beyond the farthest crossing of a beam: over twice the widest window of a bin."""
-_MOST_SEPARATE_BEAMS: Final = 16
-"""Largest number of beams whose errors are computed one by one. With more, beams of one instrument
-are changed together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +78,6 @@ class NetworkSettings:
     block_intervals: int
     """Number of clock intervals that share a mean field."""
     visibility: Definition
-    method: str = "network"
     prior: str = "block"
     exponent_relative_error: float = 0.1
     """Relative error of the exponent m."""
@@ -186,7 +175,7 @@ def retrieve_network(
             "beam_range": (("beam", "crossing"), _distances(network)[:, near]),
         },
         coords=_coordinates(beams, intervals, network, near),
-        attrs={"steps": _describe_steps(beams, network, result, settings)},
+        attrs={"steps": _describe_steps(beams, network, settings)},
     )
 
 
@@ -235,7 +224,7 @@ def _gather_signals(
 def _bins_used(grid: Array, network: Network) -> int:
     """Return the number of bins up to the farthest crossing of any beam, and a margin."""
     reached = [int(np.sum(row <= network.on_beam(index)[1][-1])) for index, row in enumerate(grid)]
-    return max(reached) + BINS_BEYOND
+    return max(reached) + THRESHOLDS.bins_beyond
 
 
 class _Solver:
@@ -255,7 +244,7 @@ class _Solver:
         instruments = list(dict.fromkeys(names))
         self.beam_groups = (
             [[index] for index in range(len(beams))]
-            if len(beams) <= _MOST_SEPARATE_BEAMS
+            if len(beams) <= THRESHOLDS.most_separate_beams
             else [
                 [index_of_beam for index_of_beam, name in enumerate(names) if name == instrument]
                 for instrument in instruments
@@ -263,7 +252,6 @@ class _Solver:
         )
         """Beams that are changed together."""
         self._arguments: dict[str, Any] = {
-            "method": settings.method,
             "prior": settings.prior,
             "variance": signals.variance,
             "overlap": signals.overlap,
@@ -341,12 +329,12 @@ class _Errors:
         overlap_change = _root_sum_square(
             list(
                 solver.extinction_changes(
-                    result, _RELATIVE_CHANGE * signals.power * solver.near_end_weights()
+                    result, THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
                 )
             )
         )
         with np.errstate(invalid="ignore", divide="ignore"):
-            condition = overlap_change / _RELATIVE_CHANGE / result.extinction
+            condition = overlap_change / THRESHOLDS.relative_change / result.extinction
         tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], signals.power.shape)
         tail_signal = _root_sum_square(list(solver.extinction_changes(result, tail)))
         exponent = solver.exponent * (1.0 + settings.exponent_relative_error)
@@ -368,9 +356,9 @@ def _lidar_ratio_error(solver: _Solver, result: NetworkResult, relative_error: f
     square_sum = np.zeros(result.extinction.shape)
     if relative_error > 0.0:
         for weights in solver.crossing_weights():
-            power = solver.signals.power * (1.0 + _RELATIVE_CHANGE * weights)
+            power = solver.signals.power * (1.0 + THRESHOLDS.relative_change * weights)
             square_sum += (solver.solve(power).extinction - result.extinction) ** 2
-    return np.asarray(np.sqrt(square_sum) * relative_error / _RELATIVE_CHANGE)
+    return np.asarray(np.sqrt(square_sum) * relative_error / THRESHOLDS.relative_change)
 
 
 def _root_sum_square(contributions: Sequence[Array]) -> Array:
@@ -470,11 +458,10 @@ def _coordinates(
 def _describe_steps(
     beams: Sequence[BeamAverages],
     network: Network,
-    result: NetworkResult,
     settings: NetworkSettings,
 ) -> str:
     """Return a description of the beams, their crossings and the definition of visibility."""
-    texts = [f"method {result.method.value}", settings.visibility.words]
+    texts = [settings.visibility.words]
     for index, beam in enumerate(beams):
         numbers, ranges = network.on_beam(index)
         crossings = ", ".join(f"{v} at {r:.0f} m" for v, r in zip(numbers, ranges, strict=True))

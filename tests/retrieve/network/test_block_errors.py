@@ -10,6 +10,7 @@ from support.oracles.network import gradient, grid, noisy, plume, signals, three
 
 from lidarops.retrieve.network import _block_errors
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 # Fields that a prior excludes -----------------------------------------------------------------
 
@@ -25,7 +26,7 @@ def test_bent_fields_have_no_level_and_no_gradient(axes):
     fields = _block_errors.bent_fields(position)
     linear = np.column_stack([np.ones(14), position])
     np.testing.assert_allclose(fields @ linear, 0.0, atol=1e-9)
-    assert np.sum(fields**2) / 14 == pytest.approx(_block_errors.BEND**2)
+    assert np.sum(fields**2) / 14 == pytest.approx(THRESHOLDS.bend**2)
     # Every quadratic field is a sum of them and a linear field.
     quadratic = (position[:, 0] - 0.3 * position[:, 1] + 20.0) ** 2 / 1e4
     design = np.column_stack([linear, fields.T])

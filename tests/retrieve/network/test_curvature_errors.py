@@ -24,6 +24,7 @@ from lidarops.retrieve.network import (
     _fit_layout,
     extinction_field,
 )
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 
 def layer(deep, height):
@@ -111,7 +112,7 @@ def test_the_noise_of_a_curvature_error_is_as_stated():
 
 
 @pytest.mark.parametrize("strength", [1.0, 2.0, 4.0])
-@pytest.mark.parametrize("deviation", [*_empirical_prior.DEVIATIONS, np.inf])
+@pytest.mark.parametrize("deviation", [*THRESHOLDS.deviations, np.inf])
 def test_the_prior_of_a_solution_is_recovered(deviation, strength):
     net = three_by_two()
     shape = (1, net.crossings)

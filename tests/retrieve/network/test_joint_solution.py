@@ -27,6 +27,7 @@ from lidarops.retrieve.network import (
     _fit_layout,
     _joint_solution,
 )
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 # Linear algebra -----------------------------------------------------------------------------
 
@@ -265,9 +266,7 @@ def test_likelihood_agrees_with_the_dense_linear_model():
     choose = np.eye(net.crossings)[oracle.crossing]
 
     def dense(deviation):
-        field = _empirical_prior.GRADIENT**2 * problem.gradient + deviation**2 * np.eye(
-            net.crossings
-        )
+        field = THRESHOLDS.gradient**2 * problem.gradient + deviation**2 * np.eye(net.crossings)
         total = noise + choose @ field @ choose.T
         inverse = np.linalg.inv(total)
         information = design.T @ inverse @ design
@@ -394,7 +393,7 @@ def test_the_mean_of_profiles_detects_a_field_that_the_prior_excludes(field, det
         _empirical_prior._Problem(data, *problem_arguments),
         _empirical_prior._mean_problem(data, *problem_arguments),
     )
-    sharp = problem.afresh(_empirical_prior.DEVIATIONS[0])
+    sharp = problem.afresh(THRESHOLDS.deviations[0])
     # Single profiles fit, even in the steep field.
     assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
     assert (

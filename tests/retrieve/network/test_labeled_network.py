@@ -16,6 +16,7 @@ from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.network import labeled
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.labeled import NetworkSettings, retrieve_network
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 PLAIN = NetworkSettings(block_intervals=72, visibility=Definition(wavelength=532e-9))
 
@@ -162,6 +163,6 @@ def test_the_number_of_beams_must_match_the_network():
 def test_bins_that_are_not_used_do_not_matter(monkeypatch):
     beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
     cut = solved(beams)
-    monkeypatch.setattr(labeled, "BINS_BEYOND", 10**6)
+    monkeypatch.setattr(labeled, "THRESHOLDS", replace(THRESHOLDS, bins_beyond=10**6))
     xr.testing.assert_identical(cut, solved(beams))
     assert beams[0].averages.sizes["range"] > 700

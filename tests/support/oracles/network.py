@@ -80,26 +80,16 @@ def at_crossings(net, field):
     return field(*net.crossing.T)
 
 
-def optical_depths(net, cycle, field):
-    """Return (row,) signed optical depths of a cycle."""
-    out = np.empty(cycle.beam.size)
-    for j, beam in enumerate(cycle.beam):
-        r = np.linspace(cycle.start_range[j], cycle.end_range[j], 4001)
-        along = field(*(net.origin[beam][:, None] + net.direction[beam][:, None] * r))
-        out[j] = np.sum((along[1:] + along[:-1]) / 2 * np.diff(r))
-    return out
-
-
 FIELDS = {"homogeneous": homogeneous(), "gradient": gradient, "plume": plume}
 QUIET = 1e-12
 """Relative variance of almost no noise."""
 
 
-def without_noise(net, field, *, step=5.0, method="cycle", **settings):
+def without_noise(net, field, *, step=5.0, prior="none", **settings):
     r = grid(net, step)
     power = signals(net, r, field, settings.get("exponent", 1.0))
     return retrieve_network(
-        power, r, net, method=method, variance=QUIET * power**2, full_overlap_range=100.0,
+        power, r, net, prior=prior, variance=QUIET * power**2, full_overlap_range=100.0,
         **settings,
     )  # fmt: skip
 
@@ -107,8 +97,7 @@ def without_noise(net, field, *, step=5.0, method="cycle", **settings):
 def with_noise(net, field, relative, profiles=500, *, seed=1, step=5.0, **settings):
     r = grid(net, step)
     power, variance = noisy(net, r, signals(net, r, field), relative, profiles, seed)
-    if settings.get("method", "network") in {"network", "multiplier"}:
-        settings.setdefault("blocks", np.arange(profiles) // 50)
+    settings.setdefault("blocks", np.arange(profiles) // 50)
     return retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0, **settings)
 
 

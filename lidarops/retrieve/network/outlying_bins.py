@@ -9,9 +9,8 @@ bins that were used.
 Edges of layers and clouds are air. Several bins then deviate, or neighbours still deviate after
 bridging; such a beam stays as it is. So do beams with bins wider than 10 m, where a layer may
 fill a single bin. As adjacent bins may be outlying too, the change that bridging them would make
-is added to the covariance of the beam, with straight lines across long runs
-(`lidarops.retrieve.network.noise.outlying_runs`). Where too many bins deviate, the stated noise
-is wrong, and the beam is rejected.
+is added to the covariance of the beam. Where too many bins deviate, the stated noise is wrong, and
+the beam is rejected.
 """
 
 from __future__ import annotations
@@ -23,16 +22,15 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.network.thresholds import THRESHOLDS
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Codes = npt.NDArray[np.uint8]
 
-OUTLYING_SIGMAS: Final = 6.0
-"""Standard errors beyond which a bin is outlying; by chance once in 5e8 bins."""
-REACH: Final = 8
-"""Bins on either side among which neighbours are searched."""
-MARGIN: Final = 4
-"""Bins before and behind the used ones of a beam that help to test these."""
+OUTLYING_SIGMAS: Final = THRESHOLDS.outlier
+REACH: Final = THRESHOLDS.reach
+MARGIN: Final = THRESHOLDS.margin
 NODES: Final = 6
 """Neighbours that a polynomial goes through."""
 GOOD: Final = 0
@@ -47,23 +45,16 @@ _SIDE: Final = 3
 _OTHER_SIDE: Final = (6, 3, 4, 3)
 """Neighbours on one side where the other side has 0, 1, 2 and 3."""
 _ONE_SIDED_DEGREE: Final = 2
-_AIR_DEVIATION: Final = (5e-2, 1e-3, 5e-4, 5e-4)
-"""Largest relative deviation by air, for 0 to 3 neighbours on the side with fewer."""
+_AIR_DEVIATION: Final = THRESHOLDS.air_deviation
 _REFERENCE_BINS: Final = 4
 """Neighbours on either side that decide which of several bins is the worst."""
 _REFERENCE_DEGREE: Final = 3
-_NOISY_BIN: Final = 0.02
-"""Relative standard error of a bin beyond which logarithms are not normal in their tails."""
-WIDEST_BIN: Final = 10.0
-"""m, largest width of a bin that is too narrow for a layer of air."""
-_SUSPECT_SIGMAS: Final = 4.5
-"""Standard errors of a deviation near a bridged bin beyond which the bin may be an edge."""
-_STEP: Final = 0.1
-"""Change of the logarithm over 4 bins that air may cause: for a visibility of 2 km."""
-_EDGE_BINS: Final = 14
-"""Bins that deviate at two edges of layers."""
-_OUTLYING_SHARE: Final = 0.2
-"""Fraction of the bins of a beam that may be outlying in addition."""
+_NOISY_BIN: Final = THRESHOLDS.noisy_bin
+WIDEST_BIN: Final = THRESHOLDS.widest_bin
+_SUSPECT_SIGMAS: Final = THRESHOLDS.suspect
+_STEP: Final = THRESHOLDS.step
+_EDGE_BINS: Final = THRESHOLDS.edge_bins
+_OUTLYING_SHARE: Final = THRESHOLDS.outlying_share
 _LARGEST_LOGARITHM: Final = 300.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -385,73 +376,6 @@ def _all_isolated(
 
 
 @_compiled
-def _exceeds(
-    values: Array, variances: Array, at: int, weights: Array, air: tuple[float, float]
-) -> bool:
-    """Return whether a bin deviates from the three on either side, without a square root.
-
-    `air` holds the absolute and the relative deviation that air may cause.
-    """
-    prediction = (
-        weights[at, 0] * values[at - 3] + weights[at, 1] * values[at - 2]
-        + weights[at, 2] * values[at - 1] + weights[at, 3] * values[at + 1]
-        + weights[at, 4] * values[at + 2] + weights[at, 5] * values[at + 3]
-    )  # fmt: skip
-    spread = variances[at] + (
-        weights[at, 0] * weights[at, 0] * variances[at - 3]
-        + weights[at, 1] * weights[at, 1] * variances[at - 2]
-        + weights[at, 2] * weights[at, 2] * variances[at - 1]
-        + weights[at, 3] * weights[at, 3] * variances[at + 1]
-        + weights[at, 4] * weights[at, 4] * variances[at + 2]
-        + weights[at, 5] * weights[at, 5] * variances[at + 3]
-    )
-    gap = abs(values[at] - prediction) - (air[0] + air[1] * abs(prediction))
-    return gap > 0.0 and not gap * gap <= OUTLYING_SIGMAS * OUTLYING_SIGMAS * spread
-
-
-@_compiled
-def _no_outlier(
-    row: tuple[Array, Array, Array, Array],
-    exponent: float,
-    codes: Codes,
-    span: tuple[int, int, int, int],
-    neighbour_plan: tuple[Indices, Array, Array],
-) -> bool:
-    """Return whether all bins are good and no used bin is outlying, as on most beams."""
-    logs, noise, scaled, scaled_variance = row
-    first, low, stop, last = span
-    noisy = (_NOISY_BIN * exponent) ** 2
-    lost = 0
-    for g in range(first, last):
-        lost |= codes[g]
-    if lost != 0:
-        return False
-    for g in range(low, stop):
-        left, right = neighbour_plan[0][g, 0], neighbour_plan[0][g, NODES - 1]
-        if left < first or right >= last:
-            return False
-        if right - left != NODES or right - g != _SIDE:
-            if _deviation(row, exponent, g, neighbour_plan[0][g], neighbour_plan[1][g],
-                    NODES, neighbour_plan[2][g]) > OUTLYING_SIGMAS:  # fmt: skip
-                return False
-            continue
-        largest_noise = noise[g]
-        for k in range(g - _SIDE, g + _SIDE + 1):
-            largest_noise = max(largest_noise, noise[k])
-        if largest_noise < noisy:
-            outlying = _exceeds(
-                logs, noise, g, neighbour_plan[1], (neighbour_plan[2][g] * exponent, 0.0)
-            )
-        else:
-            outlying = _exceeds(
-                scaled, scaled_variance, g, neighbour_plan[1], (0.0, neighbour_plan[2][g])
-            )
-        if outlying:
-            return False
-    return True
-
-
-@_compiled
 def find_outliers(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
@@ -492,10 +416,14 @@ def find_outliers(
     int
         End of the reliable bins.
     """
-    first, _, _, stop = span
+    first, low, used_stop, stop = span
     largest_number = _EDGE_BINS + int(_OUTLYING_SHARE * (stop - first))
     number = 0
-    if stop <= first or _no_outlier(row, exponent, codes, span, neighbour_plan):
+    _measure_deviations(
+        row, exponent, grid, codes, (first, stop, low, used_stop), neighbour_plan, deviations
+    )
+    # On most beams, no used bin is outlying.
+    if not np.any(deviations[low:used_stop] > OUTLYING_SIGMAS):
         return number, stop
     _measure_deviations(
         row, exponent, grid, codes, (first, stop, first, stop), neighbour_plan, deviations

@@ -1,1 +1,0 @@
-"""Outlying bins of the beams of a network, and groups of profiles with similar noise."""

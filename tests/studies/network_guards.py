@@ -1,0 +1,357 @@
+"""Ablation of the guards of networks: what changes when each of them is switched off.
+
+Every variant solves the same random networks (`lidarops.bench.stability.random_networks`), blocks
+in which noise rises, and simulated campaigns from raw files to products. In the root of a
+checkout::
+
+    python tests/studies/network_guards.py solve OUT [--only VARIANT ...] [--classes NAME ...]
+    python tests/studies/network_guards.py table OUT MARKER
+
+``table`` writes a table into ``docs/algorithms/network.md``, between two marks of that name: shares
+with all guards, then the differences without one of them, in percent, each with its Monte Carlo
+error from the scatter between networks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import xarray as xr
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from support.archives import network_campaigns
+
+from lidarops.bench.accuracy.network_cases import signals
+from lidarops.bench.stability import random_networks
+from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.network import (
+    _beam_signals,
+    _block_errors,
+    _condensed_signals,
+    _empirical_prior,
+    extinction_field,
+    labeled,
+)
+from lidarops.retrieve.network.flags import NetworkQuality
+from lidarops.run.archive import Options, Selection, reprocess
+
+PROFILES = 50
+"""Profiles of a random network: one block."""
+FALSE, FINE, COVERED = 4.0, 2.5, 1.96
+"""Stated errors beyond which a value is false, within which it needs no flag, and within which
+95 percent of the values should be."""
+REJECTING = rejecting((*Quality, *NetworkQuality))
+CAMPAIGNS, RISING = "campaigns", "noise that rises"
+ALL = "all guards"
+OWN = {
+    "outlying bins": "outliers",
+    "runs of outlying bins": "outliers",
+    "noise groups": RISING,
+    "curvature errors": "layer of a few bins",
+}
+"""Class of scenes that a guard is for."""
+PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/network.md"
+
+Patch = tuple[Any, str, Any]
+
+
+def _unscreened() -> Any:
+    condense = _condensed_signals.condense
+    return lambda *arguments, screened: condense(*arguments, screened=False)
+
+
+def _no_variance(*_: Any) -> float:
+    return 0.0
+
+
+def _no_prior(data: Any, layout: Any, crossing: Any, exponent: Any, position: Any, _: Any) -> Any:
+    return _empirical_prior.solve_without_prior(data, layout, crossing, exponent, position)
+
+
+VARIANTS: dict[str, list[Patch]] = {
+    ALL: [],
+    "prior": [(_empirical_prior, "solve_blocks", _no_prior)],
+    "prior: contradicted by profiles": [
+        (_empirical_prior, "_contradicted", lambda *_: False),
+    ],
+    "prior: contradicted by the mean": [
+        (_empirical_prior, "_off_mean_solution", lambda *_: False),
+        (_empirical_prior, "_mean_improbable", lambda *_: False),
+    ],
+    "prior: off the mean solution": [(_empirical_prior, "_off_mean_solution", lambda *_: False)],
+    "prior: mean improbable": [(_empirical_prior, "_mean_improbable", lambda *_: False)],
+    "prior: weakest where untestable": [(_empirical_prior, "_can_test_prior", lambda *_: True)],
+    "prior: deviation of the mean": [(_empirical_prior, "_least_deviation", lambda *_: 0.0)],
+    "outlying bins": [(_condensed_signals, "condense", _unscreened())],
+    "curvature errors": [
+        (extinction_field, "_curvature_variance", lambda _, fit, *__: 0.0 * fit.variance)
+    ],
+    "block errors": [
+        (_block_errors, "noise_bias_variance", _no_variance),
+        (_block_errors, "excluded_field_variance", _no_variance),
+        (_block_errors, "at_least_typical", lambda _, variance, *__: variance),
+    ],
+    "block errors: noise bias": [(_block_errors, "noise_bias_variance", _no_variance)],
+    "block errors: excluded fields": [(_block_errors, "excluded_field_variance", _no_variance)],
+    "block errors: at least typical": [
+        (_block_errors, "at_least_typical", lambda _, variance, *__: variance)
+    ],
+    "weak signals": [(_beam_signals, "LARGEST_BIN_ERROR", 1e6)],
+    "noisy passages of a profile": [
+        (
+            _beam_signals,
+            "_noisy_passages",
+            lambda *arguments: np.zeros_like(arguments[0], bool)[:, 0, :1],
+        )
+    ],
+}
+"""Names of guards, each with what replaces it. A variant of several names switches off all."""
+
+
+# Random networks ------------------------------------------------------------------------------
+
+
+def _count(error: Any, stated: Any, flagged: Any, truth: Any) -> dict[str, float]:
+    """Return sums over all near crossings of all profiles."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.abs(error) / stated
+        kept = np.isfinite(error) & ~flagged
+        relative = np.clip(np.abs(error) / truth, 0.0, 3.0)
+    return {
+        "values": float(error.size),
+        "kept": float(kept.sum()),
+        "false": float((kept & ~(size <= FALSE)).sum()),
+        "covered": float((kept & (size <= COVERED)).sum()),
+        "needless": float((np.isfinite(error) & flagged & (size <= FINE)).sum()),
+        "square": float((relative[kept] ** 2).sum()),
+        "stated": float((np.minimum(stated / truth, 3.0)[kept]).sum()),
+    }
+
+
+def _rising_noise(cluster: int) -> dict[str, float] | None:
+    """Return the counts of a block in which noise rises by a factor of 5, as at dawn."""
+    rng = np.random.default_rng((74, cluster))
+    net = random_networks._random_network(rng).network()
+    if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
+        return None
+    clean = signals(net, random_networks._layered(rng))
+    power, variance = clean.draw(float(np.exp(rng.uniform(np.log(3e-3), np.log(0.1)))), PROFILES, 1)
+    factor = np.where(np.arange(PROFILES) < rng.integers(10, 40), 1.0, 5.0)[:, None, None]
+    mean = clean.power[np.arange(PROFILES) % len(clean.power)]
+    result = extinction_field.retrieve_network(
+        mean + factor * (power - mean), clean.range, net, variance=factor**2 * variance,
+        full_overlap_range=100.0,
+    )  # fmt: skip
+    truth, near = clean.truth(PROFILES), net.near_crossing
+    return _count(
+        (result.extinction - truth)[:, near], result.extinction_standard_error[:, near],
+        result.flags.flagged[:, near], truth[:, near],
+    )  # fmt: skip
+
+
+def _random_counts(clusters: range) -> Iterator[tuple[str, int, dict[str, float]]]:
+    """Yield class, number of the network and counts of the random networks."""
+    retrieve = extinction_field.retrieve_network
+    results: list[Any] = []
+
+    def record(*arguments: Any, **settings: Any) -> Any:
+        results.append(retrieve(*arguments, **settings))
+        return results[-1]
+
+    for cluster in clusters:
+        results.clear()
+        with mock.patch.object(extinction_field, "retrieve_network", record):
+            for scored, _ in random_networks.score_networks(cluster, PROFILES):
+                near = results[-1].near_crossing
+                error = scored.error[:, near]
+                truth = results[-1].extinction[:, near] - error
+                yield (
+                    scored.failure.name, cluster,
+                    _count(
+                        error, np.asarray(scored.random)[:, near],
+                        np.asarray(scored.bits)[:, near] != 0,
+                        np.where(np.isfinite(truth), truth, 1.0),
+                    ),
+                )  # fmt: skip
+        rising = _rising_noise(cluster)
+        if rising is not None:
+            yield RISING, cluster, rising
+
+
+# Campaigns ------------------------------------------------------------------------------------
+
+
+def _campaign_inputs(folder: Path) -> Iterator[tuple[Any, Any]]:
+    """Yield arguments of the retrieval, and the truth, of campaigns from raw files."""
+    airs = (network_campaigns.HOMOGENEOUS, network_campaigns.GRADIENT, network_campaigns.PLUME)
+    for number, (air, six_beams, rate) in enumerate(
+        (air, six_beams, rate) for rate in (4.0, 0.5) for air in airs for six_beams in (False, True)
+    ):
+        campaign, truth = network_campaigns.written(
+            folder / str(number), network_campaigns.tree(air, six_beams=six_beams, rate=rate)
+        )
+        retrieve, calls = labeled.retrieve_network, []
+
+        def record(*arguments: Any, retrieve: Any = retrieve, calls: Any = calls) -> xr.Dataset:
+            calls.append((arguments, retrieve(*arguments)))
+            return calls[-1][1]
+
+        with mock.patch.object(labeled, "retrieve_network", record):
+            reprocess(
+                campaign, selection=Selection(kinds=("visibility",)), options=Options(force=True)
+            )
+        for arguments, product in calls:
+            names = [beam.instrument for beam in arguments[0]]
+            yield arguments, network_campaigns.truth_at(product, truth, names)
+
+
+def _campaign_counts(inputs: list[Any]) -> Iterator[tuple[str, int, dict[str, float]]]:
+    for number, (arguments, truth) in enumerate(inputs):
+        product = labeled.retrieve_network(*arguments)
+        stated = np.hypot(
+            product["extinction_standard_error"], product["extinction_systematic_error"]
+        )
+        flagged = (product["quality_flag"].to_numpy() & REJECTING) != 0
+        yield (
+            CAMPAIGNS, number,
+            _count(product["extinction"].to_numpy() - truth, stated.to_numpy(), flagged, truth),
+        )  # fmt: skip
+
+
+def _of(classes: list[str]) -> Callable[..., Any]:
+    """Return the solution of scenes that leaves out other classes."""
+    solve_damaged = random_networks._solve_damaged
+    chosen = [scene[1:] for scene in random_networks.FAILURES if scene[0].name in classes]
+
+    def solve_some(rng: Any, draw_air: Any, damage: Any, profiles: int) -> Any:
+        if classes and (draw_air, damage) not in chosen:
+            return None
+        return solve_damaged(rng, draw_air, damage, profiles)
+
+    return solve_some
+
+
+# Commands -------------------------------------------------------------------------------------
+
+
+def solve(out: Path, names: list[str], clusters: int, classes: list[str]) -> None:
+    """Write the counts of each variant to a file; of all classes and campaigns, or some classes."""
+    out.mkdir(parents=True, exist_ok=True)
+    inputs = []
+    if not classes:
+        with tempfile.TemporaryDirectory() as folder:
+            inputs = list(_campaign_inputs(Path(folder)))
+    for name in names:
+        with ExitStack() as patches:
+            patches.enter_context(
+                mock.patch.object(random_networks, "_solve_damaged", _of(classes))
+            )
+            for owner, attribute, replacement in VARIANTS[name]:
+                patches.enter_context(mock.patch.object(owner, attribute, replacement))
+            counts = [*_random_counts(range(clusters)), *_campaign_counts(inputs)]
+        (out / f"{name}.json").write_text(json.dumps(counts))
+
+
+SHARES: dict[str, tuple[str, str]] = {
+    "false": ("false", "kept"),
+    "covered": ("covered", "kept"),
+    "needless flags": ("needless", "values"),
+    "values": ("kept", "values"),
+}
+"""Column -> numerator and denominator."""
+
+
+def table(out: Path, marker: str) -> None:
+    """Write the table of all variants in a folder into the page."""
+    heads = ("guard switched off", "class", "networks", *SHARES)
+    rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    reference = _read(out / f"{ALL}.json")
+    names = [ALL, *sorted(path.stem for path in out.glob("*.json") if path.stem != ALL)]
+    for name in names:
+        changed = _read(out / f"{name}.json")
+        classes = [None, OWN[name]] if name in OWN else [None]
+        for of_class in classes if name != ALL else [None, *dict.fromkeys(OWN.values())]:
+            kept, all_kept = (
+                {key: entry for key, entry in counts.items() if of_class in {None, key[0]}}
+                for counts in (changed, reference)
+            )
+            if kept:
+                rows.append(_row(name, of_class or "all", kept, all_kept))
+    text = PAGE.read_text(encoding="utf-8")
+    before, _, rest = text.partition(f"<!-- {marker} -->\n")
+    _, _, after = rest.partition(f"<!-- end of {marker} -->")
+    whole = "\n".join((before + f"<!-- {marker} -->", *rows, f"<!-- end of {marker} -->" + after))
+    PAGE.write_text(whole, encoding="utf-8")
+
+
+def _read(path: Path) -> dict[tuple[str, int], dict[str, float]]:
+    return {(name, k): counts for name, k, counts in json.loads(path.read_text())}
+
+
+def _sums(counts: Any, numerator: str, denominator: str) -> tuple[Any, Any]:
+    """Return the sums of each network."""
+    clusters = sorted({(name == CAMPAIGNS, k) for name, k in counts})
+    above, below = dict.fromkeys(clusters, 0.0), dict.fromkeys(clusters, 0.0)
+    for (name, k), entry in counts.items():
+        above[name == CAMPAIGNS, k] += entry[numerator]
+        below[name == CAMPAIGNS, k] += entry[denominator]
+    return np.array(list(above.values())), np.array(list(below.values()))
+
+
+def _share(counts: Any, numerator: str, denominator: str) -> tuple[float, float]:
+    above, below = _sums(counts, numerator, denominator)
+    share = above.sum() / below.sum()
+    return share, np.sqrt(np.sum((above - share * below) ** 2)) / below.sum()
+
+
+def _difference(changed: Any, reference: Any, *pair: str) -> tuple[float, float]:
+    """Return the difference of shares, and its error from the differences of networks."""
+    terms, shares = [], []
+    for counts in (changed, reference):
+        above, below = _sums(counts, *pair)
+        shares.append(above.sum() / below.sum())
+        terms.append((above - shares[-1] * below) / below.sum())
+    return shares[0] - shares[1], float(np.sqrt(np.sum((terms[0] - terms[1]) ** 2)))
+
+
+def _row(name: str, of_class: str, changed: Any, reference: Any) -> str:
+    """Return shares of all guards, or differences from them."""
+    cells = []
+    for pair in SHARES.values():
+        figures = (
+            _share(reference, *pair) if name == ALL else _difference(changed, reference, *pair)
+        )
+        sign = "" if name == ALL else "+"
+        cells.append(f"{100 * figures[0]:{sign}.2f} ± {100 * figures[1]:.2f}")
+    networks = len({key[1] for key in changed if key[0] != CAMPAIGNS})
+    return f"| {name} | {of_class} | {networks} | {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Run a command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("command", choices=("solve", "table"))
+    parser.add_argument("out", type=Path)
+    parser.add_argument("marker", nargs="?", default="ablation")
+    parser.add_argument("--only", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
+    parser.add_argument("--classes", nargs="+", default=[])
+    parser.add_argument("--clusters", type=int, default=40)
+    arguments = parser.parse_args()
+    if arguments.command == "table":
+        table(arguments.out, arguments.marker)
+    else:
+        solve(arguments.out, arguments.only, arguments.clusters, arguments.classes)
+
+
+if __name__ == "__main__":
+    main()
