@@ -59,9 +59,6 @@ _QUICK_PEER_PROFILES: Final = 30
 _CHUNK_BLOCKS: Final = 5
 _SHORTEST: Final = 1e-9
 """s. A short call may take less than one tick of the clock."""
-_NOT_DRAWN: Final = frozenset({"multiplier 0.95", "multiplier 0"})
-"""Solvers that are in the tables only."""
-_PEERS: Final = frozenset({"slope", "Klett, far end"})
 _SCIPY: Final = "scipy least_squares"
 _HIGHEST: Final = 2.0
 """Largest systematic error in figure 2."""
@@ -102,7 +99,7 @@ def measure_network(
                 visibilities |= _visibilities(results, signals[air.name], noise)
             effort.progress(1)
         chapters.append(_errors_chapter(lidars, scores, comparisons, math.prod(chunks)))
-        works += _works(lidars, scores)
+        works += _works(lidars, scores, comparisons)
     return Study(
         "Networks of lidars: error of extinction and visibility against run time",
         effort.date,
@@ -239,9 +236,17 @@ def _share(figure: Figure | None) -> Figure | None:
     return None if figure is None else share(figure)
 
 
-def _works(lidars: LidarLine, scores: Scores) -> Iterator[Work]:
-    for (case, method), score in scores.items():
-        error, coverage, spent = score[_RMSE], score["within 1.96"], score[CPU_TIME]
+def _works(lidars: LidarLine, scores: Scores, comparisons: Scores) -> Iterator[Work]:
+    peers = {
+        (f"{air}, noise {_percent(network_cases.PEER_NOISE)}", _SCIPY): {
+            _RMSE: score["scipy, RMSE"],
+            CPU_TIME: score["scipy, CPU time"],
+        }
+        for (place, air), score in comparisons.items()
+        if place == lidars.name
+    }
+    for (case, method), score in (scores | peers).items():
+        error, coverage, spent = score[_RMSE], score.get("within 1.96"), score[CPU_TIME]
         if isinstance(error, Figure) and isinstance(spent, Figure):
             yield Work(
                 f"{lidars.name}, {case}",
@@ -250,7 +255,7 @@ def _works(lidars: LidarLine, scores: Scores) -> Iterator[Work]:
                 Figure(error.value, error.error),
                 coverage if isinstance(coverage, Figure) else None,
                 spent,
-                ours=method not in _PEERS,
+                ours=method != _SCIPY,
             )
 
 
@@ -277,8 +282,7 @@ def _errors_chapter(
         "relative noise of each bin as given, plus 1 % of the power at the first crossing of the "
         f"beam; blocks of {BLOCK} profiles. Extinction is 2 per km at 600 m with a "
         "scale height of 1 km (gradient), or 1.5 per km with a plume of 3.5 per km that is fixed "
-        "or drifts by 300 m in a block. Multipliers below 1 are those of the paper and neglect a "
-        "part of the solution; the unbiased estimate assigns that part to the start crossing. "
+        "or drifts by 300 m in a block. "
         "Errors are relative and clipped at 300 %, because a quotient of noise has no variance. "
         "Where noise hides the attenuation (0.2 per km), most values are flagged. The few "
         "unflagged ones are those that noise has made large, and their errors exceed the stated "
@@ -313,7 +317,7 @@ def _chart(lidars: LidarLine, rows: Sequence[Row], comparisons: Scores) -> Chart
             if place == lidars.name
         }
     )
-    drawn = [*(row for row in rows if row.method not in _NOT_DRAWN), *peers]
+    drawn = [*rows, *peers]
     return chart(
         f"work-precision-{lidars.name.replace(' ', '')}",
         f"Error of extinction against run time, {lidars.name}",
@@ -349,7 +353,6 @@ def _figure_chapter() -> Chapter:
             "paper, without signs": point.printed,
             "crossing 1, with signs": point.signed,
             "near crossing": point.near,
-            "solved": point.simulated,
         }
         for point in points
     }
