@@ -83,12 +83,11 @@ SCENES = {
     "Quality.TOO_FEW_BINS": "test_path_fit::test_few_bins",
     "Quality.NO_SIGNAL": "test_path_fit::test_constant_profile_has_no_signal",
     "Quality.LOW_SIGNAL": "test_cubic_and_tail::test_lost_roots_are_flagged",
-    "HomogeneousQuality.POORLY_DETERMINED": "test_path_fit::"
-    "test_single_weak_shot_of_counts_is_flagged",
-    "Quality.NEGATIVE_AMPLITUDE": "test_path_fit::test_inverted_profile_has_negative_amplitude",
-    "HomogeneousQuality.AT_BOUND": "test_path_fit::"
-    "test_extinction_stays_within_given_bounds_and_is_flagged",
-    "HomogeneousQuality.POOR_FIT": "test_path_fit::test_wrong_noise_variance_is_flagged",
+    "HomogeneousQuality.POORLY_DETERMINED": "test_homogeneous_stress::test_s12_single_weak_shot",
+    "Quality.NEGATIVE_AMPLITUDE": "test_homogeneous_stress::test_s16_inverted_signal",
+    "HomogeneousQuality.AT_BOUND": "test_path_fit::test_dead_time_and_saturation_are_flagged",
+    "HomogeneousQuality.POOR_FIT": "test_path_fit::"
+    "test_noise_beyond_the_stated_variance_is_flagged",
     "Quality.NOT_HOMOGENEOUS": "test_path_fit::"
     "test_backscatter_that_varies_along_the_path_is_flagged",
     "Quality.OUTLIER": "test_path_fit::test_cloud_and_outlier_are_flagged",
