@@ -96,7 +96,6 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
 @pytest.mark.parametrize(
     ("rule", "with_need", "without_need"),
     [
-        ("channel", ([LEVEL], {}), ([LEVEL], with_products(signal={"channels": []}))),
         ("range_window", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
         ("overlap", ([LEVEL], {}), ([LEVEL], with_facts())),
         ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
@@ -104,7 +103,6 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
         ("dead_time", ([LEVEL], {}), ([LEVEL], with_facts())),
         ("lag", ([UP], LATE), ([UP], GLUED)),
         ("signal", ([LEVEL], ANALOG), ([LEVEL], FEW)),
-        ("homogeneous", ([LEVEL], {}), ([LEVEL], ANALOG)),
         ("known_shape", ([UP], ELASTIC), ([UP], TAIL)),
         ("elastic", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
         ("gradient", (SCAN, MULTI), (SCAN, CALM)),
@@ -132,6 +130,20 @@ def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, with_need, withou
     assert all(reasons)
     channels = {omission.channel for omission in plan.left_out if omission.rule == rule}
     assert not [step for step in plan.steps if step.rule == rule and step.channel in channels]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [("read", with_products(signal={"channels": []})), ("homogeneous", ANALOG)],
+)
+def test_what_is_not_requested_is_left_out(name, changes):
+    assert name in {step.name for step in planned(LEVEL).steps}
+    plan = planned(LEVEL, **changes)
+    omissions = [omission for omission in plan.left_out if omission.name == name]
+    assert {omission.rule for omission in omissions} == {"request"}
+    assert all(omission.reason for omission in omissions)
+    left_out = {(omission.name, omission.channel) for omission in omissions}
+    assert not left_out & {(step.name, step.channel) for step in plan.steps}
 
 
 @pytest.mark.parametrize(

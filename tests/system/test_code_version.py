@@ -63,7 +63,7 @@ def test_comments_docstrings_and_line_ends_of_any_module_change_nothing(copy: Co
     ("module", "kind"),
     [
         ("retrieve/elastic/inversion.py", "elastic"),
-        ("retrieve/elastic/_layer_search.py", "elastic"),
+        ("retrieve/elastic/layers.py", "elastic"),
         ("retrieve/elastic/__init__.py", "elastic"),
         ("retrieve/homogeneous/path_fit.py", "homogeneous"),
         ("retrieve/multiangle/vertical/gaps.py", "multiangle"),

@@ -413,7 +413,7 @@ def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypa
     conditioned, pointing = scan(12)
     cut = solve(conditioned, pointing, **FAR)
     monkeypatch.setattr(labeled_altitudes, "_BESIDE", 10**6)
-    monkeypatch.setattr(labeled_altitudes, "_BATCH", 1)
+    monkeypatch.setattr(labeled_altitudes, "BATCH", 1)
     xr.testing.assert_identical(cut, solve(conditioned, pointing, **FAR))
 
 
