@@ -67,7 +67,7 @@ def test_comments_docstrings_and_line_ends_of_any_module_change_nothing(copy: Co
         ("retrieve/elastic/__init__.py", "elastic"),
         ("retrieve/homogeneous/path_fit.py", "homogeneous"),
         ("retrieve/multiangle/vertical/gaps.py", "multiangle"),
-        ("retrieve/network/noise/outlying_bins.py", "visibility"),
+        ("retrieve/network/outlying_bins.py", "visibility"),
         *((f"products/{kind}/settings.py", kind) for kind in OWN),
         *((f"products/{kind}/steps.py", kind) for kind in OWN),
         *((f"products/{kind}/variables.py", kind) for kind in OWN),
