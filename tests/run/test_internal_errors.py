@@ -136,6 +136,17 @@ def test_a_bug_in_planning_keeps_the_products_of_its_scene(
         assert "KeyError" in CliRunner().invoke(app, ["plan", str(archive.file)]).stdout
 
 
+def test_a_bug_in_the_estimate_of_memory_ends_its_scene_only(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bugs.insert_in_the_estimate(TypeError("no such thing"), DAY, monkeypatch)
+    record = reprocess(archive.write(), options=Options(memory="1GiB"))
+    assert _made_in(record) == OTHERS
+    (failed,) = (scene for scene in record.scenes if scene.internal)
+    assert failed.scene == SCENE
+    assert "in held_with_a_bug" in failed.internal
+
+
 def test_a_changed_input_is_tried_again(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         bugs.insert(TypeError("no such thing"), DAY, patch)

@@ -12,6 +12,7 @@ from lidarops.retrieve.homogeneous import labeled
 from lidarops.run import executor
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.step import Decisions
+from lidarops.steps.workload import Workload
 
 
 def insert(error: BaseException, day: str, patch: pytest.MonkeyPatch | None = None) -> None:
@@ -45,6 +46,20 @@ def insert_in_planning(error: BaseException, day: str, patch: pytest.MonkeyPatch
         return decide(self, case)
 
     patch.setattr(steps.Homogeneous, "decide", decide_with_a_bug)
+
+
+def insert_in_the_estimate(error: BaseException, day: str, patch: pytest.MonkeyPatch) -> None:
+    """Make the step ``homogeneous`` raise an error when the memory of scenes of a day is fitted."""
+    held = steps.Homogeneous.held
+
+    def held_with_a_bug(
+        self: steps.Homogeneous, settings: steps.PathSettings, work: Workload
+    ) -> float:
+        if f"{work.scene.start:%Y-%m-%d}" == day:
+            raise error
+        return held(self, settings, work)
+
+    patch.setattr(steps.Homogeneous, "held", held_with_a_bug)
 
 
 def insert_in_the_worker(error: BaseException, day: str) -> None:
