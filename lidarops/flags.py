@@ -208,20 +208,11 @@ POORLY_DETERMINED: Final = Meaning(
 )
 POOR_FIT: Final = Meaning(
     Severity.REJECT,
-    "the residuals do not match the stated noise: too large or too small (reduced chi-square)",
-)
-UNSTABLE_INVERSION: Final = Meaning(
-    Severity.REJECT,
-    "numerically unstable (near-zero denominator), or beyond the range that the boundary value"
-    " constrains",
+    "the residuals are larger than the stated noise explains (reduced chi-square)",
 )
 PRIOR_DOMINATED: Final = Meaning(
     Severity.CARE,
     "smoothness or another prior determines the extinction more than the data do",
-)
-EXTRAPOLATED: Final = Meaning(
-    Severity.REJECT,
-    "beyond the reach of the signals, where only the prior would determine the value",
 )
 LOW_LEVERAGE: Final = Meaning(
     Severity.CARE,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from lidarops import flags
 from lidarops.flags import FIRST_OWN, FlagBit, Severity
 
 
@@ -22,4 +21,11 @@ class ElasticQuality(FlagBit):
         Severity.REJECT,
         "no range window passes the tests for aerosol-free air, so the profile is not calibrated",
     )
-    UNSTABLE_INVERSION = FIRST_OWN + 2, *flags.UNSTABLE_INVERSION
+    UNSTABLE_INVERSION = (
+        FIRST_OWN + 2,
+        Severity.REJECT,
+        (
+            "numerically unstable (near-zero denominator), or beyond the range that the boundary"
+            " value constrains"
+        ),
+    )

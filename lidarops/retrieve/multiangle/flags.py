@@ -22,7 +22,11 @@ class MultiAngleQuality(FlagBit):
         "the signals of the slant paths differ by more than level layers allow",
     )
     PRIOR_DOMINATED = FIRST_OWN + 5, *flags.PRIOR_DOMINATED
-    EXTRAPOLATED = FIRST_OWN + 6, *flags.EXTRAPOLATED
+    EXTRAPOLATED = (
+        FIRST_OWN + 6,
+        Severity.REJECT,
+        "beyond the reach of the signals, where only the prior would determine the value",
+    )
     INTERPOLATED = (
         FIRST_OWN + 7,
         Severity.CARE,
