@@ -71,13 +71,14 @@ class Kind:
             If the package lacks it.
         """
         path = f"{self.package}.{module}"
-        try:
-            return getattr(import_module(path), name)
-        except (AttributeError, ModuleNotFoundError) as error:
+        # An error while the module is imported is a bug of the package, and is not hidden.
+        found = import_module(path) if find_spec(path) else None
+        if not hasattr(found, name):
             raise LidarOpsError(
                 f"kind of product {self.name!r} is incomplete: {path} has no {name}",
                 remedy=f"complete or remove the package {self.package}",
-            ) from error
+            )
+        return getattr(found, name)
 
     def optional_part(self, module: str, name: str) -> Any | None:
         """Return an object of one of the modules of the kind; None if it has no such module."""

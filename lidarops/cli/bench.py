@@ -27,7 +27,7 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, archive, campaigns, costs, elastic, homogeneous, multiangle, network "
+            help="all, archive, campaigns, elastic, homogeneous, memory, multiangle, network "
             "or reader."
         ),
     ] = None,

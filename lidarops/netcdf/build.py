@@ -44,12 +44,9 @@ class ProductEncoder:
     frame : xr.Dataset
         What is known before the first profile, in memory: ``time`` and ``time_bnds`` (datetime64,
         UTC) of all profiles, ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over
-        time), and the variables of the layout without time. For ``signal`` also ``range`` (m, bin
-        centres) and optionally ``range_bnds``; for ``homogeneous`` also ``section``,
-        ``section_range`` and ``section_bounds`` (m); for ``multiangle``, instead of the angles,
-        ``altitude`` (m above the geoid), ``beam``, ``beam_zenith_angle`` and optionally
-        ``beam_azimuth`` (degree). An attribute ``steps`` becomes ``lidarops_steps``. NaN is
-        missing. Other variables of the layout are not used.
+        time), and the coordinates and variables of the layout without time, in its units. An
+        attribute ``steps`` becomes ``lidarops_steps``. NaN is missing. Other variables of the
+        layout are not used.
     context : Context
         Kind, channel, station, instrument, campaign, scene and provenance of the product.
 

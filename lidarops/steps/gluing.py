@@ -18,6 +18,7 @@ from lidarops.steps.data import Data, Profiles
 from lidarops.steps.profiles import GluedProfiles
 from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
+from lidarops.steps.workload import Workload
 
 LAG: Final = Datum[bool]("lag")
 """Whether the lag is to be estimated."""
@@ -55,6 +56,17 @@ class Lag(Step[ChannelCase, LagSettings]):
     def carry_out(self, settings: LagSettings, data: Data) -> None:
         """Give whether the lag is to be estimated; a given one has shifted the analog ranges."""
         data[LAG] = settings.method == "estimate"
+
+    def held(self, settings: LagSettings, work: Workload) -> float:
+        """Return the bytes of the profiles from which a lag is estimated."""
+        if settings.method == "given":
+            return 0.0
+        profiles = min(labeled_gluing.LAG_PROFILES, len(work.scene.granules))
+        return _BYTES_OF_A_LAG_BIN * profiles * work.bins
+
+
+_BYTES_OF_A_LAG_BIN: Final = 65.0
+"""Bytes per bin of a profile: an estimate from 256 profiles of 16,000 bins took 266 MB."""
 
 
 class GlueSettings(SettingsModel):

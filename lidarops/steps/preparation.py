@@ -60,7 +60,7 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
         )
         reason = f"mean of {where}; signal there biases it"
         if method == "cubic":
-            reason = f"cubic of the homogeneous section {where}; another course of signal biases it"
+            reason = f"cubic of a homogeneous section, {where}; other sections bias it"
         elif method == "known_shape":
             reason = (
                 "fitted with the shape of clean air, which is assumed in the far range, and tested;"

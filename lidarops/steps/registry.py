@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, Final
 
+from lidarops.errors import LidarOpsError
 from lidarops.kinds import kind_of
 from lidarops.records import LeftOut, PlannedStep
 from lidarops.steps.case import ChannelCase
@@ -37,9 +38,14 @@ def making_step(kind: str) -> MakingStep[Any, Any]:
     Raises
     ------
     LidarOpsError
-        If there is no such kind, or its package is incomplete.
+        If there is no such kind, its package is incomplete, or its step has another name.
     """
     step: MakingStep[Any, Any] = kind_of(kind).part("steps", "STEP")
+    if not isinstance(step, MakingStep) or step.name != kind:
+        raise LidarOpsError(
+            f"kind of product {kind!r}: STEP is no step that makes a product of that name",
+            remedy=f"correct {kind_of(kind).package}.steps",
+        )
     return step
 
 
@@ -60,7 +66,15 @@ def _definitions(product: str) -> Mapping[str, Definition[Any]]:
     """Return what a plan of a product may hold, by name; the shared steps for an empty name."""
     making = making_step(product) if product else None
     own = (*making.parts, making) if making else ()
-    return {known.name: known for known in (*FILE_STEPS, *GLUE_STEPS, *SHARED, *own)}
+    shared = {known.name: known for known in (*FILE_STEPS, *GLUE_STEPS, *SHARED)}
+    known = shared | {part.name: part for part in own}
+    if len(known) != len(shared) + len(own):
+        raise LidarOpsError(
+            f"kind of product {product!r}: two of its steps, or one and a shared step, have one"
+            " name",
+            remedy=f"rename a step in {kind_of(product).package}.steps",
+        )
+    return known
 
 
 def definition(planned: PlannedStep) -> Definition[Any]:

@@ -32,8 +32,7 @@ from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
 from lidarops.steps.preparation import FEWEST_BINS
-from lidarops.steps.reading import ANALOG_NOISE, WAVELENGTH, Window, WindowSettings
-from lidarops.steps.reading import bins_with_noise as bins_with_their_noise
+from lidarops.steps.reading import ANALOG_NOISE, WAVELENGTH, Window, WindowSettings, bins_with_noise
 from lidarops.steps.step import (
     ALL_STEPS,
     REQUESTED,
@@ -101,7 +100,7 @@ class SectionWindow(Window, Choice[Case, WindowSettings]):
             yield Leave(ALL_STEPS)
             return
         farthest = max(far for _, far in _level(case))
-        bins = bins_with_their_noise(0.0, farthest, case)[1]
+        bins = bins_with_noise(0.0, farthest, case)[1]
         if not 0 < bins < case.channel.bins:
             yield Leave("a section extends to the last bin", number=float(case.channel.bins))
             return

@@ -22,7 +22,7 @@ from lidarops.steps.channels import (
 )
 from lidarops.steps.reading import NO_WAVELENGTH
 
-KIND: Final = "visibility"
+NAME: Final = "visibility"
 SAME_POINTING: Final = 0.1
 """degree; pointings of one instrument within this angle are one beam (resolution of headers)."""
 
@@ -71,7 +71,7 @@ class MemberCase:
             channel_facts(self.facts, channel.name),
             all_steps=self.campaign.all_steps,
             member=self.scene.instrument,
-            requesters=(KIND,),
+            requesters=(NAME,),
         )
 
     def why_not(self) -> tuple[str, float | None]:

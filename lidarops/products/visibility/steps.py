@@ -14,7 +14,7 @@ import xarray as xr
 from lidarops.campaign.model import Campaign, ChannelFacts, InstrumentFacts
 from lidarops.flags import Quality
 from lidarops.products.visibility.network import (
-    KIND,
+    NAME,
     SAME_POINTING,
     BeamPlan,
     MemberCase,
@@ -128,7 +128,7 @@ _AVERAGE: Final = Average(
 class Visibility(NetworkProductStep[VisibilityProductSettings, NetworkSettings]):
     """Retrieve extinction and visibility where the beams of a network cross."""
 
-    name = KIND
+    name = NAME
     settings = NetworkSettings
     inputs = (PROFILES, WAVELENGTH, OVERLAP, BACKGROUND, AVERAGE)
     parts = (Background(), Window(), _AVERAGE, Prior())
@@ -201,7 +201,7 @@ class _NetworkPlan:
             yield from self._without_lonely_beams(kept)
             reason = self._why_no_crossing(kept)
         if reason is not None:
-            yield self._joint_case.entry(KIND, reason)
+            yield self._joint_case.entry(NAME, reason)
             return
         used = {beam.instrument for beam in kept}
         yield from (
@@ -219,7 +219,7 @@ class _NetworkPlan:
         self, member: str, reason: str, number: float | None, rule: str
     ) -> PlannedStep | LeftOut:
         case = replace(self._joint_case, member=member)
-        return case.entry(KIND, Leave(reason, number, rule))
+        return case.entry(NAME, Leave(reason, number, rule))
 
     def _prepared(self, member: MemberCase) -> Iterator[PlannedStep | LeftOut]:
         """Yield the steps from the counts of an instrument to its signal."""
@@ -231,7 +231,7 @@ class _NetworkPlan:
         yield from Background().entries(self._of_product(case))
 
     def _of_product(self, case: ChannelCase) -> Case:
-        return case.of_product(KIND, self._settings)
+        return case.of_product(NAME, self._settings)
 
     @property
     def _joint_case(self) -> Case:
@@ -292,7 +292,7 @@ class _NetworkPlan:
                 yield case.entry(Window.name, _window(case, farthest))
         yield from _AVERAGE.entries(self._joint_case)
         yield from Prior().entries(self._joint_case)
-        yield self._joint_case.entry(KIND, self._visibility(beams, network, wavelength))
+        yield self._joint_case.entry(NAME, self._visibility(beams, network, wavelength))
 
     def _visibility(
         self, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
