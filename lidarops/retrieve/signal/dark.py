@@ -164,17 +164,20 @@ def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array,
     """Return mean and variance of the mean of each session, (..., session, range)."""
     means, counts, squares, freedoms = [], [], [], []
     for files in sessions:
-        session_signals = signals[..., files, :]
-        finite = np.isfinite(session_signals)
+        # A copy, changed in place: there may be many files.
+        residual = signals[..., files, :]
+        finite = np.isfinite(residual)
+        residual[~finite] = 0.0
         count = finite.sum(axis=-2)
-        mean = _ratio(np.where(finite, session_signals, 0.0).sum(axis=-2), count)
-        residual = np.where(finite, session_signals - mean[..., np.newaxis, :], 0.0)
+        mean = _ratio(residual.sum(axis=-2), count)
+        residual -= mean[..., np.newaxis, :]
+        residual[~finite] = 0.0
         # The level drifts from file to file, which is no noise of the single bin.
-        level = _ratio(residual.sum(axis=-1, keepdims=True), finite.sum(axis=-1, keepdims=True))
-        residual = np.where(finite, residual - level, 0.0)
+        residual -= _ratio(residual.sum(axis=-1, keepdims=True), finite.sum(axis=-1, keepdims=True))
+        residual[~finite] = 0.0
         means.append(mean)
         counts.append(count)
-        squares.append((residual**2).sum(axis=-2))
+        squares.append(np.square(residual, out=residual).sum(axis=-2))
         freedoms.append(np.maximum(count - 1, 0))
     all_squares = np.stack([*squares, sum(squares)], axis=-2)
     all_freedoms = np.stack([*freedoms, sum(freedoms)], axis=-2).astype(np.float64)

@@ -299,8 +299,19 @@ def read_dark(archive: xr.Dataset, channel: str, *, method: str) -> DarkSignals:
     DarkSignals
         The means of their sessions, in memory.
     """
-    power = condition(archive, channel, noise_variance=0.0)["power"]
-    return DarkSignals(DarkSessions(power.to_numpy(), archive["time"].to_numpy()), method)
+    power = np.concatenate(
+        [
+            condition(
+                archive.isel(time=slice(first, first + _DARK_TOGETHER)), channel, noise_variance=0.0
+            )["power"].to_numpy()
+            for first in range(0, archive.sizes["time"], _DARK_TOGETHER)
+        ]
+    )
+    return DarkSignals(DarkSessions(power, archive["time"].to_numpy()), method)
+
+
+_DARK_TOGETHER: Final = 32
+"""Dark files that are converted together, which bounds the memory of the conversion."""
 
 
 def _conditioned(*inputs: _Block, photon: bool, **settings: Any) -> tuple[_Block, _Block, _Block]:
