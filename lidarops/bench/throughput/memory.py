@@ -44,7 +44,7 @@ _VARIANTS: Final = 4
 """Number of different profiles; files repeat them."""
 _ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
 """degree, in the headers of consecutive files: one cycle of a scan."""
-_SLANTED: Final = 85.0
+_SLANTED: Final = 80.0
 """degree; sections may be retrieved, and the beam reaches the reference window of ``elastic``."""
 _DARK_SHARE: Final = 0.1
 """Dark files for each file of the scene."""
@@ -120,7 +120,7 @@ CASES: Final[Mapping[str, Mapping[str, Any]]] = {
         _SLANTED,
         {
             "signal": {},
-            "homogeneous": {"channels": _PHOTON, "sections": [[750, 1750]]},
+            "homogeneous": {"channels": _PHOTON, "sections": [[750, 1250]]},
             "elastic": {"channels": _PHOTON, "reference": {"lowest": 1000, "highest": 4000}},
         },
     ),
