@@ -85,6 +85,7 @@ def test_a_refused_scene_is_tried_again_with_a_larger_limit(archive: Archive) ->
     campaign = archive.write()
     refused = reprocess(campaign, options=Options(memory="100MB"))
     assert refused is not None
+    assert refused.scenes
     assert all("raise --memory-limit" in scene.error for scene in refused.scenes)
     assert all(not scene.bytes_read for scene in refused.scenes)
     again = reprocess(campaign)
@@ -97,6 +98,7 @@ def test_workers_refuse_by_their_own_limit(archive: Archive) -> None:
     with local_client(1, memory="400MiB") as client:
         record = reprocess(campaign, client=client)
     assert record is not None
+    assert record.scenes
     assert all("the limit of the workers" in scene.error for scene in record.scenes)
 
 
@@ -105,6 +107,7 @@ def test_the_plan_states_the_memory_of_each_scene(archive: Archive) -> None:
     command = ["plan", str(archive.file)]
     scenes = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)["scenes"]
     needs = [scene["estimated_memory_bytes"]["everything"] for scene in scenes]
+    assert needs
     assert all(PROCESS <= size < 2 * PROCESS for size in needs)
     assert "MB of memory" in CliRunner().invoke(app, command).output
 
