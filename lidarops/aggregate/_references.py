@@ -20,11 +20,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, opened, plain, within
+from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, opened, plain
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
 from lidarops.records import DetectionMode
+from lidarops.system.files import within
 
 Refs = dict[str, Any]
 

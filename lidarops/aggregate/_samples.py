@@ -12,12 +12,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
-from lidarops.aggregate.facts import Facts, opened, within
+from lidarops.aggregate.facts import Facts, opened
 from lidarops.aggregate.means_variables import averaged, budget_of, systematic
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
+from lidarops.system.files import within
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
-from lidarops.system.files import sha256_of
+from lidarops.system.files import sha256_of, within
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""
@@ -163,33 +163,6 @@ def list_products(root: Path) -> list[str]:
 
 def _is_listed(path: Path) -> bool:
     return path.parts[0] != FOLDER and not any(part.startswith(".") for part in path.parts)
-
-
-def within(root: Path, path: str) -> Path:
-    """Return a file of a folder; refuse paths that lead out of it.
-
-    Parameters
-    ----------
-    root : path
-    path : str
-        Relative, with forward slashes.
-
-    Returns
-    -------
-    path
-
-    Raises
-    ------
-    ProductError
-        If the path is absolute, goes up, or is a link to the outside.
-    """
-    pure = PurePosixPath(path)
-    file = root / path
-    if pure.is_absolute() or ".." in pure.parts or "\\" in path or not path:
-        raise ProductError("is not a path inside its folder", file=path)
-    if not file.resolve().is_relative_to(root.resolve()):
-        raise ProductError(f"leads out of {root}", file=path, remedy="replace the link by the file")
-    return file
 
 
 def read_product_facts(

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate.facts import Facts, coordinate_names, opened, within
+from lidarops.aggregate.facts import Facts, coordinate_names, opened
 from lidarops.aggregate.means_variables import (
     MeansDescription,
     Period,
@@ -29,6 +29,7 @@ from lidarops.netcdf.provenance import NAMESPACE, package_versions
 from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
 from lidarops.records import DetectionMode
 from lidarops.system.code_version import code_version
+from lidarops.system.files import within
 
 _MOVING: Final = ("zenith_angle", "azimuth")
 

@@ -23,7 +23,6 @@ from lidarops.aggregate.facts import (
     read_facts,
     read_product_facts,
     refuse_duplicates,
-    within,
 )
 from lidarops.aggregate.index import INDEX, IndexedPaths, find_in_index
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
@@ -32,6 +31,7 @@ from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
 from lidarops.records import DetectionMode
+from lidarops.system.files import within
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 

@@ -30,11 +30,11 @@ from lidarops.aggregate._references import (
     read_template,
     references,
 )
-from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates, within
+from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates
 from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.records import DetectionMode
-from lidarops.system.files import write_atomically
+from lidarops.system.files import within, write_atomically
 
 FORMAT: Final = 1
 _BRACES: Final = ("{", "}")

@@ -1,4 +1,4 @@
-"""The benchmarks by name: run one, write its result and page."""
+"""The benchmarks by name."""
 
 from __future__ import annotations
 
@@ -6,19 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TypeVar
 
 from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkKind, BenchmarkOutput, Effort
+from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.bench.harness.rows import Study
+from lidarops.bench.stability import study
 from lidarops.bench.throughput import archives, campaigns, memory, readers, retrievals
 from lidarops.errors import CampaignError
-from lidarops.reports.benchmark_page import build_benchmark_page
-from lidarops.system.files import write_atomically
-
-STABILITY: Final = "stability"
-"""The benchmark that is no `BenchmarkKind`, because it has no cases to choose from."""
 
 _Names = TypeVar("_Names", bound=StrEnum)
 
@@ -44,15 +40,15 @@ def run_benchmark(
     effort: Effort,
     *,
     data: Path | None = None,
-) -> BenchmarkOutput:
-    """Run a benchmark and return its result and page.
+) -> Study:
+    """Run a benchmark.
 
     Parameters
     ----------
-    what : {"accuracy", "throughput"}
+    what : {"accuracy", "throughput", "stability"}
     case : Benchmark or str, optional
         None means "reader" if files are given, else "all" for the accuracy and "homogeneous" for
-        the throughput.
+        the throughput. The stability has no cases.
     files : sequence of Path
         Raw files of one layout, only for "reader".
     effort : Effort
@@ -62,29 +58,29 @@ def run_benchmark(
     Raises
     ------
     CampaignError
-        If there is no such benchmark, or the case takes no files.
+        If there is no such benchmark, or it has no such option.
     RawFormatError
         If "reader" gets no file, or one that cannot be read.
     """
-    kind = _member(BenchmarkKind, what, "benchmark", STABILITY)
+    kind = _member(BenchmarkKind, what, "benchmark")
+    if kind is BenchmarkKind.STABILITY:
+        for name, value in {"case": case, "files": files, "data": data}.items():
+            _refuse(name, value, "is no option of the benchmark 'stability'")
+        _refuse("repeats", effort.repeats, "is no option of the benchmark 'stability'")
+        return study.measure_stability(effort)
     default = Benchmark.ALL if kind is BenchmarkKind.ACCURACY else Benchmark.HOMOGENEOUS
     benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
-    if benchmark is not Benchmark.READER and files:
-        raise CampaignError(f"the case {benchmark.value!r} takes no files", remedy="leave them out")
-    published = benchmark in {Benchmark.ELASTIC, Benchmark.ALL} and kind is BenchmarkKind.ACCURACY
-    if data is not None and not published:
-        raise CampaignError(
-            "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
-        )
-    if benchmark is Benchmark.MEMORY:
-        return memory.run_memory(kind, effort=effort)
+    if benchmark is not Benchmark.READER:
+        _refuse("files", files, f"the case {benchmark.value!r} takes no files")
+    if benchmark not in {Benchmark.ELASTIC, Benchmark.ALL} or kind is BenchmarkKind.THROUGHPUT:
+        _refuse("data", data, "is for the accuracy of the case 'elastic'")
     studies = _accuracy(data) if kind is BenchmarkKind.ACCURACY else _throughput(files)
     if benchmark not in studies:
         raise CampaignError(
             f"the case {benchmark.value!r} has no {kind.value}",
             remedy=f"choose: {' or '.join(studies)}",
         )
-    return studies[benchmark](effort).output()
+    return studies[benchmark](effort)
 
 
 _Studies = Mapping[Benchmark, Callable[[Effort], Study]]
@@ -106,28 +102,22 @@ def _throughput(files: Sequence[Path]) -> _Studies:
         Benchmark.CAMPAIGNS: campaigns.measure_campaigns,
         Benchmark.ELASTIC: retrievals.measure_elastic,
         Benchmark.HOMOGENEOUS: retrievals.measure_solvers,
+        Benchmark.MEMORY: memory.measure_memory,
         Benchmark.MULTIANGLE: retrievals.measure_scans,
         Benchmark.NETWORK: retrievals.measure_networks,
         Benchmark.READER: partial(readers.measure_readers, paths=files),
     }
 
 
-def write_benchmark(output: BenchmarkOutput, folder: Path) -> Path:
-    """Write the result of a benchmark as JSON, and its page; return the path of the page.
-
-    Raises
-    ------
-    CatalogError
-        If the folder cannot be written.
-    """
-    page = build_benchmark_page(output.report, folder)
-    write_atomically(folder / RESULT, output.json().encode())
-    return page
+def _refuse(option: str, value: object, problem: str) -> None:
+    if value:
+        raise CampaignError(problem, field=option, remedy="leave it out")
 
 
-def _member(names: type[_Names], value: str, what: str, *other_choices: str) -> _Names:
+def _member(names: type[_Names], value: str, what: str) -> _Names:
     try:
         return names(value)
     except ValueError:
-        choices = " or ".join((*names, *other_choices))
-        raise CampaignError(f"no {what} {value!r}", remedy=f"choose: {choices}") from None
+        raise CampaignError(
+            f"no {what} {value!r}", remedy=f"choose: {' or '.join(names)}"
+        ) from None

@@ -8,14 +8,7 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import (
-    JsonOption,
-    command,
-    no_url,
-    progress_bar,
-    show_rows,
-)
-from lidarops.errors import CampaignError
+from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_rows
 
 
 @command()
@@ -60,33 +53,19 @@ def bench(
 
     Example: lidarops bench stability --quick --out bench
     """
-    from lidarops.bench import registry
     from lidarops.bench.harness.benchmark import Effort
-    from lidarops.bench.stability import study
+    from lidarops.bench.registry import run_benchmark
 
     today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as bar:
         effort = Effort(quick=quick, repeats=repeats, date=today, progress=bar.advance)
-        if what == registry.STABILITY:
-            _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
-            output = study.measure_stability(effort).output()
-        else:
-            output = registry.run_benchmark(what, case, files or [], effort, data=data)
-    page = None if out is None else registry.write_benchmark(output, Path(out))
+        study = run_benchmark(what, case, files or [], effort, data=data)
+    page = None if out is None else study.write(Path(out))
     if as_json:
-        typer.echo(output.json())
-    else:
-        for chapter in output.report.parts:
-            for table in chapter.tables:
-                show_rows(table.title, table.columns, table.rows)
-        if page is not None:
-            typer.echo(f"report: {page}")
-
-
-def _refuse(options: dict[str, object]) -> None:
-    """Refuse options that the benchmark stability does not have."""
-    for name, value in options.items():
-        if value:
-            raise CampaignError(
-                "is no option of the benchmark 'stability'", field=name, remedy="leave it out"
-            )
+        typer.echo(study.json())
+        return
+    for results in (shown for chapter in study.chapters for shown in chapter.results):
+        if not results.folded:
+            show_rows(results.title, results.table.columns, results.table.rows)
+    if page is not None:
+        typer.echo(f"report: {page}")

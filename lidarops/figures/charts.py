@@ -32,8 +32,6 @@ class Series:
     high: tuple[float, ...] = ()
     hollow: bool = False
     joined: bool = False
-    band: bool = False
-    """Whether `low` and `high` are drawn as a filled area, which need not contain the points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +131,7 @@ def _series(series: Series, number: int, label: str) -> Iterator[Layer]:
     style = f"c{number % _COLOURS}"
     if series.low:
         low, high = (np.array(ends, dtype=np.float64) for ends in (series.low, series.high))
-        yield Band(x, low, high, style, bars=not series.band)
+        yield Band(x, low, high, style, bars=True)
     style += f" d{number % _DASHES}" + " hollow" * series.hollow
     mark = SERIES_MARKS[number % len(SERIES_MARKS)]
     y = np.array(series.y, dtype=np.float64)

@@ -150,7 +150,7 @@ class _File:
         inside = foreign if foreign in present else name
         if inside not in present:
             return None
-        # Indexing the file object takes four times as long.
+        # Faster than indexing the file object.
         dataset = h5py.Dataset(h5py.h5d.open(self._file.id, inside.encode()))
         if _is_bare_dimension(dataset):
             return None

@@ -1,7 +1,6 @@
 """Estimate the CPU time of a run on a common server core, from its plans.
 
-Every step of a plan states its own. The constants are set for one machine, on which the estimates
-of the four campaigns demo, scan, network and mixed were 0.9 to 1.3 of the time taken.
+Every step of a plan states its own. The constants are set for one machine.
 """
 
 from __future__ import annotations

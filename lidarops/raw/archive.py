@@ -217,7 +217,7 @@ def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Gra
     if isinstance(source, str | os.PathLike):
         files = [(path, None) for path in _expand(base, Path(source))]
     else:
-        # As Path would join them, at a tenth of the cost: the path of a granule is normalised.
+        # As Path would join them, but faster: the path of a granule is normalised.
         folder = "" if base == Path() else os.path.join(base, "")  # noqa: PTH118
         files = [
             (folder + item.path, item) if isinstance(item, Granule) else (str(base / item), None)

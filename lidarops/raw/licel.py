@@ -274,7 +274,7 @@ def read_physical(
 def _allocate(
     datasets: tuple[Dataset, ...], files: int, dtype: DTypeLike
 ) -> tuple[list[NDArray[Any]], list[Counts]]:
-    # One large block: the system maps it in huge pages, at a tenth of the cost.
+    # One large block, because the system maps it in huge pages.
     total = np.empty(files * sum(dataset.bins for dataset in datasets), dtype)
     values, start = [], 0
     for dataset in datasets:

@@ -60,7 +60,7 @@ _DASK: Final = {
     "distributed.admin.tick.interval": "500ms",
     # For the same dashboard, each process would read a dozen system files twice a second.
     "distributed.admin.system-monitor.interval": "10s",
-    # With it, mapping and returning every array takes a sixth of the time of small scenes.
+    # With it, small scenes spend much of their time on mapping and returning every array.
     f"distributed.nanny.pre-spawn-environ.{MALLOC_TRIM_VARIABLE}": None,
 }
 

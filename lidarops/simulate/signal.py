@@ -39,7 +39,7 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
     ----------
     distance : ndarray, m, shape (bins,)
         Bin centres, ascending.
-    extinction : ndarray, m-1, shape (bins,)
+    extinction : ndarray, m-1, shape (..., bins)
         At the bin centres.
 
     Notes
@@ -50,9 +50,31 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
     edges = np.concatenate([[0.0], 0.5 * (distance[1:] + distance[:-1])])
     before = np.clip(edges, 0.0, None)
     step = np.diff(before)
-    to_edge = np.concatenate([[0.0], np.cumsum(extinction[:-1] * step)])
+    to_edge = np.zeros(extinction.shape)
+    np.cumsum(extinction[..., :-1] * step, axis=-1, out=to_edge[..., 1:])
     depth: Array = to_edge + extinction * np.clip(distance - before, 0.0, None)
     return depth
+
+
+def relative_signal(distance: Array, extinction: Array, backscatter: Array) -> Array:
+    r"""Return the signal of backscatter beyond full overlap, over that of the first bin, 1.
+
+    Parameters
+    ----------
+    distance : ndarray, m, shape (bins,)
+        Range of the bin centres, positive and ascending.
+    extinction, backscatter : ndarray, shape (..., bins)
+        m-1, and in any unit.
+
+    Notes
+    -----
+    :math:`(\beta_i / \beta_0) (R_0 / R_i)^2 \exp(-2 (\tau_i - \tau_0))` is defined also where
+    nothing of the signal itself is left in the first bin.
+    """
+    depth = optical_depth(distance, extinction)
+    shape = backscatter / backscatter[..., :1] * (distance[0] / distance) ** 2
+    signal: Array = shape * np.exp(-2.0 * (depth - depth[..., :1]))
+    return signal
 
 
 def transmission(distance: Array, extinction: Array) -> Array:

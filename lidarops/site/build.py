@@ -20,25 +20,25 @@ from typing import Any, Final
 import xarray as xr
 
 from lidarops import __version__
-from lidarops.errors import CatalogError, ProductError
+from lidarops.errors import CatalogError
 from lidarops.figures import any_kind, svg
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.reports.reading import UNREADABLE
 from lidarops.site import pages, product_contents
 from lidarops.site.paths import (
     SITE,
     day_page,
-    inside,
     product_folder,
     product_page,
     product_paths,
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
-from lidarops.system.files import sha256_of, write_atomically
+from lidarops.system.files import sha256_of, within, write_atomically
 
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
@@ -46,17 +46,8 @@ _FORMAT: Final = "lidarops site"
 _EMPTY: Final = "no figure of the product"
 _OURS: Final = ("product", "station")
 """Folders that only the site writes to."""
-# Exceptions observed when damaged or foreign files are opened and read.
-_UNREADABLE: Final = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    ArithmeticError,
-    ProductError,
-)
+_UNREADABLE: Final = (*UNREADABLE, TypeError, ArithmeticError)
+"""Exceptions observed when damaged or foreign files are read and drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +172,7 @@ def _alone(task: _Task) -> _Outcome:
 def _page(task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
     try:
-        file = inside(task.products, task.path)
+        file = within(task.products, task.path)
         sha256 = sha256_of(file)
         if task.known is not None and _is_kept(task.known, sha256, task.site):
             return task.known, False
@@ -199,7 +190,7 @@ def _reason(task: _Task, error: BaseException) -> str:
 def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
     if known.sha256 != sha256:
         return False
-    files = (inside(site, name) for name in known.files)
+    files = (within(site, name) for name in known.files)
     return all(
         file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest
         for file, digest in zip(files, known.digests, strict=True)
@@ -281,7 +272,7 @@ def _joined(*problems: str) -> str:
 
 def _write(site: Path, name: str, content: bytes) -> None:
     """Write a file of the site atomically. All files are written here."""
-    target = inside(site, name)
+    target = within(site, name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(target, content)

@@ -12,12 +12,12 @@ from itertools import groupby
 from typing import Any, Final
 
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops import __version__
 from lidarops.figures import svg
 from lidarops.figures.panels import Figure
-from lidarops.figures.wording import counted, percent, size, visible
+from lidarops.figures.templates import environment
+from lidarops.figures.wording import counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.paths import day_page, href, slug, year_page
@@ -36,20 +36,6 @@ ByDay = Mapping[str, Sequence[Entry]]
 
 
 @cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("lidarops.site"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        finalize=lambda value: visible(value) if type(value) is str else value,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals |= {"version": __version__, "counted": counted}
-    return environment
-
-
-@cache
 def style() -> str:
     """Return the style sheet of the site, with that of figures."""
     own = files("lidarops.site").joinpath("templates", "site.css").read_text(encoding="utf-8")
@@ -58,7 +44,8 @@ def style() -> str:
 
 def _render(template: str, page: str, **context: Any) -> bytes:
     root = "../" * page.count("/")
-    text = _environment().get_template(template).render(root=root, **context)
+    page_of = environment("lidarops.site").get_template(template)
+    text = page_of.render(root=root, version=__version__, counted=counted, **context)
     return text.encode("utf-8", "replace")
 
 

@@ -1,4 +1,4 @@
-"""Paths of products, pages and links. No path leads out of its folder."""
+"""Paths of products, pages and links."""
 
 from __future__ import annotations
 
@@ -54,25 +54,6 @@ def product_paths(folder: Path) -> list[str]:
             if name.endswith(".nc") and not name.startswith(".")
         ]
     return sorted(paths)
-
-
-def inside(folder: Path, path: str) -> Path:
-    """Return a file of a folder.
-
-    Raises
-    ------
-    ProductError
-        If the path is absolute, goes up, or is a link to the outside.
-    """
-    pure = PurePosixPath(path)
-    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
-        raise ProductError("is not a path inside its folder", file=path)
-    file = folder / pure
-    if not file.resolve().is_relative_to(folder.resolve()):
-        raise ProductError(
-            "is a link that leads out of its folder", file=path, remedy="put the file in its place"
-        )
-    return file
 
 
 def slug(name: str) -> str:

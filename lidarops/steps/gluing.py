@@ -66,7 +66,7 @@ class Lag(Step[ChannelCase, LagSettings]):
 
 
 _BYTES_OF_A_LAG_BIN: Final = 65.0
-"""Bytes per bin of a profile: an estimate from 256 profiles of 16,000 bins took 266 MB."""
+"""Bytes per bin of a profile of the estimate."""
 
 
 class GlueSettings(SettingsModel):

@@ -13,13 +13,13 @@ from lidarops.steps.dependence import is_product, workloads
 from lidarops.steps.registry import definition
 
 PROCESS: Final = 420_000_000
-"""Bytes of a process with the code of all kinds loaded. ``lidarops bench throughput --case memory``
-measured 390 to 410 MB."""
+"""Bytes of a process with the code of all kinds loaded; above what ``lidarops bench throughput
+--case memory`` measures, like all sizes here."""
 OF_A_COUNT: Final = 26.0
-"""Bytes at the peak of a chunk of ``signal``, for each byte of its counts: the same benchmark
-measured 103 MB for chunks of 4 MB. Other kinds and other counts take down to 8 bytes."""
+"""Bytes at the peak of a chunk of ``signal``, for each byte of its counts; other kinds take
+less."""
 OF_A_FILE: Final = 5_000
-"""Bytes of the facts about a raw file: 9 MB more were measured for 2,300 more files."""
+"""Bytes of the facts about a raw file."""
 _COUNT: Final = 4
 """Bytes of a raw count."""
 

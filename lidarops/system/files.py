@@ -1,11 +1,13 @@
-"""Local files: their digest, and writing so that they are complete or absent after a kill."""
+"""Local files: their digest, paths within a folder, and writing that is complete or absent."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import tempfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+
+from lidarops.errors import ProductError
 
 
 def sha256_of(path: Path) -> str:
@@ -18,6 +20,31 @@ def sha256_of(path: Path) -> str:
     """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def within(folder: Path, path: str) -> Path:
+    """Return a file of a folder; refuse paths that lead out of it.
+
+    Parameters
+    ----------
+    folder : Path
+    path : str
+        Relative, with forward slashes.
+
+    Raises
+    ------
+    ProductError
+        If the path is absolute, goes up, or is a link to the outside.
+    """
+    pure = PurePosixPath(path)
+    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+        raise ProductError("is not a path inside its folder", file=path)
+    file = folder / pure
+    if not file.resolve().is_relative_to(folder.resolve()):
+        raise ProductError(
+            "is a link that leads out of its folder", file=path, remedy="put the file in its place"
+        )
+    return file
 
 
 def write_atomically(target: Path, content: bytes) -> None:

@@ -29,8 +29,8 @@ _BATCHES_AHEAD: Final = 8
 _MMAP_THRESHOLD: Final = (-3, 32 << 20)
 """M_MMAP_THRESHOLD of glibc, and its largest value in bytes."""
 _TRIM_THRESHOLD: Final = (-1, 256 << 20)
-"""M_TRIM_THRESHOLD of glibc, and its value in bytes: a scene leaves 100 to 200 MB, which the next
-scene needs again."""
+"""M_TRIM_THRESHOLD of glibc, and its value in bytes: more than a scene leaves, which the next scene
+needs again."""
 _ONE_THREAD: Final = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
@@ -257,7 +257,7 @@ def _end_with_parent() -> None:
 def keep_memory() -> None:
     """Let the C library of this process keep the memory of freed arrays for new ones.
 
-    Mapping it anew would take a third of the time of small tasks, and a sixth of that of scenes.
+    Small tasks and scenes would otherwise spend much of their time on mapping it anew.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt
@@ -272,7 +272,7 @@ def keep_memory() -> None:
 def objects_frozen() -> Iterator[None]:
     """Exclude all existing objects from garbage collection within the context.
 
-    Each collection would otherwise take 0.2 s to scan all loaded modules, for little garbage.
+    Each collection would otherwise scan all loaded modules, for little garbage.
     Reference counting is not affected.
     """
     if gc.get_freeze_count():

@@ -99,7 +99,7 @@ class RemoteStore:
     """
 
     def __init__(self, url: str) -> None:
-        import fsspec  # noqa: PLC0415 - most archives are local, and the import takes 0.1 s
+        import fsspec  # noqa: PLC0415 - most archives are local, and the import is slow
 
         self.url = without_keys(url)
         """The URL without credentials."""

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from lidarops.bench import all_retrievals, registry
+from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, multiangle_cases, network
 from lidarops.bench.accuracy.multiangle import StudySize
 from lidarops.bench.harness.benchmark import Effort
@@ -75,11 +75,10 @@ def test_of_equally_accurate_methods_the_first_table_shows_the_fastest():
 
 
 def test_page_and_figures_are_written_once_each(study, tmp_path):
-    output = study.output()
-    page = registry.write_benchmark(output, tmp_path)
+    page = study.write(tmp_path)
     text = page.read_text(encoding="utf-8")
-    titles = [chapter.title for chapter in output.report.parts]
-    charts = [chart.name for chapter in output.report.parts for chart in chapter.charts]
+    titles = [chapter.title for chapter in study.chapters]
+    charts = [chart.name for chapter in study.chapters for chart in chapter.charts]
     tables = [results.title for chapter in study.chapters for results in chapter.results]
     assert len(set(titles)) == len(titles)
     assert len(set(charts)) == len(charts)

@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from lidarops.bench import registry
 from lidarops.bench.harness.rows import (
     CPU_TIME,
     Chapter,
@@ -116,18 +115,17 @@ def test_a_study_has_one_json_and_one_page(tmp_path):
     )
     study = Study("Title", "2024-01-01", [chapter])
     assert study.figures("Shown")["cloud", "peer", "RMSE"].value == 4e3
-    output = study.output()
-    (part,) = output.report.parts
-    assert [table.title for table in part.tables] == ["Shown"]
-    assert [table.title for table in part.details] == ["Folded"]
-    page = registry.write_benchmark(output, tmp_path / "sub")
+    page = study.write(tmp_path / "sub")
+    text = page.read_text()
+    assert text.index("About them.") < text.index("<caption>Shown") < text.index("<details>")
+    assert text.index("<details>") < text.index("<caption>Folded")
     content = json.loads((page.parent / "result.json").read_text())
     assert (content["title"], content["date"]) == ("Title", "2024-01-01")
     row = content["tables"]["Folded"][1]
     assert (row["case"], row["method"], row["quantity"]) == ("clear", "ours", "RMSE")
     assert (row["value"], row["error"], row["unit"]) == (2.0, 0.1, "")
     with pytest.raises(CatalogError, match="cannot be written"):
-        registry.write_benchmark(output, page / "sub")
+        study.write(page / "sub")
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,7 @@ from lidarops.retrieve.elastic.inversion import ElasticResult
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
 SLOW_SHARE: Final = 5
-"""One in this many profiles is processed by `homogeneous`, which is slow. Its Monte Carlo error is
-2 percent, 5 in a quick run."""
+"""One in this many profiles is processed by `homogeneous`, which is slow."""
 BLOCK: Final = 200
 """Profiles simulated and solved together."""
 CLOSED_LEVELS: Final = (1.0, 1e4, 1e8)

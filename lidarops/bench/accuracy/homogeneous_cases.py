@@ -15,7 +15,7 @@ from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
-from lidarops.simulate.signal import backscatter_signal
+from lidarops.simulate.signal import relative_signal
 
 BINS: Final = 225
 BACKGROUND: Final = 370.0
@@ -72,10 +72,8 @@ class Scenario:
     def mean(self) -> Array:
         """Noise-free power."""
         air = np.ones(self.bins)
-        signal = backscatter_signal(
-            self.range, extinction=self.extinction * air, backscatter=air, system_constant=1.0
-        )
-        return np.asarray(self.background + self.signal * signal / signal[0])
+        signal = relative_signal(self.range, self.extinction * air, air)
+        return np.asarray(self.background + self.signal * signal)
 
     @property
     def label(self) -> str:

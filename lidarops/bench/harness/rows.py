@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.benchmark import RESULT, BenchmarkOutput, facts
 from lidarops.bench.harness.timing import Machine, machine
-from lidarops.figures.charts import Chart, ChartPanel, Ladder, Series, pareto
+from lidarops.errors import CatalogError
+from lidarops.figures import svg
+from lidarops.figures.charts import Chart, ChartPanel, Ladder, Series, draw_chart, pareto
+from lidarops.figures.templates import environment
 from lidarops.figures.wording import percent
-from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
+from lidarops.system.files import write_atomically
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
+INDEX: Final = "index.html"
+RESULT: Final = "result.json"
+"""Names of the page and of the file of all numbers in the folder of a benchmark."""
 CPU_TIME: Final = "CPU time"
 """Quantity against which errors are drawn."""
 _NONE: Final = "-"
@@ -148,6 +155,17 @@ def _cell(row: Row) -> str:
 
 
 # Tables ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table, printed alike on the page and in a terminal."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    """One cell per column; the first cell names the row."""
+    note: str = ""
 
 
 def table(
@@ -369,6 +387,11 @@ class Results:
     folded: bool = False
     """Whether the table is folded on the page and left out in a terminal."""
 
+    @property
+    def table(self) -> Table:
+        """The rows as a table."""
+        return table(self.title, self.rows, self.note, case=self.case, method=self.method)
+
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
@@ -420,22 +443,47 @@ class Study:
             for row in results.rows
         }
 
-    def output(self) -> BenchmarkOutput:
-        """Return all rows for JSON, and the page."""
+    @property
+    def facts(self) -> list[tuple[str, str]]:
+        """Date, machine and software, as far as known."""
+        about = self.machine
+        packages = ", ".join(f"{name} {version}" for name, version in about.packages.items())
+        values = (self.date, about.processor, about.python, packages)
+        terms = ("Date", "Processor", "Python", "Packages")
+        return [fact for fact in zip(terms, values, strict=True) if fact[1]]
+
+    def json(self) -> str:
+        """Return all rows, by the headings of their tables, as JSON."""
         tables = {r.title: [asdict(w) for w in r.rows] for c in self.chapters for r in c.results}
         about = {"title": self.title, "date": self.date, "machine": asdict(self.machine)}
-        parts = tuple(_part(chapter) for chapter in self.chapters)
-        page = BenchmarkReport(self.title, facts(self.date, self.machine), parts, RESULT)
-        return BenchmarkOutput({**about, "tables": tables}, page)
+        return json.dumps({**about, "tables": tables}, indent=1, allow_nan=False)
 
+    def write(self, folder: Path) -> Path:
+        """Write the page with its charts, and the JSON; return the path of the page.
 
-def _part(chapter: Chapter) -> Part:
-    tables, details = (
-        tuple(
-            table(r.title, r.rows, r.note, case=r.case, method=r.method)
-            for r in chapter.results
-            if r.folded is folded
-        )
-        for folded in (False, True)
-    )
-    return Part(chapter.title, chapter.text, tuple(chapter.charts), tables, details)
+        Raises
+        ------
+        CatalogError
+            If the folder cannot be written.
+        """
+        page = folder / INDEX
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            drawn = {
+                chart.name: draw_chart(chart)
+                for chapter in self.chapters
+                for chart in chapter.charts
+            }
+            for name, figure in drawn.items():
+                write_atomically(folder / f"{name}.svg", svg.file(figure))
+            template = environment("lidarops.reports").get_template("benchmark.html")
+            text = template.render(study=self, drawn=drawn, result=RESULT)
+            write_atomically(page, text.encode())
+            write_atomically(folder / RESULT, self.json().encode())
+        except OSError as error:
+            raise CatalogError(
+                f"the report cannot be written: {error}",
+                file=folder,
+                remedy="choose a folder you can write to",
+            ) from error
+        return page

@@ -15,6 +15,7 @@ from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValue
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+from lidarops.simulate.signal import relative_signal
 
 Random = np.random.Generator
 
@@ -55,8 +56,12 @@ class Paths:
     @property
     def clean(self) -> Array:
         """(profile, bin) without noise and background."""
-        fall = np.exp(-2.0 * self.extinction * self.depth)
-        return np.asarray(self.signal * (self.range[0] / self.range) ** 2 * fall)
+        return self.with_plume(np.zeros(self.range.size))
+
+    def with_plume(self, plume: Array) -> Array:
+        """Return `clean` with more scattering: excess over that of the path, (profile, bin)."""
+        air = np.broadcast_to(1.0 + plume, (len(self.signal), self.range.size))
+        return self.signal * air[:, :1] * relative_signal(self.range, self.extinction * air, air)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +126,8 @@ def _plume(paths: Paths, rng: Random) -> ViolatedPaths:
     middle = rng.random((count, 1)) * paths.depth[:, -1:]
     width = between(rng, 0.01, 0.5, count) * paths.depth[:, -1:]
     plume = between(rng, 1e-2, 10.0, count) * np.exp(-0.5 * ((paths.depth - middle) / width) ** 2)
-    step = paths.range[1] - paths.range[0]
-    added = paths.extinction * step * (np.cumsum(plume, axis=1) - 0.5 * (plume + plume[:, :1]))
     truth = paths.extinction * (1.0 + plume.mean(axis=1, keepdims=True))
-    return ViolatedPaths(paths.clean * (1.0 + plume) * np.exp(-2.0 * added), truth[:, 0])
+    return ViolatedPaths(paths.with_plume(plume), truth[:, 0])
 
 
 def _overlap(paths: Paths, rng: Random) -> ViolatedPaths:

@@ -54,7 +54,6 @@ DRAWS: Final = (
     Draws("scans of any and of calm air", random_scans.score_scan_methods, 8, 750, 40, 0.13),
     Draws("network", random_networks.score_networks, 50, 800, 30, 0.05),
 )
-"""Sizes for about 20 minutes on one core, and less than 2 for a quick run."""
 
 
 def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Study:

@@ -216,6 +216,20 @@ def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
     return campaign
 
 
+def campaign_settings(name: str, instruments: Mapping[str, Any], **others: Any) -> dict[str, Any]:
+    """Return the content of a campaign file of one station, ``here``, unless others are given."""
+    here = {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}
+    return {
+        "name": name,
+        "title": "Campaign of a benchmark",
+        "archive": "raw",
+        "output": "out",
+        "stations": {"here": here},
+        "instruments": dict(instruments),
+        **others,
+    }
+
+
 def _settings(size: CampaignSize) -> dict[str, Any]:
     scans = size.angles > 0
     channel = "photon_532o"
@@ -228,28 +242,20 @@ def _settings(size: CampaignSize) -> dict[str, Any]:
             "sections": [[750, 0.9 * 7.5 * size.bins]],
         }
     facts_of_lidar = {"full_overlap_range": 300, "channels": {channel: {"dead_time": 3e-9}}}
-    return {
-        "name": "measured",
-        "title": "Campaign of a benchmark",
-        "archive": "raw",
-        "output": "out",
-        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
-        "instruments": {
-            "lidar": {
-                "station": "here",
-                "files": "here/h*",
-                "facts": [facts_of_lidar if scans else facts_of_lidar | {"zenith_angle": 90}],
-                "products": products,
-            }
-        },
-        "scenes": {"window": f"{size.profiles}min"},
-        "simulation": {
-            "seed": 7,
-            "start": _DAY,
-            "duration": size.files * _INTERVAL,
-            "instruments": {"lidar": _scanning(size) if scans else _level(size)},
-        },
+    lidar = {
+        "station": "here",
+        "files": "here/h*",
+        "facts": [facts_of_lidar if scans else facts_of_lidar | {"zenith_angle": 90}],
+        "products": products,
     }
+    simulation = {
+        "seed": 7,
+        "start": _DAY,
+        "duration": size.files * _INTERVAL,
+        "instruments": {"lidar": _scanning(size) if scans else _level(size)},
+    }
+    window = {"window": f"{size.profiles}min"}
+    return campaign_settings("measured", {"lidar": lidar}, scenes=window, simulation=simulation)
 
 
 def _level(size: CampaignSize) -> dict[str, Any]:

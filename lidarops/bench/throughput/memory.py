@@ -15,20 +15,13 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from lidarops.bench.harness.benchmark import (
-    CAMPAIGN_FILE,
-    RESULT,
-    BenchmarkKind,
-    BenchmarkOutput,
-    Effort,
-    facts,
-)
-from lidarops.bench.harness.timing import Machine, machine
+from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
+from lidarops.bench.harness.rows import Chapter, Results, Scores, Study, rows_of_scores
+from lidarops.bench.throughput.campaigns import campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.raw import licel_write
 from lidarops.raw.licel_header import DatasetKind, Laser
-from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
 
 BINS: Final = 16_000
@@ -67,18 +60,8 @@ def _of_one(
     facts: dict[str, float] = {"full_overlap_range": 300}
     if zenith_angle is not None:
         facts |= {"zenith_angle": zenith_angle}
-    return {
-        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
-        "instruments": {
-            "lidar": {
-                "station": "here",
-                "files": "h*",
-                "facts": [facts],
-                "products": dict(products),
-                **instrument,
-            }
-        },
-    }
+    lidar = {"station": "here", "files": "h*", "facts": [facts], "products": dict(products)}
+    return {"instruments": {"lidar": lidar | instrument}}
 
 
 def _network() -> dict[str, Any]:
@@ -143,32 +126,13 @@ class Peak:
     """MB above the base at the peak of the scene."""
 
 
-@dataclass(frozen=True, slots=True)
-class MemoryStudy:
-    """Peak memory of processes, by size of the scene and products."""
-
-    date: str
-    machine: Machine
-    peaks: tuple[Peak, ...]
-
-
-def run_memory(kind: BenchmarkKind, *, effort: Effort) -> BenchmarkOutput:
-    """Run the benchmark of memory.
-
-    Raises
-    ------
-    CampaignError
-        If its accuracy is requested.
-    """
-    if kind is not BenchmarkKind.THROUGHPUT:
-        raise CampaignError("the case 'memory' has no accuracy", remedy="choose throughput")
-    sizes = SIZES[:2] if effort.quick else SIZES
+def measure_memory(effort: Effort) -> Study:
+    """Measure the peak memory of processes, by size of the scene and products."""
     peaks = []
-    for peak in measure_peaks(sizes, tuple(CASES)):
+    for peak in measure_peaks(SIZES[:2] if effort.quick else SIZES, tuple(CASES)):
         peaks.append(peak)
         effort.progress(1)
-    study = MemoryStudy(effort.date, machine(), tuple(peaks))
-    return BenchmarkOutput(study, memory_report(study))
+    return memory_study(effort.date, peaks)
 
 
 def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
@@ -208,13 +172,7 @@ def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
     out.mkdir()
     file = out / CAMPAIGN_FILE
-    settings = {
-        "name": "memory",
-        "title": "Campaign of a benchmark",
-        "archive": "raw",
-        "output": "out",
-        **CASES[case],
-    }
+    settings = campaign_settings("memory", **CASES[case])
     file.write_text(yaml.safe_dump(settings), encoding="utf-8")
     return load_campaign(file, archive=str(folder), output=str(out))
 
@@ -264,42 +222,30 @@ def _counts() -> np.ndarray[Any, Any]:
 # Page -----------------------------------------------------------------------------------------
 
 
-def memory_report(study: MemoryStudy) -> BenchmarkReport:
-    """Return the report page."""
-    return BenchmarkReport(
-        title="Memory of a process, by size of the scene",
-        facts=facts(study.date, study.machine),
-        parts=(
-            Part(
-                title="Peak memory above the base of a process",
-                text="Scenes of one analog and one photon-counting channel with "
-                f"{BINS:,} bins, each in a fresh process. The base is the peak after a tiny scene "
-                "of the same case, with imports and compiled code.",
-                tables=(_table(study.peaks),),
-            ),
-        ),
-        data=RESULT,
-    )
-
-
-def _table(peaks: Sequence[Peak]) -> Table:
+def memory_study(date: str, peaks: Sequence[Peak]) -> Study:
+    """Return the study of peaks, each compared with the smallest scene of its case."""
     smallest = {peak.case: peak for peak in reversed(peaks)}
-    rows = []
+    scores: Scores = {}
     for peak in peaks:
         first = smallest[peak.case]
-        growth = (peak.above - first.above) / (peak.raw - first.raw) if peak is not first else None
-        rows.append(
-            (
-                peak.case,
-                f"{peak.raw:.0f}",
-                f"{peak.base:.0f}",
-                f"{peak.above:.0f}",
-                "-" if growth is None else f"{growth:.2f}",
+        grown, more = peak.above - first.above, peak.raw - first.raw
+        scores[peak.case, f"{peak.raw:.0f}"] = {
+            "base MB": round(peak.base),
+            "above base MB": round(peak.above),
+            "slope": grown / more if more else None,
+        }
+    chapter = Chapter(
+        "Peak memory above the base of a process",
+        f"Scenes of one analog and one photon-counting channel with {BINS:,} bins, each in a fresh "
+        "process. The base is the peak after a tiny scene of the same case, with imports and "
+        "compiled code.",
+        [
+            Results(
+                "Peak memory",
+                rows_of_scores(scores),
+                "Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
+                method="raw MB",
             )
-        )
-    return Table(
-        title="Peak memory",
-        columns=("case", "raw MB", "base MB", "above base MB", "slope"),
-        rows=tuple(rows),
-        note="Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
+        ],
     )
+    return Study("Memory of a process, by size of the scene", date, [chapter])

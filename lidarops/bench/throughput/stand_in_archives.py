@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import yaml
 
+from lidarops.bench.throughput.campaigns import campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
@@ -100,18 +101,9 @@ def _settings(size: StandIns) -> dict[str, Any]:
         "facts": [{"zenith_angle": 90, "full_overlap_range": 300}],
         "products": {"signal": {}},
     }
-    return {
-        "name": "stand-ins",
-        "title": "Archive of a benchmark",
-        "archive": "raw",
-        "output": "out",
-        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
-        "instruments": {
-            f"i{number:02d}": instrument | {"files": f"*/i{number:02d}/h*"}
-            for number in range(size.instruments)
-        },
-        "scenes": {"window": "24h"},
-    }
+    names = (f"i{number:02d}" for number in range(size.instruments))
+    instruments = {name: instrument | {"files": f"*/{name}/h*"} for name in names}
+    return campaign_settings("stand-ins", instruments, scenes={"window": "24h"})
 
 
 def _granules(campaign: Campaign, instrument: str, day: int) -> Iterator[Granule]:

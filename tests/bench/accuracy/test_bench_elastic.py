@@ -19,9 +19,6 @@ from lidarops.bench.harness.timing import READ
 from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, RawFormatError
-from lidarops.figures.charts import Chart, ChartPanel, Series, draw_chart
-from lidarops.figures.panels import Band
-from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.air.molecular import MolecularProfile
 
 DRAWS = 60
@@ -300,36 +297,24 @@ def test_times_are_multiples_of_the_read_of_their_batch(timed):
 
 def test_pages_hold_tables_and_figures(accuracy, timed, published, tmp_path):
     reports = {
-        "accuracy": accuracy.output().report,
-        "published": published.output().report,
-        "throughput": timed.output().report,
+        "accuracy": accuracy,
+        "published": published,
+        "throughput": timed,
     }
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build_benchmark_page(report, folder).read_text()
-        for chapter in report.parts:
+        text = report.write(folder).read_text()
+        for chapter in report.chapters:
             for chart in chapter.charts:
                 assert (folder / f"{chart.name}.svg").read_bytes().startswith(b"<svg")
-            for table in (*chapter.tables, *chapter.details):
+            for table in (results.table for results in chapter.results):
                 assert table.title in text
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
     titles, without_files = (
-        [chapter.title for chapter in reports[name].parts] for name in ("published", "accuracy")
+        [chapter.title for chapter in reports[name].chapters] for name in ("published", "accuracy")
     )
     assert [t for t in titles if t not in without_files] == ["Files of the intercomparison"]
-
-
-def test_a_band_is_an_area_between_its_edges():
-    series = Series("method", (1.0, 10.0), (5.0, 6.0), (0.1, 0.2), (2.0, 3.0), band=True)
-    figure = draw_chart(
-        Chart("name", "Title", "Caption.", (ChartPanel("panel", "x", "y", (series,)),))
-    )
-    (area,) = (layer for layer in figure.panels[0].layers if isinstance(layer, Band))
-    assert not area.bars
-    np.testing.assert_array_equal(
-        [area.along, area.low, area.high], [series.x, series.low, series.high]
-    )
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,6 @@ from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError, RawFormatError
 from lidarops.figures.charts import pareto
-from lidarops.reports.benchmark_page import build_benchmark_page
 
 PATH = Scenario(2500.0, 8000.0, 3e-5, 1000.0)
 PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e-3, 1e4)]
@@ -237,19 +236,19 @@ def test_threads_pass_errors_on():
 
 def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
     reports = {
-        "accuracy": accuracy.output().report,
-        "throughput": timed.output().report,
+        "accuracy": accuracy,
+        "throughput": timed,
     }
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build_benchmark_page(report, folder).read_text()
-        charts = [chart for chapter in report.parts for chart in chapter.charts]
+        text = report.write(folder).read_text()
+        charts = [chart for chapter in report.chapters for chart in chapter.charts]
         assert charts
         for chart in charts:
             assert (folder / f"{chart.name}.svg").read_bytes().startswith(b"<svg")
             assert f'src="{chart.name}.svg" alt="{chart.title}' in text
-        for chapter in report.parts:
-            for table in (*chapter.tables, *chapter.details):
+        for chapter in report.chapters:
+            for table in (results.table for results in chapter.results):
                 assert table.title in text
                 assert all(len(row) == len(table.columns) for row in table.rows)
         assert "compressed" in text
@@ -257,7 +256,7 @@ def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
         assert "<script" not in text
     (tmp_path / "file").write_text("")
     with pytest.raises(CatalogError, match="cannot be written"):
-        build_benchmark_page(report, tmp_path / "file")
+        report.write(tmp_path / "file")
 
 
 def test_the_pareto_front_holds_the_unbeaten_points():

@@ -16,7 +16,6 @@ from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.rows import CPU_TIME, Figure
 from lidarops.bench.harness.timing import READ
 from lidarops.bench.throughput import retrievals
-from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.multiangle.optical_depth import (
     Regularisation,
     retrieve_optical_depth,
@@ -318,21 +317,21 @@ def test_times_are_multiples_of_the_read(timed):
 
 def test_pages_have_tables_and_figures(study, timed, tmp_path):
     reports = {
-        "accuracy": study.output().report,
-        "throughput": timed.output().report,
+        "accuracy": study,
+        "throughput": timed,
     }
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build_benchmark_page(report, folder).read_text()
+        text = report.write(folder).read_text()
         assert "2024-01-01" in text
-        assert sum(len(chapter.charts) for chapter in report.parts) >= 1
-        for chapter in report.parts:
+        assert sum(len(chapter.charts) for chapter in report.chapters) >= 1
+        for chapter in report.chapters:
             for chart in chapter.charts:
                 assert (folder / f"{chart.name}.svg").read_bytes().startswith(b"<svg")
-            for table in (*chapter.tables, *chapter.details):
+            for table in (results.table for results in chapter.results):
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
-    published = reports["accuracy"].parts[1]
+    published = reports["accuracy"].chapters[1]
     assert "this is not so" in published.text
     # 2 numbers of beams, 3 shares; priors and correlations.
-    assert len(published.tables) + len(published.details) == 6 + 2
+    assert len(published.results) == 6 + 2

@@ -16,7 +16,6 @@ from lidarops.bench.harness.rows import CPU_TIME
 from lidarops.bench.harness.statistics import mean_by_block, share_by_block
 from lidarops.bench.harness.timing import READ
 from lidarops.bench.throughput import retrievals
-from lidarops.reports.benchmark_page import build_benchmark_page
 
 PROFILES = 3 * network_cases.BLOCK
 
@@ -340,17 +339,17 @@ def test_times_are_multiples_of_the_read(throughput_result):
 
 
 def test_pages_hold_tables_and_figures(accuracy, throughput_result, tmp_path):
-    reports = {"accuracy": accuracy.output().report, "time": throughput_result.output().report}
+    reports = {"accuracy": accuracy, "time": throughput_result}
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build_benchmark_page(report, folder).read_text()
+        text = report.write(folder).read_text()
         assert "2024-01-01" in text
-        for chapter in report.parts:
+        for chapter in report.chapters:
             for chart in chapter.charts:
                 assert (folder / f"{chart.name}.svg").read_bytes().startswith(b"<svg")
-            for table in (*chapter.tables, *chapter.details):
+            for table in (results.table for results in chapter.results):
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
     assert "Figure 2 of the paper, and the correct signs" in [
-        chapter.title for chapter in reports["accuracy"].parts
+        chapter.title for chapter in reports["accuracy"].chapters
     ]

@@ -32,7 +32,6 @@ from lidarops.bench.stability.random_scenes import (
 )
 from lidarops.cli import app
 from lidarops.flags import Quality
-from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -220,7 +219,7 @@ def stability():
 
 
 def test_page_names_undetectable_violations(stability, tmp_path):
-    page = build_benchmark_page(stability.output().report, tmp_path).read_text()
+    page = stability.write(tmp_path).read_text()
     assert "no: an exponential of range has the shape of extinction itself" in page
     assert "False values: homogeneous" in page
 
@@ -232,7 +231,7 @@ def test_command_prints_json_and_writes_the_page(stability, monkeypatch, tmp_pat
         app, ["bench", "stability", "--quick", "--json", "--out", str(folder)]
     )
     assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout) == stability.output().result
+    assert json.loads(result.stdout) == json.loads(stability.json())
     assert (folder / "index.html").is_file()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from lidarops.bench import registry
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.throughput import archives, stand_in_archives
 from lidarops.bench.throughput.archives import ArchiveCost, Pass, ProcessCost
@@ -88,11 +87,11 @@ def test_growth_is_that_of_the_cost_per_file(tmp_path):
 
     small, large = measured(1000, 0.02), measured(100_000, 2.2)
     rows = measured(1_000_000, 10.0, read=False)
-    output = archives.archives_study("2024-01-01", (small, large, rows)).output()
-    assert output.report.parts[0].tables[3].rows == (
+    study = archives.archives_study("2024-01-01", (small, large, rows))
+    assert study.chapters[0].results[3].table.rows == (
         ("1000", "0.02", "0.04", "20 µs", "-", "300 MB"),
         ("100000", "2.2", "4.4", "22 µs", "1.1", "300 MB"),
         ("1000000 rows", "10", "20", "10 µs", "-", "300 MB"),
     )
-    page = registry.write_benchmark(output, tmp_path)
+    page = study.write(tmp_path)
     assert "archive.svg" in page.read_text(encoding="utf-8")

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from lidarops.bench import registry
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.rows import Study
 from lidarops.bench.throughput import campaigns, orchestration
@@ -62,14 +61,13 @@ def test_slopes_are_those_of_the_times(tmp_path):
         campaigns.stages_chapter({"scenes": costs}),
         campaigns.workers_chapter({1: 4.0, 2: 2.5}),
     ]
-    output = Study("Campaigns", "2024-01-01", chapters).output()
-    stages, workers = output.report.parts
-    assert workers.tables[0].rows[1][2] == "1.6"
-    shares = [row[3] for row in stages.tables[0].rows if row[3] != "-"]
+    stages, workers = (chapter.results[0].table for chapter in chapters)
+    assert workers.rows[1][2] == "1.6"
+    shares = [row[3] for row in stages.rows if row[3] != "-"]
     assert math.isclose(
         sum(float(share.split()[0].lstrip("<")) for share in shares), 100.0, abs_tol=0.4
     )
-    page = registry.write_benchmark(output, tmp_path)
+    page = Study("Campaigns", "2024-01-01", chapters).write(tmp_path)
     assert "growth.svg" in page.read_text(encoding="utf-8")
 
 
@@ -78,8 +76,7 @@ def test_overhead_is_a_line_over_the_plain_loop():
     flow = orchestration.RunMode("flow", (10.0 + 16.5, 110.0 + 21.5), (30.0, 140.0))
     assert orchestration.overhead(flow, serial) == pytest.approx((16.0, 0.05))
     chapter = orchestration.orchestration_chapter((serial, flow), (2, 22))
-    (table,) = Study("Flows", "", [chapter]).output().report.parts[0].tables
-    assert table.rows[1] == ("flow", "132", "140", "16", "5 %", "10.3 %")
+    assert chapter.results[0].table.rows[1] == ("flow", "132", "140", "16", "5 %", "10.3 %")
 
 
 def test_a_whole_command_is_measured_with_its_processes(tmp_path):
