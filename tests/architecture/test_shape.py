@@ -91,12 +91,11 @@ def test_no_test_imports_another_test_and_no_retrieval_test_a_benchmark(reposito
 
 
 def test_private_modules_are_imported_within_their_package_only(repository: Path):
-    """But by the benchmark of the kernels themselves."""
     for path, tree in sources(repository, "lidarops", "flows"):
         package = ".".join(path.relative_to(repository).parent.parts)
         for name in imported_modules(tree):
             private = re.match(r"(lidarops\..*)\._[a-z]\w*", name)
-            if private and path.name != "scan_kernels.py":
+            if private:
                 assert package.startswith(private[1]), f"{path} imports {name}"
 
 

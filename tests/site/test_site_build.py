@@ -25,6 +25,7 @@ from lidarops.flags import Quality
 from lidarops.site import paths
 from lidarops.site.build import build_site
 from lidarops.site.product_entry import Grade
+from lidarops.system.files import within
 
 FIRST_PAGE = 300_000
 """Most bytes that the first page may load."""
@@ -356,7 +357,7 @@ def test_hrefs_lead_back_to_their_target(name: str, folder: str) -> None:
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x.nc", "a/../../x.nc", ""])
 def test_paths_that_lead_out_are_refused(tmp_path: Path, path: str) -> None:
     with pytest.raises(ProductError, match="not a path inside"):
-        paths.inside(tmp_path, path)
+        within(tmp_path, path)
 
 
 @pytest.mark.parametrize(

@@ -305,25 +305,14 @@ def _series(
 ) -> Series:
     heights = [_height(row) or 0.0 for _, row in points]
     bars = [2.0 * _DRAWN[row.unit] * row.error for _, row in points]
-    low, high = (
-        tuple(height + sign * bar for height, bar in zip(heights, bars, strict=True))
-        for sign in (-1.0, 1.0)
-    )
-    # A bar that reaches 0 cannot be drawn on a logarithmic axis.
-    low = tuple(
-        max(end, 0.1 * height) if height > 0.0 else end
-        for end, height in zip(low, heights, strict=True)
-    )
-    bars_drawn = any(bars)
-    return Series(
-        label,
-        tuple(across for across, _ in points),
-        tuple(heights),
-        low if bars_drawn else (),
-        high if bars_drawn else (),
-        hollow=hollow,
-        joined=joined,
-    )
+    ends = [
+        # A bar that reaches 0 cannot be drawn on a logarithmic axis.
+        (max(y - bar, 0.1 * y) if y > 0.0 else y - bar, y + bar)
+        for y, bar in zip(heights, bars, strict=True)
+    ]
+    low, high = zip(*ends, strict=True) if any(bars) else ((), ())
+    across = tuple(x for x, _ in points)
+    return Series(label, across, tuple(heights), low, high, hollow=hollow, joined=joined)
 
 
 def error_against_time(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import platform
+import resource
+import sys
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Final
+from typing import Final, ParamSpec, TypeVar
 
 READ: Final = "read (np.max)"
 """Name of the floor of all times: a vectorised read of the same array in the same run."""
@@ -19,6 +22,10 @@ _TRIED: Final = 16
 _LONGEST: Final = 0.06
 """Longest time of one round of a solver, s; slower solvers get fewer profiles."""
 _PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
+_STATUS: Final = Path("/proc/self/status")
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +80,25 @@ def in_threads(function: Callable[[int], object], threads: int) -> None:
     with ThreadPoolExecutor(threads) as pool:
         for future in [pool.submit(function, number) for number in range(threads)]:
             future.result()
+
+
+def in_fresh_process(
+    function: Callable[_Arguments, _Result], *args: _Arguments.args, **kwargs: _Arguments.kwargs
+) -> _Result:
+    """Call a function in a new process, whose memory holds nothing else."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *args, **kwargs).result()
+
+
+def peak_memory() -> float:
+    """Return the peak memory of this process so far, bytes."""
+    # The maximum of `resource` includes the memory of the parent process.
+    if _STATUS.exists():
+        peak = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
+        return 1024.0 * float(peak.split()[1])
+    maximum = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(maximum) if sys.platform == "darwin" else 1024.0 * maximum
 
 
 def _processor() -> str:

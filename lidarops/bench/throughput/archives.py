@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -26,6 +22,7 @@ from lidarops.bench.harness.rows import (
     panel,
     rows_of_scores,
 )
+from lidarops.bench.harness.timing import in_fresh_process, peak_memory
 from lidarops.bench.throughput import stand_in_archives
 from lidarops.bench.throughput.campaigns import CampaignSize, simulate_campaign
 from lidarops.bench.throughput.stand_in_archives import StandIns
@@ -39,7 +36,6 @@ from lidarops.run.staleness import Judge
 _PER_FILE: Final = "CPU time per file"
 _FILES_PER_SCENE: Final = 480
 _BINS: Final = 200
-_STATUS: Final = Path("/proc/self/status")
 
 
 class Pass(StrEnum):
@@ -143,15 +139,8 @@ def _measure(
     files: int, passes: Sequence[Pass], folders: tuple[Path, Path], *, read: bool
 ) -> ArchiveCost:
     small, large = (folder / CAMPAIGN_FILE for folder in folders)
-    costs = {operation: _cost_in_process(operation, small, large) for operation in passes}
+    costs = {operation: in_fresh_process(_cost, operation, small, large) for operation in passes}
     return ArchiveCost(files, read, costs)
-
-
-def _cost_in_process(operation: Pass, small: Path, large: Path) -> ProcessCost:
-    """Return the cost of an operation in a new process, whose memory holds nothing else."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_cost, operation, small, large).result()
 
 
 def _cost(operation: Pass, small: Path, large: Path) -> ProcessCost:
@@ -159,16 +148,7 @@ def _cost(operation: Pass, small: Path, large: Path) -> ProcessCost:
     run(small)
     cpu, wall = time.process_time(), time.perf_counter()
     run(large)
-    return ProcessCost(time.process_time() - cpu, time.perf_counter() - wall, _peak())
-
-
-def _peak() -> float:
-    # The maximum of `resource` includes the memory of the parent process.
-    if _STATUS.exists():
-        peak = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
-        return 1024.0 * float(peak.split()[1])
-    maximum = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float(maximum) if sys.platform == "darwin" else 1024.0 * maximum
+    return ProcessCost(time.process_time() - cpu, time.perf_counter() - wall, peak_memory())
 
 
 def _scan(file: Path) -> None:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import resource
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -17,6 +14,7 @@ import yaml
 
 from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
 from lidarops.bench.harness.rows import Chapter, Results, Scores, Study, rows_of_scores
+from lidarops.bench.harness.timing import in_fresh_process, peak_memory
 from lidarops.bench.throughput.campaigns import campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
@@ -143,14 +141,9 @@ def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
             write_files(root / str(size), size)
         for name in cases:
             # The first process compiles what is not cached, which takes memory of its own.
-            _in_fresh_process(root, name, _TINY)
+            in_fresh_process(_peak, root, name, _TINY)
             for size in sizes:
-                yield _in_fresh_process(root, name, size)
-
-
-def _in_fresh_process(root: Path, case: str, size: int) -> Peak:
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_peak, root, case, size).result()
+                yield in_fresh_process(_peak, root, name, size)
 
 
 def _peak(root: Path, case: str, size: int) -> Peak:
@@ -165,7 +158,7 @@ def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
     record = archive.reprocess(campaign_of(folder, case, out))
     if record is None or any(scene.error for scene in record.scenes):
         raise CampaignError("a scene of the benchmark gave no product", field=case)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    return peak_memory() / 1e6
 
 
 def campaign_of(folder: Path, case: str, out: Path) -> Campaign:

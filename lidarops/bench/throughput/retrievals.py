@@ -12,12 +12,12 @@ import numpy as np
 from lidarops.bench.accuracy import multiangle_cases, network_cases
 from lidarops.bench.accuracy.elastic import elastic_cost_chapter, elastic_costs
 from lidarops.bench.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
+from lidarops.bench.accuracy.multiangle_cases import Scan
 from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import batch_label, cost_chapter, thread_gain, time_methods
 from lidarops.bench.harness.rows import Chapter, Results, Row, Scores, Study, rows_of_scores
 from lidarops.bench.harness.timing import READ, affordable
-from lidarops.bench.throughput.scan_kernels import scan_costs
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)
@@ -26,6 +26,7 @@ _PRECISIONS: Final = ("float32", "float64")
 _MISSING: Final = 0.3
 """Share of the bins that are NaN, at random."""
 _QUICK_REPEATS: Final = 3
+_SCAN_INPUTS: Final = "read (np.max), signal and variance"
 
 
 def _repeats(effort: Effort, most: int) -> int:
@@ -142,7 +143,7 @@ def measure_elastic(effort: Effort, *, batches: Sequence[int] | None = None) -> 
 
 
 def measure_scans(effort: Effort, *, batches: Sequence[int] | None = None) -> Study:
-    """Time kernels, methods and peers on clear air, beside reading the inputs.
+    """Time methods and peers on clear air, beside reading the inputs.
 
     Parameters
     ----------
@@ -153,18 +154,37 @@ def measure_scans(effort: Effort, *, batches: Sequence[int] | None = None) -> St
     scene = multiangle_cases.clear(3000.0)
     rows: list[Row] = []
     for batch in batches or ((1, 64) if effort.quick else (1, 64, 512)):
-        rows += scan_costs(batch_label(batch), scene.draw(batch, batch, 8), _repeats(effort, 5))
+        rows += _scan_costs(batch_label(batch), scene.draw(batch, batch, 8), _repeats(effort, 5))
         effort.progress(1)
     text = (
         f"Clear air, {scene.path.size} angles, {scene.altitude.size} altitudes, float64, one "
-        "thread, least CPU time of interleaved repeats. make_beams, regress and vertical.smooth "
-        "are steps; the others are complete retrievals, with all errors, residuals and flags. "
-        "Plain: without the robust passes, which a single residual too large for chance starts, "
-        "and which take more time than all other steps. The peers give values without flags, "
-        "lstsq also standard errors."
+        "thread, least CPU time of interleaved repeats. Complete retrievals, with all errors, "
+        "residuals and flags. Plain: without the robust passes, which a single residual too large "
+        "for chance starts, and which take more time than all other steps. The peers give values "
+        "without flags, lstsq also standard errors."
     )
     chapters = [cost_chapter("multiangle-time", text, rows)]
     return Study("Scans: time per profile", effort.date, chapters)
+
+
+def _scan_costs(case: str, scan: Scan, repeats: int) -> list[Row]:
+    """Return the CPU time of methods and peers, the reads first."""
+    batch = len(scan.signal)
+    # Callers pass an array, not a view of one row.
+    scan = Scan(scan.scene, scan.signal, np.ascontiguousarray(scan.variance))
+    calls: dict[str, tuple[Callable[[], object], int]] = {
+        READ: (lambda: np.max(scan.signal), batch),
+        _SCAN_INPUTS: (lambda: (np.max(scan.signal), np.max(scan.variance)), batch),
+    }
+    for name, solver in multiangle_cases.scan_methods().items():
+        calls[name] = (partial(solver, scan), batch)
+    for method in (multiangle_cases.KANO_HAMILTON, multiangle_cases.JOINT):
+        plain = partial(multiangle_cases.retrieve, scan, method, robust=False)
+        calls[f"{method}, plain"] = (plain, batch)
+    peers = multiangle_cases.scan_peers()
+    for name, solver in peers.items():
+        calls[name] = (partial(solver, scan.first(1)), 1)
+    return time_methods(case, calls, repeats, peers={_SCAN_INPUTS, *peers})
 
 
 def measure_networks(effort: Effort) -> Study:

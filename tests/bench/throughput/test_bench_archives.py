@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.timing import in_fresh_process
 from lidarops.bench.throughput import archives, stand_in_archives
 from lidarops.bench.throughput.archives import ArchiveCost, Pass, ProcessCost
 from lidarops.bench.throughput.campaigns import CampaignSize
@@ -44,7 +45,7 @@ def test_a_changed_stand_in_is_detected(tmp_path):
 def measured_archives():
     steps = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(archives, "_cost_in_process", archives._cost)
+        patch.setattr(archives, "in_fresh_process", lambda call, *args: call(*args))
         result = archives.measure_archives(
             Effort(date="2024-01-01", progress=steps.append),
             sizes=[CampaignSize(scenes=n, profiles=15, bins=100, retrieved=False) for n in (1, 2)],
@@ -76,7 +77,7 @@ def test_an_operation_can_be_measured_in_its_own_process(tmp_path):
         (tmp_path / name).mkdir()
         stand_in_archives.write_stand_ins(StandIns(1, 1), tmp_path / name / "campaign.yaml")
     files = (tmp_path / "small" / "campaign.yaml", tmp_path / "large" / "campaign.yaml")
-    spent = archives._cost_in_process(Pass.SETTLE, *files)
+    spent = in_fresh_process(archives._cost, Pass.SETTLE, *files)
     assert spent.cpu > 0.0
     assert 1e7 < spent.peak < 1e10
 
