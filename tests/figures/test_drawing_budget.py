@@ -1,0 +1,55 @@
+"""The size and the time of the figures of long products."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.products.drawn import views
+from support.products.encoded_products import build_product
+from support.products.made_products import MAKERS, context
+
+from lidarops.figures import svg
+from lidarops.figures.kind_figures import ProductSource
+from lidarops.figures.raster import COLUMNS
+
+LONG: dict[str, dict[str, Any]] = {
+    "signal": {"profiles": 1440, "bins": 800},
+    "homogeneous": {"profiles": 10_000, "sections": 6},
+    "elastic": {"profiles": 720, "bins": 800},
+    "multiangle": {"profiles": 300, "levels": 150, "zenith": np.linspace(0.0, 80.0, 16)},
+    "visibility": {"profiles": 2000, "crossings": 20, "zenith": np.full(8, 85.0)},
+}
+VIEWS = [(kind, name) for kind in MAKERS for name in views(kind)]
+MOST_BYTES = 300_000
+"""Size of a figure."""
+MOST_SECONDS = 0.1
+"""CPU time of a figure."""
+
+
+@pytest.fixture(scope="module")
+def products() -> dict[str, xr.Dataset]:
+    """A long product of each kind, with noise, which compresses worst, in its images."""
+    return {
+        kind: xr.decode_cf(build_product(MAKERS[kind](**LONG[kind]), context(kind)))
+        for kind in MAKERS
+    }
+
+
+@pytest.mark.parametrize(("kind", "name"), VIEWS)
+def test_a_figure_of_a_long_product_is_small_and_soon_drawn(products, kind, name):
+    view, product = views(kind)[name], products[kind]
+    profiles = -(-product.sizes["time"] // COLUMNS)
+    content = view.read(product, ProductSource(profiles=profiles))
+    assert content is not None
+    sizes, seconds = [], []
+    # CPU time, the least of five: another process may take the caches of the processor.
+    for _ in range(5):
+        begin = time.process_time()
+        sizes = [len(svg.file(figure)) for figure in view.draw([content])]
+        seconds.append((time.process_time() - begin) / len(sizes))
+    assert max(sizes) <= MOST_BYTES
+    assert min(seconds) <= MOST_SECONDS
