@@ -17,6 +17,9 @@ pytest_plugins = ["support.products.report_fixtures", "support.servers.s3_fixtur
 hypothesis.settings.register_profile("lidarops", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("lidarops")
 
+# Tests run in as many processes as there are cores: more threads would wait for each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 

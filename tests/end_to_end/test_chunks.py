@@ -27,9 +27,10 @@ RUN = """
 import pickle, sys
 from lidarops.process.scene import process_scene
 with open(sys.argv[1], "rb") as stream:
-    job = pickle.load(stream)
-outcome = process_scene(job)
-assert outcome.products, outcome.error
+    jobs = pickle.load(stream)
+for job in jobs:
+    outcome = process_scene(job)
+    assert outcome.products, outcome.error
 print(*(name for name in sys.modules if f"{name}.".startswith("lidarops.plan.")))
 """
 
@@ -79,13 +80,10 @@ def test_any_number_of_profiles_together_gives_the_same_bits(
 
 def test_a_worker_imports_no_planning(jobs: list[Job], tmp_path: Path) -> None:
     """A job holds all decisions, so that none is made again where it is carried out."""
-    for job in jobs:
-        if not job.plan.steps:
-            continue
-        path = tmp_path / "job"
-        path.write_bytes(pickle.dumps(job))
-        done = subprocess.run(
-            [sys.executable, "-c", RUN, str(path)], capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.split() == []
+    path = tmp_path / "jobs"
+    path.write_bytes(pickle.dumps([job for job in jobs if job.plan.steps]))
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

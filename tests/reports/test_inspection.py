@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
+from support.archives import raw_archives
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 from typer.testing import CliRunner
@@ -44,12 +45,12 @@ def test_products_show_verdicts_bits_and_extremes(kind: str, tmp_path: Path):
     assert all(word in table.output for word in ("Variables", "Quality", "do_not_use", "units"))
 
 
-def test_raw_files_show_all_their_channels(demo_archive: Path):
-    path = sorted((demo_archive / "hill").glob("v*"))[0]
+def test_raw_files_show_all_their_channels(tmp_path: Path):
+    path = raw_archives.write(tmp_path / "h0", raw_archives.content(0, bins=4000))
     shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
     description = json.loads(shown.output)
     assert description["type"] == "raw"
-    assert description["start"].startswith("2024-09-2")
+    assert description["start"].startswith("2026-03-01")
     assert {"analog_532o", "photon_532o"} <= {row["name"] for row in description["channels"]}
     widths = {row["name"]: (row["bins"], row["bin_width"]) for row in description["channels"]}
     assert set(widths.values()) == {(4000, 7.5)}, widths

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import time as clock
-from dataclasses import replace
+from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
 
@@ -67,12 +67,19 @@ def files(folder: Path) -> dict[str, bytes]:
 
 class TestFigures:
     def test_do_not_depend_on_the_number_of_processes(self, many, tmp_path, monkeypatch):
+        filled = []
+        fill = gallery.fill
+
+        def noted(*arguments, **options):
+            filled.append(fill(*arguments, **options))
+            return filled[-1]
+
+        monkeypatch.setattr(gallery, "fill", noted)
         run_page.build_report(many, tmp_path / "one")
-        alone = gallery.fill(many, tmp_path / "one")
         monkeypatch.setattr(reading, "FEWEST", 1)
         monkeypatch.setattr(reading, "_AT_A_TIME", 2)
         run_page.build_report(many, tmp_path / "two", workers=2)
-        together = gallery.fill(many, tmp_path / "two", workers=2)
+        alone, together = filled
         assert files(tmp_path / "one") == files(tmp_path / "two")
         assert together == alone
         assert [problem.path for problem in alone.problems] == ["e2.nc", "s3.nc", "s4.nc"]
@@ -133,29 +140,41 @@ def readings(paths: list[Path], read) -> list[ReadTask]:
     return [ReadTask(path, raster_variables("signal"), read, ProductSource()) for path in paths]
 
 
+@pytest.fixture(scope="module", params=[1, 2])
+def readers(request: pytest.FixtureRequest) -> Iterator[Readers]:
+    """Readers in this process, and in two others."""
+    with Readers(request.param, 1000, xr.Dataset({"level": 100.0})) as opened:
+        yield opened
+
+
 class TestReaders:
-    @pytest.mark.parametrize("workers", [1, 2])
-    def test_keep_the_order(self, paths, workers, monkeypatch):
+    def test_keep_the_order(self, paths, readers, monkeypatch):
         monkeypatch.setattr(reading, "_AT_A_TIME", 1)
-        truth = xr.Dataset({"level": 100.0})
-        with Readers(workers, 1000, truth) as readers:
-            shapes = list(readers.read_all(readings(paths, shape)))
-            known = list(readers.read_all(readings(paths, of_truth)))
-            refused = list(readers.read_all(readings([*paths, Path("no.nc")], refusing)))
+        shapes = list(readers.read_all(readings(paths, shape)))
+        known = list(readers.read_all(readings(paths, of_truth)))
+        refused = list(readers.read_all(readings([*paths, Path("no.nc")], refusing)))
         assert shapes == [(count, 4) for count in range(2, 10)]
         assert known == [100.0 + count for count in range(2, 10)]
         failures = [ReadFailure("signal: is of no use")] * len(paths)
         assert refused == [*failures, ReadFailure("the file is missing")]
 
-    def test_processes_are_started_where_they_are_worth_it(self, paths):
-        for workers, products, others in ((2, 99, False), (1, 1000, False), (2, 100, True)):
+    def test_reduce_to_the_same_rasters(self, paths, readers):
+        rasters = list(readers.read_all(readings(paths, raster_of)))
+        serial = [Readers().read(task) for task in readings(paths, raster_of)]
+        for expected, other in zip(serial, rasters, strict=True):
+            np.testing.assert_array_equal(expected.total, other.total)
+            for name in ("bits", "units", "altitude", "with_care"):
+                assert getattr(expected, name) == getattr(other, name)
+
+    def test_no_process_is_started_for_few_products(self, paths):
+        for workers, products in ((2, 99), (1, 1000)):
             with Readers(workers, products) as readers:
-                processes = set(readers.read_all(readings(paths, process)))
-            assert (os.getpid() not in processes) == others
+                assert set(readers.read_all(readings(paths, process))) == {os.getpid()}
 
     def test_death_of_a_process_stops_nothing(self, paths, monkeypatch, caplog):
         monkeypatch.setattr(reading, "_AT_A_TIME", 1)
-        with caplog.at_level(logging.WARNING), Readers(2, 1000) as readers:
+        with caplog.at_level(logging.WARNING), Readers(2, 100) as readers:
+            assert os.getpid() not in readers.read_all(readings(paths, process))
             assert list(readers.read_all(readings(paths, deadly))) == list(range(2, 10))
             assert list(readers.read_all(readings(paths, shape)))[-1] == (9, 4)
             assert set(readers.read_all(readings(paths, process))) == {os.getpid()}
@@ -173,20 +192,6 @@ class TestReaders:
     def test_errors_of_the_program_are_not_hidden_as_file_errors(self, paths):
         with Readers() as readers, pytest.raises(TypeError):
             list(readers.read_all(readings(paths, len)))
-
-    def test_reduce_to_the_same_rasters(self, paths):
-        with Readers(2, 1000) as readers:
-            parallel = list(readers.read_all(readings(paths, raster_of)))
-        with Readers() as readers:
-            serial = list(readers.read_all(readings(paths, raster_of)))
-        for expected, other in zip(serial, parallel, strict=True):
-            np.testing.assert_array_equal(expected.total, other.total)
-            assert replace(expected, bits=other.bits).bits == expected.bits
-            assert (expected.units, expected.altitude, expected.with_care) == (
-                other.units,
-                other.altitude,
-                other.with_care,
-            )
 
 
 _READER = """

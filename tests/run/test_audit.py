@@ -19,12 +19,12 @@ from lidarops.cli import app
 from lidarops.run.archive import reprocess
 
 
-@pytest.fixture
-def archive(tmp_path: Path) -> Archive:
-    """A small archive, processed once."""
-    made_here = Archive(tmp_path, days=2)
-    reprocess(made_here.write())
-    return made_here
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small archive, processed once with its retrievals."""
+    source = Archive(tmp_path_factory.mktemp("processed"), days=2)
+    reprocess(source.write())
+    return source.folder
 
 
 def _mismatches(archive: Archive) -> set[tuple[str, str]]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
-from support.archives import crash_archive
+from support.archives import crash_archive, crash_runs
 
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -105,46 +107,38 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     assert product.exists()
 
 
-_FULL = """
-import errno, os, sys
-sys.path.insert(0, {support_folder!r})
-real = os.{name}
-left = {after}
-def failing(*arguments):
-    global left
-    left -= 1
-    if left < 0:
-        raise OSError(errno.ENOSPC, "No space left on device")
-    return real(*arguments)
-os.{name} = failing
-import crash_runs
-from contextlib import suppress
-from pathlib import Path
-sys.exit(crash_runs.run(Path({folder!r}), "serial"))
-"""
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Products of an undisturbed run over eight scenes."""
+    folder = tmp_path_factory.mktemp("calm")
+    reprocess(crash_archive.make(folder, scenes=8))
+    return crash_archive.products(folder)
 
 
 @pytest.mark.parametrize(("name", "after"), [("fsync", 3), ("replace", 2), ("fsync", 0)])
 def test_a_disk_that_fills_up_is_reported_and_the_next_run_recovers(
-    tmp_path: Path, name: str, after: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, str], name: str, after: int
 ) -> None:
-    calm = tmp_path / "calm"
-    reprocess(crash_archive.make(calm, scenes=8))
-    folder = tmp_path / "full"
-    campaign = crash_archive.make(folder, scenes=8)
-    support_folder = str(crash_archive.RUNNER.parent)
-    code = _FULL.format(support_folder=support_folder, name=name, after=after, folder=str(folder))
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
-    assert process.returncode == 1, process.stderr.decode()
-    assert crash_archive.wrong_rows(folder) == []
-    assert crash_archive.visible_partial(folder, crash_archive.products(calm)) == []
+    campaign = crash_archive.make(tmp_path, scenes=8)
+    before, calls = getattr(os, name), count()
+
+    def failing(*arguments: Any) -> None:
+        if next(calls) >= after:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        before(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, name, failing)
+        assert crash_runs.run(tmp_path, "serial") == 1
+    assert crash_archive.wrong_rows(tmp_path) == []
+    assert crash_archive.visible_partial(tmp_path, whole) == []
     with Store(campaign.catalog_url, campaign.name) as store:
         assert all("No space left" in error for error in store.failures().values())
         assert store.failures()
         assert store.runs()[0].status is RunStatus.STOPPED
         assert store.runs()[0].scenes < 8
     assert not bring_up_to_date(campaign).has_failures
-    assert crash_archive.products(folder) == crash_archive.products(calm)
+    assert crash_archive.products(tmp_path) == whole
 
 
 @pytest.fixture
@@ -160,7 +154,7 @@ def tiny_disk(tmp_path: Path) -> Path:
     if not mounted:
         pytest.skip("no right to mount a file system")
     yield place
-    subprocess.run(["umount", str(place)], check=False)
+    subprocess.run(["umount", "--lazy", str(place)], check=False)
 
 
 def test_a_full_file_system_is_reported_and_nothing_is_damaged(

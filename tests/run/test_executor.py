@@ -90,6 +90,7 @@ def test_a_file_that_vanishes_after_the_scan_is_refused(archive: Archive) -> Non
     assert granule.reason == "vanished after it was catalogued (run lidarops catalog again)"
 
 
+@pytest.mark.slow
 def test_a_scene_that_kills_its_worker_is_refused_by_name(
     archive: Archive, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,7 +117,9 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
     assert not healed.failures
 
 
-@pytest.mark.parametrize("crashed", [1, 4], ids=["one", "all"])
+@pytest.mark.parametrize(
+    "crashed", [pytest.param(1, id="one"), pytest.param(4, id="all", marks=pytest.mark.slow)]
+)
 def test_scenes_that_killed_their_process_are_tried_in_another(
     archive: Archive, crashed: int
 ) -> None:

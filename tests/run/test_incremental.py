@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from distributed import Client
 from support import quick
 from support.archives.small_archive import DAY, Archive, made
 from typer.testing import CliRunner
@@ -438,7 +439,7 @@ def test_a_cluster_is_started_only_if_something_is_stale(archive: Archive) -> No
         started.append(True)
         yield client
 
-    with executor.local_client(1) as client:
+    with Client(processes=False, n_workers=1, dashboard_address=None) as client:
         options = Options(cluster=cluster)
         assert reprocess(archive.write(), options=options) is None
         assert not started

@@ -51,9 +51,13 @@ def chromium() -> Iterator[Any]:
         yield opened
 
 
-@pytest.fixture(params=["light", "dark"])
+@pytest.fixture
 def scheme(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+    """The colour scheme; pages differ by it in colours only."""
+    return str(getattr(request, "param", "light"))
+
+
+both_schemes = pytest.mark.parametrize("scheme", ["light", "dark"], indirect=True)
 
 
 @pytest.fixture
@@ -127,6 +131,7 @@ def _tab_to(page: Any, words: str) -> None:
     raise AssertionError(f"the keyboard does not reach {words!r}")
 
 
+@both_schemes
 def test_calendar_to_download_by_keyboard(site: Path, watched: Watched) -> None:
     page = watched.page
     watched.open(site / "index.html")
@@ -159,6 +164,7 @@ def test_no_page_needs_sideways_scrolling(site: Path, watched: Watched, width: i
         assert wide <= width, name
 
 
+@both_schemes
 def test_images_are_drawn_and_thumbnails_load(site: Path, watched: Watched) -> None:
     for file in _pages(site).values():
         watched.open(file)
@@ -185,6 +191,7 @@ def test_policy_blocks_other_sources(site: Path, watched: Watched) -> None:
 
 @pytest.mark.skipif(not AXE.exists(), reason="axe-core is not installed: npm ci in tests/site")
 @pytest.mark.slow
+@both_schemes
 def test_axe_finds_nothing_serious(site: Path, chromium: Any, scheme: str) -> None:
     # The policy of the pages would block axe, as any script.
     context = chromium.new_context(color_scheme=scheme, bypass_csp=True)
