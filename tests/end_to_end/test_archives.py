@@ -133,7 +133,7 @@ def _hashes(record: RunRecord) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("workers", "profiles_per_chunk"), [(2, None), (1, 7)], ids=["2 workers", "7 a chunk"]
+    ("workers", "profiles_per_chunk"), [(2, None), (1, 47)], ids=["2 workers", "47 a chunk"]
 )
 def test_products_do_not_depend_on_workers_and_chunks(
     demo: tuple[Campaign, RunRecord],

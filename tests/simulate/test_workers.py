@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,17 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CampaignError
-from lidarops.run.executor import local_client
+from lidarops.run import executor
 from lidarops.simulate import campaign as module
 from lidarops.simulate.campaign import plan_simulation, simulate_campaign
 from lidarops.simulate.files import Simulator
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A client of two processes."""
+    with executor.local_client(2) as started:
+        yield started
 
 
 def _contents(root):
@@ -31,31 +39,30 @@ def _scenery(tree):
         instrument["random_damage"] = {"fraction": 0.3, "kinds": ["garbage", "duplicate", "glitch"]}
 
 
-def test_two_processes_write_what_one_writes(small, monkeypatch):
+def test_two_processes_write_what_one_writes(small, client, monkeypatch):
     alone = small(_scenery, archive="alone")
     first = simulate_campaign(alone)
     expected = _contents(first.archive)
     monkeypatch.setattr(module, "_BATCH", 3)
     steps = []
-    with local_client(2) as client:
-        second = simulate_campaign(
-            small(_scenery, archive="shared"), client=client, progress=steps.append
-        )
-        assert _contents(second.archive) == expected
-        assert second.truth.identical(first.truth)
-        assert second.paths == first.paths
-        assert second.size == first.size == sum(map(len, expected.values()))
-        assert sum(steps) == len(first.paths)
+    second = simulate_campaign(
+        small(_scenery, archive="shared"), client=client, progress=steps.append
+    )
+    assert _contents(second.archive) == expected
+    assert second.truth.identical(first.truth)
+    assert second.paths == first.paths
+    assert second.size == first.size == sum(map(len, expected.values()))
+    assert sum(steps) == len(first.paths)
 
-        # Errors in a worker are raised like errors in this process.
-        def unwritable(tree):
-            tree["stations"]["coast"]["altitude"] = 8000
-            tree["instruments"]["coast-lidar"]["station"] = "coast"
-            tree["stations"]["coast"]["name"] = "\u6e2f"
-            tree["simulation"]["instruments"]["coast-lidar"]["acquisition"]["dialect"] = "pilar"
+    # Errors in a worker are raised like errors in this process.
+    def unwritable(tree):
+        tree["stations"]["coast"]["altitude"] = 8000
+        tree["instruments"]["coast-lidar"]["station"] = "coast"
+        tree["stations"]["coast"]["name"] = "\u6e2f"
+        tree["simulation"]["instruments"]["coast-lidar"]["acquisition"]["dialect"] = "pilar"
 
-        with pytest.raises(ValueError, match="Latin-1"):
-            simulate_campaign(small(unwritable, archive="bad"), client=client)
+    with pytest.raises(ValueError, match="Latin-1"):
+        simulate_campaign(small(unwritable, archive="bad"), client=client)
 
 
 def test_any_order_gives_the_same_files(small):
@@ -78,7 +85,14 @@ def test_the_plan_names_all_files(small):
         plan_simulation(small(lambda tree: tree.pop("simulation")))
 
 
-def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
+def test_the_command_line_writes_the_same_with_workers(small, client, tmp_path, monkeypatch):
+    started = []
+
+    def started_before(workers):
+        started.append(workers)
+        return nullcontext(client)
+
+    monkeypatch.setattr(executor, "local_client", started_before)
     campaign = small(_scenery, archive="called")
     expected = _contents(simulate_campaign(campaign).archive)
     file = tmp_path / "small.yaml"
@@ -92,3 +106,4 @@ def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
         contents = _contents(folder)
         assert contents.pop("truth.nc")
         assert contents == expected
+    assert started == [2]

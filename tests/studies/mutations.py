@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import hashlib
 import os
 import random
 import resource
@@ -18,6 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from lidarops.retrieve.common.compiled_code import keep_apart
 
 ROOT: Final = Path(__file__).parents[2]
 CACHE: Final = """
@@ -190,7 +193,12 @@ class Copy:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, folder / name)
         self._compiled = folder / "compiled"
-        self._compiled.mkdir()
+        # The compiled code of the checkout; numba names its folders after those of the sources.
+        for source in (ROOT / "lidarops").rglob("*"):
+            if source.is_dir() and source.name != "__pycache__":
+                own = _cache_name(folder / source.relative_to(ROOT))
+                for cached in Path(keep_apart()).glob(_cache_name(source)):
+                    shutil.copytree(cached, self._compiled / own)
 
     def failure(self, package: str, mutant: Mutant) -> str:
         """Return the first test that fails with a mutant; an empty text if it survives."""
@@ -249,6 +257,10 @@ class Copy:
             text=True,
             check=False,
         )
+
+
+def _cache_name(folder: Path) -> str:
+    return f"{folder.name}_{hashlib.sha1(str(folder).encode(), usedforsecurity=False).hexdigest()}"
 
 
 def _copy_compiled(source: Path, target: Path, stale: set[str]) -> None:

@@ -182,6 +182,24 @@ def test_the_window_begins_above_the_aerosol():
         assert fit.poor_fit.mean() < 0.01
 
 
+@pytest.mark.parametrize(
+    ("structure", "curved", "wavy"),
+    [
+        (1.3 * np.sin(2 * np.pi * np.arange(1000) / 80), False, True),
+        (0.5 * (1.0 - (RANGE - 4500.0) / 1500.0), True, False),
+    ],
+    ids=["waves", "curvature"],
+)
+def test_a_window_must_show_neither_waves_nor_curvature(structure, curved, wavy):
+    """From 4.5 to 6 km, which only the longest window contains."""
+    shape = air()
+    power = 20.0 + 5.0 * shape + structure * ((RANGE > 4500.0) & (RANGE < 6000.0))
+    longest = fit_known_shape(power, RANGE, shape, variance=0.09, start=4500.0)
+    # At a false alarm of 1 percent each.
+    assert (abs(longest.curvature) > 2.81, longest.waves > 31.3) == (curved, wavy)
+    assert fit_known_shape(power, RANGE, shape, variance=0.09).start == 6007.5
+
+
 def test_clean_air_is_used_from_the_nearest_start():
     rng = np.random.default_rng(8)
     shape = air()
