@@ -33,6 +33,10 @@ def test_times_may_be_dates():
         cycles(SWEEP * 2, None, bounds)
 
 
+def test_profiles_without_a_duration_are_accepted():
+    assert numbered(SWEEP * 2, lengths=0.0) == [0] * 5 + [1] * 5
+
+
 def test_incomplete_cycles_stay():
     assert numbered(SWEEP[3:] + SWEEP + SWEEP[:2]) == [0, 0, 0, 0, 0, 1, 1, 1, 1]
     assert numbered(SWEEP + SWEEP[:2]) == [0] * 5 + [1] * 2
