@@ -217,12 +217,10 @@ def references(part: Part, alike: Template, mode: DetectionMode, shared: Mapping
     counts = [source.facts.profiles for source in part.sources]
     index = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
     for row, values in ((PRODUCT, ids), (PRODUCT_INDEX, index)):
-        refs |= _inlined(row.name, values, row.dims, _without_encoding(attributes(row, mode=mode)))
+        attrs = attributes(row, mode=mode)
+        attrs.pop("_Encoding", None)
+        refs |= _inlined(row.name, values, row.dims, attrs)
     return refs
-
-
-def _without_encoding(attrs: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in attrs.items() if key != "_Encoding"}
 
 
 def _small(name: str, part: Part, alike: Template) -> Refs:
@@ -264,16 +262,12 @@ def _inlined(
 ) -> Refs:
     """Return values as one chunk that is stored with the references."""
     stored = np.ascontiguousarray(values).reshape(values.shape)
-    packed = _as_text(zlib.compress(stored.tobytes(), _LEVEL))
+    packed = base64.b64encode(zlib.compress(stored.tobytes(), _LEVEL)).decode()
     key = ".".join("0" for _ in stored.shape) or "0"
     filters = [{"id": "zlib", "level": _LEVEL}]
-    return {f"{name}/{key}": packed} | _described(
+    return {f"{name}/{key}": f"base64:{packed}"} | _described(
         name, stored.dtype, stored.shape, stored.shape, dims, attrs, filters
     )
-
-
-def _as_text(content: bytes) -> str:
-    return f"base64:{base64.b64encode(content).decode()}"
 
 
 def _described(

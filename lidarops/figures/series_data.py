@@ -34,6 +34,15 @@ class SeriesEstimate:
     """(time,) NaN where unknown."""
     units: str
 
+    def at(self, index: NDArray[np.bool_] | NDArray[np.intp]) -> SeriesEstimate:
+        """Return the estimate at some times."""
+        return replace(
+            self,
+            value=self.value[index],
+            standard_error=self.standard_error[index],
+            truth=self.truth[index],
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class TimeSeries:
@@ -265,15 +274,7 @@ def _where(section: AnySeries, keep: NDArray[np.bool_]) -> AnySeries:
         section,
         time=section.time[keep],
         flag=section.flag[keep],
-        estimates={
-            name: SeriesEstimate(
-                value=estimate.value[keep],
-                standard_error=estimate.standard_error[keep],
-                truth=estimate.truth[keep],
-                units=estimate.units,
-            )
-            for name, estimate in section.estimates.items()
-        },
+        estimates={name: estimate.at(keep) for name, estimate in section.estimates.items()},
     )
 
 
@@ -299,11 +300,11 @@ def _joined(group: list[AnySeries]) -> AnySeries:
     def joined(name: str) -> SeriesEstimate:
         parts = [series.estimates[name] for series in group]
         return SeriesEstimate(
-            value=np.concatenate([part.value for part in parts])[order],
-            standard_error=np.concatenate([part.standard_error for part in parts])[order],
-            truth=np.concatenate([part.truth for part in parts])[order],
+            value=np.concatenate([part.value for part in parts]),
+            standard_error=np.concatenate([part.standard_error for part in parts]),
+            truth=np.concatenate([part.truth for part in parts]),
             units=parts[0].units,
-        )
+        ).at(order)
 
     return replace(
         group[0],

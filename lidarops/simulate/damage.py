@@ -24,6 +24,7 @@ _LOG: Final = "".join(
 ).encode()
 _SITE: Final = re.compile(rb"(?<=\r\n ).*?(?= \d\d/\d\d/\d{4} )")
 _PLACE: Final = re.compile(rb"(:\d\d \d\d/\d\d/\d{4} \d\d:\d\d:\d\d \S+) (\S+ \S+) (\S+)([^\r]*)")
+_BINS: Final = re.compile(rb"(\r\n [01] \d \d )(\d{5}) ")
 _DATASET: Final = re.compile(rb"(?<=\r\n )[01] \d \d \d{5} [^\r]*")
 _SURPLUS: Final = 1000
 _LONG_SITE: Final = b"Demonstration site"
@@ -44,30 +45,6 @@ def damage_file(kind: DamageKind, content: bytes, random: np.random.Generator) -
     return _DAMAGE[kind](content, random)
 
 
-def _truncated(content: bytes, _: np.random.Generator) -> bytes:
-    return content[: len(content) * 3 // 5]
-
-
-def _empty(_: bytes, __: np.random.Generator) -> bytes:
-    return b""
-
-
-def _garbage(content: bytes, random: np.random.Generator) -> bytes:
-    return random.bytes(len(content))
-
-
-def _foreign(_: bytes, __: np.random.Generator) -> bytes:
-    return _LOG
-
-
-def _surplus(content: bytes, random: np.random.Generator) -> bytes:
-    return content + random.bytes(_SURPLUS)
-
-
-def _no_final_newline(content: bytes, _: np.random.Generator) -> bytes:
-    return content.removesuffix(b"\r\n")
-
-
 def _unchanged(content: bytes, _: np.random.Generator) -> bytes:
     return content
 
@@ -82,51 +59,23 @@ def _in_header(edit: Callable[[bytes], bytes]) -> _Edit:
     return change
 
 
-def _negative_bins(header: bytes) -> bytes:
-    return re.sub(rb"(\r\n [01] \d \d )\d{5} ", rb"\g<1>-0005 ", header, count=1)
+def _replaced(
+    pattern: re.Pattern[bytes], replacement: bytes | Callable[[re.Match[bytes]], bytes]
+) -> _Edit:
+    """Return an edit of the first match in the header text."""
+    return _in_header(lambda header: pattern.sub(replacement, header, count=1))
 
 
-def _too_many_bins(header: bytes) -> bytes:
-    def doubled(match: re.Match[bytes]) -> bytes:
-        return b"%s%05d " % (match[1], 2 * int(match[2]))
-
-    return re.sub(rb"(\r\n [01] \d \d )(\d{5}) ", doubled, header, count=1)
-
-
-def _impossible_position(header: bytes) -> bytes:
-    # Impossible in either order of the coordinates.
-    return _PLACE.sub(rb"\g<1> 0987.6 0765.4 \g<3>\g<4>", header, count=1)
-
-
-def _long_site(header: bytes) -> bytes:
-    return _SITE.sub(_LONG_SITE, header, count=1)
-
-
-def _blank_site(header: bytes) -> bytes:
-    return _SITE.sub(lambda site: b" " * len(site[0]), header, count=1)
-
-
-def _zenith_minus_90(header: bytes) -> bytes:
-    return _PLACE.sub(rb"\g<1> \g<2> -90\g<4>", header, count=1)
-
-
-def _wide_line(header: bytes) -> bytes:
-    def widened(match: re.Match[bytes]) -> bytes:
-        after = match[4].split()
-        weather = b" 30.0 1013.0" if after else b" 00 30.0 1013.0"
-        values = match[4].rstrip() + (b"" if len(after) > 1 else weather)
-        return b"%s %s %s%s" % (match[1], match[2], match[3], values.ljust(30))
-
-    return _PLACE.sub(widened, header, count=1)
+def _wider(match: re.Match[bytes]) -> bytes:
+    after = match[4].split()
+    weather = b" 30.0 1013.0" if after else b" 00 30.0 1013.0"
+    values = match[4].rstrip() + (b"" if len(after) > 1 else weather)
+    return b"%s %s %s%s" % (match[1], match[2], match[3], values.ljust(30))
 
 
 def _decimal_comma(header: bytes) -> bytes:
     name, _, rest = header.partition(b"\r\n")
     return name + b"\r\n" + re.sub(rb"(?<=\d)\.(?=\d)", b",", rest)
-
-
-def _zero_voltage(header: bytes) -> bytes:
-    return _replace_token(header, 5, b"0000")
 
 
 def _replace_token(header: bytes, column: int, token: bytes) -> bytes:
@@ -192,26 +141,27 @@ def _zero_shots(content: bytes, random: np.random.Generator) -> bytes:
 
 
 _DAMAGE: Final[Mapping[DamageKind, _Edit]] = {
-    DamageKind.TRUNCATED: _truncated,
-    DamageKind.EMPTY: _empty,
-    DamageKind.GARBAGE: _garbage,
-    DamageKind.NEGATIVE_BINS: _in_header(_negative_bins),
-    DamageKind.TOO_MANY_BINS: _in_header(_too_many_bins),
-    DamageKind.IMPOSSIBLE_POSITION: _in_header(_impossible_position),
-    DamageKind.FOREIGN: _foreign,
-    DamageKind.SURPLUS: _surplus,
-    DamageKind.NO_FINAL_NEWLINE: _no_final_newline,
+    DamageKind.TRUNCATED: lambda content, _: content[: len(content) * 3 // 5],
+    DamageKind.EMPTY: lambda _, __: b"",
+    DamageKind.GARBAGE: lambda content, random: random.bytes(len(content)),
+    DamageKind.NEGATIVE_BINS: _replaced(_BINS, rb"\g<1>-0005 "),
+    DamageKind.TOO_MANY_BINS: _replaced(_BINS, lambda m: b"%s%05d " % (m[1], 2 * int(m[2]))),
+    # Impossible in either order of the coordinates.
+    DamageKind.IMPOSSIBLE_POSITION: _replaced(_PLACE, rb"\g<1> 0987.6 0765.4 \g<3>\g<4>"),
+    DamageKind.FOREIGN: lambda _, __: _LOG,
+    DamageKind.SURPLUS: lambda content, random: content + random.bytes(_SURPLUS),
+    DamageKind.NO_FINAL_NEWLINE: lambda content, _: content.removesuffix(b"\r\n"),
     DamageKind.GLITCH: _in_counts(_glitch),
     DamageKind.DEAD_PHOTON: _in_counts(_dead_photon),
-    DamageKind.LONG_SITE: _in_header(_long_site),
-    DamageKind.BLANK_SITE: _in_header(_blank_site),
-    DamageKind.ZENITH_MINUS_90: _in_header(_zenith_minus_90),
-    DamageKind.WIDE_LINE: _in_header(_wide_line),
+    DamageKind.LONG_SITE: _replaced(_SITE, _LONG_SITE),
+    DamageKind.BLANK_SITE: _replaced(_SITE, lambda site: b" " * len(site[0])),
+    DamageKind.ZENITH_MINUS_90: _replaced(_PLACE, rb"\g<1> \g<2> -90\g<4>"),
+    DamageKind.WIDE_LINE: _replaced(_PLACE, _wider),
     DamageKind.DECIMAL_COMMA: _in_header(_decimal_comma),
     DamageKind.SATURATION: _in_counts(_saturation),
     DamageKind.ZERO_SHOTS: _zero_shots,
     DamageKind.RENAMED: _unchanged,
-    DamageKind.ZERO_VOLTAGE: _in_header(_zero_voltage),
+    DamageKind.ZERO_VOLTAGE: _in_header(lambda header: _replace_token(header, 5, b"0000")),
     DamageKind.LARGEST_INTEGER: _in_counts(_largest),
     DamageKind.DUPLICATE: _unchanged,
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 from lidarops.bench.harness.benchmark import Effort
@@ -45,6 +44,10 @@ class Draws:
     needless: float
     """Largest share of needless flags where the model holds."""
 
+    def score_cluster(self, cluster: int) -> Iterator[tuple[ScoredValues, int]]:
+        """Return the values of a cluster."""
+        return self.score(cluster, self.profiles)
+
 
 DRAWS: Final = (
     Draws("homogeneous", random_homogeneous.score_homogeneous, 1000, 400, 15, 1e-3),
@@ -67,13 +70,9 @@ def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Study
     chapters = []
     for draw in draws:
         clusters = draw.quick if effort.quick else draw.clusters
-        tally = collect(partial(_score_cluster, draw), clusters, effort.progress)
+        tally = collect(draw.score_cluster, clusters, effort.progress)
         chapters.append(_chapter(draw.retrieval, tally.rates(draw.needless)))
     return Study("Stability: false values without a flag", effort.date, chapters)
-
-
-def _score_cluster(draws: Draws, cluster: int) -> Iterator[tuple[ScoredValues, int]]:
-    return draws.score(cluster, draws.profiles)
 
 
 _NOTE: Final = (
