@@ -28,9 +28,7 @@ def bench(
         Path | None,
         typer.Option(help="Folder of the EARLINET elastic intercomparison, for the case elastic."),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Measure less, in about two minutes.")
-    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure less.")] = False,
     repeats: Annotated[
         int | None, typer.Option(min=1, max=100, help="Number of repeats of each timing.")
     ] = None,

@@ -1,1 +1,1 @@
-"""The HTML report of a run and of a benchmark, the run record, and `lidarops inspect`."""
+"""The HTML report of a run, the run record, and `lidarops inspect`."""

@@ -465,7 +465,7 @@ class Study:
             }
             for name, figure in drawn.items():
                 write_atomically(folder / f"{name}.svg", svg.file(figure))
-            template = environment("lidarops.reports").get_template("benchmark.html")
+            template = environment("lidarops.bench.harness").get_template("benchmark.html")
             text = template.render(study=self, drawn=drawn, result=RESULT)
             write_atomically(page, text.encode())
             write_atomically(folder / RESULT, self.json().encode())
