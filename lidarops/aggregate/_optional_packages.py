@@ -8,15 +8,13 @@ from typing import Any
 from lidarops.errors import LidarOpsError
 
 
-def need(module: str, *, extra: str = "aggregate") -> Any:
-    """Import a package of an optional extra.
+def need(module: str) -> Any:
+    """Import a package of the optional extra ``aggregate``.
 
     Parameters
     ----------
     module : str
         Such as ``pyarrow.parquet``.
-    extra : str
-        Extra of lidarops that installs it.
 
     Returns
     -------
@@ -32,5 +30,5 @@ def need(module: str, *, extra: str = "aggregate") -> Any:
     except ImportError as error:
         raise LidarOpsError(
             f"the package {module.partition('.')[0]} cannot be imported: {error}",
-            remedy=f"pip install 'lidarops[{extra}]'",
+            remedy="pip install 'lidarops[aggregate]'",
         ) from error

@@ -43,9 +43,7 @@ class MainVariable:
         return f"{self.long_name[:1].upper()}{self.long_name[1:]}{few}"
 
 
-def read_main_variable(
-    product: xr.Dataset, *, kind: str, most: int = SERIES
-) -> MainVariable | None:
+def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None:
     """Return the main variable of a product as series over time.
 
     Parameters
@@ -54,8 +52,6 @@ def read_main_variable(
         Of any kind; may be lazy. Of a large variable, only some profiles are read.
     kind : str
         Kind of the product, which may be unknown.
-    most : int, optional
-        Most series.
 
     Returns
     -------
@@ -76,7 +72,7 @@ def read_main_variable(
     rejecting = rejecting_mask(stored_bits(stated, kind))
     errors = _table(_beside(some, f"{name}_standard_error", name, np.nan))
     units = str(variable.attrs.get("units", ""))
-    most_values = np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:most]
+    most_values = np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:SERIES]
     series = tuple(
         NumberedSeries(
             time=some["time"].values.astype("datetime64[ns]"),

@@ -134,7 +134,6 @@ def assess(
     campaign: Campaign,
     *,
     selection: Selection | None = None,
-    force: bool = False,
     everything: bool = False,
     wait: float = 0.0,
 ) -> Iterator[Judgement]:
@@ -147,8 +146,6 @@ def assess(
     campaign : Campaign
     selection : Selection, optional
         What to process; default everything.
-    force : bool
-        Whether every selected product counts as stale.
     everything : bool
         Whether to yield also scenes that need nothing.
     wait : float
@@ -162,8 +159,8 @@ def assess(
     check_selection(campaign, selection)
     update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
-        judge = Judge(campaign, store, selection=selection, force=force)
-        days = _days_to_judge(judge, store, selection, force=force or everything)
+        judge = Judge(campaign, store, selection=selection)
+        days = _days_to_judge(judge, store, selection, force=everything)
         for batch in judge.batches(days):
             for judged in judge.days(batch).judgements:
                 if everything or judged.due or judged.held:
