@@ -55,13 +55,14 @@ def measure(
     counts: dict[tuple[str, str], list[Counts]] = {}
     contexts = [(nullcontext, [Guard(BASE), *(g for g in guards if g.off is None)])]
     contexts += [(guard.off, [guard]) for guard in guards if guard.off is not None]
-    for cluster in clusters:
-        for context, variants in contexts:
-            with context():
+    for context, variants in contexts:
+        # Outside the loop over clusters: some contexts compile.
+        with context():
+            for cluster in clusters:
                 scored = list(score(cluster))
-            for variant in variants:
-                for quantity, total in _totals(scored, variant.bits).items():
-                    counts.setdefault((variant.name, quantity), []).append(total)
+                for variant in variants:
+                    for quantity, total in _totals(scored, variant.bits).items():
+                        counts.setdefault((variant.name, quantity), []).append(total)
     return counts
 
 

@@ -1,38 +1,50 @@
-"""Ablation of the guards of scans over zenith angle: ``python tests/studies/scan_guards.py``."""
+"""Ablation of the guards of scans over zenith angle: ``python tests/studies/scan_guards.py``.
+
+With ``--thresholds``, every threshold is halved and doubled instead.
+"""
 
 from __future__ import annotations
 
+import argparse
+import ast
+import importlib
+import inspect
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 from unittest import mock
 
+import numba
 import numpy as np
+from numba.core.dispatcher import Dispatcher
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from studies.ablation import Guard, measure, table
 
+import lidarops.retrieve.multiangle as retrieval
 from lidarops.bench.stability import random_scans
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import (
     _block,
     _methods,
     _path_variation,
+    _sample_mask,
     robust_weights,
 )
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import _block as _vertical
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS, Thresholds
 from lidarops.retrieve.multiangle.vertical import (
     _calibration,
     _correlation,
     _outliers,
     _smoothing_choice,
-    gaps,
     smooth_profile,
 )
 
@@ -103,46 +115,86 @@ GUARDS: Final = (
     ),
     Guard("outlying beams: best pair", off=_off((robust_weights, "pair_residuals", _nothing))),
     Guard("kept information", off=_off((_block, "kept_information", _ones))),
-    Guard("least guess of the inhomogeneity", off=_at(_block, least_guess=0.0)),
     Guard(
-        "few residuals: inflation", off=_off((_vertical, "_inflation", lambda *a: np.ones(a[2])))
+        "few residuals: inflation",
+        off=_off((smooth_profile, "_inflation", lambda *a: np.ones(a[2]))),
     ),
     Guard(
-        "gaps", off=_off((gaps, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool)))
+        "gaps",
+        off=_off((_sample_mask, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool))),
     ),
     Guard("outlying estimates: screen", off=_off(SCREEN)),
     Guard("outlying estimates: bisquare", off=_off(BISQUARE)),
     Guard("outlying estimates: both", off=_off(SCREEN, BISQUARE)),
-    Guard("negligible profiles", off=_at(smooth_profile, negligible_information=0.0)),
-    Guard("largest information", off=_at(_vertical, largest_information=1e300)),
-    Guard("usual information", off=_at(_vertical, usual_information=np.inf)),
     Guard("Cp beside the likelihood", off=_at(_smoothing_choice, rougher=np.inf)),
-    Guard("calibration", off=_off((_vertical, "_calibrate", _nothing))),
+    Guard("calibration", off=_off((smooth_profile, "_calibrate", _nothing))),
     Guard(
         "calibration: scale of profiles",
         off=_off((_calibration, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
-    Guard("calibration: largest deviation", off=_at(_calibration, largest_deviation=1e9)),
     Guard("calibration: common altitudes", off=_off((_calibration, "_common", lambda c: c >= 1))),
     Guard("correlation", off=_off((_correlation, "fit_correlation", lambda *_: (0.0, 1.0)))),
     Guard(
         "correlation: amplitude",
         off=_at(_correlation, least_amplitude=1.0, largest_amplitude=1.0),
     ),
-    Guard("correlation: none below", off=_at(_correlation, none_below=0.0)),
-    Guard("correlation: simple below", off=_at(_correlation, simple_below=0.05)),
-    Guard(
-        "data share",
-        off=_at(_methods, smooth_profile, least_share=-np.inf, largest_share=np.inf),
-    ),
 )
 
 
+def _modules() -> list[ModuleType]:
+    names = pkgutil.walk_packages(retrieval.__path__, f"{retrieval.__name__}.")
+    return [importlib.import_module(info.name) for info in names]
+
+
+def _aliases(module: ModuleType) -> Iterator[tuple[str, str]]:
+    """Yield the constants of a module that repeat thresholds, and the names of these."""
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.value, ast.Attribute):
+            place = node.value.value
+            if isinstance(place, ast.Name) and place.id == "THRESHOLDS":
+                yield ast.unparse(node.target), node.value.attr
+
+
+@contextmanager
+def _changed(name: str, value: float) -> Iterator[None]:
+    """Change a threshold; modules that compile it in are compiled anew, without their caches."""
+    changed = replace(THRESHOLDS, **{name: value})
+    patches: list[Patch] = []
+    for module in _modules():
+        if hasattr(module, "THRESHOLDS"):
+            patches.append((module, "THRESHOLDS", changed))
+        aliases = [alias for alias, threshold in _aliases(module) if threshold == name]
+        patches += [(module, alias, value) for alias in aliases]
+        for function in list(vars(module).values()) if aliases else ():
+            if isinstance(function, Dispatcher):
+                again = numba.njit(nogil=True, error_model="numpy")(function.py_func)
+                patches.append((module, function.py_func.__name__, again))
+    with replaced(*patches):
+        yield
+
+
+def _thresholds() -> Iterator[Guard]:
+    """Yield every threshold halved and doubled."""
+    for field in fields(Thresholds):
+        value = getattr(THRESHOLDS, field.name)
+        for factor in (0.5, 2.0):
+            other = type(value)(factor * value)
+            yield Guard(f"{field.name} = {other:g}", off=partial(_changed, field.name, other))
+
+
 def main() -> None:
-    """Print the table."""
-    clusters = range(int(sys.argv[1]) if len(sys.argv) > 1 else CLUSTERS)
-    counts = measure(lambda k: random_scans.score_scans(k, PROFILES), clusters, GUARDS)
+    """Print the table of the guards, or of the thresholds."""
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("clusters", nargs="?", type=int, default=CLUSTERS)
+    arguments.add_argument("--thresholds", action="store_true", help="halve and double each")
+    arguments.add_argument("--only", nargs="*", help="words in the names of the rows")
+    given = arguments.parse_args()
+    guards = [*_thresholds()] if given.thresholds else [*GUARDS]
+    if given.only:
+        guards = [guard for guard in guards if any(word in guard.name for word in given.only)]
+    clusters = range(given.clusters)
+    counts = measure(lambda k: random_scans.score_scans(k, PROFILES), clusters, guards)
     sys.stdout.write("\n".join(table(counts)) + "\n")
 
 

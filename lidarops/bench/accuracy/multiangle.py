@@ -52,9 +52,6 @@ LOW: Final = 2000.0
 """m, altitude up to which the error with outliers is scored separately."""
 _CLOSE: Final = 0.5
 _PER_KM: Final = 1e3
-_DISCREPANCY: Final = "mld 0, discrepancy"
-_UNDRAWN: Final = "mld 0, sum over angles"
-"""Left out of the chart: close to `mld 0, discrepancy` in clear air, and worse in clouds."""
 _ANGLE: Final = "largest zenith angle (degree)"
 _DEPTH: Final = "RMSE of optical depth"
 _EXTINCTION: Final = "RMSE of extinction (km⁻¹)"
@@ -233,7 +230,6 @@ def _works(scores: Scores) -> Iterator[Work]:
 
 def _scenes(scores: Scores) -> Chapter:
     rows = rows_of_scores(scores)
-    drawn = [row for row in rows if row.method != _UNDRAWN]
     return Chapter(
         "Error against CPU time",
         "Clear air: 12 beams from 0 to 75°, evenly spaced in slant path, 201 altitudes from "
@@ -244,21 +240,21 @@ def _scenes(scores: Scores) -> Chapter:
         "estimate the scatter. The peers know it, solve each altitude on its own, and use each "
         "sample that exceeds 3 times its noise. This selects bright samples and causes the bias of "
         "lstsq in clear air; our methods avoid it by selecting with the mean signal of a window of "
-        "altitudes. mld: order of the penalty and choice of its strength.",
+        "altitudes.",
         [
             Results(
                 scene,
                 [row for row in rows if row.case == scene],
                 f"{_ERRORS} Within 1 and 1.96 stated standard errors: 68.3 and 95 % if the stated "
                 "errors are right. At the top: mean error at the highest altitude. Extinction: "
-                "RMSE of all differences of optical depths; coverage of published values, of which "
-                "at least 90 % come from the data. Data share: median; the remainder is zero for "
-                "mld 0, and the altitude below for mld_prior.",
+                "RMSE of all differences of optical depths; coverage of published values. Data "
+                "share: median; the remainder is zero for mld, and the altitude below for "
+                "mld_prior.",
             )
             for scene in dict.fromkeys(row.case for row in rows)
         ],
         [
-            error_against_time(f"work-{name}", drawn, quantity, hollow=cases.scan_peers())
+            error_against_time(f"work-{name}", rows, quantity, hollow=cases.scan_peers())
             for name, quantity in (("optical-depth", _DEPTH), ("extinction", _EXTINCTION))
         ],
     )
@@ -288,7 +284,7 @@ def _published(size: StudySize) -> Chapter:
         [
             tables[CENTRAL],
             Results(
-                "mld_prior at 15°, 6 beams, 25 %, with a multiple of the truth as prior",
+                "mld at 15°, 6 beams, 25 %, with a multiple of the truth as prior",
                 rows_of_scores(_priors(size)),
                 "With the truth as prior, the error comes from noise only.",
                 case="prior / truth",
@@ -374,13 +370,10 @@ def _priors(size: StudySize) -> Scores:
     scores: Scores = {}
     for factor in PRIORS:
         prior = factor * truth
-        results = [
-            cases.estimate(scan, cases.MLD_PRIOR, prior_optical_depth=prior) for scan in scans
-        ]
+        depths = [cases.with_prior(scan, prior) for scan in scans]
         scores[f"{factor:g}", ""] = {
             "prior alone": abs(factor - 1.0) * float(np.sqrt(np.mean(truth**2))),
-            _DEPTH: _rmse([result.optical_depth for result in results], scene),
-            _SHARE: _median([result.data_share for result in results]),
+            _DEPTH: _rmse(depths, scene),
         }
     return scores
 
@@ -395,7 +388,7 @@ def _correlations(size: StudySize) -> Scores:
             shape = (size.published, scene.path.size, scene.altitude.size)
             air = scene.inhomogeneity * cases.correlated(rng, shape, correlation)
             scans.append(scene.observe(air, rng))
-        for name in (cases.KANO_HAMILTON, _DISCREPANCY, cases.MLD_PRIOR, cases.JOINT):
+        for name in (cases.KANO_HAMILTON, cases.MLD, cases.MLD_PRIOR, cases.JOINT):
             depths = [cases.scan_methods()[name](scan).optical_depth for scan in scans]
             scores[f"{correlation:g}", name] = {
                 _DEPTH: _rmse(depths, scene),
@@ -409,7 +402,7 @@ def _verdict(central: Scores) -> str:
         figure = central[f"{angle:g}", method][_DEPTH]
         return figure if isinstance(figure, Figure) else Figure(float("nan"))
 
-    mld, two_angle = rmse(_DISCREPANCY, 15.0), rmse(TWO_ANGLE_ALONE, 30.0)
+    mld, two_angle = rmse(cases.MLD, 15.0), rmse(TWO_ANGLE_ALONE, 30.0)
     line, zero = rmse(cases.KANO_HAMILTON, 15.0), rmse(NOTHING, 15.0)
     return (
         "A cloud of 8 layers of 50 m, optical depth 4.4, observed at 6 or 4 evenly spaced angles. "
@@ -417,8 +410,8 @@ def _verdict(central: Scores) -> str:
         "publication states (in a figure, without a number) that the regularised derivative (mld, "
         "the historical method) is stable at 15°, while two angles, shown for 30° and 10 %, are "
         "not acceptable. For the error at single altitudes, this is "
-        f"{'not ' if mld.value > two_angle.value else ''}so: with 25 % at 15°, the RMSE of mld of "
-        f"order 0 is {with_error(mld.value, mld.error)}, that of two angles at 30° with 10 % is "
+        f"{'not ' if mld.value > two_angle.value else ''}so: with 25 % at 15°, the RMSE of mld is "
+        f"{with_error(mld.value, mld.error)}, that of two angles at 30° with 10 % is "
         f"{with_error(two_angle.value, two_angle.error)}, that of the straight line "
         f"{with_error(line.value, line.error)} and that of an optical depth of zero "
         f"{zero.value:.2f}. Most of the optical depth by mld comes from its prior (data share; "
@@ -432,7 +425,7 @@ def _angle_chart(rows: Sequence[Row]) -> Chart:
         NOTHING,
         TWO_ANGLE_ALONE,
         cases.KANO_HAMILTON,
-        _DISCREPANCY,
+        cases.MLD,
         cases.MLD_PRIOR,
         cases.JOINT,
     )

@@ -13,7 +13,6 @@ from scipy.optimize import lsq_linear
 from lidarops.bench.harness.rows import Array
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
-    Regularisation,
     retrieve_optical_depth,
 )
 
@@ -321,19 +320,8 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
 
 def scan_methods() -> Mapping[str, ScanSolver]:
     """Return the methods of lidarops that are compared, by name."""
-    choices = {
-        "mld 0, discrepancy": Regularisation(0, "discrepancy"),
-        "mld 0, Cp": Regularisation(0, "cp"),
-        "mld 0, GCV": Regularisation(0, "gcv"),
-        "mld 0, sum over angles": Regularisation(average="angles"),
-        "mld 1, discrepancy": Regularisation(1, "discrepancy"),
-        "mld 1, GCV": Regularisation(1, "gcv"),
-    }
-    return {
-        **{name: partial(estimate, method=name) for name in (TWO_ANGLE, KANO_HAMILTON)},
-        **{n: partial(estimate, method=MLD, regularisation=c) for n, c in choices.items()},
-        **{name: partial(estimate, method=name) for name in (MLD_PRIOR, JOINT)},
-    }
+    names = (TWO_ANGLE, KANO_HAMILTON, MLD, MLD_PRIOR, JOINT)
+    return {name: partial(estimate, method=name) for name in names}
 
 
 def retrieve(scan: Scan, method: str, **options: Any) -> MultiAngleResult:
@@ -359,6 +347,13 @@ def estimate(scan: Scan, method: str, **options: Any) -> ScanEstimates:
         data_share=result.data_share,
         freedom=result.effective_degrees_of_freedom,
     )
+
+
+def with_prior(scan: Scan, prior: Array) -> Array:
+    """Return optical depth by "mld" from the difference of the scan from a prior (altitude,)."""
+    known = np.exp(2.0 * scan.scene.path[:, np.newaxis] * prior)
+    rest = replace(scan, signal=scan.signal * known, variance=scan.variance * known**2)
+    return estimate(rest, MLD).optical_depth + prior
 
 
 # Peers ----------------------------------------------------------------------------------------

@@ -282,8 +282,8 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
 
 
 _BYTES_OF_AN_ALTITUDE: Final = 430.0
-"""Bytes per altitude of a beam of a cycle at the peak of the retrieval: ``lidarops bench throughput
---case memory`` measured 265 MB above the base for 625,000 of them."""
+"""Bytes per altitude of a beam of a cycle at the peak of the retrieval, as ``lidarops bench
+throughput --case memory`` measures."""
 
 
 class _Scans(WholeProduct):

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import ndtri
 
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle import _sample_mask, robust_weights
 from lidarops.retrieve.multiangle.slant_paths import Scan, surrounds_zenith
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import gaps as _gaps
 
 Array = npt.NDArray[np.float64]
 
-WINDOW: Final = THRESHOLDS.pooled
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_DEPENDENT: Final = 1e-8
+"""Squared length of a column outside those before it, over its own, up to which it depends on
+them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +31,9 @@ class BeamBlock:
     """(profile, angle, altitude); 0 where there is no sample."""
     noise: Array
     """Their variances; inf where there is no sample."""
-    path: Array
-    """(angle, altitude), finite."""
-    distance: Array
-    """(2, angle, altitude), finite: horizontal distance over altitude, eastward and northward."""
+    design: Array
+    """(3, angle, altitude), finite: horizontal distance over altitude, eastward and northward, and
+    slant path."""
     alive: npt.NDArray[np.intp]
     """(profile, altitude): number of beams not yet lost in noise."""
     sides: bool
@@ -43,6 +42,11 @@ class BeamBlock:
     """Beams that an altitude needs to be within the reach."""
     gaps: npt.NDArray[np.bool_]
     """(profile,): whether samples are missing between others."""
+
+    @property
+    def path(self) -> Array:
+        """Slant path, (angle, altitude)."""
+        return np.asarray(self.design[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,7 @@ class Regression:
         return self.table[:, number]
 
 
-def make_beam_block(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> BeamBlock:
+def make_beam_block(signal: Array, variance: Array, scan: Scan) -> BeamBlock:
     """Return logarithms and geometry of one block.
 
     Parameters
@@ -86,12 +90,13 @@ def make_beam_block(signal: npt.NDArray[np.floating], variance: Array, scan: Sca
     return BeamBlock(
         logarithm,
         noise,
-        np.nan_to_num(scan.path, nan=1.0),
-        np.nan_to_num(np.stack([scan.east, scan.north])),
+        np.stack(
+            [np.nan_to_num(scan.east), np.nan_to_num(scan.north), np.nan_to_num(scan.path, nan=1.0)]
+        ),
         alive,
         surrounds_zenith(scan.tilted_azimuths),
         min(3, max(int(scan.usable.sum()), 2)),
-        _gaps.profiles_with_gaps(noise < np.inf, signal, variance),
+        _sample_mask.profiles_with_gaps(noise < np.inf, signal, variance),
     )
 
 
@@ -134,40 +139,47 @@ def shows_gradient(
     -------
     (altitude,) bool
     """
-    ratio = fit.residual * np.where(np.isnan(fit.residual), 0.0, weights_of(beams, fit))
-    ratio = np.nan_to_num(ratio)
+    weights = np.where(np.isnan(fit.residual), 0.0, weights_of(beams, fit))
     noisiest = np.where(beams.noise < np.inf, beams.noise, 0.0).max(axis=1)
     testable = (fit.column(kh.SIDES) == 0.0) & (noisiest < THRESHOLDS.gradient_noise)
+    testable &= fit.column(kh.FREEDOM) > 0
+    inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
     gradient = np.zeros(altitude.size, dtype=np.bool_)
-    for d in beams.distance:
-        product = np.einsum("tak,ak->tk", ratio, d)
-        known = _unexplained(beams, fit, d)
-        used = testable & (known > 0.0)
-        total = np.where(used, product * altitude, 0.0).sum(axis=0)
-        square = np.where(used, known * altitude**2, 0.0).sum(axis=0)
-        inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
-        weight = inside @ square
+    for distance in beams.design[:2]:
+        *_, (left, square) = orthogonal_columns(
+            weights, (np.ones(altitude.size), beams.path, distance)
+        )
+        known = np.where(testable & np.isfinite(square[:, 0]), square[:, 0], 0.0)
+        product = (weights * left * np.nan_to_num(fit.residual)).sum(axis=1)
+        total = np.where(known > 0.0, product * altitude, 0.0).sum(axis=0)
+        weight = inside @ (known * altitude**2).sum(axis=0)
         spread = weight * (1.0 + correlation) / (1.0 - correlation) + (slack * weight) ** 2
         gradient |= np.abs(inside @ total) > THRESHOLDS.gradient_limit * np.sqrt(spread)
     return gradient
 
 
-def _unexplained(beams: BeamBlock, fit: Regression, d: Array) -> Array:
-    """Return the weighted squares of a distance not explained by path and constant.
+def orthogonal_columns(weights: Array, columns: Iterable[Array]) -> list[tuple[Array, Array]]:
+    """Return columns orthogonal to those before them, and their squared lengths.
 
-    The shape is (profile, altitude).
+    Parameters
+    ----------
+    weights : (profile, angle, altitude) float
+    columns : iterable of (angle, altitude) or (altitude,) float
+
+    Returns
+    -------
+    list of (profile, angle, altitude) float, (profile, 1, altitude) float
+        The squared length is infinite where a column depends on those before it.
     """
-    weights = weights_of(beams, fit)
-    whole = weights.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        centre_d = np.einsum("tak,ak->tk", weights, d) / whole
-        centre_x = np.einsum("tak,ak->tk", weights, beams.path) / whole
-        off_d = d - centre_d[:, np.newaxis]
-        off_x = beams.path - centre_x[:, np.newaxis]
-        cross = (weights * off_d * off_x).sum(axis=1)
-        square = (weights * off_x**2).sum(axis=1)
-        left = (weights * off_d**2).sum(axis=1) - cross**2 / square
-    return np.where(fit.column(kh.FREEDOM) > 0, np.nan_to_num(left), 0.0)
+    basis: list[tuple[Array, Array]] = []
+    for column in columns:
+        left = np.broadcast_to(column, weights.shape)
+        least = _DEPENDENT * (weights * left**2).sum(axis=1, keepdims=True)
+        for before, square in basis:
+            left = left - (weights * before * left).sum(axis=1, keepdims=True) / square * before
+        square = (weights * left**2).sum(axis=1, keepdims=True)
+        basis.append((left, np.where(square > least, square, np.inf)))
+    return basis
 
 
 def weights_of(beams: BeamBlock, fit: Regression) -> Array:
@@ -223,7 +235,7 @@ def residual_scale(beams: BeamBlock, fit: Regression) -> Array:
     shape = (beams.noise.shape[0], beams.noise.shape[2])
     if not fit.robust:
         return np.ones(shape)
-    of_chi2 = robust_weights.clean_moments(robust_weights.PASS_WIDTH)[0]
+    of_chi2 = robust_weights.clean_moments(THRESHOLDS.pass_width)[0]
     count = np.count_nonzero(beams.noise < np.inf, axis=1) - 2.0 - fit.column(kh.SIDES)
     expected = fit.column(kh.EXPECTED)
     known = expected > 0.0
@@ -243,10 +255,8 @@ def _fit(
         np.empty((0, *beams.noise.shape[1:])),
     )
     for _ in range(2):
-        # With a guess of zero, one altitude would have all the weight of its window.
-        guess = np.maximum(variance, THRESHOLDS.least_guess * variance.max())
-        table = _table(beams, keep, guess, nothing, nothing)
-        variance, freedom = _dersimonian_laird(table, guess, moments[0])
+        table = _table(beams, keep, variance, nothing, nothing)
+        variance, freedom = _dersimonian_laird(table, variance, moments[0])
     return replace(_fit_known(beams, keep, variance, moments[1]), freedom=freedom)
 
 
@@ -263,18 +273,17 @@ def _table(
 ) -> Array:
     """Return the fit of every altitude; residuals and leverages are filled if they have rows."""
     table = np.empty((beams.noise.shape[0], kh.COLUMNS, beams.noise.shape[2]))
-    y, noise, x, d = beams.logarithm, beams.noise, beams.path, beams.distance
-    kh.fit_levels(y, noise, keep, variance, x, d, beams.sides, table, residual, leverage)
+    kh.fit_levels(
+        beams.logarithm, beams.noise, keep, variance, beams.design, beams.sides, table,
+        residual, leverage,
+    )  # fmt: skip
     return table
 
 
 def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Array, Array]:
-    r"""Return the variance of the inhomogeneity, and its degrees of freedom.
+    """Return the variance of the inhomogeneity, formula 4 of the page, and its degrees of freedom.
 
-    .. math:: s^2 = \max\left(0,
-              \frac{\sum [s_0^2 \sum w (1 - h) + Q - E(Q)]}{\sum \sum w (1 - h)}\right),
-
-    pooled over the block and a window of altitudes (`dersimonian1986`).
+    Pooled over the block and a window of altitudes (`dersimonian1986`).
     """
     freedom = _windowed(table[:, kh.FREEDOM].sum(axis=0))
     trace = table[:, kh.TRACE].sum(axis=0)
@@ -288,15 +297,11 @@ def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Arr
     return np.interp(altitudes, altitudes[known], variance), freedom
 
 
-@_compiled
 def _windowed(values: Array) -> Array:
     """Return sums over the window around each altitude, cut at the ends of the grid."""
-    half = WINDOW // 2
-    total = np.zeros(values.size)
-    for k in range(values.size):
-        for j in range(max(k - half, 0), min(k + half + 1, values.size)):
-            total[k] += values[j]
-    return total
+    half = THRESHOLDS.pooled // 2
+    padded = np.pad(values, half)
+    return np.asarray(sliding_window_view(padded, 2 * half + 1).sum(axis=1))
 
 
 def pooled_freedom(fit: Regression) -> Array:
@@ -330,28 +335,20 @@ def outlier_limit(count: int) -> float:
 
 
 def _fit_robustly(beams: BeamBlock, inhomogeneity: float | None) -> Regression:
-    residual = np.empty(beams.noise.shape)
-    robust_weights.start_residuals(beams.logarithm, beams.noise, beams.path, residual)
-    scale = _start_scale(beams, residual) if inhomogeneity is None else inhomogeneity**2
-    keep = np.empty(beams.noise.shape)
-    variance = np.broadcast_to(np.asarray(scale), beams.noise.shape[2:]).astype(np.float64)
-    robust_weights.pair_residuals(beams.logarithm, beams.noise, beams.path, variance, residual)
-    width = robust_weights.START_WIDTH
-    leverage = np.zeros(beams.noise.shape)
-    for _ in range(3):
-        robust_weights.fill_robust_weights(residual, leverage, beams.noise, variance, width, keep)
+    y, noise, path = beams.logarithm, beams.noise, beams.path
+    residual, leverage = np.empty(noise.shape), np.zeros(noise.shape)
+    robust_weights.start_residuals(y, noise, path, residual)
+    if inhomogeneity is None:
+        variance, samples = robust_weights.median_variance(residual, noise)
+        variance = _windowed(variance * samples) / np.maximum(_windowed(samples), 1.0)
+    else:
+        variance = np.full(noise.shape[2], inhomogeneity**2)
+    robust_weights.pair_residuals(y, noise, path, variance, residual)
+    for width in (THRESHOLDS.start_width, THRESHOLDS.pass_width, THRESHOLDS.pass_width):
+        keep = robust_weights.bisquare(residual, leverage, noise, variance, width)
         fit = _fit(beams, keep, inhomogeneity, robust_weights.clean_moments(width))
         residual, leverage, variance = fit.residual, fit.leverage, fit.inhomogeneity
-        width = robust_weights.PASS_WIDTH
     return fit
-
-
-def _start_scale(beams: BeamBlock, residual: Array) -> Array:
-    """Return the variance of the inhomogeneity from medians, averaged over the window."""
-    variance, samples = np.empty(residual.shape[2]), np.empty(residual.shape[2])
-    robust_weights.median_variance(residual, beams.noise, variance, samples)
-    total = _windowed(samples)
-    return np.where(total > 0, _windowed(variance * samples) / np.maximum(total, 1.0), 0.0)
 
 
 def end_beams(beams: BeamBlock) -> BeamBlock:

@@ -1,11 +1,10 @@
-r"""Compiled weighted regression of logarithms on slant path, one altitude at a time.
+"""Compiled weighted regression of logarithms on slant path, one altitude at a time.
 
-The model is :math:`y_l = c - 2 x_l \tau + g \cdot d_l + e_l` with the slant path x and the error
-variance :math:`v_l + s^2` (detector noise and inhomogeneity of the air). A horizontal gradient g
-over the horizontal distance d is included only where beams point to all sides.
+The formulas are in ``docs/algorithms/multiangle.md``. Altitudes are the innermost loop: they are
+contiguous, and independent of each other.
 """
 
-# ruff: noqa: FBT001, FBT003 - compiled functions take no keyword-only arguments
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
@@ -44,6 +43,9 @@ COLUMNS: Final = 13
 
 _SAME_PATH: Final = 1e-20
 """Variance of slant paths up to which they count as equal."""
+_DEPENDENT: Final = 1e-12
+"""Squared length of a distance outside the columns before it, over that of both distances, up to
+which it depends on them."""
 _OPPOSITE: Final = 1e-6
 """radian, rounding by which the gap between opposite azimuths may exceed half a turn."""
 
@@ -51,20 +53,13 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def _surrounds_zenith(weights: Array, design: Array) -> bool:
-    """Return whether every half turn around the zenith has a beam with weight.
-
-    Parameters
-    ----------
-    weights : (angle,) float
-    design : (4, angle) float
-        The first two rows are the distances to the east and north.
-    """
+def _surrounds_zenith(weights: Array, design: Array, k: int) -> bool:
+    """Return whether every half turn around the zenith has a beam with weight at an altitude."""
     tilted = 0
-    azimuths = np.empty(weights.size)
-    for a in range(weights.size):
-        if weights[a] > 0.0 and math.hypot(design[0, a], design[1, a]) > 1e-9:
-            azimuths[tilted] = math.atan2(design[0, a], design[1, a])
+    azimuths = np.empty(weights.shape[0])
+    for a in range(weights.shape[0]):
+        if weights[a, k] > 0.0 and math.hypot(design[0, a, k], design[1, a, k]) > 1e-9:
+            azimuths[tilted] = math.atan2(design[0, a, k], design[1, a, k])
             tilted += 1
     if tilted < 2:
         return False
@@ -76,155 +71,221 @@ def _surrounds_zenith(weights: Array, design: Array) -> bool:
 
 
 @_compiled
-def _dot(weights: Array, first: Array, second: Array) -> float:
-    total = 0.0
-    for a in range(weights.size):
-        total += weights[a] * first[a] * second[a]
-    return total
+def _around(weights: Array, design: Array, around: Array) -> None:
+    """Fill 1 at the altitudes where the beams with weight surround the zenith, else 0."""
+    for k in range(around.size):
+        changed = k == 0
+        for a in range(weights.shape[0]):
+            changed |= (weights[a, k] > 0.0) != (weights[a, k - 1] > 0.0)
+        if changed:
+            around[k] = 1.0 if _surrounds_zenith(weights, design, k) else 0.0
+        else:
+            around[k] = around[k - 1]
 
 
 @_compiled
-def _orthogonal(
-    weights: Array, design: Array, sides: bool, q: Array, norm: Array, mean: Array
-) -> int:
-    """Fill orthogonal columns of one altitude, and the coordinates of the model's origin on them.
-
-    Parameters
-    ----------
-    weights : (angle,) float
-    design : (4, angle) float
-        East, north, path, ones.
-    sides : bool
-        Whether to include the gradients.
-    q : (3, angle) float
-        Output: east, north and path, each orthogonal to the columns before it; 0 if left out.
-    norm, mean : (3,) float
-        Outputs: the squared lengths, and the coordinates of x = 0, d = 0.
-
-    Returns
-    -------
-    int
-        Number of gradients included.
-    """
-    ones = design[3]
-    whole = _dot(weights, ones, ones)
-    lever = _dot(weights, design[0], design[0]) + _dot(weights, design[1], design[1])
-    included = 0
-    for c in range(3):
-        norm[c] = mean[c] = 0.0
-        q[c] = 0.0
-        if c < 2 and not sides:
-            continue
-        centre = _dot(weights, design[c], ones) / whole
-        least = 1e-12 * lever if c < 2 else _SAME_PATH * whole
-        for a in range(weights.size):
-            q[c, a] = design[c, a] - centre
-        mean[c] = -centre
-        for b in range(c):
-            if norm[b] > 0.0:
-                share = _dot(weights, q[b], q[c]) / norm[b]
-                for a in range(weights.size):
-                    q[c, a] -= share * q[b, a]
-                mean[c] -= share * mean[b]
-        norm[c] = _dot(weights, q[c], q[c])
-        if not norm[c] > least:
-            norm[c] = mean[c] = 0.0
-            q[c] = 0.0
-        elif c < 2:
-            included += 1
-    return included
-
-
-@_compiled
-def _span(weights: Array, path: Array) -> float:
-    low, high = np.inf, -np.inf
-    for a in range(weights.size):
-        if weights[a] > 0.0:
-            low, high = min(low, path[a]), max(high, path[a])
-    return high - low if high >= low else 0.0
-
-
-@_compiled
-def _slopes(weights: Array, design: Array, q: Array, norm: Array, mean: Array, out: Array) -> None:
-    """Fill the variances, gradient slopes and span of the fit of one altitude."""
-    whole = _dot(weights, design[3], design[3])
-    out[INTERCEPT_VARIANCE] = 1.0 / whole
-    for c in range(3):
-        if norm[c] > 0.0:
-            out[INTERCEPT_VARIANCE] += mean[c] * mean[c] / norm[c]
-    out[INFORMATION] = 4.0 * norm[2]
-    for a in range(weights.size):
-        out[SHARE] += (weights[a] * q[2, a]) ** 2
-    out[SHARE] /= norm[2]
-    if out[SIDES] == 0.0:
-        out[SLOPE_EAST] = -0.5 * _dot(weights, q[2], design[0]) / norm[2]
-        out[SLOPE_NORTH] = -0.5 * _dot(weights, q[2], design[1]) / norm[2]
-    out[SPAN] = _span(weights, design[2])
-
-
-@_compiled
-def _fit_level(
-    y: Array,
-    weights: Array,
-    keep: Array,
-    design: Array,
-    sides: bool,
-    q: Array,
-    residual: Array,
-    hat: Array,
-    out: Array,
-) -> None:
-    """Fit one altitude, with gradients if `sides`; fill residuals and leverages.
-
-    Parameters
-    ----------
-    y : (angle,) float
-    weights, keep : (angle,) float
-        Weights, and the factors by which outliers reduced them.
-    design : (4, angle) float
-        East, north, path, ones.
-    sides : bool
-    q : (3, angle) float
-        Output: the orthogonal columns.
-    residual, hat : (angle,) float
-        Outputs; NaN and 1 if there is no fit.
-    out : (COLUMNS,) float
-        Output.
-    """
-    norm, mean = np.empty(3), np.empty(3)
-    included = _orthogonal(weights, design, sides, q, norm, mean)
-    beams = np.count_nonzero(weights)
-    if included > 0 and beams <= 2 + included:
-        # With the gradient no residual would be left to check the optical depth.
-        included = _orthogonal(weights, design, False, q, norm, mean)
+def _sums(weights: Array, first: Array, second: Array, out: Array) -> None:
+    """Fill the weighted sums over beams of products."""
     out[:] = 0.0
-    out[TAU] = out[INTERCEPT] = out[INTERCEPT_VARIANCE] = np.nan
-    residual[:] = np.nan
-    hat[:] = 1.0
-    out[SIDES] = included
-    if norm[2] == 0.0:
-        return
-    _slopes(weights, design, q, norm, mean, out)
-    whole = _dot(weights, design[3], design[3])
-    middle = _dot(weights, y, design[3]) / whole
-    out[INTERCEPT] = middle
-    for a in range(weights.size):
-        residual[a] = y[a] - middle
-        hat[a] = weights[a] / whole
+    for a in range(weights.shape[0]):
+        for k in range(out.size):
+            out[k] += weights[a, k] * first[a, k] * second[a, k]
+
+
+@_compiled
+def _ratio(over: Array, under: Array) -> None:
+    """Divide in place; 0 where the divisor is not positive."""
+    for k in range(over.size):
+        over[k] = over[k] / under[k] if under[k] > 0.0 else 0.0
+
+
+@_compiled
+def _subtract(values: Array, share: Array, column: Array) -> None:
+    for a in range(values.shape[0]):
+        for k in range(share.size):
+            values[a, k] -= share[k] * column[a, k]
+
+
+@_compiled
+def _orthogonal_columns(
+    weights: Array, design: Array, least: Array, q: Array, norm: Array, mean: Array, c: int
+) -> None:
+    """Make a column orthogonal to a constant and to the columns before it, at every altitude.
+
+    Parameters
+    ----------
+    weights : (angle, altitude) float
+    design : (3, angle, altitude) float
+        Distance to the east and north, slant path.
+    least : (altitude,) float
+        Squared length up to which the column is left out.
+    q : (3, angle, altitude) float
+        The columns; 0 if left out.
+    norm, mean : (3, altitude) float
+        Their squared lengths, and the coordinates of path 0 and distance 0 on them.
+    c : int
+        The column: those before it are inputs, it is output.
+    """
+    whole, share = np.zeros(least.size), np.zeros(least.size)
+    for a in range(weights.shape[0]):
+        for k in range(whole.size):
+            whole[k] += weights[a, k]
+            share[k] += weights[a, k] * design[c, a, k]
+    for k in range(whole.size):
+        share[k] /= whole[k]
+        mean[c, k] = -share[k]
+    for a in range(weights.shape[0]):
+        for k in range(whole.size):
+            q[c, a, k] = design[c, a, k] - share[k]
+    for b in range(c):
+        _sums(weights, q[b], q[c], share)
+        _ratio(share, norm[b])
+        _subtract(q[c], share, q[b])
+        for k in range(whole.size):
+            mean[c, k] -= share[k] * mean[b, k]
+    _sums(weights, q[c], q[c], norm[c])
+    _leave_out(norm[c] > least, q, norm, mean, c)
+
+
+@_compiled
+def _leave_out(kept: npt.NDArray[np.bool_], q: Array, norm: Array, mean: Array, c: int) -> None:
+    """Set a column to 0 where it is not kept."""
+    for k in range(kept.size):
+        if not kept[k]:
+            norm[c, k] = mean[c, k] = 0.0
+            for a in range(q.shape[1]):
+                q[c, a, k] = 0.0
+
+
+@_compiled
+def _gradients(
+    weights: Array, design: Array, beams: Array, q: Array, norm: Array, mean: Array, sides: Array
+) -> None:
+    """Fill the columns of the gradients, and their number `sides` at each altitude."""
+    around, lever, share = np.empty(sides.size), np.empty(sides.size), np.empty(sides.size)
+    _around(weights, design, around)
+    _sums(weights, design[0], design[0], lever)
+    _sums(weights, design[1], design[1], share)
+    for k in range(sides.size):
+        lever[k] = _DEPENDENT * (lever[k] + share[k]) if around[k] > 0.0 else np.inf
+    for c in range(2):
+        _orthogonal_columns(weights, design, lever, q, norm, mean, c)
+        for k in range(sides.size):
+            sides[k] += 1.0 if norm[c, k] > 0.0 else 0.0
+    # Otherwise no residual would be left to check the optical depth.
+    spare = beams > 2.0 + sides
+    for c in range(2):
+        _leave_out(spare, q, norm, mean, c)
+    for k in range(sides.size):
+        sides[k] = sides[k] if spare[k] else 0.0
+
+
+@_compiled
+def _fill_precision(
+    weights: Array, design: Array, whole: Array, q: Array, norm: Array, mean: Array, out: Array
+) -> None:
+    """Fill the columns of a fit that do not depend on the signal."""
+    angles, altitudes = weights.shape
+    for k in range(altitudes):
+        out[INTERCEPT_VARIANCE, k] = 1.0 / whole[k]
+        out[INFORMATION, k] = 4.0 * norm[2, k]
     for c in range(3):
-        if norm[c] > 0.0:
-            slope = _dot(weights, q[c], residual) / norm[c]
-            out[INTERCEPT] += slope * mean[c]
-            out[TAU] = -0.5 * slope
-            for a in range(weights.size):
-                residual[a] -= slope * q[c, a]
-                hat[a] += weights[a] * q[c, a] * q[c, a] / norm[c]
-    out[FREEDOM] = beams - 2 - included
-    if out[FREEDOM] > 0.0:
-        for a in range(weights.size):
-            out[CHI2] += weights[a] * residual[a] * residual[a]
-            out[TRACE] += weights[a] * (1.0 - hat[a])
-            out[EXPECTED] += keep[a] * (1.0 - hat[a]) if weights[a] > 0.0 else 0.0
+        for k in range(altitudes):
+            if norm[c, k] > 0.0:
+                out[INTERCEPT_VARIANCE, k] += mean[c, k] * mean[c, k] / norm[c, k]
+    low, high = np.full(altitudes, np.inf), np.full(altitudes, -np.inf)
+    for a in range(angles):
+        for k in range(altitudes):
+            lever = weights[a, k] * q[2, a, k]
+            out[SHARE, k] += lever * lever
+            out[SLOPE_EAST, k] += lever * design[0, a, k]
+            out[SLOPE_NORTH, k] += lever * design[1, a, k]
+            path = design[2, a, k]
+            low[k] = min(low[k], path if weights[a, k] > 0.0 else np.inf)
+            high[k] = max(high[k], path if weights[a, k] > 0.0 else -np.inf)
+    for k in range(altitudes):
+        out[SPAN, k] = high[k] - low[k]
+        out[SHARE, k] /= norm[2, k]
+        known = out[SIDES, k] == 0.0
+        out[SLOPE_EAST, k] = -0.5 * out[SLOPE_EAST, k] / norm[2, k] if known else 0.0
+        out[SLOPE_NORTH, k] = -0.5 * out[SLOPE_NORTH, k] / norm[2, k] if known else 0.0
+
+
+@_compiled
+def _fill_fit(
+    y: Array, weights: Array, whole: Array, q: Array, norm: Array, mean: Array,
+    residual: Array, hat: Array, out: Array,
+) -> None:  # fmt: skip
+    """Fill optical depth, intercept, residuals and leverages."""
+    angles, altitudes = weights.shape
+    slope = np.zeros(altitudes)
+    for a in range(angles):
+        for k in range(altitudes):
+            slope[k] += weights[a, k] * y[a, k]
+    for k in range(altitudes):
+        out[INTERCEPT, k] = slope[k] / whole[k]
+    for a in range(angles):
+        for k in range(altitudes):
+            residual[a, k] = y[a, k] - out[INTERCEPT, k]
+            hat[a, k] = weights[a, k] / whole[k]
+    for c in range(3):
+        _sums(weights, q[c], residual, slope)
+        _ratio(slope, norm[c])
+        _subtract(residual, slope, q[c])
+        for k in range(altitudes):
+            out[INTERCEPT, k] += slope[k] * mean[c, k]
+            out[TAU, k] = -0.5 * slope[k]
+        for a in range(angles):
+            for k in range(altitudes):
+                lever = weights[a, k] * q[c, a, k] * q[c, a, k]
+                hat[a, k] += lever / norm[c, k] if norm[c, k] > 0.0 else 0.0
+
+
+@_compiled
+def _fill_scatter(
+    weights: Array, keep: Array, beams: Array, residual: Array, hat: Array, out: Array
+) -> None:
+    """Fill chi2 and its expectation where residuals are left."""
+    angles, altitudes = weights.shape
+    for k in range(altitudes):
+        out[FREEDOM, k] = beams[k] - 2.0 - out[SIDES, k]
+    for a in range(angles):
+        kept = keep[a] if keep.shape[0] > 0 else np.ones(altitudes)
+        for k in range(altitudes):
+            if out[FREEDOM, k] > 0.0:
+                free = 1.0 - hat[a, k]
+                out[TRACE, k] += weights[a, k] * free
+                out[EXPECTED, k] += kept[k] * free if weights[a, k] > 0.0 else 0.0
+                out[CHI2, k] += weights[a, k] * residual[a, k] * residual[a, k]
+
+
+@_compiled
+def _empty(fitted: Array, residual: Array, hat: Array, out: Array) -> None:
+    """Mark the altitudes where the slant paths do not differ."""
+    for k in range(fitted.size):
+        if not fitted[k] > 0.0:
+            sides = out[SIDES, k]
+            out[:, k] = 0.0
+            out[TAU, k] = out[INTERCEPT, k] = out[INTERCEPT_VARIANCE, k] = np.nan
+            out[SIDES, k] = sides
+            residual[:, k] = np.nan
+            hat[:, k] = 1.0
+
+
+@_compiled
+def _fill_weights(
+    noise: Array, keep: Array, inhomogeneity: Array, weights: Array, whole: Array, beams: Array
+) -> None:
+    """Fill the weights, their sum over beams, and the number of beams with weight."""
+    whole[:] = 0.0
+    beams[:] = 0.0
+    for a in range(weights.shape[0]):
+        for k in range(whole.size):
+            weights[a, k] = 1.0 / (noise[a, k] + inhomogeneity[k])
+            if keep.shape[0] > 0:
+                weights[a, k] *= keep[a, k]
+            whole[k] += weights[a, k]
+            beams[k] += 1.0 if weights[a, k] > 0.0 else 0.0
 
 
 @_compiled
@@ -233,8 +294,7 @@ def fit_levels(
     noise: Array,
     keep: Array,
     inhomogeneity: Array,
-    x: Array,
-    d: Array,
+    design: Array,
     sides: bool,
     out: Array,
     residuals: Array,
@@ -250,10 +310,8 @@ def fit_levels(
         Factors of the weights.
     inhomogeneity : (altitude,) float
         Variance of the logarithms on top of the noise.
-    x : (angle, altitude) float
-        Slant path, finite.
-    d : (2, angle, altitude) float
-        Horizontal distance over altitude, eastward and northward.
+    design : (3, angle, altitude) float
+        Horizontal distance over altitude, eastward and northward, and slant path, all finite.
     sides : bool
         Whether all beams of the scan together surround the zenith.
     out : (profile, COLUMNS, altitude) float
@@ -263,34 +321,23 @@ def fit_levels(
         hat matrix; not filled if they have no profile.
     """
     count, angles, altitudes = y.shape
-    weights, before, kept, column = (
-        np.empty(angles),
-        np.empty(angles),
-        np.ones(angles),
-        np.empty(angles),
-    )
-    q, residual, hat = np.empty((3, angles)), np.empty(angles), np.empty(angles)
-    design, row = np.ones((4, angles)), np.empty(COLUMNS)
+    weights, q = np.empty((angles, altitudes)), np.zeros((3, angles, altitudes))
+    residual, hat = np.empty((angles, altitudes)), np.empty((angles, altitudes))
+    norm, mean = np.zeros((3, altitudes)), np.zeros((3, altitudes))
+    whole, beams = np.empty(altitudes), np.empty(altitudes)
     for t in range(count):
-        before[:] = 0.0
-        around = False
-        for k in range(altitudes):
-            changed = False
+        out[t] = 0.0
+        _fill_weights(noise[t], keep[t], inhomogeneity, weights, whole, beams)
+        if sides:
+            _gradients(weights, design, beams, q, norm, mean, out[t, SIDES])
+        _orthogonal_columns(weights, design, _SAME_PATH * whole, q, norm, mean, 2)
+        _fill_precision(weights, design, whole, q, norm, mean, out[t])
+        _fill_fit(y[t], weights, whole, q, norm, mean, residual, hat, out[t])
+        _fill_scatter(weights, keep[t], beams, residual, hat, out[t])
+        _empty(norm[2], residual, hat, out[t])
+        if residuals.shape[0] > 0:
             for a in range(angles):
-                weights[a] = 1.0 / (noise[t, a, k] + inhomogeneity[k])
-                if keep.shape[1] > 0:
-                    kept[a] = keep[t, a, k]
-                    weights[a] *= kept[a]
-                changed |= (weights[a] > 0.0) != (before[a] > 0.0)
-                before[a] = weights[a]
-                column[a] = y[t, a, k]
-                design[0, a], design[1, a], design[2, a] = d[0, a, k], d[1, a, k], x[a, k]
-            if sides and changed:
-                around = _surrounds_zenith(weights, design)
-            _fit_level(column, weights, kept, design, around, q, residual, hat, row)
-            out[t, :, k] = row
-            if residuals.shape[0] > 0:
-                for a in range(angles):
+                for k in range(altitudes):
                     on = noise[t, a, k] < np.inf
-                    residuals[t, a, k] = residual[a] if on else np.nan
-                    leverages[t, a, k] = hat[a] if on else np.nan
+                    residuals[t, a, k] = residual[a, k] if on else np.nan
+                    leverages[t, a, k] = hat[a, k] if on else np.nan

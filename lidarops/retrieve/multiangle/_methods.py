@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import partial
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.multiangle import _block, _mld_blocks, _path_variation
+from lidarops.retrieve.multiangle import _block, _path_variation, mld
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 from lidarops.retrieve.multiangle._result import MultiAngleResult, StepRecord
-from lidarops.retrieve.multiangle.mld import Regularisation
 from lidarops.retrieve.multiangle.slant_paths import Scan
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import smooth_profile
+from lidarops.retrieve.multiangle.vertical._correlation import residual_moments
+from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -36,30 +37,22 @@ class BlockSettings:
     largest_gradient: float
     """m-1."""
     robust: bool
-    regularisation: Regularisation
     layers: tuple[tuple[int, int], ...]
     """Indices of the altitudes at bottom and top of layers, -1 for the lidar."""
 
 
-def solve_block(
-    signal: npt.NDArray[np.floating], variance: Array, prior: Array | None, settings: BlockSettings
-) -> MultiAngleResult:
+def solve_block(signal: Array, variance: Array, settings: BlockSettings) -> MultiAngleResult:
     """Return the solution of the profiles of one block, without quality bits.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
-    prior : (profile, altitude) float, optional
-        Optical depth, for "mld_prior".
     settings : BlockSettings
     """
     beams = _block.make_beam_block(signal, variance, settings.scan)
-    steps = [_angles_step(settings.scan)]
     fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
-    steps += [_robust_step(fit, settings), _gradient_step(beams)]
     method, reason = _choose_method(beams, settings)
-    steps.append(StepRecord(method, ran=True, reason=reason))
-    profiles = _METHODS[method](beams, fit, prior, settings)
+    profiles = _METHODS[method](beams, fit, settings)
     lowest = _path_variation.path_variation_from(beams, fit)
     if lowest is not None:
         profiles.flags.poor_stratification[:, lowest:] = True
@@ -68,40 +61,29 @@ def solve_block(
     if method in _BLIND:
         # These methods fit no gradient, even if beams point to all sides.
         profiles.flags.one_sided[:] |= np.isfinite(profiles.optical_depth)
-    return replace(profiles, steps=tuple(steps))
+    steps = (*_steps(beams, fit, settings), StepRecord(method, ran=True, reason=reason))
+    return replace(profiles, steps=steps)
 
 
-def _angles_step(scan: Scan) -> StepRecord:
-    left_out = int(np.count_nonzero(~scan.usable))
-    if left_out:
-        return StepRecord(
-            "drop_longest_paths",
-            ran=True,
-            reason=f"{left_out} beams are longer than 10 vertical paths",
-        )
-    return StepRecord(
-        "drop_longest_paths", ran=False, reason="no beam is longer than 10 vertical paths"
+def _steps(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Iterator[StepRecord]:
+    """Yield what the data decided before the method."""
+    number = int(np.count_nonzero(~settings.scan.usable))
+    count = number or "no"
+    are = "are" if number else "is"
+    beam = "beams" if number else "beam"
+    yield StepRecord(
+        "drop_longest_paths", number > 0, f"{count} {beam} {are} longer than 10 vertical paths"
     )
-
-
-def _robust_step(fit: Regression, settings: BlockSettings) -> StepRecord:
     if not settings.robust:
-        return StepRecord("robust_passes", ran=False, reason="not requested")
-    if fit.robust:
-        return StepRecord("robust_passes", ran=True, reason="a residual is too large for chance")
-    return StepRecord(
-        "robust_passes",
-        ran=False,
-        reason="no residual is too large for chance, or fewer than 4 beams",
-    )
-
-
-def _gradient_step(beams: BeamBlock) -> StepRecord:
-    if beams.sides:
-        return StepRecord("horizontal_gradient", ran=True, reason="beams point to all sides")
-    return StepRecord(
-        "horizontal_gradient", ran=False, reason="a half turn around the zenith has no beam"
-    )
+        why = "not requested"
+    elif fit.robust:
+        why = "a residual is too large for chance"
+    else:
+        why = "no residual is too large for chance, or fewer than 4 beams"
+    yield StepRecord("robust_passes", fit.robust, why)
+    around = "beams point to all sides"
+    free = "a half turn around the zenith has no beam"
+    yield StepRecord("horizontal_gradient", beams.sides, around if beams.sides else free)
 
 
 def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]:
@@ -112,105 +94,129 @@ def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]
     return "joint", "extinction is requested"
 
 
-def _kano_hamilton(
-    beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
-) -> MultiAngleResult:
+def _kano_hamilton(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Return the estimates of single altitudes."""
     profiles = _start(beams, fit, settings)
-    within = np.isfinite(profiles.optical_depth)
-    factor = _block.student_factor(fit.freedom)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * factor
-    profiles.optical_depth_standard_error[:] = np.where(within, error, np.nan)
-    profiles.extinction[:] = _layer_means(profiles.optical_depth, settings.height)
-    both = profiles.optical_depth_standard_error**2
-    step = np.diff(settings.height, prepend=0.0)
-    profiles.extinction_standard_error[:] = np.sqrt(both + _below(both)) / step
-    slopes = np.where(within, _gradient_slopes(fit, settings), np.nan)
-    _fill_gradient_errors(profiles, slopes, settings)
-    count = within.sum(axis=1)
-    profiles.effective_degrees_of_freedom[:] = np.where(count > 0, count, np.nan)
-    profiles.data_share[:] = np.where(within, 1.0, np.nan)
-    _subtract_bounds(profiles, settings)
+        error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
+    single = _Single(
+        profiles.optical_depth, error, np.ones_like(error), np.ones_like(error),
+        _gradient_slopes(fit, settings),
+    )  # fmt: skip
+    _fill_single(profiles, single, settings)
     _raise_gradient(profiles, beams, fit, settings, _lag_one(beams, fit))
     return profiles
 
 
-def _two_angle(
-    beams: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
-) -> MultiAngleResult:
+def _two_angle(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Solve with the shortest and the longest path of each altitude.
 
     The inhomogeneity comes from all beams of the scan.
     """
     ends = _block.end_beams(beams)
-    profiles = _kano_hamilton(
-        ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), prior, settings
-    )
+    profiles = _kano_hamilton(ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), settings)
     profiles.flags.gradient[:] = False
     return profiles
 
 
-def _joint(
-    beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
+def _mld(
+    beams: BeamBlock, fit: Regression, settings: BlockSettings, *, from_below: bool = False
 ) -> MultiAngleResult:
+    """Differentiate along the slant path, each altitude on its own."""
+    profiles = _start(beams, fit, settings)
+    estimates = mld.solve_mld(beams, fit.inhomogeneity, from_below=from_below)
+    single = _Single(
+        estimates.optical_depth, np.sqrt(estimates.variance), estimates.data_share,
+        estimates.freedom, settings.largest_gradient * settings.height * estimates.slopes,
+    )  # fmt: skip
+    _fill_single(profiles, single, settings)
+    with np.errstate(invalid="ignore"):
+        dominated = np.asarray(profiles.data_share < THRESHOLDS.least_share)
+    profiles.flags.prior_dominated[:] |= dominated
+    _withhold_extinction(profiles, dominated)
+    return profiles
+
+
+class _Single(NamedTuple):
+    """Estimates of single altitudes, (profile, altitude), and their gradient errors."""
+
+    optical_depth: Array
+    standard_error: Array
+    data_share: Array
+    freedom: Array
+    slopes: Array
+    """(2, profile, altitude): error by the largest gradient to the east and north."""
+
+
+def _fill_single(profiles: MultiAngleResult, single: _Single, settings: BlockSettings) -> None:
+    """Fill optical depth within the reach, and what follows from it with independent errors."""
+    within = np.isfinite(profiles.optical_depth) & np.isfinite(single.optical_depth)
+    for values, estimates in (
+        (profiles.optical_depth, single.optical_depth),
+        (profiles.optical_depth_standard_error, single.standard_error),
+        (profiles.data_share, single.data_share),
+    ):
+        values[:] = np.where(within, estimates, np.nan)
+    profiles.extinction[:] = _layer_means(profiles.optical_depth, settings.height)
+    both = profiles.optical_depth_standard_error**2
+    step = np.diff(settings.height, prepend=0.0)
+    profiles.extinction_standard_error[:] = np.sqrt(both + _below(both)) / step
+    _fill_gradient_errors(profiles, np.where(within, single.slopes, np.nan), settings)
+    freedom = np.where(within, single.freedom, 0.0).sum(axis=1)
+    profiles.effective_degrees_of_freedom[:] = np.where(within.any(axis=1), freedom, np.nan)
+    lidar = np.zeros((len(within), 1))
+    tau, square = np.hstack([profiles.optical_depth, lidar]), np.hstack([both, lidar])
+    for number, (bottom, top) in enumerate(settings.layers):
+        profiles.layer_optical_depth[:, number] = tau[:, top] - tau[:, bottom]
+        profiles.layer_optical_depth_standard_error[:, number] = np.sqrt(
+            square[:, top] + square[:, bottom]
+        )
+
+
+def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Combine the estimates of single altitudes into profiles with smooth extinction."""
     profiles = _start(beams, fit, settings)
     within = np.isfinite(profiles.optical_depth)
+    rows = np.flatnonzero(within.any(axis=1))
+    if rows.size == 0:
+        return profiles
     share = fit.column(kh.SHARE) * fit.inhomogeneity * _block.kept_information(beams, fit)
-    residuals = smooth_profile.residual_moments(
+    moments = residual_moments(
         fit.residual * _block.residual_scale(beams, fit)[:, np.newaxis],
         np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
-        np.nan_to_num(fit.leverage, nan=1.0),
+        fit.leverage,
         fit.inhomogeneity,
         np.where(within, share, 0.0),
         beams.gaps,
     )
-    smooth = smooth_profile.smooth_optical_depth(
-        profiles.optical_depth,
-        np.where(within, fit.column(kh.INFORMATION), 0.0),
+    smooth = smooth_optical_depth(
+        profiles.optical_depth[rows],
+        np.where(within, fit.column(kh.INFORMATION), 0.0)[rows],
         settings.height,
-        residuals=residuals,
+        residuals=moments.of(rows),
     )
-    if smooth is None:
-        profiles.optical_depth[:] = np.nan
-        return profiles
-    profiles.optical_depth[:] = smooth.optical_depth
-    profiles.optical_depth_standard_error[:] = smooth.optical_depth_standard_error
-    profiles.extinction[:] = smooth.extinction
-    profiles.extinction_standard_error[:] = smooth.extinction_standard_error
-    profiles.effective_degrees_of_freedom[:] = smooth.effective_degrees_of_freedom
-    profiles.data_share[:] = smooth.data_share
-    slopes = _gradient_slopes(fit, settings)
-    responses = [smooth.respond(np.where(within, slope, 0.0)) for slope in slopes]
-    _fill_gradient_errors(profiles, np.stack(responses), settings)
+    profiles.optical_depth[rows] = smooth.optical_depth
+    profiles.optical_depth_standard_error[rows] = smooth.optical_depth_standard_error
+    profiles.extinction[rows] = smooth.extinction
+    profiles.extinction_standard_error[rows] = smooth.extinction_standard_error
+    profiles.effective_degrees_of_freedom[rows] = smooth.effective_degrees_of_freedom
+    profiles.data_share[rows] = smooth.data_share
+    slopes = np.full((2, *within.shape), np.nan)
+    for slope, single in zip(slopes, _gradient_slopes(fit, settings), strict=True):
+        slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
+    _fill_gradient_errors(profiles, slopes, settings)
     for number, (bottom, top) in enumerate(settings.layers):
         depth, error = smooth.layer(bottom, top)
-        profiles.layer_optical_depth[:, number] = depth
-        profiles.layer_optical_depth_standard_error[:, number] = error
-    _take_vertical_flags(profiles, smooth)
+        profiles.layer_optical_depth[rows, number] = depth
+        profiles.layer_optical_depth_standard_error[rows, number] = error
+    flags = profiles.flags
+    flags.interpolated[rows] |= smooth.interpolated
+    flags.outlier[rows] |= smooth.downweighted
+    flags.prior_dominated[rows] |= smooth.saturated & np.isfinite(smooth.optical_depth)
+    flags.undersmoothed[rows] |= smooth.undersmoothed[:, np.newaxis]
+    flags.high_correlation[rows] |= smooth.high_correlation
     _raise_gradient(profiles, beams, fit, settings, smooth.correlation)
-    _withhold_extinction(profiles, _dominated(profiles))
     return profiles
-
-
-def _take_vertical_flags(profiles: MultiAngleResult, smooth: smooth_profile.VerticalResult) -> None:
-    profiles.flags.interpolated[:] |= smooth.interpolated
-    profiles.flags.outlier[:] |= smooth.downweighted
-    profiles.flags.prior_dominated[:] |= smooth.prior_dominated
-    for name, mask in (
-        ("saturated", smooth.saturated),
-        ("undersmoothed", smooth.undersmoothed),
-        ("high_correlation", smooth.high_correlation),
-    ):
-        getattr(profiles.flags, name)[mask] = True
-
-
-def _dominated(profiles: MultiAngleResult) -> Mask:
-    """Return where smoothness or a prior, not the data, determines the optical depth."""
-    with np.errstate(invalid="ignore"):
-        below = profiles.data_share < THRESHOLDS.least_share
-        return np.asarray(below | (profiles.data_share > THRESHOLDS.largest_share))
 
 
 def _withhold_extinction(profiles: MultiAngleResult, where: Mask) -> None:
@@ -318,67 +324,12 @@ def _below(values: Array) -> Array:
     return np.concatenate([np.zeros((values.shape[0], 1)), values[:, :-1]], axis=1)
 
 
-def _subtract_bounds(profiles: MultiAngleResult, settings: BlockSettings) -> None:
-    """Fill optical depths of layers with the differences between their bounds."""
-    lidar = np.zeros((profiles.optical_depth.shape[0], 1))
-    tau = np.hstack([profiles.optical_depth, lidar])
-    square = np.hstack([profiles.optical_depth_standard_error**2, lidar])
-    for number, (bottom, top) in enumerate(settings.layers):
-        profiles.layer_optical_depth[:, number] = tau[:, top] - tau[:, bottom]
-        profiles.layer_optical_depth_standard_error[:, number] = np.sqrt(
-            square[:, top] + square[:, bottom]
-        )
-
-
-def _mld_prior(
-    beams: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
-) -> MultiAngleResult:
-    return _mld(beams, fit, prior, settings, from_below=prior is None)
-
-
-def _mld(
-    beams: BeamBlock,
-    fit: Regression,
-    prior: Array | None,
-    settings: BlockSettings,
-    *,
-    from_below: bool = False,
-) -> MultiAngleResult:
-    """Differentiate along the slant path, each altitude on its own."""
-    profiles = _start(beams, fit, settings)
-    estimates = _mld_blocks.solve_mld_blocks(
-        beams, fit.inhomogeneity, settings.regularisation, prior, from_below=from_below
-    )
-    within = np.isfinite(profiles.optical_depth) & np.isfinite(estimates.optical_depth)
-    profiles.optical_depth[:] = np.where(within, estimates.optical_depth, np.nan)
-    profiles.optical_depth_standard_error[:] = np.where(within, estimates.standard_error, np.nan)
-    profiles.data_share[:] = np.where(within, estimates.data_share, np.nan)
-    profiles.extinction[:] = _layer_means(profiles.optical_depth, settings.height)
-    both = profiles.optical_depth_standard_error**2
-    step = np.diff(settings.height, prepend=0.0)
-    profiles.extinction_standard_error[:] = np.sqrt(both + _below(both)) / step
-    slopes = np.where(
-        within, settings.largest_gradient * settings.height * estimates.slopes, np.nan
-    )
-    _fill_gradient_errors(profiles, slopes, settings)
-    profiles.effective_degrees_of_freedom[:] = np.where(
-        within.any(axis=1), np.where(within, estimates.freedom, 0.0).sum(axis=1), np.nan
-    )
-    dominated = _dominated(profiles)
-    profiles.flags.prior_dominated[:] |= within & dominated
-    _subtract_bounds(profiles, settings)
-    _withhold_extinction(profiles, dominated)
-    return profiles
-
-
 _BLIND: Final = ("two_angle", "mld", "mld_prior")
 """Methods that cannot detect a horizontal gradient."""
-_METHODS: Final[
-    dict[str, Callable[[BeamBlock, Regression, Array | None, BlockSettings], MultiAngleResult]]
-] = {
+_METHODS: Final[dict[str, Callable[[BeamBlock, Regression, BlockSettings], MultiAngleResult]]] = {
     "two_angle": _two_angle,
     "kano_hamilton": _kano_hamilton,
     "joint": _joint,
     "mld": _mld,
-    "mld_prior": _mld_prior,
+    "mld_prior": partial(_mld, from_below=True),
 }

@@ -1,4 +1,4 @@
-"""Compiled selection of the samples of a scan, and their logarithms with variances.
+"""Selection of the samples of a scan, and their logarithms with variances.
 
 The selection of a sample does not depend on its own value: where the signal is weak, dropping low
 samples and keeping high ones would be the largest error of all.
@@ -7,7 +7,7 @@ samples and keeping high ones would be the largest error of all.
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import numba
 import numpy as np
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
 Ends = npt.NDArray[np.int32]
 
 LOWEST_SNR: Final = THRESHOLDS.lowest_snr
@@ -33,7 +34,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def _clean(signal: Any, variance: Any, row: Array) -> None:
+def _clean(signal: Array, variance: Array, row: Array) -> None:
     """Fill signal, variance and 1 at altitudes with data, zeros elsewhere."""
     values, spread, count = row[0], row[1], row[2]
     for k in range(signal.size):
@@ -107,13 +108,12 @@ def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
 
 @_compiled
 def take_logarithms(
-    signal: Any, variance: Any, usable: Any, logarithm: Array, noise: Array, ends: Ends
+    signal: Array, variance: Array, usable: Booleans, logarithm: Array, noise: Array, ends: Ends
 ) -> None:
-    r"""Take the logarithms of range-corrected signals without the bias caused by noise.
+    """Take the logarithms of range-corrected signals without the bias caused by noise.
 
-    With q the variance of the signal over the square of its expectation, which is estimated from
-    neighbouring altitudes, the logarithm of a normal signal over its expectation has the mean
-    :math:`-q/2 - 3q^2/4` and the variance :math:`q + 5q^2/2`, to second order.
+    Formula 3 of ``docs/algorithms/multiangle.md``; the expectation of the signal is estimated from
+    neighbouring altitudes.
 
     Parameters
     ----------
@@ -149,3 +149,29 @@ def take_logarithms(
                     known = min(ratio, _LARGEST_RATIO)
                     noise[t, a, k] = ratio * (1.0 + 2.5 * known)
                     logarithm[t, a, k] = math.log(row[0, k]) + known * (0.5 + 0.75 * known)
+
+
+def profiles_with_gaps(used: Booleans, signal: Array, variance: Array) -> Booleans:
+    """Return which profiles miss samples between others of the same beam.
+
+    A weak signal that noise made negative is not used, but does not count as missing.
+
+    Parameters
+    ----------
+    used : (profile, beam, altitude) bool
+        Samples that are used.
+    signal, variance : (profile, beam, altitude) float
+        NaN where missing.
+
+    Returns
+    -------
+    (profile,) bool
+    """
+    gaps: Booleans = np.any(used[..., 1:] & ~used[..., :-1], axis=(1, 2))
+    rows = np.flatnonzero(gaps)
+    if rows.size:
+        below = np.logical_or.accumulate(used[rows], axis=-1)
+        above = np.logical_or.accumulate(used[rows, :, ::-1], axis=-1)[..., ::-1]
+        measured = np.isfinite(signal[rows]) & np.isfinite(variance[rows])
+        gaps[rows] = np.any(below & above & ~measured, axis=(1, 2))
+    return gaps

@@ -41,7 +41,7 @@ QUALITY_OF_FLAG: Final = {
     "high_correlation": MultiAngleQuality.HIGH_CORRELATION,
     "outlier": Quality.OUTLIER,
 }
-"""Of `MultiAngleFlags`; `saturated` is included in `prior_dominated`."""
+"""Of `MultiAngleFlags`."""
 _PER_PROFILE: Final = ("effective_degrees_of_freedom", "reach")
 _PER_ALTITUDE: Final = (
     "optical_depth",

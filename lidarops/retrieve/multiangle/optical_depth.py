@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,6 @@ from lidarops.retrieve.multiangle import _methods, slant_paths
 from lidarops.retrieve.multiangle._methods import BlockSettings
 from lidarops.retrieve.multiangle._result import MultiAngleFlags, MultiAngleResult, StepRecord
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
-from lidarops.retrieve.multiangle.mld import Regularisation
 
 Array = npt.NDArray[np.float64]
 
@@ -28,7 +27,6 @@ __all__ = [
     "MultiAngleFlags",
     "MultiAngleMethod",
     "MultiAngleResult",
-    "Regularisation",
     "StepRecord",
     "layer_bounds",
     "retrieve_optical_depth",
@@ -47,9 +45,9 @@ class MultiAngleMethod(StrEnum):
     JOINT = "joint"
     """`KANO_HAMILTON`, then one smooth profile through all altitudes."""
     MLD = "mld"
-    """Regularised differentiation of the logarithm along the slant path, the historical method."""
+    """Regularised derivative along the slant path, formula 3 of `gobrusenko1989`."""
     MLD_PRIOR = "mld_prior"
-    """`MLD` applied to the difference from a prior."""
+    """`MLD` applied to the difference from the altitude below, its formula 4."""
 
 
 def retrieve_optical_depth(
@@ -64,35 +62,12 @@ def retrieve_optical_depth(
     inhomogeneity: float | None = None,
     largest_gradient: float = LARGEST_GRADIENT,
     robust: bool = True,
-    regularisation: Regularisation | None = None,
-    prior_optical_depth: npt.ArrayLike | None = None,
     layers: Sequence[tuple[float, float]] = (),
 ) -> MultiAngleResult:
-    r"""Retrieve optical depth and extinction from signals at several zenith angles.
+    """Retrieve optical depth and extinction from signals at several zenith angles.
 
-    In a horizontally homogeneous atmosphere, the logarithm of the range-corrected signal at an
-    altitude z decreases linearly with the slant path x:
-
-    .. math:: y_l(z) = c(z) - 2 x_l \tau(z) + g(z) \cdot d_l + e_l,
-
-    where e is detector noise and inhomogeneity (variance :math:`v_l + s^2`), and g a horizontal
-    gradient over the distance d, fitted at altitudes where beams point to all sides. x is the
-    secant up to 75 degrees and follows the curvature of the Earth beyond; a beam with x > 10 is
-    left out. A beam ends where the mean signal of the 15 altitudes around is less than 3 times its
-    noise, or that of the next 5 less than twice.
-
-    All profiles are one block: inhomogeneity, correlation and smoothness are common to them.
-    :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles
-    and 15 altitudes. If a residual of the block is too large for chance (beyond 4.5
-    standard errors, with a probability of 1 percent among all residuals), outliers get less
-    weight, starting from repeated medians and the pair of beams with which most others agree. The
-    number of passes is fixed.
-
-    In simulated scans of clear air and of a cloud (correlation of the air at neighbouring
-    altitudes 0 to 0.9, up to 30 percent of the samples missing at random), the errors of "joint"
-    in blocks of 32 profiles are 0.93 to 1.1 times the stated ones for optical depth and 0.6 to 1.0
-    times for extinction. With gaps, standard errors of a block of 8 profiles are up to 15 percent
-    too large.
+    All profiles are one block: inhomogeneity, correlation and smoothness are common to them. Model,
+    estimators and thresholds are in ``docs/algorithms/multiangle.md``.
 
     Parameters
     ----------
@@ -119,11 +94,6 @@ def retrieve_optical_depth(
         `extinction_gradient_error`.
     robust : bool
         Whether to test for outliers.
-    regularisation : Regularisation, optional
-        For "mld" and "mld_prior".
-    prior_optical_depth : (..., altitude) float, optional
-        For "mld_prior", broadcast against the profiles; the optical depth at the altitude below
-        if not given.
     layers : sequence of (float, float)
         m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
         altitudes and the station, by at most half the distance to the next one.
@@ -135,14 +105,13 @@ def retrieve_optical_depth(
     Raises
     ------
     RetrievalInputError
-        For invalid arguments, or arguments that the method does not accept.
+        For invalid arguments.
 
     References
     ----------
-    kano1968, hamilton1969, dersimonian1986, siegel1982.
+    kano1968, hamilton1969, gobrusenko1989, dersimonian1986, siegel1982.
     """
     chosen = inputs.choice(method, MultiAngleMethod, "method")
-    _refuse_unused_options(chosen, regularisation, prior_optical_depth)
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
     rows, noise, leading = _cube(signal, variance, scan.path.shape)
@@ -154,11 +123,9 @@ def retrieve_optical_depth(
         _positive(inhomogeneity, "inhomogeneity"),
         _positive(largest_gradient, "largest_gradient") or 0.0,
         robust,
-        regularisation or Regularisation(),
         _layers(layers, np.append(height, 0.0) + station_altitude),
     )
-    prior = _prior(prior_optical_depth, leading, height.size)
-    result = _methods.solve_block(rows, noise, prior, settings)
+    result = _methods.solve_block(rows, noise, settings)
     observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
     result.quality[:] = _quality(result, observed)
     return result.with_leading_axes(leading)
@@ -193,27 +160,13 @@ def layer_bounds(
     return levels[np.array(_layers(layers, levels), dtype=np.int64).reshape(-1, 2)]
 
 
-def _refuse_unused_options(
-    method: MultiAngleMethod, regularisation: Any, prior: npt.ArrayLike | None
-) -> None:
-    """Raise for options that the method would silently ignore."""
-    allowed = {
-        "regularisation": (regularisation, (MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR)),
-        "prior_optical_depth": (prior, (MultiAngleMethod.MLD_PRIOR,)),
-    }
-    for name, (value, methods) in allowed.items():
-        if value is not None and method not in methods:
-            raise RetrievalInputError(
-                f"is given with method {method.value!r}",
-                field=name,
-                remedy=f"leave it out, or choose {' or '.join(methods)}",
-            )
-
-
 def _cube(
     signal: npt.ArrayLike, variance: npt.ArrayLike, shape: tuple[int, ...]
-) -> tuple[inputs.Floats, Array, tuple[int, ...]]:
-    """Return signal and variance as (profile, angle, altitude), and the leading axes."""
+) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return signal and variance as (profile, angle, altitude), and the leading axes.
+
+    Compiled functions have one version, for writable float64 in C order.
+    """
     array = inputs.real_array(signal, "signal")
     if array.ndim < 2 or array.shape[-2:] != shape:
         raise RetrievalInputError(
@@ -223,19 +176,21 @@ def _cube(
         )
     leading = array.shape[:-2]
     count = int(np.prod(leading, dtype=np.int64))
-    noise = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
+    noise = inputs.real_array(variance, "variance")
     if np.any(noise < 0):
         raise RetrievalInputError(
             "is negative", field="variance", remedy="give squares of the signal's unit"
         )
     try:
-        noise = np.broadcast_to(noise, array.shape)
+        spread = np.broadcast_to(noise, array.shape)
     except ValueError:
         raise RetrievalInputError(
             f"has the shape {noise.shape}, which does not broadcast to {array.shape}",
             field="variance",
         ) from None
-    return array.reshape(count, *shape), noise.reshape(count, *shape), leading
+    cubes = (np.require(cube, np.float64, ["C", "W"]) for cube in (array, spread))
+    rows, variances = (np.asarray(cube).reshape(count, *shape) for cube in cubes)
+    return rows, variances, leading
 
 
 def _layers(layers: Sequence[tuple[float, float]], levels: Array) -> tuple[tuple[int, int], ...]:
@@ -269,25 +224,6 @@ def _positive(value: float | None, name: str) -> float | None:
     if value is not None and not (np.isfinite(value) and value >= 0):
         raise RetrievalInputError(f"is {value}", field=name, remedy="give zero or more")
     return value
-
-
-def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], altitudes: int) -> Array | None:
-    if values is None:
-        return None
-    prior = inputs.real_array(values, "prior_optical_depth").astype(np.float64, copy=False)
-    if not np.all(np.isfinite(prior)):
-        raise RetrievalInputError(
-            "has values that are not finite",
-            field="prior_optical_depth",
-            remedy="give a value for every altitude",
-        )
-    try:
-        return np.broadcast_to(prior, (*leading, altitudes)).reshape(-1, altitudes)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {prior.shape}, which does not broadcast to {(*leading, altitudes)}",
-            field="prior_optical_depth",
-        ) from None
 
 
 def _quality(profiles: MultiAngleResult, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:

@@ -1,4 +1,4 @@
-"""Compiled weights against outliers in a scan: a start that resists outliers, then two passes.
+"""Weights against outliers in a scan: a start that resists outliers, then two passes.
 
 The start is the repeated median over pairs of beams (`siegel1982`), which withstands up to half
 of the beams being wrong, then the pair with which most other beams agree. Tukey's bisquare of
@@ -19,15 +19,10 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 
 START_WIDTH: Final = THRESHOLDS.start_width
-PASS_WIDTH: Final = THRESHOLDS.pass_width
 FEWEST_BEAMS: Final = THRESHOLDS.fewest_beams
 _CLOSEST: Final = THRESHOLDS.closest_paths
-_KEPT: Final = THRESHOLDS.kept_weight
-_FEWEST_KEPT: Final = THRESHOLDS.fewest_kept
 _GAUSS: Final = 1.4826
 """Standard deviation over median absolute deviation of normal deviates."""
-_CLEAR: Final = THRESHOLDS.clear_variance
-_MEDIAN_OF: Final = THRESHOLDS.median_of
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -186,48 +181,33 @@ def pair_residuals(
                 residuals[t, beams[i], k] -= level + slope * xs[i]
 
 
-@_compiled
-def median_variance(residuals: Array, noise: Array, out: Array, samples: Array) -> None:
-    """Estimate the variance from median residuals, less that of the noise, at each altitude.
+def median_variance(residuals: Array, noise: Array) -> tuple[Array, Array]:
+    """Return the variance from median residuals, less that of the noise, at each altitude.
 
     Parameters
     ----------
     residuals, noise : (profile, angle, altitude) float
-    out, samples : (altitude,) float
-        Outputs: the variance, 0 where there is no sample, and the number of samples.
+
+    Returns
+    -------
+    variance, samples : (altitude,) float
+        0 where there is no sample, and the number of samples.
     """
-    profiles, angles, altitudes = residuals.shape
-    sizes, variances = np.empty(profiles * angles), np.empty(profiles * angles)
-    for k in range(altitudes):
-        count = fitted = 0
-        for t in range(profiles):
-            before = count
-            for a in range(angles):
-                if not math.isnan(residuals[t, a, k]):
-                    sizes[count] = abs(residuals[t, a, k])
-                    variances[count] = noise[t, a, k]
-                    count += 1
-            fitted += 1 if count > before else 0
-        samples[k] = count
-        out[k] = 0.0
-        if count > 2 * fitted:
-            scale = _GAUSS * np.median(sizes[:count])
-            spread = scale * scale * count / (count - 2 * fitted)
-            out[k] = max(spread - np.median(variances[:count]), 0.0)
+    on = ~np.isnan(residuals)
+    samples = on.sum(axis=(0, 1)).astype(np.float64)
+    unknowns = 2.0 * on.any(axis=1).sum(axis=0)
+    variance = np.zeros_like(samples)
+    for k in np.flatnonzero(samples > unknowns):
+        scale = _GAUSS * np.median(np.abs(residuals[..., k][on[..., k]]))
+        spread = scale**2 * samples[k] / (samples[k] - unknowns[k])
+        variance[k] = max(spread - np.median(noise[..., k][on[..., k]]), 0.0)
+    return variance, samples
 
 
-@_compiled
-def fill_robust_weights(
-    residuals: Array,
-    leverages: Array,
-    noise: Array,
-    inhomogeneity: Array,
-    width: float,
-    keep: Array,
-) -> None:
-    """Fill the bisquare of the studentised residuals; 1 where it would leave too few beams.
-
-    Where detector noise dominates, a logarithm is skewed; the relative residual is used there.
+def bisquare(
+    residuals: Array, leverages: Array, noise: Array, inhomogeneity: Array, width: float
+) -> Array:
+    """Return the bisquare of the studentised residuals; 1 where it would leave too few beams.
 
     Parameters
     ----------
@@ -235,37 +215,34 @@ def fill_robust_weights(
     inhomogeneity : (altitude,) float
     width : float
         Standard errors at or above which the weight is 0.
-    keep : (profile, angle, altitude) float
-        Output.
+
+    Returns
+    -------
+    (profile, angle, altitude) float
     """
-    profiles, angles, altitudes = residuals.shape
-    for t in range(profiles):
-        for k in range(altitudes):
-            kept = 0
-            for a in range(angles):
-                size = residuals[t, a, k]
-                if math.isnan(size):
-                    keep[t, a, k] = 1.0
-                    continue
-                variance = noise[t, a, k] + inhomogeneity[k]
-                if noise[t, a, k] > inhomogeneity[k]:
-                    size = math.expm1(min(size, 700.0))
-                leverage = min(leverages[t, a, k], 1.0 - 1e-9)
-                share = size * size / (variance * (1.0 - leverage) * width * width)
-                keep[t, a, k] = (1.0 - share) ** 2 if share < 1.0 else 0.0
-                kept += 1 if keep[t, a, k] > _KEPT else 0
-            if kept < _FEWEST_KEPT:
-                for a in range(angles):
-                    keep[t, a, k] = 1.0
+    free = 1.0 - np.minimum(leverages, 1.0 - 1e-9)
+    share = _studentised(residuals, free, noise, inhomogeneity) ** 2 / width**2
+    keep = np.where(np.isnan(residuals), 1.0, (1.0 - np.minimum(share, 1.0)) ** 2)
+    kept = ((keep > THRESHOLDS.kept_weight) & ~np.isnan(residuals)).sum(axis=1, keepdims=True)
+    return np.asarray(np.where(kept < THRESHOLDS.fewest_kept, 1.0, keep))
 
 
-@_compiled
+def _studentised(residuals: Array, free: Array, noise: Array, inhomogeneity: Array) -> Array:
+    """Return residuals over their standard errors.
+
+    Where detector noise dominates, a logarithm is skewed; the relative residual is used there.
+    """
+    relative = np.expm1(np.minimum(residuals, 700.0))
+    size = np.where(noise > inhomogeneity, relative, residuals)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(size / np.sqrt((noise + inhomogeneity) * free))
+
+
 def largest_residual(
     residuals: Array, leverages: Array, noise: Array, inhomogeneity: Array
 ) -> tuple[float, int]:
     """Return the largest studentised residual, in a unit that outliers do not inflate.
 
-    Where detector noise dominates, the relative residual is used, as in `fill_robust_weights`.
     Samples less than 10 times their noise count only where inhomogeneity exceeds the noise:
     otherwise their noise is not known well enough to judge rare deviations.
 
@@ -281,26 +258,12 @@ def largest_residual(
     count : int
         Number of residuals.
     """
-    profiles, angles, altitudes = residuals.shape
-    stride = max(residuals.size // _MEDIAN_OF, 1)
-    sizes = np.empty(residuals.size // stride + 1)
-    count = seen = 0
-    largest = 0.0
-    for t in range(profiles):
-        for a in range(angles):
-            for k in range(altitudes):
-                free = 1.0 - leverages[t, a, k]
-                clear = noise[t, a, k] < max(_CLEAR, inhomogeneity[k])
-                if free > 1e-9 and clear:
-                    spread = noise[t, a, k] + inhomogeneity[k]
-                    size = residuals[t, a, k]
-                    if noise[t, a, k] > inhomogeneity[k]:
-                        size = math.expm1(min(size, 700.0))
-                    size = abs(size) / math.sqrt(spread * free)
-                    largest = max(largest, size)
-                    if seen % stride == 0:
-                        sizes[count] = size
-                        count += 1
-                    seen += 1
-    unit = _GAUSS * np.median(sizes[:count]) if count > 0 else 1.0
-    return (largest / min(unit, 1.0) if unit > 0.0 else largest), seen
+    free = 1.0 - leverages
+    used = (free > 1e-9) & (noise < np.maximum(THRESHOLDS.clear_variance, inhomogeneity))
+    sizes = np.abs(_studentised(residuals, free, noise, inhomogeneity)[used])
+    if sizes.size == 0:
+        return 0.0, 0
+    stride = max(residuals.size // THRESHOLDS.median_of, 1)
+    unit = _GAUSS * float(np.median(sizes[::stride]))
+    largest = float(sizes.max())
+    return (largest / min(unit, 1.0) if unit > 0.0 else largest), sizes.size

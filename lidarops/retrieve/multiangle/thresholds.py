@@ -11,6 +11,7 @@ class Thresholds:
     """Numbers of the multi-angle retrieval, dimensionless unless stated.
 
     The last words of each entry state what set the number; "assumed" where nothing is recorded.
+    ``python tests/studies/scan_guards.py --thresholds`` halves and doubles each of them.
     """
 
     # Directions and cycles (`scan_cycles`, `slant_paths`).
@@ -32,24 +33,26 @@ class Thresholds:
     """degree beyond which the path follows the curvature of the Earth; below, the secant errs by
     less than 0.3 percent of the optical depth, by the formula."""
     longest_path: float = 10.0
-    """Slant over vertical path beyond which a beam is left out, for refraction; assumed."""
+    """Slant over vertical path beyond which a beam is left out: the secant errs by 2 percent at 84
+    degrees, and refraction is not modelled; by the formula."""
 
     # Samples (`_common_altitude`, `_sample_mask`).
     clear_bin: float = 30.0
     """Signal over noise from which the logarithm is interpolated; below, the error of
     interpolating the signal is far less than its noise; assumed."""
     lowest_snr: float = 3.0
-    """Mean signal over noise of the altitudes around, below which a beam ends; assumed."""
+    """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
+    light (`test_kano_hamilton`)."""
     around: int = 15
-    """Altitudes of that mean, so many that a sample has little influence on its own selection;
-    assumed."""
+    """Altitudes of that mean, so many that a sample has little influence on its own selection; by
+    the same bias."""
     swallowed_snr: float = 2.0
     """The same of the altitudes from one upwards: the wide window would accept samples behind a
-    cloud that swallows the beam; assumed."""
+    cloud that swallows the beam; by the stiff case of optical depth 20."""
     ahead: int = 5
-    """Altitudes of that mean; assumed."""
+    """Altitudes of that mean; by the same case."""
     least_noise: float = 1e-6
-    """Smallest noise over signal; no lidar has less; assumed."""
+    """Smallest noise over signal; a variance of 0 counts as this; by definition."""
     farthest_expected: float = 3.0
     """Standard deviations by which the expected signal may differ from the sample; assumed."""
 
@@ -58,17 +61,14 @@ class Thresholds:
     """Altitudes over which the inhomogeneity is pooled; assumed."""
     first_guess: float = 0.03**2
     """Variance of the inhomogeneity with which the first fit is weighted; assumed."""
-    least_guess: float = 0.01
-    """Smallest variance of the second fit, over the largest of all altitudes; assumed."""
     fewest_freedom: float = 4.1
-    """Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2;
-    assumed."""
+    """Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2: the
+    variance is at most doubled; by definition."""
     least_span: float = 0.1
     """Span of slant paths below which LOW_LEVERAGE is raised: 0 to 25 degrees; assumed."""
     least_share: float = 0.9
-    """Data share below which smoothness or a prior determines extinction; assumed."""
-    largest_share: float = 1.1
-    """Data share above which they do; assumed."""
+    """Data share below which the prior determines the extinction of "mld" and "mld_prior"; by
+    definition."""
 
     # Outlying beams (`_block`, `robust_weights`).
     outlying_residual: float = 4.5
@@ -82,7 +82,8 @@ class Thresholds:
     pass_width: float = 7.0
     """Standard errors from a weighted fit beyond which a sample has no weight; assumed."""
     closest_paths: float = 1e-3
-    """Distance of two slant paths, over their span, below which they define no slope; assumed."""
+    """Distance of two slant paths, over their span, below which they define no slope: they would
+    amplify noise 1000 times; by the formula."""
     kept_weight: float = 0.3
     """Weight above which a beam counts as kept; assumed."""
     fewest_kept: int = 3
@@ -91,7 +92,7 @@ class Thresholds:
     """Variance of a logarithm up to which its noise is well known: signal 10 times its noise;
     assumed."""
     median_of: int = 100_000
-    """Residuals that suffice for the median of their sizes; assumed."""
+    """Residuals that suffice for the median of their sizes, which errs by 0.4 percent; formula."""
 
     # Horizontal gradient (`_block`, `_methods`).
     gradient_window: float = 1000.0
@@ -121,16 +122,10 @@ class Thresholds:
     """Robust weight up to which a sample is left out of the test of growth; assumed."""
 
     # Correlation along altitude (`vertical`).
-    none_below: float = 0.05
-    """Ratio at the first lag below which the correlation is taken as zero; assumed."""
-    simple_below: float = 0.1
-    """Ratio at the first lag below which the decay cannot be estimated; assumed."""
     least_amplitude: float = 0.5
     """Least amplitude of the correlation; assumed."""
     largest_amplitude: float = 1.05
     """Largest amplitude of the correlation; assumed."""
-    largest_correlation: float = 0.97
-    """Limit of the correlation; assumed."""
     highest_correlation: float = 0.85
     """Correlation beyond which HIGH_CORRELATION is raised. In random scenes standard errors remain
     right beyond it; if the laser energy varies from file to file they do not; simulations."""
@@ -138,7 +133,7 @@ class Thresholds:
     """Correlated share, over the largest of the neighbours, from which an altitude is linked;
     assumed."""
     least_correlated: float = 1e-6
-    """Correlated share up to which noise counts as uncorrelated; assumed."""
+    """Correlated share up to which noise counts as uncorrelated; limit of rounding."""
 
     # Outlying estimates (`vertical`).
     jump: float = 5.0
@@ -153,30 +148,26 @@ class Thresholds:
     smallest_kept: float = 1e-9
     """The least share; a smaller one would cost the solution its digits."""
     majority: float = 0.5
-    """Share of weight, and of estimates, that is regarded as a majority; assumed."""
+    """Share of weight, and of estimates, that is regarded as a majority; by definition."""
     half_window: int = 7
     """Altitudes to either side of windows of medians and means; assumed."""
 
     # Smoothness and its errors (`vertical`).
     least_smooth_freedom: float = 2.0
-    """Degrees of freedom below which a weight of smoothness is not allowed; assumed."""
+    """Degrees of freedom below which a weight of smoothness is not allowed: a straight line and one
+    more; by definition."""
     fewest_to_choose: int = 8
     """Profiles from which one weight of smoothness is chosen, and errors are calibrated; with
-    fewer, solutions are averaged; assumed."""
+    fewer, solutions are averaged; by coverage in the ten scenes of `test_smooth_profile`."""
     rougher: float = 1.2
-    """Ratio of degrees of freedom from which Cp is preferred to the likelihood; assumed."""
+    """Ratio of degrees of freedom from which Cp is preferred to the likelihood; by coverage in the
+    same scenes."""
     negligible_likelihood: float = 1e-6
-    """Relative likelihood below which a weight is left out of the average; assumed."""
-    largest_information: float = 1e6
-    """Limit of information, in medians of the block; assumed."""
-    usual_information: float = 100.0
-    """Limit of the mean information, in medians of the block; assumed."""
-    negligible_information: float = 1e-4
-    """Information of a profile, in medians, below which it is treated as empty; assumed."""
+    """Relative likelihood below which a weight is left out of the average; below the 12 bits of a
+    stored value."""
     pilot: float = 0.01
-    """Weight of smoothness of the pilot solution over that of the solution; assumed."""
-    largest_deviation: float = 3.0
-    """Standard deviations to which the smoothing errors of the pilot are clipped; assumed."""
+    """Weight of smoothness of the pilot solution over that of the solution; by coverage in the same
+    scenes."""
     least_scale: float = 0.7
     """Least scale of the smoothing error of a profile, because a thin haze may still have a sharp
     layer. With 1, errors would be too large where profiles differ by noise alone; simulations."""

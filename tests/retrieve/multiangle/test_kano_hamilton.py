@@ -33,7 +33,8 @@ def fit(y, variance, path, distance=None, keep=None, *, sides=False, inhomogenei
     table = np.empty((profiles, kh.COLUMNS, altitudes))
     residual, leverage = np.empty(y.shape), np.empty(y.shape)
     added = np.full(altitudes, inhomogeneity)
-    kh.fit_levels(y, variance, keep, added, path, distance, sides, table, residual, leverage)
+    design = np.concatenate([distance, path[np.newaxis]])
+    kh.fit_levels(y, variance, keep, added, design, sides, table, residual, leverage)
     return table, residual, leverage
 
 

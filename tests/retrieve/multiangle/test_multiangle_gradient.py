@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle import optical_depth
 
 ZENITH = np.array([-75.0, -60.0, -45.0, -30.0, 0.0, 30.0, 45.0, 60.0, 75.0])
@@ -34,18 +33,3 @@ def test_methods_blind_to_a_gradient_flag_it(method):
     assert not result.flags.one_sided[known].any()
     true = np.broadcast_to(1e-4 * ALTITUDE, known.shape)
     assert np.abs(result.optical_depth - true)[known].max() < 0.01
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_prior_that_is_not_finite_is_refused(bad):
-    signal, variance = level_sky(0.0)
-    prior = np.full(ALTITUDE.size, bad)
-    with pytest.raises(RetrievalInputError, match="prior_optical_depth"):
-        optical_depth.retrieve_optical_depth(
-            signal,
-            ZENITH,
-            ALTITUDE,
-            variance=variance,
-            method="mld_prior",
-            prior_optical_depth=prior,
-        )

@@ -24,7 +24,6 @@ from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleFlags,
-    Regularisation,
     retrieve_optical_depth,
 )
 
@@ -360,7 +359,7 @@ def test_constant_extinction_leaves_the_smoother_saturated():
     signal, variance, _ = signals(rng, 20, STEEP, atmosphere, ratio=1e9, inhomogeneity=1e-4)
     result = retrieve_optical_depth(signal, STEEP, height, variance=variance)
     assert result.optical_depth[:, -1] == pytest.approx(0.24, abs=0.002)
-    assert result.flags.saturated.all()
+    assert result.flags.prior_dominated.all()
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
@@ -465,9 +464,6 @@ def test_known_inhomogeneity_is_not_estimated(small):
         ({"method": "best"}, "method"),
         ({"inhomogeneity": -0.1}, "inhomogeneity"),
         ({"largest_gradient": np.nan}, "largest_gradient"),
-        ({"regularisation": Regularisation()}, "regularisation"),
-        ({"prior_optical_depth": 0.1}, "prior_optical_depth"),
-        ({"prior_optical_depth": np.ones(3), "method": "mld_prior"}, "prior_optical_depth"),
         ({"station_altitude": 1e4}, "altitude"),
         ({"layers": [(500.0, 200.0)]}, "layers"),
         ({"layers": [(500.0, 2e4)]}, "layers"),

@@ -134,7 +134,7 @@ def _blocks_of_constant() -> Answer:
     ]
     return Answer({
         "optical depth at the top": np.stack([result.optical_depth[:, -1] for result in results]),
-        "share saturated": np.mean([result.flags.saturated.all() for result in results]),
+        "share saturated": np.mean([result.flags.prior_dominated.all() for result in results]),
     })  # fmt: skip
 
 

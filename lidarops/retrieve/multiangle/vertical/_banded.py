@@ -42,57 +42,35 @@ def penalty(altitude: Array) -> Array:
     (3, altitude) float64
         m-3: diagonal, first and second off-diagonal.
     """
-    return _penalty(np.diff(altitude, prepend=0.0))
-
-
-@_compiled
-def _penalty(step: Array) -> Array:
-    altitudes = step.size
-    bands = np.zeros((3, altitudes))
-    row = np.empty(3)
-    for k in range(altitudes - 1):
-        root = math.sqrt(2.0 / (step[k] + step[k + 1]))
-        row[0] = root / step[k]
-        row[1] = -root * (1.0 / step[k] + 1.0 / step[k + 1])
-        row[2] = root / step[k + 1]
-        # The row acts on the optical depths at k-1, k and k+1; that of the lidar is zero.
-        for i in range(3):
-            for j in range(i, 3):
-                if k - 1 + i >= 0:
-                    bands[j - i, k - 1 + i] += row[i] * row[j]
+    step = np.diff(altitude, prepend=0.0)
+    root = np.sqrt(2.0 / (step[:-1] + step[1:]))
+    # Each row acts on the optical depths below, at and above an altitude; that of the lidar is 0.
+    below, above = root / step[:-1], root / step[1:]
+    at = -root * (1.0 / step[:-1] + 1.0 / step[1:])
+    bands = np.zeros((3, altitude.size))
+    bands[0, 1:] += above**2
+    bands[0, :-1] += at**2
+    bands[0, :-2] += below[1:] ** 2
+    bands[1, :-1] += at * above
+    bands[1, :-2] += (below * at)[1:]
+    bands[2, :-2] += (below * above)[1:]
     return bands
 
 
-@_compiled
-def multiply_banded(bands: Array, vector: Array, out: Array) -> None:
-    """Multiply a vector by one symmetric pentadiagonal matrix of (3, altitude) bands."""
-    altitudes = vector.size
-    for k in range(altitudes):
-        out[k] = bands[0, k] * vector[k]
-    for k in range(altitudes - 1):
-        out[k] += bands[1, k] * vector[k + 1]
-        out[k + 1] += bands[1, k] * vector[k]
-    for k in range(altitudes - 2):
-        out[k] += bands[2, k] * vector[k + 2]
-        out[k + 2] += bands[2, k] * vector[k]
+def multiply_rows(bands: Array, rows: Array) -> Array:
+    """Multiply (profile, altitude) rows, each by its own symmetric matrix of bands.
 
-
-@_compiled
-def multiply_rows(bands: Array, vectors: Array) -> Array:
-    """Multiply (profile, altitude) rows, each by its own matrix of (3, profile, altitude) bands."""
-    out = np.empty_like(vectors)
-    for t in range(vectors.shape[0]):
-        multiply_banded(bands[:, t], vectors[t], out[t])
+    Parameters
+    ----------
+    bands : (3, profile or 1, altitude) float64
+    rows : (profile, altitude) float64
+    """
+    out: Array = bands[0] * rows
+    for step in (1, 2):
+        beside = bands[step][:, :-step]
+        out[:, step:] += beside * rows[:, :-step]
+        out[:, :-step] += beside * rows[:, step:]
     return out
-
-
-@_compiled
-def add_rows(values: Array, profile: Integers, share: Array, out: Array) -> None:
-    """Add (system, altitude) rows to those of their profiles, each with its share."""
-    for i in range(profile.size):
-        row = out[profile[i]]
-        for k in range(row.size):
-            row[k] += values[i, k] * share[i]
 
 
 @_compiled

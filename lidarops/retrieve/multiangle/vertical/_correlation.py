@@ -18,7 +18,11 @@ Integers = npt.NDArray[np.int64]
 LAGS: Final = 3
 """Largest distance of residuals that are multiplied, in altitudes."""
 _LINKED: Final = THRESHOLDS.linked
-_CANDIDATES: Final = np.arange(99) / 100.0
+_HALF_WINDOW: Final = THRESHOLDS.half_window
+_FARTHEST: Final = 2
+"""Largest distance of linked altitudes."""
+_LEAST_SHARE: Final = THRESHOLDS.least_correlated
+_CANDIDATES: Final = np.arange(98) / 100.0
 """Correlations to choose from."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -28,8 +32,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 class ResidualMoments:
     """Sums over the residuals of beams, from which the noise of optical depths is estimated.
 
-    Returned by `smooth_profile.residual_moments`. The correlation along altitude and the standard
-    errors depend on them.
+    The correlation along altitude and the standard errors depend on them.
     """
 
     lag_products: Array
@@ -51,26 +54,9 @@ class ResidualMoments:
 
 
 @_compiled
-def lag_sums(
+def _lag_sums(
     residual: Array, weight: Array, leverage: Array, variance: Array
 ) -> tuple[Array, Array, Array]:
-    """Return sums of products of residuals along altitude, and their values at full correlation.
-
-    Each product is weighted by the share of the inhomogeneity in it: where noise dominates, the
-    products show errors along a beam, such as those of the background, not the air.
-
-    Parameters
-    ----------
-    residual, weight, leverage : (profile, beam, altitude) float64
-    variance : (altitude,) float64
-        Of the inhomogeneity.
-
-    Returns
-    -------
-    products, norms : (profile, 3) float64
-    freedom : (profile, altitude) float64
-        Number of beams used minus 2, at least 0.
-    """
     profiles, beams, altitudes = residual.shape
     products, norms = np.zeros((profiles, LAGS)), np.zeros((profiles, LAGS))
     freedom = np.zeros((profiles, altitudes))
@@ -99,11 +85,45 @@ def lag_sums(
     return products, norms, freedom
 
 
+def residual_moments(
+    residual: Array,
+    weight: Array,
+    leverage: Array,
+    inhomogeneity_variance: Array,
+    inhomogeneity_share: Array,
+    gaps: Booleans,
+) -> ResidualMoments:
+    r"""Return sums over the residuals of a fit over beams.
+
+    Each product is weighted by the share of the inhomogeneity in it: where noise dominates, the
+    products show errors along a beam, such as those of the background, not the air.
+
+    Parameters
+    ----------
+    residual : (profile, beam, altitude) float64
+        Logarithm of the signal minus its fit.
+    weight : (profile, beam, altitude) float64
+        :math:`w = 1 / (v + s^2)`; zero or NaN where a beam was not used.
+    leverage : (profile, beam, altitude) float64
+        Diagonal of the hat matrix, :math:`h = w (1 / \sum w + (x - \bar x)^2 / S_{xx})`.
+    inhomogeneity_variance : (altitude,) float64
+        :math:`s^2`.
+    inhomogeneity_share : (profile, altitude) float64
+        :math:`f = s^2 \sum w^2 (x - \bar x)^2 / S_{xx}`, the share of :math:`s^2` in the
+        variance of the optical depth.
+    gaps : (profile,) bool
+        Whether samples are missing between others, so that neighbouring altitudes come from
+        different beams.
+    """
+    products, norms, freedom = _lag_sums(residual, weight, leverage, inhomogeneity_variance)
+    share = np.clip(np.nan_to_num(inhomogeneity_share), 0.0, 1.0)
+    return ResidualMoments(products, norms, share, freedom, gaps)
+
+
 def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     r"""Fit :math:`\phi \rho^h` to the pooled lag ratios of a block.
 
-    Detector noise is not correlated along altitude, so :math:`\phi` may be less than 1. With a
-    ratio below 0.1 at the first lag, the decay cannot be estimated, and :math:`\phi` is 1.
+    Detector noise is not correlated along altitude, so :math:`\phi` may be less than 1.
 
     Parameters
     ----------
@@ -119,8 +139,6 @@ def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     if not np.all(norm > 0.0):
         return 0.0, 1.0
     ratio = products.sum(axis=0) / norm
-    if ratio[0] < THRESHOLDS.simple_below:
-        return (float(ratio[0]) if ratio[0] >= THRESHOLDS.none_below else 0.0), 1.0
     shape = _CANDIDATES[:, np.newaxis] ** np.arange(1, LAGS + 1)
     square = np.maximum((shape**2).sum(axis=1), np.finfo(np.float64).tiny)
     amplitude = np.clip(
@@ -130,19 +148,17 @@ def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     )
     misfit = ((ratio - amplitude[:, np.newaxis] * shape) ** 2).sum(axis=1)
     best = int(np.argmin(misfit))
-    return min(float(_CANDIDATES[best]), THRESHOLDS.largest_correlation), float(amplitude[best])
+    return (float(_CANDIDATES[best]), float(amplitude[best])) if best > 0 else (0.0, 1.0)
 
 
 @_compiled
 def correlated_precision(information: Array, share: Array, correlation: float) -> Array:
-    r"""Return the precision of the estimates as an autoregressive process along altitude.
+    """Return the precision of the estimates as an autoregressive process along altitude.
 
-    Noise of which only a share f is correlated is not such a process. The one used here has the
-    same variance and the same power at low frequencies, which contain the smooth profile:
-    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`. An altitude whose
-    correlated share is less than half of that of one of the two on either side is not linked: most
-    of its noise is its own and does not predict that of its neighbours. It is bridged like a single
-    missing altitude; a longer gap breaks the chain.
+    Formula 8 of ``docs/algorithms/multiangle.md``. An altitude whose correlated share is less than
+    half of that of one of the two on either side is not linked: most of its noise is its own and
+    does not predict that of its neighbours. It is bridged like a single missing altitude; a longer
+    gap breaks the chain.
 
     Parameters
     ----------
@@ -151,7 +167,7 @@ def correlated_precision(information: Array, share: Array, correlation: float) -
     share : (profile, altitude) float64
         Correlated share of the variance.
     correlation : float
-        Correlation of that noise at neighbouring altitudes.
+        Of that noise at neighbouring altitudes.
 
     Returns
     -------
@@ -179,4 +195,68 @@ def correlated_precision(information: Array, share: Array, correlation: float) -
                 across = np.sqrt(information[t, k]) * np.sqrt(information[t, last])
                 bands[step, t, last] = -joint / rest * across
             last, joint = k, 1.0
+    return bands
+
+
+@_compiled
+def _link(information: Array, share: Array, linked: Booleans) -> None:
+    """Fill which altitudes have at least half of the correlated share of those on either side."""
+    for k in range(share.size):
+        most = np.max(share[max(k - 2, 0) : k + 3])
+        enough = share[k] > _LEAST_SHARE and share[k] >= _LINKED * most
+        linked[k] = information[k] > 0.0 and enough
+
+
+@_compiled
+def _own_noise(share: Array, linked: Booleans, k: int) -> float:
+    """Return the mean over links around an altitude of own over correlated noise."""
+    total = count = 0.0
+    for j in range(max(k - _HALF_WINDOW, 0), min(k + _HALF_WINDOW + 1, share.size)):
+        if linked[j]:
+            total += (1.0 - share[j]) / share[j]
+            count += 1.0
+    return total / count if count > 0.0 else 0.0
+
+
+@_compiled
+def gap_precision(information: Array, share: Array, correlation: float) -> Array:
+    """Return the precision of estimates whose neighbours come from different beams.
+
+    Formula 9 of ``docs/algorithms/multiangle.md``; parameters and shape as of
+    `correlated_precision`.
+    """
+    profiles, altitudes = information.shape
+    bands = np.zeros((3, profiles, altitudes))
+    decay = 2.0 * correlation / (1.0 - correlation)
+    linked = np.zeros(altitudes, np.bool_)
+    for t in range(profiles):
+        _link(information[t], share[t], linked)
+        last, known = -1, 0.0
+        for k in range(altitudes):
+            own = information[t, k]
+            if not (own > 0.0 and share[t, k] > _LEAST_SHARE):
+                bands[0, t, k] = own
+                continue
+            usual = _own_noise(share[t], linked, k)
+            q = decay / (1.0 + usual)
+            r = q / (q + 2.0)
+            if not linked[k]:
+                left = (1.0 - r) * (1.0 - r) / (1.0 + r * r)
+                bands[0, t, k] = left * own / (1.0 + share[t, k] * decay)
+                continue
+            ratio = (1.0 - share[t, k]) / share[t, k]
+            level = 1.0 / (1.0 + usual + (1.0 - r) * (1.0 - r) * (ratio - usual))
+            own *= level / share[t, k]
+            step = k - last
+            q = level * decay
+            joint = (q / (q + 2.0)) ** step
+            bands[0, t, k] = own
+            if last >= 0 and step > _FARTHEST:
+                bands[0, t, k] = own * (1.0 - joint) / (1.0 + joint)
+            elif last >= 0:
+                rest = 1.0 - joint * joint
+                bands[0, t, k] = own / rest
+                bands[0, t, last] += known * joint * joint / rest
+                bands[step, t, last] = -joint / rest * np.sqrt(own) * np.sqrt(known)
+            last, known = k, own
     return bands

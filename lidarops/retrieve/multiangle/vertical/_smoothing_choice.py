@@ -51,13 +51,7 @@ class Scores:
 
 
 def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
-    r"""Score every weight on the grid for the profiles of one block that have data.
-
-    With :math:`x` the solution, :math:`C` its covariance and the profiles pooled,
-
-    .. math::
-        J = \sum [t'\Omega(t - x) + \ln|\Omega + \lambda K|] - r \ln\lambda, \quad
-        C_p = \sum [(t - x)'\Omega(t - x) + 2 tr C\Omega].
+    """Score every weight on the grid for the profiles of one block, formula 10 of the page.
 
     A long block is scored on every n-th profile.
 
@@ -69,10 +63,6 @@ def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: floa
     stiffness : (3, altitude) float64
     unit : float
         Factor of the dimensionless weights.
-
-    Returns
-    -------
-    Scores
     """
     profiles, altitudes = estimates.shape
     most = max(_SCORED_PROFILES, _SCORED_VALUES // altitudes)

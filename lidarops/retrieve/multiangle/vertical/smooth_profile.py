@@ -1,48 +1,106 @@
-"""Combine optical depths of single altitudes into a profile with smooth extinction.
+"""Combine optical depths of single altitudes into profiles with smooth extinction.
 
-A scan gives the optical depth of each altitude independently
-(`lidarops.retrieve.multiangle.optical_depth`). Altitudes are connected because extinction changes
-gradually and the optical depth is zero at the lidar. The smoothest profile that fits the data is
-the solution of one pentadiagonal system, computed exactly in one sweep.
+A scan gives the optical depth of each altitude independently. Altitudes are connected because
+extinction changes gradually and the optical depth is zero at the lidar. The formulas are in
+``docs/algorithms/multiangle.md``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, TypeVar
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import _correlation
-from lidarops.retrieve.multiangle.vertical._block import (
-    Estimates,
-    VerticalSolution,
-    solve_vertical,
+from lidarops.retrieve.multiangle.vertical import (
+    _banded,
+    _calibration,
+    _correlation,
+    _outliers,
+    _smoothing_choice,
 )
 from lidarops.retrieve.multiangle.vertical._correlation import ResidualMoments
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
-_Rows = TypeVar("_Rows", Array, Booleans)
 
-LARGEST_DEPTH: Final = 1e6
-"""Optical depth beyond which an estimate counts as missing."""
-_INFORMATION: Final = (1e-16, 1e16)
-"""Information below which an estimate counts as missing, and its upper limit."""
 _UNIFORM: Final = 1e-3
 """Largest relative deviation of a step from the mean step; allows for rounded altitudes."""
 
 
 @dataclass(frozen=True, slots=True)
+class _Block:
+    """Estimates with the properties common to them."""
+
+    estimates: Array
+    information: Array
+    share: Array
+    """Correlated share of the variance."""
+    correlation: float
+    stiffness: Array
+    extent: float
+    """m, from the lidar to the highest estimate."""
+    gaps: Integers
+    """Rows where neighbouring altitudes come from different beams."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidates:
+    """Weights of smoothness with which each profile is solved, and their shares in the average."""
+
+    smoothing: Array
+    """(candidate,)"""
+    share: Array
+    """(candidate,), 1 in total."""
+
+    def solve(self, right: Array, bands: Array, stiffness: Array) -> Array:
+        """Return solutions and the bands of the inverse, (4, profile * candidate, altitude)."""
+        profiles, count = len(right), self.share.size
+        out = np.empty((4, profiles * count, right.shape[1]))
+        row, smoothing = np.repeat(np.arange(profiles), count), np.tile(self.smoothing, profiles)
+        _banded.solve_banded(bands, right, stiffness, row, smoothing, out)
+        return out
+
+    def mean(self, values: Array) -> Array:
+        """Average (profile * candidate, altitude) rows into (profile, altitude)."""
+        apart = values.reshape(-1, self.share.size, values.shape[1])
+        return np.asarray(np.einsum("tck,c->tk", apart, self.share))
+
+    def mixed(self, value: Array, variance: Array) -> tuple[Array, Array]:
+        """Return mean and variance of the mixture of the solutions of each profile."""
+        mean = self.mean(value)
+        away = value - np.repeat(mean, self.share.size, axis=0)
+        return mean, self.mean(variance + away**2)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Solution of a block."""
+
+    information: Array
+    """After the loss of weight of outlying estimates."""
+    bands: Array
+    saturated: bool
+    candidates: _Candidates
+    depth: Array
+    variance: Array
+    extinction: Array
+    """Optical depth of the layer from the altitude below."""
+    extinction_variance: Array
+    own: Array
+    """Weight of each estimate in its own optical depth."""
+
+
+@dataclass(frozen=True, slots=True)
 class VerticalResult:
-    """Smoothed profiles. Arrays are (profile, altitude) or (profile,); NaN where withheld."""
+    """Smoothed profiles, (profile, altitude) unless stated; NaN beyond the reach."""
 
     optical_depth: Array
-    """From the lidar to the altitude, NaN beyond the reach."""
+    """From the lidar to the altitude."""
     optical_depth_standard_error: Array
     """Random error and smoothing error."""
     extinction: Array
@@ -57,21 +115,18 @@ class VerticalResult:
     correlation: float
     """Of the inhomogeneity at neighbouring altitudes."""
     interpolated: Booleans
-    """(profile, altitude): no estimate there; interpolated from those around, or from the lidar."""
+    """No estimate there; interpolated from those around, or from the lidar."""
     downweighted: Booleans
-    """(profile, altitude): the estimate is an outlier of its profile."""
-    prior_dominated: Booleans
-    """(profile, altitude): `saturated`, or `data_share` outside 0.9-1.1. Concerns extinction."""
-    saturated: Booleans
-    """(profile,): the best fit has the largest smoothness that is allowed."""
+    """The estimate is an outlier of its profile."""
+    saturated: bool
+    """The best fit of the block has the largest smoothness that is allowed."""
     undersmoothed: Booleans
     """(profile,): more than 10 degrees of freedom and more than 0.4 per altitude."""
-    high_correlation: Booleans
-    """(profile,): the correlation exceeds 0.85; standard errors may be too small."""
-    solved: Integers
-    """(member,): the profiles that have data."""
-    solution: VerticalSolution
-    """Of these profiles."""
+    high_correlation: bool
+    """The correlation exceeds 0.85; standard errors may be too small."""
+    block: _Block
+    fit: _Fit
+    ratio: _Ratio
 
     def respond(self, rows: Array) -> Array:
         """Return the solution for other estimates with the same weights, NaN beyond the reach.
@@ -83,8 +138,8 @@ class VerticalResult:
         rows : (profile, altitude) float
             Finite wherever there was an estimate.
         """
-        responses = self.solution.respond(rows[self.solved])
-        return self._scattered(np.where(self.solution.within, responses, np.nan))
+        rows = _respond(self.block, self.fit, rows)
+        return np.where(np.isfinite(self.optical_depth), rows, np.nan)
 
     def layer(self, lower: int, upper: int) -> tuple[Array, Array]:
         """Return the optical depth between two altitudes, and its standard error, (profile,).
@@ -96,48 +151,48 @@ class VerticalResult:
         lower, upper : int
             Indices of altitudes in ascending order, -1 for the lidar.
         """
-        depth = self.optical_depth[:, upper].copy()
+        block, fit = self.block, self.fit
+        right = np.zeros(block.estimates.shape)
+        right[:, upper] = 1.0
         if lower >= 0:
-            depth -= self.optical_depth[:, lower]
-        error = np.sqrt(self.solution.layer_variance(lower, upper))
-        return depth, self._scattered(np.where(self.solution.within[:, upper], error, np.nan))
+            right[:, lower] = -1.0
+        estimates = _banded.multiply_rows(fit.bands, block.estimates)
+        inverse, solved = (
+            fit.candidates.solve(rows, fit.bands, block.stiffness)[0] for rows in (right, estimates)
+        )
+        posterior, value = (
+            rows[:, [upper]] - (rows[:, [lower]] if lower >= 0 else 0.0)
+            for rows in (inverse, solved)
+        )
+        depth, variance = fit.candidates.mixed(value, posterior)
+        variance *= self.ratio.of(np.array([upper]), np.array([lower]))
+        reached = np.isfinite(self.optical_depth[:, upper])
+        return (
+            np.where(reached, depth[:, 0], np.nan),
+            np.where(reached, np.sqrt(variance[:, 0]), np.nan),
+        )
 
-    def _scattered(self, rows: Array) -> Array:
-        return _scattered(rows, self.solved, len(self.optical_depth))
 
+@dataclass(frozen=True, slots=True)
+class _Ratio:
+    """Factors on the posterior variances of a block."""
 
-def residual_moments(
-    residual: Array,
-    weight: Array,
-    leverage: Array,
-    inhomogeneity_variance: Array,
-    inhomogeneity_share: Array,
-    gaps: Booleans,
-) -> ResidualMoments:
-    r"""Return the sums over residuals of a fit over beams that `smooth_optical_depth` needs.
+    calibration: _calibration.Calibration | None
+    """None if the block is too small to be calibrated."""
+    inflation: Array
+    """(altitude,): because the noise is estimated from few residuals."""
 
-    Parameters
-    ----------
-    residual : (profile, beam, altitude) float
-        Logarithm of the signal minus its fit.
-    weight : (profile, beam, altitude) float
-        :math:`w = 1 / (v + s^2)`; zero or NaN where a beam was not used.
-    leverage : (profile, beam, altitude) float
-        Diagonal of the hat matrix, :math:`h = w (1 / \sum w + (x - \bar x)^2 / S_{xx})`.
-    inhomogeneity_variance : (altitude,) float
-        :math:`s^2`.
-    inhomogeneity_share : (profile, altitude) float
-        :math:`f = s^2 \sum w^2 (x - \bar x)^2 / S_{xx}`, the share of :math:`s^2` in the
-        variance of the optical depth.
-    gaps : (profile,) bool
-        Whether samples are missing between others, so that neighbouring altitudes come from
-        different beams.
-    """
-    products, norms, freedom = _correlation.lag_sums(
-        residual, weight, leverage, inhomogeneity_variance
-    )
-    share = np.clip(np.nan_to_num(inhomogeneity_share), 0.0, 1.0)
-    return ResidualMoments(products, norms, share, freedom, gaps)
+    def of(self, upper: Integers, lower: Integers) -> Array:
+        """Return the factor on the variance of differences of optical depths.
+
+        The shape is (profile, difference), or (difference,) if common to all profiles.
+        """
+        below = np.where(lower >= 0, self.inflation[np.maximum(lower, 0)], 1.0)
+        few: Array = np.maximum(self.inflation[upper], below)
+        if self.calibration is None:
+            return few
+        factor: Array = few * _calibration.variance_ratio(self.calibration, upper, lower)
+        return factor
 
 
 def smooth_optical_depth(
@@ -147,37 +202,18 @@ def smooth_optical_depth(
     *,
     residuals: ResidualMoments | None = None,
     robust: bool = True,
-) -> VerticalResult | None:
-    r"""Return profiles with smooth extinction from optical depths of single altitudes.
+) -> VerticalResult:
+    """Return profiles with smooth extinction from optical depths of single altitudes.
 
-    None where no profile has an estimate.
-
-    Minimises
-
-    .. math:: (\tau - t)' \Omega (\tau - t)
-              + \lambda \int (d \alpha / d z)^2 dz, \quad \tau(z_0) = 0,
-
-    with the estimates :math:`t`, their precision :math:`\Omega` (of an autoregressive process
-    along altitude with the variance and the low-frequency power of the noise) and the extinction
-    :math:`\alpha`. There is no iteration: the correlation comes from residuals 1 to 3 altitudes
-    apart, :math:`\lambda` from a fixed grid, and the solution from one sweep.
-
-    The correlation, :math:`\lambda` and the calibration of the standard errors are common to the
-    profiles. With 8 profiles or more, :math:`\lambda` has the largest restricted likelihood or,
-    where that smooths more than Mallows' :math:`C_p` allows, the least :math:`C_p`. The standard
-    errors are calibrated at each altitude with the change of a rougher pilot solution by
-    smoothing: its average over the profiles, for each profile in proportion to its optical depth,
-    but at least 0.7 of the usual variance. With fewer profiles, solutions are averaged over
-    :math:`\lambda`, weighted by their likelihood.
+    The correlation, the weight of smoothness and the calibration of the standard errors are common
+    to the profiles. With fewer than 8 profiles, solutions are averaged over the weight.
 
     Parameters
     ----------
     optical_depth : (profile, altitude) float
-        Estimates of single altitudes; NaN where there is none.
+        Estimates of single altitudes; NaN where there is none. Each profile has one.
     information : (profile, altitude) float
-        Reciprocal variances; NaN or 0 where there is no estimate. An estimate that is not
-        finite, or beyond 1e6, is treated as missing; information is limited to 1e6 times the
-        median. A profile with less than 1e-4 of the typical information is treated as empty.
+        Reciprocal variances; NaN or 0 where there is no estimate.
     altitude : (altitude,) float
         m above the lidar, ascending and uniform.
     residuals : ResidualMoments, optional
@@ -199,14 +235,20 @@ def smooth_optical_depth(
     (variances), beaton1974 (bisquare).
     """
     _require_uniform(altitude)
-    depth, weight = _valid(optical_depth, information)
-    solved = _informative(weight, altitude)
-    if solved.size == 0:
-        return None
-    moments = None if residuals is None else residuals.of(solved)
-    estimates = Estimates(depth[solved], weight[solved], altitude, moments)
-    solution = solve_vertical(estimates, robust=robust)
-    return _result(solution, np.diff(altitude, prepend=0.0), solved, len(depth))
+    used = np.isfinite(optical_depth) & (information > 0.0)
+    block = _block(
+        np.where(used, optical_depth, 0.0), np.where(used, information, 0.0), altitude, residuals
+    )
+    freedom = None if residuals is None else residuals.degrees_of_freedom
+    few = freedom is not None and freedom.max() < THRESHOLDS.fewest_beams - 2.0
+    fit = _solve_block(block, robust=robust and not few)
+    within = np.cumsum(used[:, ::-1], axis=1)[:, ::-1] > 0
+    calibrated = len(within) >= THRESHOLDS.fewest_to_choose
+    ratio = _Ratio(
+        _calibrate(block, fit, within) if calibrated else None,
+        _inflation(freedom, block.correlation, altitude.size),
+    )
+    return _result(block, fit, ratio, within, np.diff(altitude, prepend=0.0))
 
 
 def _require_uniform(altitude: Array) -> None:
@@ -218,71 +260,160 @@ def _require_uniform(altitude: Array) -> None:
         )
 
 
-def _valid(optical_depth: Array, information: Array) -> tuple[Array, Array]:
-    """Return estimates and their information, both 0 where there is no valid estimate."""
-    valid = np.isfinite(information) & (information >= _INFORMATION[0])
-    valid &= np.abs(optical_depth) <= LARGEST_DEPTH
-    weight = np.where(valid, np.minimum(information, _INFORMATION[1]), 0.0)
-    return np.where(valid, optical_depth, 0.0), weight
+def _block(
+    depth: Array, information: Array, altitude: Array, moments: ResidualMoments | None
+) -> _Block:
+    highest = int(np.flatnonzero((information > 0.0).any(axis=0))[-1])
+    correlation, share = 0.0, np.zeros_like(depth)
+    gaps = np.zeros(0, dtype=np.int64)
+    if moments is not None:
+        correlation, amplitude = _correlation.fit_correlation(
+            moments.lag_products, moments.lag_norms
+        )
+        share = np.clip(moments.inhomogeneity_share * amplitude, 0.0, 1.0)
+        gaps = np.flatnonzero(moments.gaps)
+    stiffness = _banded.penalty(altitude)
+    return _Block(depth, information, share, correlation, stiffness, float(altitude[highest]), gaps)
 
 
-def _informative(information: Array, altitude: Array) -> Integers:
-    """Return the profiles whose information is not negligible beside that of the others."""
-    candidates = np.flatnonzero((information > 0.0).any(axis=1))
-    total = (information[candidates] * altitude**2).sum(axis=1)
-    return (
-        candidates[total >= THRESHOLDS.negligible_information * np.median(total)]
-        if total.size
-        else candidates
+def _solve_block(block: _Block, *, robust: bool) -> _Fit:
+    if not robust:
+        return _fit(block, block.information)
+    screened = _outliers.screen_outliers(block.estimates, block.information)
+    fit = _fit(block, _outliers.reduce_information(block.information, screened))
+    reduced = _outliers.downweight_outliers(
+        block.estimates, block.information, block.share, fit.depth, fit.variance
     )
+    return fit if reduced is None else _fit(block, reduced)
+
+
+def _fit(block: _Block, information: Array) -> _Fit:
+    """Choose the smoothness of a block and solve."""
+    bands = _precision(block, information)
+    unit = float(information[information > 0.0].mean()) * block.extent**3
+    choice = _smoothing_choice.choose_smoothing(
+        _smoothing_choice.score_smoothing(bands, block.estimates, block.stiffness, unit)
+    )
+    candidates = _Candidates(choice.smoothing * unit, choice.share)
+    right = _banded.multiply_rows(bands, block.estimates)
+    solved, diagonal, beside, second = candidates.solve(right, bands, block.stiffness)
+    gained = np.diff(solved, axis=1, prepend=0.0)
+    uncertain = diagonal.copy()
+    uncertain[:, 1:] += diagonal[:, :-1] - 2.0 * beside[:, :-1]
+    repeated = np.repeat(bands, choice.share.size, axis=1)
+    own = _own_weights(repeated, np.array([diagonal, beside, second]))
+    return _Fit(
+        information,
+        bands,
+        choice.saturated,
+        candidates,
+        *candidates.mixed(solved, diagonal),
+        *candidates.mixed(gained, uncertain),
+        candidates.mean(own),
+    )
+
+
+def _precision(block: _Block, information: Array) -> Array:
+    share = _reduced_share(block, information)
+    bands = _correlation.correlated_precision(information, share, block.correlation)
+    rows = block.gaps
+    if rows.size and block.correlation > 0.0:
+        bands[:, rows] = _correlation.gap_precision(
+            information[rows], share[rows], block.correlation
+        )
+    return bands
+
+
+def _reduced_share(block: _Block, information: Array) -> Array:
+    """Return the correlated share of the variance: an estimate with less weight has more own noise.
+
+    The bisquare raises the information of good estimates slightly above the whole; a share above 1
+    would leave a negative variance.
+    """
+    whole = block.information
+    ratio = np.where(whole > 0.0, information / np.where(whole > 0.0, whole, 1.0), 1.0)
+    return np.asarray(block.share * np.minimum(ratio, 1.0))
+
+
+def _respond(block: _Block, fit: _Fit, rows: Array) -> Array:
+    """Apply the smoother of each profile to its row."""
+    right = _banded.multiply_rows(fit.bands, np.where(fit.information > 0.0, rows, 0.0))
+    return fit.candidates.mean(fit.candidates.solve(right, fit.bands, block.stiffness)[0])
+
+
+def _own_weights(bands: Array, inverse: Array) -> Array:
+    """Return the diagonal of the smoother of each system."""
+    own: Array = bands[0] * inverse[0]
+    for step in (1, 2):
+        both = (bands[step] * inverse[step])[:, :-step]
+        own[:, :-step] += both
+        own[:, step:] += both
+    return own
+
+
+def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calibration:
+    information, share = _calibration.typical_profile(
+        fit.information, _reduced_share(block, fit.information)
+    )
+    pilot = replace(fit.candidates, smoothing=fit.candidates.smoothing * THRESHOLDS.pilot)
+    right = _banded.multiply_rows(fit.bands, block.estimates)
+    rough = pilot.solve(right, fit.bands, block.stiffness)[0]
+    right = _banded.multiply_rows(fit.bands, rough)
+    smooth = fit.candidates.solve(right, fit.bands, block.stiffness)[0]
+    bands = _correlation.correlated_precision(
+        information[np.newaxis], share[np.newaxis], block.correlation
+    )
+    return _calibration.Calibration(
+        bands[:, 0],
+        information,
+        share,
+        block.correlation,
+        block.stiffness,
+        float(fit.candidates.smoothing[0]),
+        np.where(within, rough - smooth, np.nan),
+        _calibration.relative_squares(fit.depth, fit.variance, within),
+    )
+
+
+def _inflation(freedom: Array | None, correlation: float, altitudes: int) -> Array:
+    """Return the factor on variances because noise is estimated from a window of residuals."""
+    if freedom is None:
+        return np.ones(altitudes)
+    total = np.convolve(freedom.sum(axis=0), np.ones(THRESHOLDS.pooled), mode="full")
+    start = THRESHOLDS.pooled // 2
+    square = correlation * correlation
+    known = total[start : start + altitudes] * (1.0 - square) / (1.0 + square)
+    known = np.maximum(known, THRESHOLDS.fewest_freedom)
+    factor: Array = known / (known - 2.0)
+    return factor
 
 
 def _result(
-    solution: VerticalSolution, step: Array, solved: Integers, profiles: int
+    block: _Block, fit: _Fit, ratio: _Ratio, within: Booleans, step: Array
 ) -> VerticalResult:
-    """Return the public result; rows of other profiles are NaN or False."""
-    fit, within, used = solution.fit, solution.within, solution.fit.information > 0.0
-    variance, extinction_variance = solution.errors(step)
-    error = np.sqrt(variance)
-    response = solution.respond(fit.depth)
+    rows = np.arange(step.size)
+    error = np.sqrt(fit.variance * ratio.of(rows, np.full(step.size, -1)))
+    extinction_error = np.sqrt(fit.extinction_variance * ratio.of(rows, rows - 1)) / step
     certain = within & (np.abs(fit.depth) > error)
+    response = _respond(block, fit, fit.depth)
     share = np.where(certain, response / np.where(certain, fit.depth, 1.0), np.nan)
-    smoothed = certain & ~((share >= THRESHOLDS.least_share) & (share <= THRESHOLDS.largest_share))
     freedom = fit.own.sum(axis=1)
-    everywhere = np.ones(solved.size, np.bool_)
-
-    def values(rows: Array) -> Array:
-        return _scattered(np.where(within, rows, np.nan), solved, profiles)
-
-    def flags(rows: Booleans) -> Booleans:
-        return _scattered(rows, solved, profiles)
-
+    used = fit.information > 0.0
     return VerticalResult(
-        optical_depth=values(fit.depth),
-        optical_depth_standard_error=values(error),
-        extinction=values(fit.extinction / step),
-        extinction_standard_error=values(np.sqrt(extinction_variance)),
-        data_share=values(share),
-        effective_degrees_of_freedom=_scattered(freedom, solved, profiles),
-        correlation=solution.block.correlation,
-        interpolated=flags(within & ~used),
-        downweighted=flags(solution.downweighted),
-        prior_dominated=flags(within & (fit.saturated | smoothed)),
-        saturated=flags(fit.saturated & everywhere),
-        undersmoothed=flags(
-            (freedom > THRESHOLDS.most_freedom) & (freedom > THRESHOLDS.roughest * used.sum(axis=1))
-        ),
-        high_correlation=flags(
-            (solution.block.correlation > THRESHOLDS.highest_correlation) & everywhere
-        ),
-        solved=solved,
-        solution=solution,
+        optical_depth=np.where(within, fit.depth, np.nan),
+        optical_depth_standard_error=np.where(within, error, np.nan),
+        extinction=np.where(within, fit.extinction / step, np.nan),
+        extinction_standard_error=np.where(within, extinction_error, np.nan),
+        data_share=share,
+        effective_degrees_of_freedom=freedom,
+        correlation=block.correlation,
+        interpolated=within & ~used,
+        downweighted=fit.information < THRESHOLDS.majority * block.information,
+        saturated=fit.saturated,
+        undersmoothed=(freedom > THRESHOLDS.most_freedom)
+        & (freedom > THRESHOLDS.roughest * used.sum(axis=1)),
+        high_correlation=block.correlation > THRESHOLDS.highest_correlation,
+        block=block,
+        fit=fit,
+        ratio=ratio,
     )
-
-
-def _scattered(rows: _Rows, solved: Integers, profiles: int) -> _Rows:
-    """Return rows of the solved profiles among all profiles; NaN or False for others."""
-    missing = np.nan if rows.dtype.kind == "f" else False
-    out: _Rows = np.full((profiles, *rows.shape[1:]), missing)
-    out[solved] = rows
-    return out

@@ -14,10 +14,8 @@ from support.oracles.banded_matrices import dense
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle.vertical import _banded, _correlation, _outliers, monotone
-from lidarops.retrieve.multiangle.vertical.smooth_profile import (
-    residual_moments,
-    smooth_optical_depth,
-)
+from lidarops.retrieve.multiangle.vertical._correlation import residual_moments
+from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
 
 ALTITUDE = 150.0 + 30.0 * np.arange(60)
 PER_KM = 1e-3
@@ -75,10 +73,10 @@ def test_smoothing_after_kano_hamilton_equals_one_joint_fit():
     depth = -0.5 * (weight * centred * y).sum(axis=0) / square
     altitude = 100.0 + 30.0 * np.arange(altitudes)
     result = smooth_optical_depth(depth[None], 4.0 * square[None], altitude)
-    shares = result.solution.fit.pairs.share
+    shares = result.fit.candidates.share
     stiffness = dense(_banded.penalty(altitude))
     together = np.zeros(altitudes)
-    for lam, share in zip(result.solution.fit.pairs.smoothing, shares, strict=True):
+    for lam, share in zip(result.fit.candidates.smoothing, shares, strict=True):
         normal = np.zeros((2 * altitudes, 2 * altitudes))
         normal[:altitudes, :altitudes] = np.diag(total)
         cross = -2.0 * (weight * x[:, None]).sum(axis=0)
@@ -96,8 +94,7 @@ def test_constant_extinction_is_returned_exactly_and_flagged_as_saturated():
     np.testing.assert_allclose(result.optical_depth, depth, rtol=1e-9)
     np.testing.assert_allclose(result.extinction, 4e-5, rtol=1e-7)
     np.testing.assert_allclose(result.data_share, 1.0, rtol=1e-9)
-    assert result.saturated.all()
-    assert result.prior_dominated.all()
+    assert result.saturated
 
 
 def test_extinction_adds_up_to_the_optical_depth():
@@ -230,7 +227,7 @@ def test_standard_errors_of_sharp_layers_in_thin_hazes_hold_beside_thick_hazes()
         scene = dataclasses.replace(scene, truth=air + amount * haze + (amount < 1.0) * sharp)
         result = solve(scene, estimates(scene, 32, np.random.default_rng(seed), 0.3))
         score = (result.extinction - truth_of(scene, result)[1]) / result.extinction_standard_error
-        deviations.append(np.where(result.prior_dominated, np.nan, score)[:thin])
+        deviations.append(score[:thin])
     deviation = np.concatenate(deviations)
     assert rms(deviation) < 1.0
     assert np.mean(np.abs(deviation[np.isfinite(deviation)]) > 4.0) < 0.01
@@ -333,7 +330,7 @@ def test_robust_passes_cost_clean_data_nothing():
     depth[0, 30] += 0.12
     result = smooth_optical_depth(depth, information, ALTITUDE)
     assert result.downweighted[0, 30]
-    share = result.solution.fit.information / information
+    share = result.fit.information / information
     assert np.median(share[1:]) > 1.0
     assert share[1:].mean() == pytest.approx(1.0, abs=0.01)
 
@@ -385,48 +382,6 @@ def test_missing_estimates_are_interpolated_and_flagged(profiles):
     assert middle > 0.9 * result.optical_depth_standard_error[2, 22]
 
 
-def test_profile_without_data_stays_empty_and_leaves_the_others_alone():
-    depth, information, _ = plain(9, np.random.default_rng(21))
-    alone = smooth_optical_depth(depth, information, ALTITUDE)
-    empty = np.full((1, 60), np.nan)
-    depth = np.concatenate([depth[:4], empty, depth[4:]])
-    information = np.concatenate([information[:4], np.zeros((1, 60)), information[4:]])
-    result = smooth_optical_depth(depth, information, ALTITUDE)
-    assert result.solved.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
-    np.testing.assert_array_equal(np.delete(result.optical_depth, 4, axis=0), alone.optical_depth)
-    for field in dataclasses.fields(result):
-        values = getattr(result, field.name)
-        if isinstance(values, np.ndarray) and values.dtype == np.float64:
-            assert np.isnan(values[4]).all()
-    assert not result.interpolated[4].any()
-    assert np.isnan(monotone.project(result.optical_depth)[4]).all()
-    error = result.layer(-1, 15)[1]
-    assert np.isnan(error[4])
-    assert np.isfinite(np.delete(error, 4)).all()
-
-
-@pytest.mark.parametrize("profiles", [0, 1, 9])
-def test_no_estimates_give_no_result(profiles):
-    missing = np.full((profiles, 60), np.nan)
-    assert smooth_optical_depth(missing, missing, ALTITUDE) is None
-
-
-@pytest.mark.parametrize(
-    ("value", "weight"),
-    [(1e300, 2500.0), (np.inf, 2500.0), (0.1, 1e300), (0.1, np.inf), (0.1, 1e-300), (1e7, 2500.0)],
-)
-@pytest.mark.parametrize("profiles", [3, 20])
-def test_an_impossible_estimate_does_not_spread(value, weight, profiles):
-    depth, information, truth = plain(profiles, np.random.default_rng(22))
-    depth[0, 30], information[0, 30] = value, weight
-    result = smooth_optical_depth(depth, information, ALTITUDE)
-    assert np.isfinite(result.optical_depth).all()
-    assert np.isfinite(result.extinction_standard_error).all()
-    error = np.abs(result.optical_depth - truth)
-    assert error[1:].max() < 0.06
-    assert np.abs(np.delete(error[0], np.arange(24, 37))).max() < 0.1
-
-
 @pytest.mark.parametrize("altitudes", [1, 2, 3, 4])
 @pytest.mark.parametrize("profiles", [1, 9])
 def test_few_altitudes_are_solved(altitudes, profiles):
@@ -450,28 +405,16 @@ def test_any_pattern_of_estimates_is_solved_or_withheld(seed, profiles, altitude
     depth = rng.normal(size=shape) * 10.0 ** rng.uniform(-6.0, 5.0, shape)
     information = 10.0 ** (rng.uniform(-9.0, 9.0) + rng.uniform(-2.0, 2.0, shape))
     information[rng.random(shape) < rng.random()] = rng.choice([0.0, np.nan])
+    information[:, rng.integers(altitudes)] = 1.0
     result = smooth_optical_depth(depth, information, ALTITUDE[:altitudes])
     known = np.isfinite(information) & (information > 0.0)
-    assert (result is None) == (not known.any())
-    if result is None:
-        return
     within = np.cumsum(known[:, ::-1], axis=1)[:, ::-1] > 0
-    total = (np.where(known, information, 0.0) * ALTITUDE[:altitudes] ** 2).sum(axis=1)
-    within[total < 1e-4 * np.median(total[known.any(axis=1)])] = False
     for values in (result.optical_depth, result.extinction):
         np.testing.assert_array_equal(np.isfinite(values), within)
     for values in (result.optical_depth_standard_error, result.extinction_standard_error):
         np.testing.assert_array_equal(np.isfinite(values), within)
         assert (values[within] > 0.0).all()
     np.testing.assert_array_equal(result.interpolated, within & ~known)
-
-
-def test_profile_with_negligible_information_is_withheld():
-    depth, information, _ = plain(9, np.random.default_rng(24))
-    information[3] *= 1e-5
-    result = smooth_optical_depth(depth, information, ALTITUDE)
-    np.testing.assert_array_equal(result.solved, np.delete(np.arange(9), 3))
-    assert np.isnan(result.optical_depth[3]).all()
 
 
 # Blocks -------------------------------------------------------------------------------------
@@ -529,9 +472,7 @@ def test_lag_sums_follow_their_definition():
 @pytest.mark.parametrize(
     ("ratios", "expected"),
     [
-        ((0.03, 0.0, 0.0), (0.0, 1.0)),
         ((-0.2, 0.0, 0.0), (0.0, 1.0)),
-        ((0.08, 0.5, 0.5), (0.08, 1.0)),
         ((0.8, 0.64, 0.512), (0.8, 1.0)),
         ((0.56, 0.392, 0.2744), (0.7, 0.8)),
         ((1.0, 1.0, 1.0), (0.97, 1.05)),
@@ -580,8 +521,7 @@ def test_correlated_noise_has_wider_errors_and_a_flag():
     ]
     errors = [r.optical_depth_standard_error.mean() for r in results]
     assert errors[0] < errors[1] < errors[2]
-    assert [r.high_correlation.any() for r in results] == [False, False, True]
-    assert results[2].high_correlation.all()
+    assert [r.high_correlation for r in results] == [False, False, True]
     np.testing.assert_allclose(results[1].correlation, 0.6, atol=0.01)
 
 
@@ -616,8 +556,6 @@ def test_data_share_is_the_response_to_the_solution_where_that_is_significant():
     )
     significant = np.abs(result.optical_depth) > result.optical_depth_standard_error
     np.testing.assert_array_equal(known, significant)
-    outside = (result.data_share < 0.9) | (result.data_share > 1.1)
-    np.testing.assert_array_equal(result.prior_dominated, outside | result.saturated[:, None])
 
 
 # Refusals -----------------------------------------------------------------------------------
