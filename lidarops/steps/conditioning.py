@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from lidarops.records import DetectionMode, Granule, Role
 from lidarops.retrieve.signal import labeled
+from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
@@ -30,7 +31,7 @@ OVERLAP: Final = Datum[Callable[[Array], Array]]("overlap")
 """Returns the overlap at ranges in m."""
 RANGE_OFFSET: Final = Datum[float]("range_offset")
 """m, added to the range of every bin."""
-DARK: Final = Datum[labeled.DarkSignals]("dark")
+DARK: Final = Datum[DarkSignals]("dark")
 DEAD_TIME: Final = Datum[float]("dead_time")
 """s."""
 RELATIVE_VARIANCE: Final = Datum[bool]("relative_variance")

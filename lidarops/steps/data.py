@@ -89,10 +89,6 @@ class Profiles(ABC):
         """Return power, variance and quality of profiles, (time, range)."""
 
     @abstractmethod
-    def signals(self, counts: xr.Dataset, background: BackgroundSettings) -> xr.Dataset:
-        """Return background-subtracted, range-corrected signals of profiles."""
-
-    @abstractmethod
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""
 

@@ -10,9 +10,9 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.retrieve.signal import labeled, labeled_gluing
-from lidarops.retrieve.signal.labeled import DarkSignals
+from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
-from lidarops.steps.data import Averages, BackgroundSettings, Chunk, Indices, Profiles
+from lidarops.steps.data import Averages, Chunk, Indices, Profiles
 
 _PARTS: Final = ("power", "variance", "quality")
 
@@ -58,16 +58,6 @@ class FileProfiles(Profiles):
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles."""
         return labeled.condition(counts, self._channel, **self._settings)
-
-    def signals(self, counts: xr.Dataset, background: BackgroundSettings) -> xr.Dataset:
-        """Return background-subtracted, range-corrected signals of profiles."""
-        return labeled.range_corrected_signals(
-            counts,
-            self._channel,
-            background_range=background.range,
-            background_method=background.method,
-            **self._settings,
-        )
 
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""
@@ -130,12 +120,6 @@ class GluedProfiles(Profiles):
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles, and the variables of the gluing."""
         return labeled_gluing.glue(self._analog.of(counts), self._photon.of(counts), lag=self._lag)
-
-    def signals(self, counts: xr.Dataset, background: BackgroundSettings) -> xr.Dataset:
-        """Return background-subtracted, range-corrected signals of profiles."""
-        joined = self.of(counts)
-        signals = labeled.correct_for_range(joined, background.range, background.method)
-        return signals.assign(gluing(joined))
 
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""

@@ -14,7 +14,7 @@ from lidarops.kinds import Scope, kinds_of
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, Role, Scene
-from lidarops.retrieve.signal.dark import dark_profile
+from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.steps import dependence
 
 
@@ -341,7 +341,7 @@ class TestDark:
         times = np.array(minutes) * 60
         products = np.array([60.0, 90.0, 120.0]) * 60
         nearest, interpolated = (
-            dark_profile(signals, times, products, method=method)
+            DarkSignals(signals, times, method=method).at(products)
             for method in ("nearest", "interpolated")
         )
         assert np.array_equal(nearest.dark, interpolated.dark)

@@ -40,14 +40,7 @@ def _same(power: Any, range_: Any, variance: Any, **_: Any) -> Any:
     return outlying_bins.BridgedProfiles(power, noise, np.zeros(np.shape(power), np.bool_))
 
 
-def _same_rows(rows: Any, noise: Any, _: Any) -> Any:
-    return rows, noise, np.zeros(rows.shape, np.bool_)
-
-
-NO_BRIDGES: Final = (
-    (outlying_bins, "bridge_outliers", _same),
-    (outlying_bins, "bridge_rows", _same_rows),
-)
+NO_BRIDGES: Final = (outlying_bins, "bridge_outliers", _same)
 
 
 @cache
@@ -66,10 +59,7 @@ def _variant(old: str, new: str) -> types.ModuleType:
 def bridges(old: str, new: str) -> Iterator[None]:
     """Replace a text in the detection of outlying bins."""
     module = _variant(old, new)
-    with replaced(
-        (outlying_bins, "bridge_outliers", module.bridge_outliers),
-        (outlying_bins, "bridge_rows", module.bridge_rows),
-    ):
+    with replaced((outlying_bins, "bridge_outliers", module.bridge_outliers)):
         yield
 
 
@@ -135,7 +125,7 @@ GUARDS: Final = (
     Guard("least certainty", off=threshold(least_certainty=0.0)),
     Guard("skewed errors", off=threshold(skewed=0.0)),
     Guard("longest gap", off=threshold(longest_gap=np.inf)),
-    Guard("bridging of outliers", off=partial(replaced, *NO_BRIDGES)),
+    Guard("bridging of outliers", off=partial(replaced, NO_BRIDGES)),
     Guard("outlier: contrast", off=partial(bridges, "THRESHOLDS.least_contrast", "0.0")),
     Guard("outlier: step", off=partial(bridges, "if not step <= allowed:", "if False:")),
     Guard("outlier: equal counts", off=partial(bridges, "THRESHOLDS.most_equal", "9")),

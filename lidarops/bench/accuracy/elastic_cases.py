@@ -225,8 +225,7 @@ def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
         cubic_and_tail.cubic(
             counts[:, far],
             sky.range[far],
-            statistics=cubic_and_tail.Statistics.POISSON,
-            shots=SHOTS,
+            variance=photon_counts.mean_profile_variance(counts[:, far], SHOTS),
         )
     )
 

@@ -178,8 +178,8 @@ def _averages(work: Workload) -> int:
 
 
 _BYTES_OF_A_BIN: Final = 170.0
-"""Bytes per bin of an average that is open or being inverted. ``lidarops bench throughput --case
-memory`` measured 182 MB above the base for averages of one minute, with those of a chunk."""
+"""Bytes per bin of an average that is open or being inverted, from ``lidarops bench throughput
+--case memory``."""
 
 
 class _Inversion(RowProduct):

@@ -104,10 +104,7 @@ LAYOUT: Final = Layout(
     " measurement. Profiles are means over time; range is along the beam. Particles in the"
     " reference window that decrease with height nearly as molecules do look like aerosol-free air,"
     " and no test of the signal detects them: only the error of the scattering ratio declared in"
-    " the settings covers them. In simulations with a declared error of 0.02, 0.001 percent of the"
-    " values without a rejecting flag deviated by more than 4 standard errors where such haze"
-    " scattered up to 3.5 percent of what molecules scatter at 7 km, and 12 percent where it"
-    " scattered 0.35 to 35 percent: declare a larger error where the air is hazy at all heights. An"
+    " the settings covers them. Declare a larger error where the air is hazy at all heights. An"
     " elastic signal does not determine the lidar ratio either; its declared error has to cover"
     " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
     " bin deviates from theirs by more than noise explains.",

@@ -11,11 +11,12 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.products.signal.settings import SignalSettings
-from lidarops.retrieve.signal.labeled import background_words
+from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct
 from lidarops.steps.preparation import BACKGROUND, FEWEST_BINS, Background, tail
+from lidarops.steps.profiles import gluing
 from lidarops.steps.step import (
     REQUESTED,
     Decisions,
@@ -72,7 +73,10 @@ class _Signals(RowProduct):
         """Yield the signals of profiles."""
         if chunk.rows.start == 0:
             yield self._frame()
-        signals = self._profiles.signals(chunk.counts, self._background)
+        conditioned = chunk.profiles(self._profiles)
+        signals = correct_for_range(
+            conditioned, self._background.range, self._background.method
+        ).assign(gluing(conditioned))
         if self._overlap is not None:
             signals = _without_overlap(signals, self._overlap)
         shots = self._profiles.shots(chunk.counts)

@@ -6,7 +6,6 @@ scattering follows from the number density.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -169,8 +168,6 @@ def rayleigh_cross_section(wavelength: ArrayLike) -> Array:
     Notes
     -----
     .. math:: \sigma = \frac{24 \pi^3 (n^2 - 1)^2}{\lambda^4 N^2 (n^2 + 2)^2} F_K
-
-    The fits of `bucholtz1995` are 0.05 to 0.2 percent smaller from 0.3 to 1.1 micrometres.
 
     References
     ----------
@@ -351,42 +348,6 @@ class MolecularProfile:
         wavelength : float, m
         """
         return self.extinction(altitude, wavelength) / molecular_lidar_ratio(wavelength)
-
-    def column(self, bottom: float, top: float) -> float:
-        """Return the column of molecules between two altitudes, m-2.
-
-        Parameters
-        ----------
-        bottom, top : float, m
-            Above mean sea level.
-
-        Raises
-        ------
-        RetrievalInputError
-            Where the top is not higher than the bottom.
-
-        Notes
-        -----
-        Gauss quadrature with two nodes per 50 m, accurate to 1e-6.
-        """
-        if not (math.isfinite(bottom) and bottom < top < math.inf):
-            raise RetrievalInputError(f"{top:g} m is not higher than {bottom:g} m", field="top")
-        edges = np.linspace(bottom, top, math.ceil((top - bottom) / 50.0) + 1)
-        half = np.diff(edges) / 2.0
-        middle, offset = edges[:-1] + half, half / math.sqrt(3.0)
-        nodes = self.number_density(np.stack([middle - offset, middle + offset]))
-        return float(np.sum(nodes * half))
-
-    def optical_depth(self, wavelength: float, *, bottom: float = 0.0, top: float = 80e3) -> float:
-        """Return the molecular optical depth between two altitudes, 1.
-
-        Parameters
-        ----------
-        wavelength : float, m
-        bottom, top : float, m
-            Above mean sea level.
-        """
-        return self.column(bottom, top) * float(rayleigh_cross_section(wavelength))
 
 
 _UNITS: Final = {"Pa": 1.0, "hPa": 100.0}

@@ -11,7 +11,7 @@ expectation of the noise is subtracted from the coefficients, and no large numbe
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
@@ -71,7 +71,7 @@ def make_triples(range_: Array, lag: int) -> Triples:
 
 
 @_compiled
-def _coefficients(p: Array, v: Array, t: Triples, poisson: float) -> _Coefficients:
+def _coefficients(p: Array, v: Array, t: Triples) -> _Coefficients:
     """Sum the coefficients over the triples, less the expectation of their noise."""
     s3 = s2 = s1 = s0 = noise = moved = 0.0
     for i in range(t.a.size):
@@ -86,7 +86,7 @@ def _coefficients(p: Array, v: Array, t: Triples, poisson: float) -> _Coefficien
         noise += 2.0 * a * w * v1 + u * u * (v0 + v2) + 4.0 * w * w * v1
         s0 += b * c
         s0 -= u * w * v1 * (p0 + p2) - u * u * (v0 * p2 + v2 * p0)
-        s0 += w * w * v1 * (6.0 * p1 - 4.0 * poisson)
+        s0 += w * w * v1 * (6.0 * p1)
         moved += 6.0 * w * w * v1 * p1 - u * w * v1 * (p0 + p2) + u * u * (v0 * p2 + v2 * p0)
     return _Coefficients(2.0 * s3, 3.0 * s2, s1 - noise, s0, noise, moved)
 
@@ -111,7 +111,7 @@ def largest_root(a: float, b: float, c: float) -> float:
 
 
 @_compiled
-def _load(power: Any, p: Array) -> bool:
+def _load(power: Array, p: Array) -> bool:
     """Copy one profile; return whether all bins are usable."""
     whole = True
     for i in range(p.size):
@@ -150,19 +150,6 @@ def _curved_share(p: Array) -> float:
 
 
 @_compiled
-def _fill_variance(
-    p: Array, relative: Array, known_variance: bool, poisson: float, v: Array
-) -> float:
-    """Fill the variance of every bin; return its level, 0 where there is none."""
-    level = 1.0 if known_variance or poisson > 0.0 else _difference_variance(p, relative)
-    if not math.isfinite(level):
-        level = 0.0
-    for i in range(v.size):
-        v[i] = poisson * max(p[i], 0.0) if poisson > 0.0 else level * relative[i]
-    return level
-
-
-@_compiled
 def _all_finite(values: Array) -> bool:
     finite = True
     for i in range(values.size):
@@ -171,7 +158,7 @@ def _all_finite(values: Array) -> bool:
 
 
 @_compiled
-def _gradient(p: Array, v: Array, t: Triples, poisson: float, out: Array) -> None:
+def _gradient(p: Array, v: Array, t: Triples, out: Array) -> None:
     """Fill the derivatives of the constant coefficient with respect to the power of each bin."""
     for i in range(out.size):
         out[i] = 0.0
@@ -181,10 +168,9 @@ def _gradient(p: Array, v: Array, t: Triples, poisson: float, out: Array) -> Non
         b = u * (p[i] - 2.0 * p[j] + p[k]) - 2.0 * a * p[j]
         c = a * p[j] * p[j] - u * (p[i] * p[k] - p[j] * p[j])
         noise = u * w * v[j]
-        out[i] += u * (c - b * p[k]) - noise + u * u * (v[k] + poisson * p[k])
-        out[k] += u * (c - b * p[i]) - noise + u * u * (v[i] + poisson * p[i])
+        out[i] += u * (c - b * p[k]) - noise + u * u * v[k]
+        out[k] += u * (c - b * p[i]) - noise + u * u * v[i]
         out[j] += 2.0 * w * (b * p[j] - c) + 6.0 * w * w * v[j]
-        out[j] += poisson * w * (w * (6.0 * p[j] - 4.0 * poisson) - u * (p[i] + p[k]))
 
 
 @_compiled
@@ -212,7 +198,7 @@ def _coarse(value: float, step: float) -> float:
 
 @_compiled
 def _solve_profile(
-    p: Array, v: Array, t: Triples, poisson: float, curved: float, gradient: Array, row: Array
+    p: Array, v: Array, t: Triples, curved: float, gradient: Array, row: Array
 ) -> None:
     """Solve one loaded profile: the root about a rough centre, then one Newton step about it."""
     if _spread(p, p[0]) == 0.0:
@@ -225,18 +211,16 @@ def _solve_profile(
     for i in range(p.size):
         p[i] = (p[i] - centre) / scale
         v[i] /= scale * scale
-    # In units of the scale, a Poisson variance is its mean over the scale.
-    unit = poisson / scale
-    s = _coefficients(p, v, t, unit)
+    s = _coefficients(p, v, t)
     x = largest_root(s.square / s.cubic, s.linear / s.cubic, s.constant / s.cubic)
     x = _coarse(x, 2.0**-26)
     for i in range(p.size):
         p[i] -= x
-    s = _coefficients(p, v, t, unit)
+    s = _coefficients(p, v, t)
     row[BACKGROUND] = centre + scale * (x - s.constant / s.linear)
     row[STATUS] = SOLVED if s.linear > 0.0 and math.isfinite(row[BACKGROUND]) else UNSOLVED
     row[CONTRAST] = s.linear / s.noise
-    _gradient(p, v, t, unit, gradient)
+    _gradient(p, v, t, gradient)
     variance = 0.0
     for i in range(p.size):
         gradient[i] /= -s.linear
@@ -257,10 +241,9 @@ def _all_alike(variance: Array) -> bool:
 
 @_compiled
 def solve_cubic_profiles(
-    power: Any,
+    power: Array,
     variance: Array,
     known_variance: bool,
-    poisson: Array,
     t: Triples,
     gradients: Array,
     out: Array,
@@ -269,12 +252,10 @@ def solve_cubic_profiles(
 
     Parameters
     ----------
-    power : (profile, bin) float32 or float64
+    power : (profile, bin) float64
     variance : (profile or 1, bin) float64
-        Absolute, or relative where it is not known; not used for counts.
+        Absolute, or relative where it is not known.
     known_variance : bool
-    poisson : (profile or 1,) float64
-        Variance over mean where the power are counts, one over the number of shots; else 0.
     t : Triples
         Of `make_triples`.
     gradients : (profile or 1, bin) float64
@@ -287,13 +268,16 @@ def solve_cubic_profiles(
     p, v = np.empty(n), np.empty(n)
     for k in range(power.shape[0]):
         whole = _load(power[k], p)
-        unit = poisson[k % poisson.size]
         relative = variance[k % variance.shape[0]]
-        level = _fill_variance(p, relative, known_variance, unit, v)
-        if not (whole and _all_finite(v) and (unit > 0.0 or _all_alike(relative))):
+        level = 1.0 if known_variance else _difference_variance(p, relative)
+        if not math.isfinite(level):
+            level = 0.0
+        for i in range(n):
+            v[i] = level * relative[i]
+        if not (whole and _all_finite(v) and _all_alike(relative)):
             out[k, STATUS] = MISSING
             continue
-        curved = 0.0 if known_variance or unit > 0.0 else _curved_share(p)
-        _solve_profile(p, v, t, unit, curved, gradients[k % gradients.shape[0]], out[k])
+        curved = 0.0 if known_variance else _curved_share(p)
+        _solve_profile(p, v, t, curved, gradients[k % gradients.shape[0]], out[k])
         # Without a noise level there is no standard error: 0 / 0 gives NaN.
         out[k, VARIANCE] *= level / level

@@ -268,7 +268,7 @@ def _choose(rows: Array, limits: Limits) -> int:
 
 @_summing
 def _prepare(
-    power: Any,
+    power: Array,
     shape: Array,
     mask: Array,
     variance: Array,
@@ -280,7 +280,7 @@ def _prepare(
     total = count = 0.0
     for i in range(values.size):
         weight = 1.0 / variance[i]
-        value = np.float64(power[i])
+        value = power[i]
         good = (abs(value) < HUGE) & (shape[i] > 0.0) & (shape[i] < HUGE)
         good &= (weight > 0.0) & (weight < HUGE) & (mask[i] > 0.0)
         usable[i] = weight if good else 0.0
@@ -301,12 +301,12 @@ def _tilt(range_: Array, lever: Array) -> None:
 
 
 @_compiled
-def fill_pasts(power: Any, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
+def fill_pasts(power: Array, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
     """Lower the end of each window to the bin past its last usable bin.
 
     Parameters
     ----------
-    power : (profile, bin) float32 or float64
+    power : (profile, bin) float64
     mask : (profile or 1, bin) float64
     pasts : (profile,) int
     """
@@ -320,7 +320,7 @@ def fill_pasts(power: Any, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
 
 @_compiled
 def fit_shape(
-    power: Any,
+    power: Array,
     shape: Array,
     range_: Array,
     mask: Array,
@@ -334,7 +334,7 @@ def fit_shape(
 
     Parameters
     ----------
-    power : (profile, bin) float32 or float64
+    power : (profile, bin) float64
     shape, mask : (profile or 1, bin) float64
         Bins are skipped where the mask is 0.
     range_ : (bin,) float64

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -11,9 +10,10 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.background import _cubic_kernel, photon_counts
+from lidarops.retrieve.background import _cubic_kernel
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.frozen_arrays import frozen
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -26,13 +26,6 @@ _QUALITY_OF_STATUS: Final = {
     _cubic_kernel.CONSTANT: Quality.NO_SIGNAL,
     _cubic_kernel.UNSOLVED: Quality.NO_REAL_SOLUTION,
 }
-
-
-class Statistics(StrEnum):
-    """Distribution of the noise of the power."""
-
-    GAUSS = "gauss"
-    POISSON = "poisson"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +50,6 @@ def cubic(
     *,
     lag: int | None = None,
     variance: npt.ArrayLike | None = None,
-    statistics: str = "gauss",
-    shots: npt.ArrayLike | None = None,
 ) -> BackgroundResult:
     r"""Return the background of a homogeneous path, without iteration.
 
@@ -72,9 +63,8 @@ def cubic(
     without cancellation. The expectation of the noise in the coefficients is subtracted first;
     otherwise a short lag biases the background high.
 
-    The scatter is 1.3 to 2.1 times the least possible one, which
-    `lidarops.retrieve.homogeneous.path_fit` reaches. The signal at the start of the section must
-    exceed the noise.
+    The scatter is larger than that of `lidarops.retrieve.homogeneous.path_fit`. The signal at the
+    start of the section must exceed the noise.
 
     Parameters
     ----------
@@ -87,10 +77,6 @@ def cubic(
     variance : (..., range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`. Where not
         given, one variance for the profile is estimated from differences along range.
-    statistics : {"gauss", "poisson"}
-        "poisson" takes `power` as mean counts per shot, with Poisson variance.
-    shots : (...) float, optional
-        Number of shots of which `power` is the mean count; 1 where not given. Needs "poisson".
 
     Returns
     -------
@@ -114,25 +100,8 @@ def cubic(
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
     noise = inputs.variance_rows(variance, grid, leading)
-    poisson = inputs.choice(statistics, Statistics, "statistics") is Statistics.POISSON
-    if poisson and variance is not None:
-        raise RetrievalInputError(
-            "is given for counts, whose variance follows from their mean",
-            field="variance",
-            remedy="leave it out, or choose statistics='gauss'",
-        )
-    if shots is not None and not poisson:
-        raise RetrievalInputError(
-            "is given for Gaussian noise", field="shots", remedy="choose statistics='poisson'"
-        )
-    result = solve_cubic(
-        rows,
-        grid.values,
-        lag,
-        noise,
-        known_variance=variance is not None,
-        shots=photon_counts.checked_shots(rows, shots, leading) if poisson else None,
-    )[0]
+    known = variance is not None
+    result, _ = solve_cubic(rows, grid.values, lag, noise, known_variance=known)
     return BackgroundResult(
         result.background.reshape(leading),
         result.background_standard_error.reshape(leading),
@@ -147,7 +116,6 @@ def solve_cubic(
     variance: Array,
     *,
     known_variance: bool,
-    shots: Array | None = None,
     want_gradients: bool = False,
 ) -> tuple[BackgroundResult, Array]:
     """Return the result of `cubic` and its gradients, for arrays checked by `common.inputs`.
@@ -160,8 +128,6 @@ def solve_cubic(
         m, ascending.
     lag : int, optional
     known_variance : bool
-    shots : (profile or 1,) float, optional
-        Shots per mean count; None for Gaussian noise.
     want_gradients : bool
         Whether to return the derivatives of the backgrounds with respect to the power.
 
@@ -177,10 +143,10 @@ def solve_cubic(
     out = np.full((count, _cubic_kernel.COLUMNS), np.nan)
     gradients = np.zeros((count if want_gradients else 1, bins))
     if bins >= 3:
-        poisson = np.zeros(1) if shots is None else 1.0 / shots
         triples = _cubic_kernel.make_triples(range_, _checked_lag(lag, bins))
+        rows = frozen(power.astype(np.float64, copy=False))
         _cubic_kernel.solve_cubic_profiles(
-            power, variance, known_variance, poisson, triples, gradients, out
+            rows, frozen(variance), known_variance, triples, gradients, out
         )
     status = out[:, _cubic_kernel.STATUS]
     quality = np.zeros(count, dtype=np.int32)

@@ -150,12 +150,9 @@ def fit_known_shape(
     Returns
     -------
     KnownShapeResult
-        With the leading axes of `power`. The standard errors cover random noise.
-        They do not cover an error of the shape, which `curvature` and `waves` show only where it
-        exceeds the noise. With haze of 0.6 to 3 times the backscatter of air (scale height 3 km)
-        in the shape but not in the air, 11 percent of the backgrounds that are not `poor_fit` are
-        off by more than 4 standard errors, nearly all by an amount that no test of the window
-        could detect (`lidarops bench stability`).
+        With the leading axes of `power`. The standard errors cover random noise. They do not
+        cover an error of the shape, which `curvature` and `waves` show only where it exceeds the
+        noise.
 
     Raises
     ------
@@ -168,7 +165,7 @@ def fit_known_shape(
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    rows = frozen(rows)
+    rows = frozen(rows.astype(np.float64, copy=False))
     shapes = frozen(inputs.noise_rows(shape, "shape", grid, leading))
     allowed = _mask_rows(mask, grid, leading)
     noise = _noise(variance, exposure, grid, leading)
@@ -226,7 +223,7 @@ def _mask_rows(
 
 
 def _pasts(
-    rows: inputs.Floats,
+    rows: Array,
     allowed: Array,
     stop: npt.ArrayLike | None,
     range_: Array,

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 
 HUGE: Final = 1e300
 
@@ -109,7 +110,7 @@ def usable(power: float, variance: float) -> bool:
 
 
 @_compiled
-def _calibrate(power: Any, variance: Array, window: Any, path: Array, out: Array) -> int:
+def _calibrate(power: Array, variance: Array, window: Mask, path: Array, out: Array) -> int:
     """Calibrate with the summed power of the window over that expected for its scattering ratio.
 
     Returns
@@ -152,20 +153,21 @@ def _calibrate(power: Any, variance: Array, window: Any, path: Array, out: Array
 
 @_compiled
 def _integrate(
-    power: Any,
+    power: Array,
     variance: Array,
-    window: Any,
+    window: Mask,
     range_: Array,
     path: Array,
+    start: int,
     direction: int,
     calibration: Array,
     longest_gap: float,
     work: Array,
     state: Codes,
 ) -> None:
-    """Integrate from the reference bin, the first one, away from the lidar (`direction` 1).
+    """Integrate from the reference bin `start`, away from the lidar (`direction` 1) or towards it.
 
-    With `direction` -1, all arrays along range are reversed. Bins that are reached become `VALID`.
+    Bins that are reached become `VALID`.
     """
     d_start, weight, window_variance, count = (
         calibration[0],
@@ -177,8 +179,9 @@ def _integrate(
     twice, last = 2.0 * direction, -1
     last_power = last_gain = last_ratio = last_air = 0.0
     last_distance = last_variance = last_slope = 0.0
-    for i in range(range_.size):
-        p, v = np.float64(power[i]), variance[i]
+    for steps in range(range_.size - start if direction > 0 else start + 1):
+        i = start + direction * steps
+        p, v = power[i], variance[i]
         if not usable(p, v):
             continue
         g, s, distance = path[GAIN, i], path[RATIO, i], range_[i]
@@ -187,7 +190,7 @@ def _integrate(
         ratio_term, air_term = q * path[SOURCE_RATIO, i], q * path[SOURCE_AIR, i]
         if last >= 0:
             step = abs(distance - last_distance)
-            if i - last > 1 and step > longest_gap:
+            if abs(i - last) > 1 and step > longest_gap:
                 break
             half = 0.5 * step
             share = last_slope - twice * half * last_gain
@@ -216,11 +219,11 @@ def _integrate(
 
 
 @_compiled
-def _divide(power: Any, gain: Array, air: Array, work: Array, out: Array) -> None:
+def _divide(power: Array, gain: Array, air: Array, work: Array, out: Array) -> None:
     d, inverse, total = work[DENOMINATOR], work[INVERSE], work[TOTAL]
     for i in range(out.size):
         inverse[i] = 1.0 / d[i]
-        total[i] = gain[i] * np.float64(power[i]) * inverse[i]
+        total[i] = gain[i] * power[i] * inverse[i]
         out[i] = total[i] - air[i]
 
 
@@ -297,7 +300,7 @@ def _measure_certainty(
 
 @_compiled
 def _solve_bins(
-    power: Any,
+    power: Array,
     variance: Array,
     path: Array,
     by_reference: float,
@@ -373,7 +376,7 @@ def _scale(
 
 @_compiled
 def _attenuate(
-    power: Any,
+    power: Array,
     variance: Array,
     offset: float,
     range_: Array,
@@ -385,7 +388,7 @@ def _attenuate(
     inverse, constant_error = 1.0 / constant, noise * noise + other_errors * other_errors
     for i in range(range_.size):
         factor = range_[i] * range_[i] * inverse
-        value = factor * np.float64(power[i])
+        value = factor * power[i]
         common = factor * offset - value * background
         square = factor * factor * variance[i] + value * value * constant_error
         values[i] = value
@@ -394,7 +397,7 @@ def _attenuate(
 
 @_compiled
 def _withhold(
-    power: Any, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
+    power: Array, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
 ) -> None:
     invalid = 0
     for i in range(state.size):
@@ -413,9 +416,9 @@ def _withhold(
 
 @_compiled
 def invert_fernald(
-    power: Any,
+    power: Array,
     variance: Array,
-    window: Any,
+    window: Mask,
     range_: Array,
     air: tuple[Array, Array, Array],
     scattering_ratio: Array,
@@ -430,7 +433,7 @@ def invert_fernald(
 
     Parameters
     ----------
-    power : (profile, bin) float32 or float64
+    power : (profile, bin) float64
         Background subtracted.
     variance : (profile or 1, bin) float64
     window : (profile or 1, bin) bool
@@ -480,15 +483,11 @@ def invert_fernald(
         start = _calibrate(power[k], noise, in_window, path, calibration)
         nearest = -1
         if start >= 0:
-            _integrate(
-                power[k, start:], noise[start:], in_window[start:], range_[start:], path[:, start:],
-                1, calibration, limits[0], work[:, start:], state[k, start:],
-            )  # fmt: skip
-            _integrate(
-                power[k, start::-1], noise[start::-1], in_window[start::-1], range_[start::-1],
-                path[:, start::-1], -1, calibration, limits[0], work[:, start::-1],
-                state[k, start::-1],
-            )  # fmt: skip
+            for direction in (1, -1):
+                _integrate(
+                    power[k], noise, in_window, range_, path, start, direction, calibration,
+                    limits[0], work, state[k],
+                )  # fmt: skip
             by_reference = -calibration[0] * cause[1] * calibration[4]
             _solve_bins(power[k], noise, path, by_reference, cause[0], work, k, out)
             _measure_certainty(noise, by_reference, cause[0], path, limits[2:], work, out[NOISE, k])

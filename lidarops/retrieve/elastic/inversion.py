@@ -16,7 +16,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.elastic import _fernald, outlying_bins
+from lidarops.retrieve.elastic import _fernald
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -81,9 +81,6 @@ class ElasticResult:
     """No value: the denominator of the solution is too small, or not certain to be positive."""
     calibrated: Mask
     """Whether the reference window holds a positive signal, with the leading axes of the power."""
-    outlying: Mask
-    """The bin is an isolated outlier: its value is interpolated from its neighbours
-    (`outlying_bins.bridge_outliers`)."""
 
     @property
     def backscatter_standard_error(self) -> Array:
@@ -128,25 +125,6 @@ class ElasticResult:
         return 1.0 / np.where(self.molecular_backscatter > 0.0, self.molecular_backscatter, np.nan)
 
 
-@dataclass(frozen=True, slots=True)
-class _Problem:
-    """Arguments in the layout of the kernel: rows of profiles, ascending in range."""
-
-    grid: inputs.RangeGrid
-    leading: tuple[int, ...]
-    power: inputs.Floats
-    variance: Array | None
-    window: Mask
-    air: tuple[Array, Array, Array]
-    """Molecular backscatter and extinction, lidar ratio of the particles."""
-    outlying: Mask
-    scattering_ratio: Array
-    errors: tuple[Array, Array]
-    """Standard error of the lidar ratio, relative one of the air density."""
-    causes: Array
-    """Standard error of the background, relative one of the scattering ratio, for each profile."""
-
-
 def invert_elastic(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
@@ -175,8 +153,8 @@ def invert_elastic(
     sign have the same weight. The relative error of the trapezoids is below 1e-4 where scattering
     changes over 100 m or more and bins are 7.5 m apart. Errors are of first order; noise errors
     are widened where the reference is noisy (`Thresholds.skewed`). Noise is taken as independent
-    from bin to bin, and its correlation through the integrals and the window is propagated. An
-    isolated bin that its variance does not explain is interpolated from its neighbours.
+    from bin to bin, and its correlation through the integrals and the window is propagated.
+    Replace outlying bins before (`outlying_bins.bridge_outliers`).
 
     Parameters
     ----------
@@ -205,9 +183,7 @@ def invert_elastic(
     reference_relative_error : float or (...) float
         Relative standard error of the scattering ratio in the reference window. It alone covers
         particles whose backscatter falls with height nearly as that of air, which no test of the
-        signal reveals. With 0.02, 12 percent of the values are off by more than 4 standard errors
-        where such haze scatters 0.35 to 35 percent of the molecular backscatter at 7 km, and
-        0.001 percent where it scatters a tenth of that (`lidarops bench stability`).
+        signal reveals.
     molecular_relative_error : float or (..., range) float
         Relative standard error of the air density; one error of this shape, common to all bins.
 
@@ -232,58 +208,43 @@ def invert_elastic(
     ----------
     fernald1984, sasano1985.
     """
-    problem = _prepare(
-        power,
-        range,
-        variance,
-        reference,
-        (molecular_backscatter, molecular_extinction, lidar_ratio),
-        reference_scattering_ratio,
-        (lidar_ratio_standard_error, molecular_relative_error),
-        (background_standard_error, reference_relative_error),
+    grid = inputs.range_grid(range)
+    rows, leading = inputs.profiles(power, grid)
+    air = _air(molecular_backscatter, molecular_extinction, lidar_ratio, grid, leading)
+    ratio = _profile_values(reference_scattering_ratio, "reference_scattering_ratio", leading)
+    _require(
+        ratio > 0.0, ratio, "reference_scattering_ratio", "give 1 where air is free of particles"
     )
-    return _result(problem, *_invert(problem))
-
-
-def _invert(problem: _Problem) -> tuple[Array, Array, _fernald.Codes]:
-    count, bins = problem.power.shape
-    out = np.empty((_fernald.FIELDS, count, bins))
-    scalars = np.empty((count, _fernald.SCALARS))
-    state = np.empty((count, bins), dtype=np.uint8)
-    variance = problem.variance if problem.variance is not None else np.zeros((1, bins))
+    noise = np.zeros((1, grid.size))
+    if variance is not None:
+        noise = inputs.variance_rows(variance, grid, leading)
+    ratio_error = _errors(lidar_ratio_standard_error, "lidar_ratio_standard_error", grid, leading)
+    air_error = _errors(molecular_relative_error, "molecular_relative_error", grid, leading)
+    out = np.empty((_fernald.FIELDS, *rows.shape))
+    scalars = np.empty((len(rows), _fernald.SCALARS))
+    state = np.empty(rows.shape, dtype=np.uint8)
     _fernald.invert_fernald(
-        frozen(problem.power),
-        frozen(variance),
-        frozen(problem.window),
-        frozen(problem.grid.values),
-        (frozen(problem.air[0]), frozen(problem.air[1]), frozen(problem.air[2])),
-        frozen(problem.scattering_ratio),
-        (frozen(problem.errors[0]), frozen(problem.errors[1])),
-        frozen(problem.causes),
-        np.array(
-            [
-                THRESHOLDS.longest_gap,
-                THRESHOLDS.least_denominator,
-                THRESHOLDS.least_certainty**2,
-                THRESHOLDS.skewed**2,
-            ]
-        ),
+        frozen(rows.astype(np.float64, copy=False)),
+        frozen(noise),
+        frozen(_window(reference, grid, leading)),
+        frozen(grid.values),
+        (frozen(air[0]), frozen(air[1]), frozen(air[2])),
+        frozen(ratio),
+        (frozen(ratio_error), frozen(air_error)),
+        frozen(_causes((background_standard_error, reference_relative_error), leading)),
+        _limits(),
         out,
         scalars,
         state,
     )
-    if problem.variance is None:
+    if variance is None:
         out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
         scalars[:, _fernald.CONSTANT_ERROR] = np.nan
-    return out, scalars, state
-
-
-def _result(problem: _Problem, out: Array, scalars: Array, state: _fernald.Codes) -> ElasticResult:
-    shape = (*problem.leading, problem.grid.size)
 
     def profiles(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        shape = (*leading, grid.size)
         values = rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
-        return problem.grid.turn(values)
+        return grid.turn(values)
 
     fields = [profiles(rows) for rows in out]
     return ElasticResult(
@@ -291,62 +252,47 @@ def _result(problem: _Problem, out: Array, scalars: Array, state: _fernald.Codes
         budget=ErrorBudget(*fields[_fernald.NOISE : _fernald.MOLECULAR + 1]),
         attenuated_backscatter=fields[_fernald.ATTENUATED],
         attenuated_backscatter_standard_error=fields[_fernald.ATTENUATED_ERROR],
-        lidar_constant=scalars[:, _fernald.CONSTANT].reshape(problem.leading),
-        lidar_constant_standard_error=scalars[:, _fernald.CONSTANT_ERROR].reshape(problem.leading),
-        molecular_backscatter=profiles(problem.air[0]),
-        lidar_ratio=profiles(problem.air[2]),
-        lidar_ratio_standard_error=profiles(problem.errors[0]),
-        molecular_relative_error=profiles(problem.errors[1]),
+        lidar_constant=scalars[:, _fernald.CONSTANT].reshape(leading),
+        lidar_constant_standard_error=scalars[:, _fernald.CONSTANT_ERROR].reshape(leading),
+        molecular_backscatter=profiles(air[0]),
+        lidar_ratio=profiles(air[2]),
+        lidar_ratio_standard_error=profiles(ratio_error),
+        molecular_relative_error=profiles(air_error),
         valid=profiles(state == _fernald.VALID),
         unstable=profiles(state == _fernald.UNSTABLE),
-        calibrated=np.any(state != _fernald.MISSING, axis=-1).reshape(problem.leading),
-        outlying=profiles(problem.outlying),
+        calibrated=np.any(state != _fernald.MISSING, axis=-1).reshape(leading),
     )
 
 
-def _prepare(
-    power: npt.ArrayLike,
-    range_: npt.ArrayLike,
-    variance: npt.ArrayLike | None,
-    reference: Reference,
-    air: tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike],
-    scattering_ratio: npt.ArrayLike,
-    errors: tuple[npt.ArrayLike, npt.ArrayLike],
-    causes: tuple[npt.ArrayLike, npt.ArrayLike],
-) -> _Problem:
-    grid = inputs.range_grid(range_)
-    rows, leading = inputs.profiles(power, grid)
-    backscatter = inputs.noise_rows(air[0], "molecular_backscatter", grid, leading)
-    extinction = inputs.noise_rows(air[1], "molecular_extinction", grid, leading)
-    lidar_ratio = inputs.noise_rows(air[2], "lidar_ratio", grid, leading)
+def _limits() -> Array:
+    """Return the limits of the kernel."""
+    return np.array(
+        [
+            THRESHOLDS.longest_gap,
+            THRESHOLDS.least_denominator,
+            THRESHOLDS.least_certainty**2,
+            THRESHOLDS.skewed**2,
+        ]
+    )
+
+
+def _air(
+    molecular_backscatter: npt.ArrayLike,
+    molecular_extinction: npt.ArrayLike,
+    lidar_ratio: npt.ArrayLike,
+    grid: inputs.RangeGrid,
+    leading: tuple[int, ...],
+) -> tuple[Array, Array, Array]:
+    """Return backscatter and extinction of the air, and the lidar ratio, (profile or 1, bin)."""
+    backscatter = inputs.noise_rows(molecular_backscatter, "molecular_backscatter", grid, leading)
+    extinction = inputs.noise_rows(molecular_extinction, "molecular_extinction", grid, leading)
+    ratio = inputs.noise_rows(lidar_ratio, "lidar_ratio", grid, leading)
     largest = THRESHOLDS.largest_backscatter
     _require_molecular(backscatter, "molecular_backscatter", largest)
     # The lidar ratio of air is below 10 sr.
     _require_molecular(extinction, "molecular_extinction", 10.0 * largest)
-    _require(lidar_ratio > 0.0, lidar_ratio, "lidar_ratio", "give positive sr")
-    ratio = _profile_values(scattering_ratio, "reference_scattering_ratio", leading)
-    _require(
-        ratio > 0.0, ratio, "reference_scattering_ratio", "give 1 where air is free of particles"
-    )
-    noise, outlying = None, np.zeros((1, grid.size), dtype=np.bool_)
-    if variance is not None:
-        noise = inputs.variance_rows(variance, grid, leading)
-        rows, noise, outlying = outlying_bins.bridge_rows(rows, noise, grid)
-    return _Problem(
-        grid,
-        leading,
-        rows,
-        noise,
-        _window(reference, grid, leading),
-        (backscatter, extinction, lidar_ratio),
-        outlying,
-        ratio,
-        (
-            _errors(errors[0], "lidar_ratio_standard_error", grid, leading),
-            _errors(errors[1], "molecular_relative_error", grid, leading),
-        ),
-        _causes(causes, leading),
-    )
+    _require(ratio > 0.0, ratio, "lidar_ratio", "give positive sr")
+    return backscatter, extinction, ratio
 
 
 def _causes(causes: tuple[npt.ArrayLike, npt.ArrayLike], leading: tuple[int, ...]) -> Array:

@@ -13,12 +13,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.retrieve.air.molecular import (
-    HIGHEST,
-    MolecularProfile,
-    molecular_lidar_ratio,
-    rayleigh_cross_section,
-)
+from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, estimate
 from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.elastic import inversion as _elastic
@@ -186,8 +181,8 @@ def invert_elastic(
 
 
 def _air(molecules: MolecularProfile, altitude: Array, distance: Array, wavelength: float) -> _Air:
-    extinction = molecules.number_density(altitude) * rayleigh_cross_section(wavelength)
-    backscatter = extinction / molecular_lidar_ratio(wavelength)
+    extinction = molecules.extinction(altitude, wavelength)
+    backscatter = molecules.backscatter(altitude, wavelength)
     shape = _known_shape.molecular_shape(backscatter, extinction, distance)
     return _Air(backscatter, extinction, shape)
 
@@ -314,11 +309,10 @@ def _solution_flags(
     signal: _Signal,
     quality: Flags,
 ) -> Flags:
-    """Return the bits of reference, background, outlying bins and inversion."""
+    """Return the bits of reference, background and inversion."""
     bits = np.zeros(solution.valid.shape, dtype=np.int32)
     bits[~window.chosen] |= np.int32(ElasticQuality.NO_REFERENCE)
     bits[signal.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
-    bits[solution.outlying] |= np.int32(Quality.OUTLIER)
     unsolved = window.chosen[:, np.newaxis] & ~solution.valid & ((quality & _WITHHELD) == 0)
     bits[unsolved] |= np.int32(ElasticQuality.UNSTABLE_INVERSION)
     return bits

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numba
 import numpy as np
@@ -115,7 +115,7 @@ def find_layers(
     rate = THRESHOLDS.cloud_false_alarm / (grid.size * lengths.size)
     mask = np.zeros(rows.shape, dtype=np.bool_)
     _mark_layers(
-        frozen(rows),
+        frozen(rows.astype(np.float64, copy=False)),
         frozen(noise),
         frozen(shape),
         lengths.astype(np.int64),
@@ -133,14 +133,14 @@ def find_layers(
 
 
 @_compiled
-def _accumulate(power: Any, variance: Array, shape: Array, sums: Array) -> None:
+def _accumulate(power: Array, variance: Array, shape: Array, sums: Array) -> None:
     """Sum from the far end, so that sums over far bins keep their digits."""
     signal = air = noise = count = 0.0
     sums[:, power.size] = 0.0
     for j in range(power.size):
         i = power.size - 1 - j
         if usable(power[i], variance[i]):
-            signal += np.float64(power[i])
+            signal += power[i]
             air += shape[i]
             noise += variance[i]
             count += 1.0
@@ -233,7 +233,7 @@ def _end(sums: Array, base: int, length: int) -> int:
 
 @_compiled
 def _mark_layers(
-    power: Any,
+    power: Array,
     variance: Array,
     shape: Array,
     lengths: npt.NDArray[np.int64],
@@ -245,7 +245,7 @@ def _mark_layers(
 
     Parameters
     ----------
-    power : (profile, bin) float32 or float64
+    power : (profile, bin) float64
     variance, shape : (profile or 1, bin) float64
     lengths : (scale,) int64
         Bins that are averaged below and above a base, ascending.

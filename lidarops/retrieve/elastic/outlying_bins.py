@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numba
 import numpy as np
@@ -40,7 +40,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 class BridgedProfiles:
     """Profiles with outlying bins replaced."""
 
-    power: npt.NDArray[np.floating]
+    power: Array
     variance: Array
     outlying: Mask
     """The bins that were replaced, with the shape of the power."""
@@ -70,11 +70,6 @@ def bridge_outliers(
     interpolated between the adjacent bins, and a variance for which the sum over the three bins
     has its right variance. The 4 bins at either end are not tested.
 
-    In simulations none of 1e8 bins of normal noise was taken for an outlier. Of outliers by 10
-    standard deviations 90 percent were detected, of those by 20 or more 99.9 percent. Where the
-    air varies randomly from bin to bin by more than the noise, up to 0.2 percent of the bins are
-    replaced. A cloud within one bin counts as an outlier where its optical depth is below 0.05.
-
     Parameters
     ----------
     power : (..., range) float
@@ -97,43 +92,22 @@ def bridge_outliers(
         For invalid arguments.
     """
     grid = inputs.range_grid(range)
-    rows, leading = inputs.profiles(power, grid)
-    shape = (*leading, grid.size)
-    level = inputs.profile_values(background, "background", leading)
+    profiles, leading = inputs.profiles(power, grid)
+    rows = profiles.astype(np.float64, copy=False)
+    given = inputs.profile_values(background, "background", leading)
+    level = np.zeros(1) if given is None else given
     noise = inputs.variance_rows(variance, grid, leading)
-    signal = rows if level is None else rows - level[:, np.newaxis]
-    bridged, noise, outlying = bridge_rows(signal, noise, grid)
-    if level is not None:
-        bridged = np.where(outlying, bridged + level[:, np.newaxis], rows)
-    noise = np.broadcast_to(noise, rows.shape)
-    return BridgedProfiles(*(grid.turn(a.reshape(shape)) for a in (bridged, noise, outlying)))
-
-
-def bridge_rows(
-    rows: inputs.Floats, noise: Array, grid: inputs.RangeGrid
-) -> tuple[inputs.Floats, Array, Mask]:
-    """Replace outlying bins as `bridge_outliers`, in rows of profiles ascending in range.
-
-    Parameters
-    ----------
-    rows : (profile, bin) float
-    noise : (profile or 1, bin) float64
-    grid : RangeGrid
-
-    Returns
-    -------
-    (profile, bin) float, (profile or 1, bin) float64, (profile, bin) bool
-        As in `BridgedProfiles`.
-    """
+    signal = rows - level[:, np.newaxis]
     outlying = np.zeros(rows.shape, dtype=np.bool_)
     work = np.empty((5, grid.size))
-    count = _mark_outliers(frozen(rows), frozen(noise), frozen(grid.values), work, outlying)
-    if count == 0:
-        return rows, noise, outlying
-    power = rows.copy()
-    variance = np.array(np.broadcast_to(noise, rows.shape))
-    _fill(power, variance, frozen(grid.values), outlying)
-    return power, variance, outlying
+    _mark_outliers(frozen(signal), frozen(noise), frozen(grid.values), work, outlying)
+    noise = np.broadcast_to(noise, rows.shape)
+    if outlying.any():
+        noise = noise.copy()
+        _fill(signal, noise, frozen(grid.values), outlying)
+        rows = np.where(outlying, signal + level[:, np.newaxis], rows)
+    shape = (*leading, grid.size)
+    return BridgedProfiles(*(grid.turn(a.reshape(shape)) for a in (rows, noise, outlying)))
 
 
 @_compiled
@@ -196,14 +170,14 @@ def _most_equal(j: int, power: Array) -> int:
 
 @_compiled
 def _may_hold_outliers(
-    power: Any, variance: Array, factor_below: Array, factor_above: Array
+    power: Array, variance: Array, factor_below: Array, factor_above: Array
 ) -> bool:
     """Return whether a bin is missing, or beyond both adjacent bins by more than noise."""
     suspects = 0
     for i in range(1, power.size - 1):
-        value = np.float64(power[i])
-        below = value - factor_below[i] * np.float64(power[i - 1])
-        above = value - factor_above[i] * np.float64(power[i + 1])
+        value = power[i]
+        below = value - factor_below[i] * power[i - 1]
+        above = value - factor_above[i] * power[i + 1]
         peak = (below * above > 0.0) & (below * below > OUTLYING**2 * variance[i])
         missing = not ((abs(value) < HUGE) & (variance[i] >= 0.0) & (variance[i] < HUGE))
         suspects += 1 if peak | missing else 0
@@ -211,9 +185,10 @@ def _may_hold_outliers(
 
 
 @_compiled
-def _mark_outliers(power: Any, variance: Array, range_: Array, work: Array, outlying: Mask) -> int:
-    """Mark the outlying bins of all profiles, and return their number."""
-    total = 0
+def _mark_outliers(
+    power: Array, variance: Array, range_: Array, work: Array, outlying: Mask
+) -> None:
+    """Mark the outlying bins of all profiles."""
     bins = range_.size
     factor_below, factor_above = np.zeros(bins), np.zeros(bins)
     factor_below[1:] = (range_[:-1] / range_[1:]) ** 2
@@ -225,7 +200,7 @@ def _mark_outliers(power: Any, variance: Array, range_: Array, work: Array, outl
             continue
         count = 0
         for i in range(bins):
-            value, value_variance = np.float64(power[p, i]), row[i]
+            value, value_variance = power[p, i], row[i]
             if usable(value, value_variance):
                 square = range_[i] * range_[i]
                 q[count], noise[count] = value * square, value_variance * square * square
@@ -243,23 +218,21 @@ def _mark_outliers(power: Any, variance: Array, range_: Array, work: Array, outl
                 j, _farthest(j, q), usable_range, q, noise
             ):
                 outlying[p, int(index[j])] = True
-                total += 1
-    return total
 
 
 @_compiled
-def _fill(power: Any, variance: Array, range_: Array, outlying: Mask) -> None:
+def _fill(power: Array, variance: Array, range_: Array, outlying: Mask) -> None:
     """Interpolate the outlying bins between the nearest usable bins."""
     for p in range(power.shape[0]):
         before = -1
         for i in range(range_.size):
-            if not usable(np.float64(power[p, i]), variance[p, i]):
+            if not usable(power[p, i], variance[p, i]):
                 continue
             if not outlying[p, i]:
                 before = i
                 continue
             after = i + 1
-            while outlying[p, after] or not usable(np.float64(power[p, after]), variance[p, after]):
+            while outlying[p, after] or not usable(power[p, after], variance[p, after]):
                 after += 1
             near, far = (range_[before] / range_[i]) ** 2, (range_[after] / range_[i]) ** 2
             weight = (range_[i] - range_[before]) / (range_[after] - range_[before])

@@ -12,15 +12,11 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.air.molecular import (
-    MolecularProfile,
-    molecular_lidar_ratio,
-    rayleigh_cross_section,
-)
+from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._common_altitude import along_beam
-from lidarops.retrieve.signal import averaging
+from lidarops.retrieve.signal.averaging import RunningMean
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -359,12 +355,12 @@ def _shapes(
         )
     in_front = distance > 0
     climb = np.cos(np.radians(zenith_angle))[:, np.newaxis]
-    extinction = molecules.number_density(
-        station_altitude + climb * distance[in_front]
-    ) * rayleigh_cross_section(wavelength)
+    altitude = station_altitude + climb * distance[in_front]
     shapes = np.zeros((zenith_angle.size, distance.size))
     shapes[:, in_front] = known_shape.molecular_shape(
-        extinction / molecular_lidar_ratio(wavelength), extinction, distance[in_front]
+        molecules.backscatter(altitude, wavelength),
+        molecules.extinction(altitude, wavelength),
+        distance[in_front],
     )
     return shapes
 
@@ -381,7 +377,9 @@ def _visit_means(
     group = np.zeros(shots.size, dtype=np.int64)
     group[first[1:]] = 1
     group = np.cumsum(group)
-    means = averaging.time_mean(values, noise, groups=group, weights=shots, axis=0)
+    sums = RunningMean((first.size, values.shape[1]))
+    sums.add(values, noise, groups=group, weights=shots)
+    means = sums.averages()
     known = np.isfinite(left)
     total = np.add.reduceat(np.where(known, left, 0.0), first)
     bits = np.bitwise_or.reduceat(bits, first, axis=0)

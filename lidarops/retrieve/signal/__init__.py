@@ -2,19 +2,19 @@
 
 In this order:
 
-1. `dark_profile` gives the dark signal of analog channels at the time of each profile.
+1. `DarkSignals` gives the dark signal of analog channels at the time of each profile.
 2. `analog_signal` converts ADC counts to mV and subtracts the dark signal. `photon_signal`
    converts photon counts to MHz and corrects for dead time: here and nowhere else.
 3. `estimate_lag` and `shift_signal` align analog with photon counting.
 4. `glue` joins analog (near) and photon counting (far).
-5. `time_mean` averages profiles.
+5. `RunningMean` averages profiles.
 6. `range_corrected` subtracts the background and multiplies with the square of range.
 
 `labeled`, `labeled_gluing` and `labeled_averaging` do the same on `xarray` data; import them as
 modules, so that the numerics stay free of xarray.
 """
 
-from lidarops.retrieve.signal.averaging import Averages, time_mean
+from lidarops.retrieve.signal.averaging import Averages, RunningMean
 from lidarops.retrieve.signal.counts_to_signal import (
     Signal,
     analog_signal,
@@ -22,23 +22,23 @@ from lidarops.retrieve.signal.counts_to_signal import (
     photon_signal,
     range_corrected,
 )
-from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
+from lidarops.retrieve.signal.dark import DarkProfile, DarkSignals
 from lidarops.retrieve.signal.gluing import GluedSignal, glue
 from lidarops.retrieve.signal.lag import LagEstimate, estimate_lag, shift_signal
 
 __all__ = [
     "Averages",
     "DarkProfile",
+    "DarkSignals",
     "GluedSignal",
     "LagEstimate",
+    "RunningMean",
     "Signal",
     "analog_signal",
-    "dark_profile",
     "difference_variance",
     "estimate_lag",
     "glue",
     "photon_signal",
     "range_corrected",
     "shift_signal",
-    "time_mean",
 ]

@@ -17,7 +17,7 @@ alone.
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
@@ -27,6 +27,7 @@ from lidarops.flags import Quality
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
+Singles = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.uint32]
 
 BLOCK: Final = 16
@@ -504,8 +505,8 @@ def range_corrected_profiles(
     background: Array,
     background_variance: Array,
     square: Array,
-    out_power: Any,
-    out_variance: Any,
+    out_power: Singles,
+    out_variance: Singles,
 ) -> None:
     """Subtract the background and multiply with the square of range.
 
@@ -515,7 +516,7 @@ def range_corrected_profiles(
     background, background_variance : (profile,) float64
     square : (bin,) float64
         m^2.
-    out_power, out_variance : (profile, bin) float32 or float64
+    out_power, out_variance : (profile, bin) float32
         Output.
     """
     for k in range(power.shape[0]):

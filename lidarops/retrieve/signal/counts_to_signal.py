@@ -22,12 +22,12 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.common.inputs import Floats
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
+Singles = npt.NDArray[np.float32]
 
 MIN_NOISE_BINS = kernels.BLOCK
 """Smallest half-width of such a window in bins: 16."""
@@ -40,9 +40,9 @@ _COUNT_LIMITS = np.iinfo(np.int32)
 class Signal:
     """A signal with the variance of its noise and its quality, all of one shape."""
 
-    power: Floats
+    power: Array
     """mV or MHz; NaN where `quality` holds INPUT_MISSING or SATURATED."""
-    variance: Floats
+    variance: Array
     """Noise variance in the square of the signal's unit."""
     quality: Flags
     """Bits of `lidarops.flags.Quality`."""
@@ -128,11 +128,11 @@ def analog_signal(
     )
     scale = _Scale(summed, step, fired * (2.0**adc_bits - 1.0), fired)
     if noise_variance is None:
-        variance = _estimated_variance(power, grid)
+        variance = difference_variance(power, grid)
         clipped = _flag_clipped(power, quality, scale, variance)
         if clipped.size:
             # Clipped bins are less noisy than others and lowered the estimate.
-            _rows(variance)[clipped] = _estimated_variance(_rows(power)[clipped], grid)
+            _rows(variance)[clipped] = difference_variance(_rows(power)[clipped], grid)
         return Signal(power, _add_rounding(variance, scale), quality)
     _require(0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2")
     noise = np.full(power.shape, noise_variance)
@@ -425,14 +425,6 @@ def _noise_model(grid: Array) -> kernels.NoiseModel:
     )
 
 
-def _estimated_variance(power: Array, grid: Array) -> Array:
-    rows, variance = _rows(power), np.empty(power.shape)
-    kernels.noise_profiles(
-        frozen(rows), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)
-    )
-    return variance
-
-
 def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - the field's word
     r"""Return the noise variance of an analog signal, estimated from third differences along range.
 
@@ -467,62 +459,64 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
         For shapes that do not match, a range that is not finite or repeats a bin.
     """
     grid = _grid(range)
-    rows = _profiles(power, "power", grid.size)
-    return _estimated_variance(rows, grid)
+    profiles = _profiles(power, "power", grid.size)
+    variance = np.empty(profiles.shape)
+    kernels.noise_profiles(
+        frozen(_rows(profiles)), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)
+    )
+    return variance
 
 
 def range_corrected(
-    signal: Signal,
+    power: Array,
+    variance: Array,
     range: Array,  # noqa: A002 - the field's word
     *,
     background: npt.ArrayLike,
-    background_variance: npt.ArrayLike,
-    dtype: npt.DTypeLike = np.float64,
-) -> Signal:
-    r"""Return the signal minus the background, multiplied by the square of range.
+    background_standard_error: npt.ArrayLike,
+) -> tuple[Singles, Singles]:
+    r"""Return the signal minus the background, multiplied by the square of range, and its error.
 
     .. math:: X = (P - P^*) R^2, \qquad \mathrm{var}(X) = (v_P + v_{P^*}) R^4
 
     Parameters
     ----------
-    signal : Signal
-        (..., range).
+    power, variance : (..., range) float
+        mV or MHz, and its square.
     range : (range,) float
         m.
-    background, background_variance : (...) float
-        In the unit of the signal and its square.
-    dtype : {float64, float32}
-        Type of power and variance of the result; the arithmetic is that of float64.
+    background, background_standard_error : (...) float
+        In the unit of the signal.
 
     Returns
     -------
-    Signal
-        In mV m2 or MHz m2. Negative values are kept: clipping would bias every mean.
+    signal, standard_error : (..., range) float32
+        In mV m2 or MHz m2, computed in float64; noise is far above the precision of float32.
+        Negative values are kept: clipping would bias every mean.
 
     Raises
     ------
     RetrievalInputError
-        For shapes that do not match, a range that is not finite or repeats a bin, another dtype.
+        For shapes that do not match, a range that is not finite or repeats a bin.
     """
     grid = _grid(range)
-    kind = np.dtype(dtype)
-    if kind not in (np.float32, np.float64):
-        raise RetrievalInputError(f"is {kind}", field="dtype", remedy="choose float32 or float64")
-    powers = _profiles(signal.power, "power", grid.size)
-    variances = _profiles(signal.variance, "variance", grid.size)
+    powers = _profiles(power, "power", grid.size)
+    variances = _profiles(variance, "variance", grid.size)
     if variances.shape != powers.shape:
         raise RetrievalInputError(
             f"has the shape {variances.shape}, the power {powers.shape}", field="variance"
         )
     leading = powers.shape[:-1]
-    result = Signal(np.empty(powers.shape, kind), np.empty(powers.shape, kind), signal.quality)
+    level = _per_profile(background, "background", leading)
+    level_error = _per_profile(background_standard_error, "background_standard_error", leading)
+    signal, square = np.empty((2, *powers.shape), np.float32)
     kernels.range_corrected_profiles(
         frozen(_rows(powers)),
         frozen(_rows(variances)),
-        frozen(_per_profile(background, "background", leading)),
-        frozen(_per_profile(background_variance, "background_variance", leading)),
+        frozen(level),
+        frozen(level_error**2),
         frozen(grid**2),
-        _rows(result.power),
-        _rows(result.variance),
+        _rows(signal),
+        _rows(square),
     )
-    return result
+    return signal, np.sqrt(square, out=square)

@@ -40,14 +40,8 @@ class DarkProfile:
     files share that noise: it does not average down over them."""
 
 
-def dark_profile(
-    dark_signals: npt.ArrayLike,
-    dark_times: npt.ArrayLike,
-    times: npt.ArrayLike,
-    *,
-    method: str = "nearest",
-) -> DarkProfile:
-    r"""Return the dark signal of each profile from the dark files.
+class DarkSignals:
+    r"""Dark signals of an analog channel at any time, from its dark files.
 
     Consecutive dark files within `Thresholds.session_gap` form a session, with mean
     :math:`\bar D_s` at its mean time. Between two sessions,
@@ -55,39 +49,26 @@ def dark_profile(
     .. math:: D(t) = (1 - u) \bar D_1 + u \bar D_2, \quad u = \frac{t - t_1}{t_2 - t_1}, \qquad
               v = (1 - u)^2 v_1 + u^2 v_2
 
+    The files are not kept.
+
     Parameters
     ----------
     dark_signals : (..., dark, range) float
         mV; NaN is skipped.
     dark_times : (dark,) float in s, or datetime64
         Middle of each dark file, in any order.
-    times : (time,) float in s, or datetime64
-        Middle of each profile.
     method : {"nearest", "interpolated"}
-
-    Returns
-    -------
-    DarkProfile
-        The variance is the scatter of the files of a session about their mean, after removing
-        the level of each file, averaged over 65 neighbouring bins. A session of one file gets the
-        scatter of files in other sessions; without any, that between neighbouring bins in the
-        far half of the range.
 
     Raises
     ------
     RetrievalInputError
         For no dark file, an unknown time, or shapes that do not match.
     """
-    return DarkSessions(dark_signals, dark_times).at(times, method=method)
 
-
-class DarkSessions:
-    """Means of the sessions of dark files, from which dark signals at any times follow.
-
-    Parameters and errors are those of `dark_profile`. The files are not kept.
-    """
-
-    def __init__(self, dark_signals: npt.ArrayLike, dark_times: npt.ArrayLike) -> None:
+    def __init__(
+        self, dark_signals: npt.ArrayLike, dark_times: npt.ArrayLike, *, method: str = "nearest"
+    ) -> None:
+        self._method = inputs.choice(method, _DarkMethod, "method")
         signals = _signals(dark_signals)
         self._times = np.atleast_1d(np.asarray(dark_times))
         dark_seconds, _ = _seconds(self._times, self._times)
@@ -100,14 +81,31 @@ class DarkSessions:
         self._sessions = _sessions(dark_seconds)
         self._means, self._variances = _means(signals, self._sessions)
 
-    def at(self, times: npt.ArrayLike, *, method: str) -> DarkProfile:
-        """Return the dark signal of each profile, see `dark_profile`."""
-        chosen = inputs.choice(method, _DarkMethod, "method")
+    def at(self, times: npt.ArrayLike) -> DarkProfile:
+        """Return the dark signal of each profile.
+
+        Parameters
+        ----------
+        times : (time,) float in s, or datetime64
+            Middle of each profile.
+
+        Returns
+        -------
+        DarkProfile
+            The variance is the scatter of the files of a session about their mean, after removing
+            the level of each file, averaged over 65 neighbouring bins. A session of one file gets
+            the scatter of files in other sessions; without any, that between neighbouring bins in
+            the far half of the range.
+        """
         dark_seconds, seconds = _seconds(self._times, times)
-        shares = _shares(dark_seconds, self._sessions, seconds, chosen)
+        shares = _shares(dark_seconds, self._sessions, seconds, self._method)
         return DarkProfile(
             _weighted_sum(shares, self._means), _weighted_sum(shares**2, self._variances)
         )
+
+    def variance(self, times: npt.ArrayLike) -> Array:
+        """Return the variance of the dark signal at times, (..., time, range)."""
+        return self.at(times).variance
 
 
 def _signals(values: npt.ArrayLike) -> Array:

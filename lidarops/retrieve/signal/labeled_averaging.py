@@ -123,7 +123,7 @@ class ClockAverage:
             variance if common is None else np.maximum(variance - common, 0.0),
             groups=group,
             weights=self._weights[profiles],
-            shared_variance=common,
+            shared_variance=0.0 if common is None else common,
         )
         first = np.flatnonzero(np.diff(group, prepend=-1))
         self._bits[group[first]] |= np.bitwise_or.reduceat(quality & ~_MISSING, first, axis=0)

@@ -54,3 +54,26 @@ def test_bins_beyond_a_thick_layer_of_uncertain_lidar_ratio_are_withheld():
     # Beyond the reference the layer reduces the denominator of the solution.
     assert result.valid[RANGE < 4e3].all()
     assert result.unstable[RANGE > 5.1e3].all()
+
+
+def test_errors_hold_where_the_reference_is_noisy():
+    """A reference that is too high by noise makes values and their first-order errors too low."""
+    r = RANGE[::5]
+    backscatter, extinction = AIR.backscatter(r, 532e-9), AIR.extinction(r, 532e-9)
+    power = backscatter * np.exp(-2.0 * np.cumsum(extinction) * 37.5) / r**2
+    window = (r > 7e3) & (r < 8e3)
+    noise = power[window].mean() * np.sqrt(window.sum()) / 6.0
+    draws = power + noise * np.random.default_rng(1).normal(size=(20_000, r.size))
+    result = invert_elastic(
+        draws,
+        r,
+        molecular_backscatter=backscatter,
+        molecular_extinction=extinction,
+        lidar_ratio=8.0,
+        reference=(7e3, 8e3),
+        variance=noise**2,
+    )
+    near = np.searchsorted(r, 700.0)
+    error = np.abs(result.backscatter / result.backscatter_standard_error)[:, near]
+    assert result.valid[:, near].mean() > 0.9
+    assert (error[result.valid[:, near]] > 4.0).mean() < 1e-3

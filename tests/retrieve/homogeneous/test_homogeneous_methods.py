@@ -314,19 +314,6 @@ def test_variance_of_a_mean_profile():
         mean_profile_variance(1.0)
 
 
-def test_cubic_of_mean_counts_per_shot():
-    rng = np.random.default_rng(14)
-    shots = np.array([1.0, 8.0])[:, np.newaxis, np.newaxis]
-    expected = 510.0 + signal(LONG, 3000.0, 0.03 * KM)
-    power = rng.poisson(expected * shots, (2, 2000, 225)) / shots
-    fit = cubic_and_tail.cubic(power, LONG, statistics="poisson", shots=shots[..., 0])
-    for row, error in zip(fit.background - 510.0, fit.background_standard_error, strict=True):
-        assert abs(np.mean(row)) < 0.1 * np.std(row)
-        assert 0.93 < np.mean(np.abs(row) < 1.96 * error) < 0.97
-    ratio = np.median(fit.background_standard_error, axis=1)
-    assert ratio[0] / ratio[1] == pytest.approx(np.sqrt(8.0), rel=0.1)
-
-
 # Bias of the published tables ---------------------------------------------------------------
 
 

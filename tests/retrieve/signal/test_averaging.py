@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.signal import averaging
+from lidarops.retrieve.signal.averaging import RunningMean
 
 
 def by_hand(values, variance, shared, weights):
@@ -26,28 +26,34 @@ def by_hand(values, variance, shared, weights):
     )
 
 
+def mean_of(profiles, variance=1.0, groups=None, **settings):
+    """Return the averages of profiles; all in one group where none are given."""
+    group = np.zeros(len(profiles), np.intp) if groups is None else np.asarray(groups)
+    sums = RunningMean((max(int(group.max(initial=0)), 0) + 1, np.shape(profiles)[-1]))
+    sums.add(profiles, variance, groups=group, **settings)
+    return sums.averages()
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 5))
 @settings(max_examples=60, deadline=None)
 def test_mean_follows_its_formulas(seed, length, bins):
     rng = np.random.default_rng(seed)
-    values = rng.normal(size=(2, length, bins))
+    values = rng.normal(size=(length, bins))
     values[rng.random(values.shape) < 0.2] = np.nan
     variance, shared = rng.random(values.shape), rng.random(values.shape)
-    weights = rng.integers(0, 4, (2, length)).astype(float)
+    weights = rng.integers(0, 4, length).astype(float)
     groups = rng.integers(-1, 3, length)
-    result = averaging.time_mean(
-        values, variance, groups=groups, weights=weights, shared_variance=shared
-    )
-    for k, g, i in np.ndindex(2, max(int(groups.max()), 0) + 1, bins):
+    result = mean_of(values, variance, groups, weights=weights, shared_variance=shared)
+    for g, i in np.ndindex(max(int(groups.max()), 0) + 1, bins):
         inside = groups == g
         expected = by_hand(
-            values[k, inside, i], variance[k, inside, i], shared[k, inside, i], weights[k, inside]
+            values[inside, i], variance[inside, i], shared[inside, i], weights[inside]
         )
         actual = (
-            result.values[k, g, i],
-            result.variance[k, g, i],
-            result.shared_variance[k, g, i],
-            result.count[k, g, i],
+            result.values[g, i],
+            result.variance[g, i],
+            result.shared_variance[g, i],
+            result.count[g, i],
         )
         np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-14)
 
@@ -57,39 +63,38 @@ def test_noise_averages_down_and_shared_errors_do_not():
     rng = np.random.default_rng(1)
     shots = np.array([100.0, 200.0, 600.0, 100.0])
     noise = 3.0 / np.sqrt(shots)
-    dark = rng.normal(0.0, 0.5, (4000, 1, 1))
-    profiles = 7.0 + dark + rng.normal(size=(4000, 4, 3)) * noise[:, np.newaxis]
-    result = averaging.time_mean(
-        profiles, noise[:, np.newaxis] ** 2, weights=shots, shared_variance=0.25
-    )
+    dark = rng.normal(0.0, 0.5, 12_000)
+    profiles = 7.0 + dark + rng.normal(size=(4, 12_000)) * noise[:, np.newaxis]
+    result = mean_of(profiles, noise[:, np.newaxis] ** 2, weights=shots, shared_variance=0.25)
     deviation = result.values - 7.0
-    assert np.var(deviation) == pytest.approx(result.standard_error[0, 0, 0] ** 2, rel=0.05)
-    assert result.variance[0, 0, 0] == pytest.approx(9.0 / shots.sum(), rel=1e-12)
-    assert result.shared_variance[0, 0, 0] == pytest.approx(0.25, rel=1e-12)
+    both = result.variance + result.shared_variance
+    assert np.var(deviation) == pytest.approx(both[0, 0], rel=0.05)
+    assert result.variance[0, 0] == pytest.approx(9.0 / shots.sum(), rel=1e-12)
+    assert result.shared_variance[0, 0] == pytest.approx(0.25, rel=1e-12)
     assert np.var(deviation - dark) == pytest.approx(9.0 / shots.sum(), rel=0.05)
 
 
 def test_gaps_bias_neither_the_mean_nor_its_variance():
     rng = np.random.default_rng(2)
-    profiles = rng.normal(5.0, 1.0, (3000, 8, 4))
-    profiles[:, :5, 1] = np.nan
+    profiles = rng.normal(5.0, 1.0, (8, 3000, 4))
+    profiles[:5, :, 1] = np.nan
     profiles[:, :, 2] = np.inf
-    profiles[:, 1:, 3] = np.nan
-    result = averaging.time_mean(profiles, 1.0)
-    np.testing.assert_array_equal(result.count[0, 0], [8, 3, 0, 1])
-    np.testing.assert_allclose(result.variance[0, 0, [0, 1, 3]], [1 / 8, 1 / 3, 1.0])
-    assert np.isnan(result.values[:, 0, 2]).all()
-    assert np.isnan(result.variance[:, 0, 2]).all()
+    profiles[1:, :, 3] = np.nan
+    result = mean_of(profiles.reshape(8, -1))
+    np.testing.assert_array_equal(result.count[0, :4], [8, 3, 0, 1])
+    np.testing.assert_allclose(result.variance[0, [0, 1, 3]], [1 / 8, 1 / 3, 1.0])
+    assert np.isnan(result.values[0, 2::4]).all()
+    assert np.isnan(result.variance[0, 2::4]).all()
     for i in (0, 1, 3):
-        spread = np.sqrt(result.variance[0, 0, i])
-        assert result.values[..., i].mean() == pytest.approx(5.0, abs=4 * spread / np.sqrt(3000))
-        assert result.values[..., i].std() == pytest.approx(spread, rel=0.06)
+        spread, values = np.sqrt(result.variance[0, i]), result.values[0, i::4]
+        assert values.mean() == pytest.approx(5.0, abs=4 * spread / np.sqrt(3000))
+        assert values.std() == pytest.approx(spread, rel=0.06)
 
 
 def test_means_of_no_values_are_gaps():
     profiles = np.ones((5, 2))
     profiles[:, 1] = np.nan
-    result = averaging.time_mean(profiles, 1.0)
+    result = mean_of(profiles)
     np.testing.assert_array_equal(result.values, [[1.0, np.nan]])
     np.testing.assert_array_equal(result.count, [[5, 0]])
     assert np.isnan(result.shared_variance[0, 1])
@@ -98,7 +103,7 @@ def test_means_of_no_values_are_gaps():
 def test_a_variance_that_is_not_known_stays_so():
     variance = np.ones((4, 2))
     variance[1, 0] = np.nan
-    result = averaging.time_mean(np.ones((4, 2)), variance)
+    result = mean_of(np.ones((4, 2)), variance)
     np.testing.assert_array_equal(result.values, [[1.0, 1.0]])
     np.testing.assert_array_equal(np.isnan(result.variance), [[True, False]])
 
@@ -106,61 +111,48 @@ def test_a_variance_that_is_not_known_stays_so():
 @pytest.mark.parametrize("dtype", ["<f4", "<f8", ">f8"])
 def test_no_bit_depends_on_the_chunks(dtype):
     rng = np.random.default_rng(3)
-    profiles = rng.normal(1e6, 1.0, (6, 50, 33)).astype(dtype)
+    profiles = rng.normal(1e6, 1.0, (50, 198)).astype(dtype)
     profiles[rng.random(profiles.shape) < 0.1] = np.nan
     variance = rng.random(profiles.shape)
     groups = np.repeat(np.arange(5), 10)
-    whole = averaging.time_mean(profiles, variance, groups=groups)
-    for rows, bins in (
-        (slice(0, 1), slice(None)),
-        (slice(2, 5), slice(7, 8)),
-        (slice(5, 6), slice(1, 32, 3)),
-    ):
-        chunk = averaging.time_mean(profiles[rows, :, bins], variance[rows, :, bins], groups=groups)
-        np.testing.assert_array_equal(whole.values[rows, :, bins], chunk.values)
-        np.testing.assert_array_equal(whole.variance[rows, :, bins], chunk.variance)
+    whole = mean_of(profiles, variance, groups)
+    for bins in (slice(0, 33), slice(73, 74), slice(166, 197, 3)):
+        chunk = mean_of(profiles[:, bins], variance[:, bins], groups)
+        np.testing.assert_array_equal(whole.values[:, bins], chunk.values)
+        np.testing.assert_array_equal(whole.variance[:, bins], chunk.variance)
+    in_parts = RunningMean((5, 198))
+    for rows in (slice(0, 3), slice(3, 14), slice(14, 50)):
+        in_parts.add(profiles[rows], variance[rows], groups=groups[rows])
+    np.testing.assert_array_equal(whole.values, in_parts.averages().values)
     for g in range(5):
         inside = groups == g
-        alone = averaging.time_mean(profiles[:, inside], variance[:, inside])
-        np.testing.assert_array_equal(whole.values[:, g : g + 1], alone.values)
-
-
-def test_any_axis_can_be_time():
-    rng = np.random.default_rng(4)
-    profiles = rng.normal(size=(5, 3, 4))
-    shots = np.arange(1.0, 6.0)
-    first = averaging.time_mean(profiles, 1.0, weights=shots, axis=0)
-    moved = averaging.time_mean(np.moveaxis(profiles, 0, 1), 1.0, weights=shots)
-    np.testing.assert_array_equal(first.values[0], moved.values[:, 0])
-    last = averaging.time_mean(np.moveaxis(profiles, 0, -1), 1.0, weights=shots, axis=-1)
-    np.testing.assert_allclose(last.values[..., 0], moved.values[:, 0], rtol=1e-14)
-    assert last.count.shape == (3, 4, 1)
+        alone = mean_of(profiles[inside], variance[inside])
+        np.testing.assert_array_equal(whole.values[g : g + 1], alone.values)
 
 
 def test_no_profiles_give_gaps():
-    result = averaging.time_mean(np.empty((0, 4)), 1.0)
+    result = mean_of(np.empty((0, 4)))
     np.testing.assert_array_equal(result.count, np.zeros((1, 4)))
     assert np.isnan(result.values).all()
-    dark = averaging.time_mean(np.ones((3, 4)), 1.0, weights=[0.0, 0.0, np.nan])
+    dark = mean_of(np.ones((3, 4)), weights=[0.0, 0.0, np.nan])
     assert np.isnan(dark.values).all()
 
 
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"profiles": np.ones(3), "axis": -2}, "axis"),
         ({"variance": -1.0}, "variance"),
         ({"variance": np.ones((3, 3))}, "variance"),
         ({"shared_variance": [-1.0, 0.0]}, "shared_variance"),
         ({"weights": -np.ones(4)}, "weights"),
         ({"weights": np.ones(3)}, "weights"),
-        ({"groups": np.zeros(4)}, "groups"),
-        ({"groups": [0, 1]}, "groups"),
+        ({"groups": [0, 0]}, "profiles"),
         ({"profiles": np.array([["a", "b"]])}, "profiles"),
     ],
 )
 def test_impossible_arguments_are_refused(change, field):
-    arguments = {"profiles": np.ones((4, 2)), "variance": 1.0} | change
+    arguments = {"profiles": np.ones((4, 2)), "variance": 1.0, "groups": [0] * 4} | change
+    sums = RunningMean((1, 2))
     with pytest.raises(RetrievalInputError) as error:
-        averaging.time_mean(arguments.pop("profiles"), arguments.pop("variance"), **arguments)
+        sums.add(arguments.pop("profiles"), arguments.pop("variance"), **arguments)
     assert error.value.field == field

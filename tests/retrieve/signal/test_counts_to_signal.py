@@ -401,34 +401,18 @@ def test_every_missing_value_has_a_flag() -> None:
 
 
 def test_range_correction_carries_both_variances() -> None:
-    counts = np.full((1, 400), 900, np.int32)
-    raw = counts_to_signal.photon_signal(counts, SHOTS, RANGE, bin_width=7.5)
-    result = counts_to_signal.range_corrected(
-        raw, RANGE, background=np.array([40.0]), background_variance=np.array([0.25])
-    )
-    # 30 MHz minus 40 MHz: negative, and not clipped.
-    assert result.power[0] == pytest.approx(-10.0 * RANGE**2)
-    assert result.variance[0] == pytest.approx((raw.variance[0] + 0.25) * RANGE**4)
-
-
-def test_range_correction_in_float32_is_that_of_float64_rounded() -> None:
     counts = np.random.default_rng(1).poisson(900, (3, 400)).astype(np.int32)
     raw = _photon(counts, np.full(3, 600))
-    levels = {"background": np.array([1.0, 2.0, np.nan]), "background_variance": 0.1}
-    double = counts_to_signal.range_corrected(raw, RANGE, **levels)
-    single = counts_to_signal.range_corrected(raw, RANGE, **levels, dtype=np.float32)
-    assert single.power.dtype == single.variance.dtype == np.float32
-    np.testing.assert_array_equal(single.power, double.power.astype(np.float32))
-    np.testing.assert_array_equal(single.variance, double.variance.astype(np.float32))
-    assert np.isnan(double.power[2]).all()
-    # From float32 too, as products hold it.
-    from_single = counts_to_signal.Signal(
-        raw.power.astype(np.float32), raw.variance.astype(np.float32), raw.quality
+    level = np.array([40.0, 2.0, np.nan])
+    signal, error = counts_to_signal.range_corrected(
+        raw.power, raw.variance, RANGE, background=level, background_standard_error=0.5
     )
-    again = counts_to_signal.range_corrected(from_single, RANGE, **levels)
-    np.testing.assert_allclose(again.power[:2], double.power[:2], rtol=1e-5)
-    with pytest.raises(RetrievalInputError, match="float32 or float64"):
-        counts_to_signal.range_corrected(raw, RANGE, **levels, dtype=np.float16)
+    assert signal.dtype == error.dtype == np.float32
+    # 30 MHz minus 40 MHz: negative, and not clipped.
+    expected = (raw.power - level[:, np.newaxis]) * RANGE**2
+    assert (expected[0] < 0.0).all()
+    np.testing.assert_array_equal(signal, expected.astype(np.float32))
+    np.testing.assert_allclose(error, np.sqrt(raw.variance + 0.25) * RANGE**2, rtol=1e-6)
 
 
 _COUNTS = np.ones((1, 400), np.int32)
@@ -455,7 +439,11 @@ _COUNTS = np.ones((1, 400), np.int32)
         (
             "background",
             lambda: counts_to_signal.range_corrected(
-                _photon(_COUNTS, SHOTS), RANGE, background=[1.0, 2.0], background_variance=0.0
+                np.ones((1, 400)),
+                np.ones((1, 400)),
+                RANGE,
+                background=[1.0, 2.0],
+                background_standard_error=0.0,
             ),
         ),
         (

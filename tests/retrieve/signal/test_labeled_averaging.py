@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.signal.dark import DarkSessions, dark_profile
-from lidarops.retrieve.signal.labeled import DarkSignals
+from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 
 BINS = 16
@@ -265,9 +264,7 @@ class TestSharedVariance:
         errors, stated = [], []
         for draw in range(100):
             files = sigma * rng.standard_normal((darks, BINS))
-            dark = DarkSignals(
-                DarkSessions(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND), "nearest"
-            )
+            dark = DarkSignals(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND)
             conditioned, shots = made(minutes, seed=draw)
             noise = sigma * rng.standard_normal((profiles, BINS))
             conditioned["power"][:] = noise - dark.at(conditioned["time"].to_numpy()).dark
@@ -289,9 +286,6 @@ def test_the_variance_of_a_dark_signal_is_that_of_its_files():
     rng = np.random.default_rng(3)
     files = rng.standard_normal((6, 400))
     times = MIDNIGHT + np.arange(6) * 60 * SECOND
-    dark = DarkSignals(DarkSessions(files, times), "nearest")
+    dark = DarkSignals(files, times)
     requested = MIDNIGHT + np.array([0, 3600]) * SECOND
-    np.testing.assert_array_equal(
-        dark.variance(requested), dark_profile(files, times, requested, method="nearest").variance
-    )
     assert abs(dark.variance(requested).mean() * 6 - 1.0) < 0.15

@@ -210,9 +210,9 @@ def _standard(altitude: Any) -> Answer:
 
 
 def _scattering(wavelength: float) -> Answer:
-    air = molecular.MolecularProfile.us_standard()
+    air, height = molecular.MolecularProfile.us_standard(), np.linspace(0.0, 80e3, 8001)
     return Answer({"cross section": molecular.rayleigh_cross_section(wavelength),
-                   "optical depth": air.optical_depth(wavelength),
+                   "optical depth": np.trapezoid(air.extinction(height, wavelength), height),
                    "lidar ratio": molecular.molecular_lidar_ratio(wavelength)})  # fmt: skip
 
 

@@ -252,9 +252,11 @@ def _shaped(
             "variance": (scale * noise) ** 2, **changes}  # fmt: skip
 
 
-def _mean(profiles: Array, variance: Any = 1.0, **settings: Any) -> Answer:
-    means = averaging.time_mean(profiles, np.broadcast_to(variance, profiles.shape), **settings)
-    return Answer({"mean": means.values, "mean_standard_error": means.standard_error})
+def _mean(profiles: Array, variance: float = 1.0) -> Answer:
+    sums = averaging.RunningMean((1, profiles.shape[1]))
+    sums.add(profiles, variance, groups=np.zeros(len(profiles), np.intp))
+    means = sums.averages()
+    return Answer({"mean": means.values, "mean_standard_error": np.sqrt(means.variance)})
 
 
 def _glue(**arguments: Any) -> Answer:
