@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -145,12 +145,12 @@ def shows_gradient(
     testable &= fit.column(kh.FREEDOM) > 0
     inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
     gradient = np.zeros(altitude.size, dtype=np.bool_)
+    ratio = weights * np.nan_to_num(fit.residual)
+    plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
     for distance in beams.design[:2]:
-        *_, (left, square) = orthogonal_columns(
-            weights, (np.ones(altitude.size), beams.path, distance)
-        )
+        left, square = orthogonal_columns(weights, (distance,), plain)[-1]
         known = np.where(testable & np.isfinite(square[:, 0]), square[:, 0], 0.0)
-        product = (weights * left * np.nan_to_num(fit.residual)).sum(axis=1)
+        product = sum_over_beams(ratio, left)[:, 0]
         total = np.where(known > 0.0, product * altitude, 0.0).sum(axis=0)
         weight = inside @ (known * altitude**2).sum(axis=0)
         spread = weight * (1.0 + correlation) / (1.0 - correlation) + (slack * weight) ** 2
@@ -158,28 +158,39 @@ def shows_gradient(
     return gradient
 
 
-def orthogonal_columns(weights: Array, columns: Iterable[Array]) -> list[tuple[Array, Array]]:
+def orthogonal_columns(
+    weights: Array, columns: Iterable[Array], before: Sequence[tuple[Array, Array]] = ()
+) -> list[tuple[Array, Array]]:
     """Return columns orthogonal to those before them, and their squared lengths.
 
     Parameters
     ----------
     weights : (profile, angle, altitude) float
     columns : iterable of (angle, altitude) or (altitude,) float
+    before : sequence of (Array, Array)
+        Columns returned earlier.
 
     Returns
     -------
     list of (profile, angle, altitude) float, (profile, 1, altitude) float
-        The squared length is infinite where a column depends on those before it.
+        Those before and the new ones. The squared length is infinite where a column depends on
+        those before it.
     """
-    basis: list[tuple[Array, Array]] = []
+    basis = list(before)
     for column in columns:
         left = np.broadcast_to(column, weights.shape)
-        least = _DEPENDENT * (weights * left**2).sum(axis=1, keepdims=True)
-        for before, square in basis:
-            left = left - (weights * before * left).sum(axis=1, keepdims=True) / square * before
-        square = (weights * left**2).sum(axis=1, keepdims=True)
+        weighted = weights * left
+        least = _DEPENDENT * sum_over_beams(weighted, left)
+        for other, square in basis:
+            left = left - sum_over_beams(weighted, other) / square * other
+        square = sum_over_beams(weights * left, left)
         basis.append((left, np.where(square > least, square, np.inf)))
     return basis
+
+
+def sum_over_beams(first: Array, second: Array) -> Array:
+    """Return the sums over beams of products, (profile, 1, altitude)."""
+    return np.asarray(np.einsum("tak,tak->tk", first, second))[:, np.newaxis]
 
 
 def weights_of(beams: BeamBlock, fit: Regression) -> Array:

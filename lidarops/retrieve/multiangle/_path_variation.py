@@ -10,7 +10,12 @@ import numpy.typing as npt
 from scipy.special import polygamma
 
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle._block import BeamBlock, Regression, orthogonal_columns
+from lidarops.retrieve.multiangle._block import (
+    BeamBlock,
+    Regression,
+    orthogonal_columns,
+    sum_over_beams,
+)
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -87,7 +92,7 @@ def _beam_means(
     for column, square in orthogonal_columns(
         weights, (np.ones(altitudes.size), *beams.design[..., altitudes])
     ):
-        left = left - (weights * column * left).sum(axis=1, keepdims=True) / square * column
+        left = left - sum_over_beams(weights * column, left) / square * column
         known += np.isfinite(square[:, 0])
     freedom = np.maximum(used.sum(axis=1) - known, 0)
     limit = np.where(freedom > 0, THRESHOLDS.clipped, 0.0)[:, np.newaxis]
