@@ -30,7 +30,6 @@ MODULES: Final = (
     "lidarops.retrieve.multiangle.labeled",
     "lidarops.retrieve.network.extinction_field",
     "lidarops.retrieve.network.geometry",
-    "lidarops.retrieve.network.cycles",
     "lidarops.retrieve.network.labeled",
     "lidarops.simulate.campaign",
     "lidarops.simulate.signal",

@@ -20,6 +20,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -31,18 +32,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from support.archives import network_campaigns
 
-from lidarops.bench.accuracy.network_cases import signals
+from lidarops.bench.accuracy.network_cases import Air, signals
 from lidarops.bench.stability import random_networks
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.network import (
     _beam_signals,
     _block_errors,
-    _condensed_signals,
     _empirical_prior,
     extinction_field,
     labeled,
+    outlying_bins,
 )
 from lidarops.retrieve.network.flags import NetworkQuality
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.run.archive import Options, Selection, reprocess
 
 PROFILES = 50
@@ -52,12 +54,14 @@ FALSE, FINE, COVERED = 4.0, 2.5, 1.96
 95 percent of the values should be."""
 REJECTING = rejecting((*Quality, *NetworkQuality))
 CAMPAIGNS, RISING = "campaigns", "noise that rises"
+STEEP, CURVED = "steep field", "outliers in curved air"
+CHOSEN: list[str] = []
 ALL = "all guards"
 OWN = {
     "outlying bins": "outliers",
-    "runs of outlying bins": "outliers",
-    "noise groups": RISING,
+    "noisy profiles": RISING,
     "curvature errors": "layer of a few bins",
+    "prior: weakest where untestable": STEEP,
 }
 """Class of scenes that a guard is for."""
 PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/network.md"
@@ -65,55 +69,31 @@ PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/network.md"
 Patch = tuple[Any, str, Any]
 
 
-def _unscreened() -> Any:
-    condense = _condensed_signals.condense
-    return lambda *arguments, screened: condense(*arguments, screened=False)
+def _no(*_: Any) -> bool:
+    return False
 
 
-def _no_variance(*_: Any) -> float:
-    return 0.0
-
-
-def _no_prior(data: Any, layout: Any, crossing: Any, exponent: Any, position: Any, _: Any) -> Any:
-    return _empirical_prior.solve_without_prior(data, layout, crossing, exponent, position)
+def _without_prior(problem: Any) -> Any:
+    mean = problem.mean().solve(_empirical_prior.NO_PRIOR)
+    free = problem.solve(_empirical_prior.NO_PRIOR)
+    return _empirical_prior.BlockSolution(free, mean, mean, contradicted=False)
 
 
 VARIANTS: dict[str, list[Patch]] = {
     ALL: [],
-    "prior": [(_empirical_prior, "solve_blocks", _no_prior)],
-    "prior: contradicted by profiles": [
-        (_empirical_prior, "_contradicted", lambda *_: False),
+    "prior": [
+        (extinction_field, "solve_block", _without_prior),
     ],
-    "prior: contradicted by the mean": [
-        (_empirical_prior, "_off_mean_solution", lambda *_: False),
-        (_empirical_prior, "_mean_improbable", lambda *_: False),
+    "prior: contradicted by profiles": [(_empirical_prior, "_contradicted", _no)],
+    "prior: contradicted by the mean": [(_empirical_prior, "_improbable", _no)],
+    "prior: weakest where untestable": [
+        (_empirical_prior, "_can_test_prior", lambda *_: True),
     ],
-    "prior: off the mean solution": [(_empirical_prior, "_off_mean_solution", lambda *_: False)],
-    "prior: mean improbable": [(_empirical_prior, "_mean_improbable", lambda *_: False)],
-    "prior: weakest where untestable": [(_empirical_prior, "_can_test_prior", lambda *_: True)],
-    "prior: deviation of the mean": [(_empirical_prior, "_least_deviation", lambda *_: 0.0)],
-    "outlying bins": [(_condensed_signals, "condense", _unscreened())],
-    "curvature errors": [
-        (extinction_field, "_curvature_variance", lambda _, fit, *__: 0.0 * fit.variance)
-    ],
-    "block errors": [
-        (_block_errors, "noise_bias_variance", _no_variance),
-        (_block_errors, "excluded_field_variance", _no_variance),
-        (_block_errors, "at_least_typical", lambda _, variance, *__: variance),
-    ],
-    "block errors: noise bias": [(_block_errors, "noise_bias_variance", _no_variance)],
-    "block errors: excluded fields": [(_block_errors, "excluded_field_variance", _no_variance)],
-    "block errors: at least typical": [
-        (_block_errors, "at_least_typical", lambda _, variance, *__: variance)
-    ],
-    "weak signals": [(_beam_signals, "LARGEST_BIN_ERROR", 1e6)],
-    "noisy passages of a profile": [
-        (
-            _beam_signals,
-            "_noisy_passages",
-            lambda *arguments: np.zeros_like(arguments[0], bool)[:, 0, :1],
-        )
-    ],
+    "noise bias": [(_block_errors, "noise_bias_variance", lambda *_: 0.0)],
+    "curvature errors": [(_block_errors, "curvature_variance", lambda *_: 0.0)],
+    "outlying bins": [(outlying_bins, "search", lambda *_: None)],
+    "weak signals": [(_beam_signals, "THRESHOLDS", replace(THRESHOLDS, largest_bin_error=1e6))],
+    "noisy profiles": [(_beam_signals, "THRESHOLDS", replace(THRESHOLDS, noisy_profile=1e30))],
 }
 """Names of guards, each with what replaces it. A variant of several names switches off all."""
 
@@ -141,22 +121,54 @@ def _count(error: Any, stated: Any, flagged: Any, truth: Any) -> dict[str, float
 def _rising_noise(cluster: int) -> dict[str, float] | None:
     """Return the counts of a block in which noise rises by a factor of 5, as at dawn."""
     rng = np.random.default_rng((74, cluster))
+    factor = np.where(np.arange(PROFILES) < rng.integers(10, 40), 1.0, 5.0)[:, None, None]
+    return _own_counts(rng, random_networks._layered, (3e-3, 0.1), factor=factor)
+
+
+def _steep_field(cluster: int) -> dict[str, float] | None:
+    """Return the counts of a block in a field with a scale height of 80 to 300 m."""
+
+    def steep(rng: Any) -> Air:
+        value = float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))
+        scale = float(np.exp(rng.uniform(np.log(80.0), np.log(300.0))))
+        return Air("steep", lambda _: lambda __, up: value * np.exp(-(up - 500.0) / scale))
+
+    return _own_counts(np.random.default_rng((75, cluster)), steep, (1e-3, 0.1))
+
+
+def _curved_outliers(cluster: int) -> dict[str, float] | None:
+    """Return the counts of a block with 0.5 to 4 percent of outlying bins in plumes and layers."""
+    rng = np.random.default_rng((76, cluster))
+    air = random_networks._plume if cluster % 2 else random_networks._thin_layer
+    return _own_counts(rng, air, (1e-3, 0.1), outlying=float(rng.uniform(0.005, 0.04)))
+
+
+def _own_counts(
+    rng: Any, air: Any, noises: tuple[float, float], *, factor: Any = 1.0, outlying: float = 0.0
+) -> dict[str, float] | None:
     net = random_networks._random_network(rng).network()
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return None
-    clean = signals(net, random_networks._layered(rng))
-    power, variance = clean.draw(float(np.exp(rng.uniform(np.log(3e-3), np.log(0.1)))), PROFILES, 1)
-    factor = np.where(np.arange(PROFILES) < rng.integers(10, 40), 1.0, 5.0)[:, None, None]
+    clean = signals(net, air(rng))
+    noise = float(np.exp(rng.uniform(*np.log(noises))))
+    power, variance = clean.draw(noise, PROFILES, int(rng.integers(2**31)), additive=noise / 3.0)
     mean = clean.power[np.arange(PROFILES) % len(clean.power)]
+    power, variance = mean + factor * (power - mean), factor**2 * variance
+    hit = rng.random(power.shape) < outlying
+    power = power + hit * rng.uniform(5.0, 100.0, power.shape) * np.sqrt(variance)
     result = extinction_field.retrieve_network(
-        mean + factor * (power - mean), clean.range, net, variance=factor**2 * variance,
-        full_overlap_range=100.0,
-    )  # fmt: skip
+        power, clean.range, net, variance=variance, full_overlap_range=100.0
+    )
     truth, near = clean.truth(PROFILES), net.near_crossing
     return _count(
         (result.extinction - truth)[:, near], result.extinction_standard_error[:, near],
         result.flags.flagged[:, near], truth[:, near],
     )  # fmt: skip
+
+
+OWN_SCENES = {
+    RISING: _rising_noise, STEEP: _steep_field, CURVED: _curved_outliers
+}  # fmt: skip
 
 
 def _random_counts(clusters: range) -> Iterator[tuple[str, int, dict[str, float]]]:
@@ -183,9 +195,11 @@ def _random_counts(clusters: range) -> Iterator[tuple[str, int, dict[str, float]
                         np.where(np.isfinite(truth), truth, 1.0),
                     ),
                 )  # fmt: skip
-        rising = _rising_noise(cluster)
-        if rising is not None:
-            yield RISING, cluster, rising
+        for name, count in OWN_SCENES.items():
+            if not CHOSEN or name in CHOSEN:
+                counts = count(cluster)
+                if counts is not None:
+                    yield name, cluster, counts
 
 
 # Campaigns ------------------------------------------------------------------------------------
@@ -247,6 +261,7 @@ def _of(classes: list[str]) -> Callable[..., Any]:
 def solve(out: Path, names: list[str], clusters: int, classes: list[str]) -> None:
     """Write the counts of each variant to a file; of all classes and campaigns, or some classes."""
     out.mkdir(parents=True, exist_ok=True)
+    CHOSEN[:] = classes
     inputs = []
     if not classes:
         with tempfile.TemporaryDirectory() as folder:

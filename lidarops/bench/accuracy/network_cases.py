@@ -11,7 +11,6 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.cycles import systematic_error
 from lidarops.retrieve.network.extinction_field import (
     FieldPrior,
     NetworkResult,
@@ -256,6 +255,35 @@ class FigurePoint:
     """At a crossing from which the cycle leads away from the lidars."""
 
 
+def systematic_error(optical_depth: Array, multiplier: float) -> float:
+    r"""Return (true - estimate) / true of reciprocal extinction at the start of a cycle of beams.
+
+    .. math::
+        \frac{S_1 - \tilde S_1}{S_1} = \frac{\sum_{j<k} (\mu_j - \mu_{j+1})
+        e^{-2 \sum_{l \le j} \tau_l}}{1 - \mu_k e^{-2 \sum_l \tau_l}}, \quad
+        \mu_j = \lambda^{j-1}
+
+    It holds in any field, because extinction at the crossings cancels (drabenko2021, equation 17).
+
+    Parameters
+    ----------
+    optical_depth : (row,) float
+        Exponent m times optical depth of each row, negative where it leads towards its lidar.
+    multiplier : float
+        0 to 1.
+
+    Returns
+    -------
+    float
+        NaN beyond the pole.
+    """
+    attenuation = np.exp(-2.0 * np.cumsum(optical_depth))
+    powers = multiplier ** np.arange(attenuation.size)
+    determinant = float(1.0 - powers[-1] * attenuation[-1])
+    neglected = float(np.sum((powers[:-1] - powers[1:]) * attenuation[:-1]))
+    return neglected / determinant if determinant > 0.0 else np.nan
+
+
 def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     """Return one point of figure 2 of drabenko2021, without signs and with correct ones."""
     lidars = LidarLine("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
@@ -266,15 +294,12 @@ def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     leads_away = _leads_away(net)
     near = depths if leads_away else depths[[1, 0, 2]]
 
-    def error(optical_depth: Array) -> float | None:
-        return _finite(float(systematic_error(optical_depth, PAPER_MULTIPLIER)))
-
     return FigurePoint(
         first_lidar,
         elevation,
-        printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
-        signed=error(depths if leads_away else -depths),
-        near=error(near),
+        printed=systematic_error(depths, PAPER_MULTIPLIER),
+        signed=_finite(systematic_error(depths if leads_away else -depths, PAPER_MULTIPLIER)),
+        near=_finite(systematic_error(near, PAPER_MULTIPLIER)),
     )
 
 

@@ -1,4 +1,4 @@
-"""Signals of the beams of a network: validated, averaged over blocks and condensed."""
+"""Signals of the beams of a network: validated and condensed, without those that noise hides."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.network import _condensed_signals, _fit_layout
-from lidarops.retrieve.network._condensed_signals import CondensedSignals
+from lidarops.retrieve.network._condensed_signals import NOT_POSITIVE, CondensedSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -26,7 +26,7 @@ _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeamSignals:
-    """Condensed signals of the beams: the input of all methods."""
+    """Condensed signals of the beams."""
 
     layout: FitLayout
     exponent: Array
@@ -36,8 +36,8 @@ class BeamSignals:
     block: Indices
     """(profile,) block numbers."""
     weak: Booleans
-    """(profile, passage) True where the signal of the block, or of a profile far noisier than
-    most of the block, is too weak to be used."""
+    """(profile, passage) True where noise hides an existing signal, in the block or in a profile
+    far noisier than most of it."""
     leading: tuple[int, ...]
     """Shape of the axes before beam and range."""
 
@@ -63,25 +63,14 @@ def prepare_signals(
     exponents = _exponents(exponent, network.beams)
     layout = _fit_layout.lay_out_fits(network, ranges, overlap_function, nearest, int(bins))
     block = _blocks(blocks, leading)
-    rows, row = _variances(variance, signal.shape, descending=descending)
-    count = int(block.max(initial=-1)) + 1
-    members = [np.flatnonzero(block == number) for number in range(count)]
-    mean, mean_rows, single, averaged = _median_signals(signal, rows, row, members, layout)
-    data = _condensed_signals.condense(signal, rows, row, exponents, layout, screened=True)
-    # A median is robust against single bins, and its variance is only an estimate.
-    means = _condensed_signals.condense(
-        mean, mean_rows, np.arange(count), exponents, layout, screened=False
-    )
-    bin_variance, negative = _relative_noise(mean, single, averaged, layout)
-    weak = ~(bin_variance <= THRESHOLDS.largest_bin_error**2) & (
-        (means.usable == 1) | _faded(means, negative, layout)
-    )
-    means.usable[weak] = 0
+    variances = _variances(variance, leading, signal.shape, descending=descending)
+    data = _condensed_signals.condense(signal, variances, exponents, layout)
+    with np.errstate(all="ignore"):
+        weak, negative = _weak_passages(signal, variances, layout, block)
     # Missing signals already have a reason.
-    too_noisy = _noisy_passages(signal, rows, row, single[block], layout)
-    too_noisy &= data.usable == 1
-    data.usable[(means.usable == 0)[block] | too_noisy] = 0
-    return BeamSignals(layout, exponents, data, block, weak[block] | too_noisy, leading)
+    weak &= data.usable | (data.status == NOT_POSITIVE)[:, layout.passages.beam]
+    data.usable[weak | negative] = False
+    return BeamSignals(layout, exponents, data, block, weak, leading)
 
 
 def _grids(values: npt.ArrayLike, beams: int) -> tuple[Array, bool]:
@@ -188,8 +177,8 @@ def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
 
 
 def _variances(
-    variance: npt.ArrayLike, shape: tuple[int, ...], *, descending: bool
-) -> tuple[Array, Indices]:
+    variance: npt.ArrayLike, leading: tuple[int, ...], shape: tuple[int, ...], *, descending: bool
+) -> Array:
     array = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
     if np.any(array < 0):
         raise RetrievalInputError(
@@ -197,145 +186,43 @@ def _variances(
         )
     if descending and array.ndim > 0:
         array = array[..., ::-1]
-    shared = all(length == 1 for length in array.shape[:-2])
     try:
-        if shared:
-            rows = np.broadcast_to(array.reshape(array.shape[-2:]), shape[1:])[np.newaxis]
-        else:
-            rows = array.reshape(-1, *array.shape[-2:])
-            rows = np.broadcast_to(rows, (shape[0], *shape[1:]))
+        full = np.broadcast_to(array, (*leading, *shape[1:]))
     except ValueError:
         raise RetrievalInputError(
             f"has the shape {array.shape}",
             field="variance",
             remedy=f"give (..., beam, range), here (..., {shape[1]}, {shape[2]})",
         ) from None
-    row = np.zeros(shape[0], dtype=np.intp) if shared else np.arange(shape[0])
-    return np.ascontiguousarray(rows), row
+    return full.reshape(shape)
 
 
-def _moving_sum(values: Array, width: int) -> Array:
-    """Return sums over a window that shrinks at the ends."""
-    size = values.shape[-1]
-    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
-    centre = np.arange(size)
-    start = np.maximum(centre - width // 2, 0)
-    stop = np.minimum(centre + width // 2 + 1, size)
-    return np.asarray(sums[..., stop] - sums[..., start])
+def _weak_passages(
+    power: Array, variance: Array, layout: FitLayout, block: Indices
+) -> tuple[Booleans, Booleans]:
+    """Return (profile, passage) where noise hides the signal, and where the signal is negative.
 
-
-def _median_signals(
-    signal: Array, rows: Array, row: Indices, members: list[Indices], layout: FitLayout
-) -> tuple[Array, Array, Array, Indices]:  # fmt: skip
-    """Return median signals of blocks, their variances, variances of one profile, and numbers.
-
-    A median, because a single outlying bin must not spoil a block. A profile with a gap on a beam
-    is left out: laser energy changes from profile to profile, and the gap would make a step. A
-    few noisy profiles do not harm a median and do not count in its variance.
+    A block decides together: profiles whose signal is positive by chance would be selected. So
+    does a profile far noisier than its block. It is compared with its own level, because a higher
+    laser energy also raises the noise.
     """
-    shape = (len(members), *signal.shape[1:])
-    mean, spread, single = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
-    averaged = np.zeros(len(members), dtype=np.intp)
-    first, bins = layout.first_passage, layout.weights.shape[1]
-    for beam in range(shape[1]):
-        if first[beam] == first[beam + 1]:
-            continue
-        low, high = layout.window[first[beam]], layout.window[first[beam + 1] - 1] + bins
-        complete = np.asarray(np.isfinite(signal[:, beam, low:high]).all(axis=1))
-        for number, profiles in enumerate(members):
-            used = profiles[complete[profiles]]
-            if used.size == 0:
-                continue
-            mean[number, beam] = np.median(signal[used, beam], axis=0)
-            single[number, beam, low:high] = _typical_variance(
-                rows[row[used], beam, low:high],
-                signal[used, beam, low:high],
-                mean[number, beam, low:high],
-            )
-            spread[number, beam] = _MEDIAN_OVER_MEAN * single[number, beam] / used.size
-            averaged[number] = min(averaged[number], used.size) if averaged[number] else used.size
-    return mean, spread, single, averaged
-
-
-def _typical_variance(variances: Array, signal: Array, median: Array) -> Array:
-    """Return (bin,) means of the variances that are not far larger than most.
-
-    Parameters
-    ----------
-    variances, signal : (profile, bin) float64
-    median : (bin,) float64
-        Median signal.
-    """
-    width = min(THRESHOLDS.energy_bins, median.size)
-    known = np.isfinite(variances)
-    typical = np.median(np.where(known, variances, np.inf), axis=0)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        energy_ratio = (_moving_sum(signal, width) / _moving_sum(median, width)) ** 2
-        allowed = THRESHOLDS.noisy_profile * np.fmin(
-            np.fmax(energy_ratio, 1.0), THRESHOLDS.noisy_profile
-        )
-        counted = variances <= allowed * typical
-        # With few counts, the median of the variances may be zero.
-        counted = known & (counted | (typical == 0.0))
-        return np.asarray(np.where(counted, variances, 0.0).sum(axis=0) / counted.sum(axis=0))
-
-
-def _noisy_passages(
-    signal: Array, rows: Array, row: Indices, single: Array, layout: FitLayout
-) -> Booleans:
-    """Return (profile, passage) where a profile far noisier than its block is too weak.
-
-    It is compared with its own level, because a higher laser energy also raises the noise.
-    """
-    out = np.zeros((signal.shape[0], layout.passages.beam.size), dtype=np.bool_)
-    if rows.shape[0] == 1:
-        return out
     bins = layout.weights.shape[1]
-    for c in range(out.shape[1]):
-        beam, window = layout.passages.beam[c], slice(layout.window[c], layout.window[c] + bins)
-        with np.errstate(invalid="ignore", over="ignore"):
-            spread = rows[row, beam, window].sum(axis=1) / bins
-            typical = single[:, beam, window].sum(axis=1) / bins
-            level = np.maximum(signal[:, beam, window].sum(axis=1) / bins, 0.0)
-            noisier = (typical > 0.0) & ~(spread <= THRESHOLDS.noisy_profile * typical)
-            out[:, c] = noisier & ~(spread <= THRESHOLDS.largest_bin_error**2 * level**2)
-    return out
-
-
-def _faded(
-    means: CondensedSignals, significantly_negative: Booleans, layout: FitLayout
-) -> Booleans:
-    """Return (block, passage) where noise alone made an existing signal not positive.
-
-    Such a signal counts as weak. A beam without any signal, or with a signal significantly below
-    zero, is faulty and is reported as not positive.
-    """
-    beam, first = layout.passages.beam, layout.first_passage[layout.passages.beam]
-    negative = (means.status == _condensed_signals.NOT_POSITIVE)[:, beam]
-    return np.asarray(
-        negative & (means.usable == 0) & (means.usable[:, first] == 1) & ~significantly_negative
-    )
-
-
-def _relative_noise(
-    mean: Array, single: Array, averaged: Indices, layout: FitLayout
-) -> tuple[Array, Booleans]:
-    """Return (block, passage) relative variance of a bin of one profile around a crossing.
-
-    Also return where the mean signal is significantly below zero.
-    """
-    total, bins = layout.passages.beam.size, layout.weights.shape[1]
-    out, negative = (
-        np.zeros((mean.shape[0], total)),
-        np.zeros((mean.shape[0], total), dtype=np.bool_),
-    )
-    number = np.maximum(averaged, 1) * bins / _MEDIAN_OVER_MEAN
-    for c in range(total):
-        beam, window = layout.passages.beam[c], slice(layout.window[c], layout.window[c] + bins)
-        # The square of an outlying bin may overflow.
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            level = mean[:, beam, window].sum(axis=1) / bins
-            spread = single[:, beam, window].sum(axis=1) / bins
-            out[:, c] = np.where(level > 0, spread / level**2, np.inf)
-            negative[:, c] = ~(level >= -THRESHOLDS.negative * np.sqrt(spread / number))
-    return out, negative
+    level, spread = np.empty((2, len(power), layout.passages.beam.size))
+    for c, (beam, first) in enumerate(zip(layout.passages.beam, layout.window, strict=True)):
+        level[:, c] = power[:, beam, first : first + bins].sum(axis=1) / bins
+        spread[:, c] = variance[:, beam, first : first + bins].sum(axis=1) / bins
+    weak, negative = np.zeros(level.shape, np.bool_), np.zeros(level.shape, np.bool_)
+    limit = THRESHOLDS.largest_bin_error**2
+    for number in np.unique(block):
+        rows = np.flatnonzero(block == number)
+        for c in range(level.shape[1]):
+            known = rows[np.isfinite(level[rows, c]) & np.isfinite(spread[rows, c])]
+            if known.size == 0:
+                continue
+            typical = np.median(level[known, c]), np.median(spread[known, c])
+            error = np.sqrt(_MEDIAN_OVER_MEAN * typical[1] / (known.size * bins))
+            negative[rows, c] = typical[0] < -THRESHOLDS.negative * error
+            noisy = spread[rows, c] > THRESHOLDS.noisy_profile * typical[1]
+            noisy &= spread[rows, c] > limit * np.maximum(level[rows, c], 0.0) ** 2
+            weak[rows, c] = noisy | (typical[1] > limit * max(typical[0], 0.0) ** 2)
+    return weak & ~negative, negative

@@ -1,175 +1,105 @@
-"""Errors of a profile that only the other profiles of its block show.
+"""Errors of ln extinction that the profiles of a block show together.
 
-In thin air a single profile shows little of its own error. Amplified noise raises its logarithm
-of extinction, and the error computed there is then too small. A field that the prior excludes
-shifts all profiles alike, and no profile can separate it from attenuation. The block shows both:
-how far single profiles are from the solution of their mean, how large an error typically is, and
-what the mean of the beams leaves undetermined without a prior. Values do not change here, only
+In thin air a single profile shows little of its own error: amplified noise raises its logarithm of
+extinction, and the error computed there is too small. A field that the prior excludes shifts all
+profiles alike, and no profile can separate it from attenuation. The curvature of a signal within
+the bins of a fit is hidden by noise. The block shows all three. Values do not change here, only
 their errors.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.network._condensed_signals import CondensedSignals
+from lidarops.retrieve.network._empirical_prior import BlockSolution, median
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Booleans = npt.NDArray[np.bool_]
 
+_MEDIAN_OVER_MEAN: Final = np.pi / 2.0
+"""Variance of a median over the variance of a mean."""
 _ROUNDING: Final = 1e-9
 """Relative size of a field below which it is rounding."""
 
 
-def bent_fields(position: Array) -> Array:
-    """Return quadratic fields without level and gradient that span curvature in any direction.
+def prior_variance(block: BlockSolution) -> Array:
+    """Return (profile, crossing) variances by fields that deviate from the prior.
 
-    The sum of their squares, averaged over the crossings, is `bend` squared. The fields of
-    r_i r_j, i < j, count twice, as in the squares of r' H r with a random symmetric H.
-
-    Parameters
-    ----------
-    position : (crossing, 3) float64
-        m.
-
-    Returns
-    -------
-    (field, crossing) float64
-        Fields of ln extinction; none where a gradient describes any field of so few crossings.
+    One field is no sample of many: errors are stated for one that deviates `doubt` times as much
+    as the prior states, and where nothing can contradict a prior, as much as the weakest one.
     """
-    return _cached_bent_fields(np.ascontiguousarray(position, dtype=np.float64).tobytes())
+    solution, free = block.profiles, block.free_mean
+    weakest = max(THRESHOLDS.strengths[-1] / solution.prior.strength, THRESHOLDS.doubt)
+    factor = np.where(np.isfinite(free.variance[0]), THRESHOLDS.doubt, weakest)
+    return np.asarray((factor**2 - 1.0) * solution.prior_share)
 
 
-@lru_cache(maxsize=32)
-def _cached_bent_fields(position: bytes) -> Array:
-    # All blocks share a network, and a decomposition costs more than a profile.
-    positions = np.frombuffer(position, dtype=np.float64).reshape(-1, 3)
-    if positions.shape[0] == 0:
-        return np.zeros((0, 0))
-    centred = positions - positions.mean(axis=0)
-    radius = float(np.sqrt(np.mean(np.sum(centred * centred, axis=1))))
-    if radius == 0.0:
-        return np.zeros((0, positions.shape[0]))
-    centred /= radius
-    first, second = np.triu_indices(3)
-    weight = np.where(first == second, 1.0, np.sqrt(2.0))
-    fields = (weight * centred[:, first] * centred[:, second]).T
-    linear = np.column_stack([np.ones(len(centred)), centred])
-    axes, scale, _ = np.linalg.svd(linear, full_matrices=False)
-    linear_axes = axes[:, scale > _ROUNDING * scale[0]]
-    fields = fields - (fields @ linear_axes) @ linear_axes.T
-    fields = fields[np.mean(fields * fields, axis=1) > _ROUNDING**2]
-    total = float(np.sqrt(np.sum(fields * fields) / len(centred)))
-    return np.ascontiguousarray(fields * (THRESHOLDS.bend / total if total > 0.0 else 0.0))
-
-
-def noise_bias_variance(logarithm: Array, variance: Array, mean: Array) -> Array:
-    """Return the squares of the bias of single profiles by noise.
+def noise_bias_variance(block: BlockSolution) -> Array:
+    """Return (crossing,) squares of the bias of single profiles by noise.
 
     Profiles and their mean share the field and the prior. Where they differ on average, the
     logarithm of extinction is not linear in the noise of a profile; their mean has less noise.
-    A field that changes within the block makes a difference smaller than the errors.
-
-    Parameters
-    ----------
-    logarithm, variance : (profile, crossing) float64
-        ln extinction and its variance; NaN where there is none.
-    mean : (crossing,) float64
-        ln extinction from the mean of the beams.
-
-    Returns
-    -------
-    (crossing,) float64
-        0 where the difference is less than half the typical standard error.
+    Differences below half the typical standard error are harmless.
     """
-    known = np.isfinite(logarithm) & np.isfinite(variance)
-    number = np.maximum(known.sum(axis=0), 1)
-    median = _median(np.where(known, logarithm, np.nan))
-    largest = THRESHOLDS.largest_deviation**2 * _median(np.where(known, variance, np.nan))
+    logarithm, variance = block.profiles.logarithm, block.profiles.variance
+    middle = median(logarithm)
+    largest = THRESHOLDS.largest_deviation * np.sqrt(median(variance))
     # A profile with contradictory beams must not raise the errors of all others.
-    with np.errstate(invalid="ignore"):
-        typical = np.where(known, np.minimum(variance, largest), 0.0).sum(axis=0) / number
-        deviation = np.clip(logarithm - median, -np.sqrt(largest), np.sqrt(largest))
-        gap = np.where(known, deviation, 0.0).sum(axis=0) / number + median - mean
-    significant = known.any(axis=0) & (gap * gap > THRESHOLDS.harmless**2 * typical)
-    return np.asarray(np.where(significant, gap * gap, 0.0))
+    deviation = np.clip(logarithm - middle, -largest, largest)
+    gap = _mean(deviation) + middle - block.mean.logarithm[0]
+    typical = _mean(np.minimum(variance, largest**2))
+    return np.where(gap * gap > THRESHOLDS.harmless**2 * typical, gap * gap, 0.0)
 
 
-def excluded_field_variance(
-    excluded_variance: Array, with_prior: Array, without_prior: Array, variance: Array
-) -> Array:
-    """Return variances from fields that the prior excludes and the beams do not.
+def curvature_variance(data: CondensedSignals, carried: Array) -> Array:
+    r"""Return (profile, crossing) variances from curved signals within a fit.
 
-    All profiles share such an error, so it is at most what the mean of the beams leaves
-    undetermined without a prior.
-
-    Parameters
-    ----------
-    excluded_variance : (profile, crossing) float64
-        Variance from such fields where only the prior limits them.
-    with_prior, without_prior : (crossing,) float64
-        ln extinction from the mean of the beams, with and without the prior.
-    variance : (crossing,) float64
-        Variance of `without_prior`; NaN where the beams leave a crossing undetermined.
-
-    Returns
-    -------
-    (profile, crossing) float64
-    """
-    gap = without_prior - with_prior
-    allowed = variance + gap * gap
-    return np.asarray(
-        np.minimum(excluded_variance, np.where(np.isfinite(allowed), allowed, np.inf))
-    )
-
-
-def at_least_typical(extinction: Array, variance: Array, block: Indices, seen: Booleans) -> Array:
-    """Return variances raised to at least the median of their block, in m-2.
-
-    The error of an attenuation does not depend on the extinction that noise makes of it, so the
-    error of a profile with a high value is too small. Each profile is compared with those that
-    have at least its usable passages, because missing passages make errors larger. Small errors
-    stay as they are.
+    Where the logarithm f of the signal is curved along the beam, a line through equal weights of
+    bins is too high by about f'' (bins^2 - 1) step^2 / 24. A polynomial of degree 4 through the
+    same bins has almost none of this error, but twice the noise, so it is not a better value.
+    Their difference, carried to the solution, shows the error. The result is the largest of
+    three, each less the contribution of noise: the square of the shift by the median of the block,
+    the mean square of the shifts of its profiles (a layer may rise or sink), and the square of the
+    shift of the profile itself.
 
     Parameters
     ----------
-    extinction, variance : (profile, crossing) float64
-        m-1 and m-2; NaN where there is none.
-    block : (profile,) intp
-    seen : (profile, passage) bool
-        True where a passage is usable.
+    data : CondensedSignals
+        Of the profiles of one block.
+    carried : (profile, crossing, passage) float64
+        Derivatives of ln extinction by the log values.
     """
-    raised = variance.copy()
-    for number in np.unique(block):
-        profiles = np.flatnonzero(block == number)
-        patterns, kind = np.unique(seen[profiles], axis=0, return_inverse=True)
-        for k, pattern in enumerate(patterns):
-            alike = profiles[kind.reshape(-1) == k]
-            peers = profiles[(seen[profiles] >= pattern).all(axis=1)]
-            raised[alike] = _at_least_median(extinction, variance, alike, peers)
-    return raised
+    error, noise = np.moveaxis(data.curvature_error, -1, 0)
+    number = data.usable.sum(axis=0)
+    known = np.where(data.usable, 1.0, np.nan)
+    shared, shared_noise = np.nan_to_num(median(error * known)), median(noise * known)
+    # The median of one or two is their mean.
+    shared_noise *= np.where(number > 2, _MEDIAN_OVER_MEAN, 1.0) / np.maximum(number, 1)
+    shared_noise = np.nan_to_num(shared_noise)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = carried * carried
+        own_shift, own_noise = (
+            (values * of[:, np.newaxis]).sum(axis=2)
+            for values, of in ((carried, error), (squares, noise))
+        )
+        shared_shift = (carried * shared).sum(axis=2)
+        shared_excess = shared_shift**2 - THRESHOLDS.shared_noise * (squares * shared_noise).sum(2)
+        # A noisy profile would hide the shift of the others, or imitate one.
+        counted = own_noise > 0.0
+        counted &= own_noise <= THRESHOLDS.noisy_profile * np.median(own_noise, axis=0)
+        number = np.maximum(counted.sum(axis=0), 1)
+        by_chance = (1.0 + THRESHOLDS.chance * np.sqrt(2.0 / number)) * own_noise
+        excess = np.where(counted, own_shift**2 - by_chance, 0.0).sum(axis=0) / number
+        largest = np.fmax(shared_excess, own_shift**2 - THRESHOLDS.profile_noise * own_noise)
+        return np.asarray(np.fmax(np.fmax(largest, excess), 0.0))
 
 
-def _at_least_median(extinction: Array, variance: Array, rows: Indices, peers: Indices) -> Array:
-    """Return variances of rows, at least the medians of their peers where these are large."""
-    typical, median = _median(variance[peers]), _median(extinction[peers])
-    own = variance[rows]
-    with np.errstate(invalid="ignore"):
-        large = typical > (THRESHOLDS.nonlinear_error * median) ** 2
-    return np.asarray(np.where(large & np.isfinite(own), np.fmax(own, typical), own))
-
-
-def _median(values: Array) -> Array:
-    """Return (crossing,) medians of the finite values; NaN where there is none."""
+def _mean(values: Array) -> Array:
+    """Return means over profiles of the finite values; NaN where there is none."""
     known = np.isfinite(values)
-    if known.all():
-        return np.asarray(np.median(values, axis=0))
-    out = np.full(values.shape[1], np.nan)
-    for column in np.flatnonzero(known.any(axis=0)):
-        out[column] = np.median(values[known[:, column], column])
-    return out
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0))

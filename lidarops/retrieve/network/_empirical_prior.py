@@ -1,27 +1,24 @@
-"""Empirical prior of the extinction field of a network.
+r"""Solutions of a block of profiles with an empirical prior of the extinction field.
 
 Along a beam, a gradient of extinction looks like attenuation, and only weak information separates
 them. The prior therefore limits a gradient over the network to tens of percent; this limit is
 fixed, because the likelihood cannot give it. Deviations of single crossings are visible to the
 beams that cross there: their standard deviation is the most likely one for all profiles of a
-block, and at least the one that their mean requires. The level of a profile is free. One field is
-no sample of many, so errors are stated for a field that deviates twice as much
-(`lidarops.retrieve.network._joint_solution`). Where the beams are too few to test the prior, the
-weakest prior is used.
+block. The level of a profile is free. Where the mean of the profiles contradicts the prior, it is
+weakened, then dropped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from lidarops.retrieve.network import _block_errors, _joint_solution
+from lidarops.retrieve.network import _joint_solution
 from lidarops.retrieve.network._condensed_signals import CondensedSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -29,207 +26,233 @@ from lidarops.retrieve.network.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
-Codes = npt.NDArray[np.uint8]
 
 _UNDETERMINED_COST: Final = 1e3
 """-2 ln likelihood of a profile that is not determined."""
 _FIRST_PASSES: Final = 12
 _NEXT_PASSES: Final = 4
 _LAST_PASSES: Final = 8
+_ALL_PASSES: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Prior of ln extinction over the crossings, with a free level."""
+
+    deviation: float
+    """Standard deviation at single crossings; inf for no prior."""
+    strength: float = 1.0
+    """Factor of that, and of the standard deviation by a gradient."""
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a prior."""
+        return bool(np.isfinite(self.deviation))
+
+    def precision(self, position: Array) -> tuple[Array, float]:
+        """Return the (crossing, crossing) precision, and -ln of its determinant.
+
+        Parameters
+        ----------
+        position : (crossing, 3) float64
+            m.
+        """
+        if not self.exists:
+            return np.zeros((len(position), len(position))), 0.0
+        covariance = THRESHOLDS.gradient**2 * _gradient_covariance(position)
+        covariance += self.deviation**2 * np.eye(len(position))
+        covariance *= self.strength**2
+        precision = np.linalg.inv(covariance)
+        sums = precision.sum(axis=0)
+        norm = float(np.linalg.slogdet(covariance)[1] + np.log(sums.sum()))
+        return precision - np.outer(sums, sums) / sums.sum(), norm
+
+
+NO_PRIOR: Final = Prior(np.inf)
+
+
+def _gradient_covariance(position: Array) -> Array:
+    """Return the covariance of a linear field of unit variance in any direction."""
+    centred = position - position.mean(axis=0)
+    covariance = centred @ centred.T
+    size = float(np.trace(covariance))
+    # One crossing has no gradient.
+    return np.asarray(covariance * (len(position) / size if size > 0 else 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PriorSolution:
-    """Logarithms of extinction at the measured crossings."""
+class Solution:
+    """Logarithms of extinction at the measured crossings, with one prior for all profiles."""
 
+    prior: Prior
     logarithm: Array
-    """(profile, crossing) of extinction in m-1."""
+    """(profile, crossing) of extinction in m-1; NaN where undetermined or unseen."""
     variance: Array
-    """(profile, crossing), including the doubt in the prior."""
-    prior_true_variance: Array
-    """(profile, crossing) variance if the prior is true."""
-    excluded_variance: Array
-    """(profile, crossing) variance from fields that only the prior excludes."""
+    """(profile, crossing) if the prior is true."""
+    prior_share: Array
+    """(profile, crossing) variance by a field that deviates as the prior states."""
+    carried: Array
+    """(profile, crossing, passage) derivatives by the log values."""
     chi_square: Array
     """(profile,) of the beams alone, without the prior."""
     degrees_of_freedom: Array
     """(profile,) of that."""
-    prior_chi_square: Array
+    total_chi_square: Array
     """(profile,) of beams and prior together."""
-    prior_degrees_of_freedom: Array
+    total_degrees_of_freedom: Array
     """(profile,) of that."""
-    deviation: Array
-    """(profile,) standard deviation of the prior; inf without one."""
-    strength: Array
-    """(profile,) factor of that standard deviation and of the gradient."""
-    status: Codes
-    """(profile,) status code of `lidarops.retrieve.network._joint_solution`."""
-    left_out: Codes
-    """(profile, beam) 1 where a beam was left out: its covariance is singular or missing."""
-    prior_contradicted: Booleans
-    """(profile,) True where the beams contradict the prior but cannot replace it."""
+    determined: Booleans
+    """(profile,) False without crossings, or where the system is singular."""
+    settled: Booleans
+    """(profile,) True where the solution converged."""
+    left_out: Booleans
+    """(profile, beam) True where the covariance of a beam is singular or missing."""
+    constants: Array
+    """(profile, beam) logarithms of signal over extinction at the last passages."""
+    cost: float
+    """-2 ln likelihood of all profiles."""
 
 
-class _Problem:
-    """Condensed profiles, and the constants of their beams where a solution starts."""
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Condensed signals of profiles that share a field."""
 
-    def __init__(
-        self,
-        data: CondensedSignals,
-        layout: FitLayout,
-        crossing: Indices,
-        exponent: Array,
-        position: Array,
-    ) -> None:
-        self.data = data
-        self.crossings = position.shape[0]
-        self.gradient = _gradient_covariance(position)
-        self.bends = _block_errors.bent_fields(position)
-        self.geometry = (layout.first_passage, layout.offset, crossing)
-        self.constants = np.zeros((data.log_value.shape[0], exponent.size))
-        self.likelihood = 0.0
-        _joint_solution.start_constants(
-            data.integral, data.usable, data.slope, segment_lengths(layout), exponent,
-            layout.first_passage, self.constants,
-        )  # fmt: skip
-        self.start = self.constants.copy()
+    data: CondensedSignals
+    layout: FitLayout
+    crossing: Indices
+    """(passage,) number of the measured crossing at each passage."""
+    exponent: Array
+    """(beam,)."""
+    position: Array
+    """(crossing, 3) m, of the measured crossings."""
 
-    def afresh(self, deviation: float, strength: float = 1.0) -> PriorSolution:
-        """Solve all profiles from the first start constants."""
-        self.constants[:] = self.start
-        return self.solve(deviation, 2 * _FIRST_PASSES, strength)
+    @cached_property
+    def counts(self) -> Indices:
+        """(profile, beam) Number of usable passages; 0 where there is only one."""
+        counts = reaches(self.data.usable, self.layout)
+        return np.where(counts >= 2, counts, 0)
 
-    def solve(self, deviation: float, passes: int, strength: float = 1.0) -> PriorSolution:
-        """Solve all profiles from the present constants, and update these."""
-        shape = (self.constants.shape[0], self.crossings)
-        logarithm, variance = np.full(shape, np.nan), np.full(shape, np.nan)
-        prior_true_variance, excluded_variance = np.full(shape, np.nan), np.full(shape, np.nan)
-        summary, status = (
-            np.full((shape[0], _joint_solution.COLUMNS), np.nan),
-            np.zeros(shape[0], dtype=np.uint8),
-        )
-        left_out = np.zeros(self.constants.shape, dtype=np.uint8)
-        precision, norm, without_prior = _precision(self.gradient, deviation, strength)
-        data = self.data
+    def start_constants(self) -> Array:
+        """Return (profile, beam) constants of homogeneous air.
+
+        Along all beams of a profile, the fall of the signal over the integral is its extinction.
+        """
+        counts, first = self.counts, self.layout.first_passage[:-1]
+        last = first + np.maximum(counts - 1, 0)
+        rows = np.arange(len(counts))[:, np.newaxis]
+        ranges = np.append(self.layout.passages.range, 0.0)
+        passages = np.minimum(last, ranges.size - 2)
+        usable = counts > 0
+        fall = np.where(usable, -np.expm1(self.data.log_value[rows, passages]), 0.0)
+        sums = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(self.data.integral, 1)], axis=1)
+        total = np.where(usable, sums[rows, last] - sums[rows, first], 0.0)
+        with np.errstate(all="ignore"):
+            extinction = fall.sum(axis=1, keepdims=True) / total.sum(axis=1, keepdims=True)
+            depth = 2.0 * self.exponent * extinction * (ranges[last] - ranges[first])
+            constants = np.log(total / np.expm1(np.fmax(depth, THRESHOLDS.thinnest_beam)))
+        return np.where(usable, constants, 0.0)
+
+    def solve(
+        self, prior: Prior, passes: int = _ALL_PASSES, constants: Array | None = None
+    ) -> Solution:
+        """Solve all profiles, from the constants of homogeneous air or from the given ones."""
+        profiles, crossings = len(self.data.usable), len(self.position)
+        precision, norm = prior.precision(self.position)
+        weak = 0.0 if prior.exists else THRESHOLDS.weak_precision
+        counts = self.counts.copy()
+        constants = self.start_constants() if constants is None else constants.copy()
+        logarithm = np.zeros((profiles, crossings))
+        covariance = np.zeros((profiles, crossings, crossings))
+        carried = np.zeros((profiles, crossings, self.crossing.size))
+        seen = np.zeros(logarithm.shape, dtype=np.bool_)
+        summary = np.zeros((profiles, _joint_solution.COLUMNS))
         _joint_solution.solve_joint(
-            data.log_value, data.integral, data.usable, data.covariance, self.geometry,
-            precision, self.bends, norm, without_prior, passes, self.constants, logarithm, variance,
-            prior_true_variance, excluded_variance, summary, status, left_out,
+            self.data.log_value, self.data.integral, self.data.covariance,
+            (self.layout.first_passage, self.layout.offset, self.crossing),
+            precision + weak * np.eye(crossings), weak, passes, counts, constants, logarithm,
+            covariance, carried, seen, summary,
         )  # fmt: skip
-        determined = status != _joint_solution.UNDETERMINED
-        # A prior must not become likelier by leaving a profile undetermined.
-        terms = np.where(determined, summary[:, _joint_solution.LIKELIHOOD], _UNDETERMINED_COST)
-        self.likelihood = float(np.sum(terms))
-        return PriorSolution(
-            logarithm, variance, prior_true_variance, excluded_variance, summary[:, 0],
-            summary[:, 1], summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation),
-            np.full(shape[0], strength), status, left_out, np.zeros(shape[0], dtype=np.bool_),
-        )  # fmt: skip
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        cost = summary[:, _joint_solution.LIKELIHOOD] + norm
+        determined = np.isfinite(cost)
+        known = determined[:, np.newaxis] & seen & (variance < THRESHOLDS.largest_variance)
+        shares = np.diagonal(covariance @ precision @ covariance, axis1=1, axis2=2)
+        chi_square = summary[:, _joint_solution.CHI_SQUARE]
+        spare = counts.sum(axis=1) - (counts > 0).sum(axis=1)
+        free = spare - seen.sum(axis=1)
+        # Beams may disagree even if crossings stay undetermined or constants diverged.
+        alone = not prior.exists and np.isfinite(chi_square)
+        return Solution(
+            prior,
+            np.where(known, logarithm, np.nan),
+            np.where(known, variance, np.nan),
+            np.where(known, np.maximum(shares, 0.0), np.nan),
+            carried,
+            chi_square,
+            free.astype(np.float64),
+            summary[:, _joint_solution.TOTAL_CHI_SQUARE],
+            np.where(alone, free, spare - 1).astype(np.float64),
+            determined,
+            summary[:, _joint_solution.STEP] < THRESHOLDS.converged_step,
+            (counts == 0) & (self.counts > 0),
+            constants,
+            # A prior must not become likelier by leaving a profile undetermined.
+            float(np.sum(np.where(determined, cost, _UNDETERMINED_COST))),
+        )
+
+    def mean(self) -> Problem:
+        """Return the mean of the profiles as one profile.
+
+        It is taken beam by beam, up to the passage that brings most values into it, because few
+        profiles may have all beams. Values and integrals are relative to the first value of each
+        beam, because laser energy changes from profile to profile.
+        """
+        data, layout = self.data, self.layout
+        out = CondensedSignals(*(np.zeros_like(getattr(data, n)[:1]) for n in data.__slots__))
+        reach = reaches(data.usable, layout)
+        for beam in range(reach.shape[1]):
+            on_beam = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
+            packed = slice(layout.offset[beam], layout.offset[beam + 1])
+            depth = _mean_depth(reach[:, beam])
+            used = np.flatnonzero(reach[:, beam] >= depth)
+            count = on_beam.stop - on_beam.start
+            used = used[_not_noisy(data.covariance[used, packed], count, depth)]
+            if depth == 0 or used.size == 0:
+                continue
+            out.usable[0, on_beam][:depth] = True
+            for mean, values, part in (
+                (out.log_value, data.log_value, on_beam),
+                (out.integral, data.integral, on_beam),
+                (out.covariance, data.covariance, packed),
+            ):
+                mean[0, part] = values[used, part].sum(axis=0) / used.size
+            out.covariance[0, packed] /= used.size
+        return Problem(out, layout, self.crossing, self.exponent, self.position)
 
 
-def segment_lengths(layout: FitLayout) -> Array:
-    """Return the distance in m from each passage to the next on its beam; 0 for the last."""
-    out = np.zeros(layout.passages.range.size)
-    same = layout.passages.beam[:-1] == layout.passages.beam[1:]
-    out[:-1][same] = np.diff(layout.passages.range)[same]
-    return out
+def reaches(usable: Booleans, layout: FitLayout) -> Indices:
+    """Return (profile, beam) numbers of usable passages before the first one that is not."""
+    return np.stack(
+        [
+            np.logical_and.accumulate(usable[:, first:last], axis=1).sum(axis=1)
+            for first, last in zip(layout.first_passage, layout.first_passage[1:], strict=False)
+        ],
+        axis=1,
+    ).astype(np.intp)
 
 
-def solve_without_prior(
-    data: CondensedSignals, layout: FitLayout, crossing: Indices, exponent: Array, position: Array
-) -> PriorSolution:
-    """Solve each profile alone. Arguments are those of `solve_blocks`."""
-    problem = _Problem(data, layout, crossing, exponent, position)
-    return problem.solve(np.inf, 2 * _FIRST_PASSES)
-
-
-def solve_blocks(
-    data: CondensedSignals,
-    layout: FitLayout,
-    crossing: Indices,
-    exponent: Array,
-    position: Array,
-    block: Indices,
-) -> PriorSolution:
-    """Solve the profiles of each block with its most likely prior.
+def _mean_depth(reach: Indices) -> int:
+    """Return the number of passages of a beam in the mean; 0 where no profile has two.
 
     Parameters
     ----------
-    data : Condensed
-    layout : FitLayout
-    crossing : (passage,) intp
-        Number of the measured crossing at each passage.
-    exponent : (beam,) float64
-    position : (crossing, 3) float64
-        m, of the measured crossings.
-    block : (profile,) intp
+    reach : (profile,) intp
+        Number of usable passages of the beam in each profile.
     """
-    shape = (block.size, position.shape[0])
-
-    def missing(*size: int) -> Array:
-        return np.full(size, np.nan)
-
-    count = block.size
-    out = PriorSolution(
-        missing(*shape), missing(*shape), missing(*shape), missing(*shape), missing(count),
-        missing(count), missing(count), missing(count), missing(count), missing(count),
-        np.full(count, _joint_solution.UNDETERMINED, dtype=np.uint8),
-        np.zeros((count, exponent.size), dtype=np.uint8), np.zeros(count, dtype=np.bool_),
-    )  # fmt: skip
-    for number in np.unique(block):
-        profiles = np.flatnonzero(block == number)
-        block_data = data.take(profiles)
-        solution = _solve_block(
-            _Problem(block_data, layout, crossing, exponent, position),
-            partial(_mean_problem, block_data, layout, crossing, exponent, position),
-        )
-        for field in fields(PriorSolution):
-            getattr(out, field.name)[profiles] = getattr(solution, field.name)
-    return out
-
-
-def _mean_problem(
-    data: CondensedSignals, layout: FitLayout, crossing: Indices, exponent: Array, position: Array
-) -> _Problem | None:
-    """Return the mean of profiles as a problem; None where too few share a beam."""
-    mean = _mean_profile(data, layout)
-    return None if mean is None else _Problem(mean, layout, crossing, exponent, position)
-
-
-def _mean_profile(data: CondensedSignals, layout: FitLayout) -> CondensedSignals | None:
-    """Return the mean of profiles as one profile; None where too few have any beam.
-
-    The mean is taken beam by beam, up to the passage that brings most values into it, because few
-    profiles may have all beams. Values and integrals are relative to the first value of each
-    beam, because laser energy changes from profile to profile.
-    """
-    usable = np.zeros((1, data.usable.shape[1]), dtype=np.uint8)
-    log_value, integral = np.full(usable.shape, np.nan), np.zeros(usable.shape)
-    covariance = np.zeros((1, data.covariance.shape[1]))
-    slope = np.full((*usable.shape, 2), np.nan)
-    for beam in range(layout.first_passage.size - 1):
-        on_beam = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
-        packed = slice(layout.offset[beam], layout.offset[beam + 1])
-        reach = np.logical_and.accumulate(data.usable[:, on_beam] == 1, axis=1).sum(axis=1)
-        depth = _mean_depth(reach)
-        if depth == 0:
-            continue
-        used = np.flatnonzero(reach >= depth)
-        used = used[_not_noisy(data.covariance[used, packed], on_beam.stop - on_beam.start, depth)]
-        number = used.size
-        if number < THRESHOLDS.fewest_profiles:
-            continue
-        usable[0, on_beam][:depth] = 1
-        log_value[0, on_beam] = data.log_value[used, on_beam].sum(axis=0) / number
-        integral[0, on_beam] = data.integral[used, on_beam].sum(axis=0) / number
-        covariance[0, packed] = data.covariance[used, packed].sum(axis=0) / number / number
-        slope[0, on_beam] = data.slope[used, on_beam].sum(axis=0) / number
-        slope[0, on_beam, 1] /= number
-    if not usable.any():
-        return None
-    return CondensedSignals(
-        log_value, integral, usable, covariance, slope, data.status[:1], data.bridged[:1]
-    )
+    depths = np.arange(2, int(reach.max(initial=1)) + 1)
+    # At the first passage all values are zero.
+    values = [(depth - 1) * np.sum(reach >= depth) for depth in depths]
+    return int(depths[np.argmax(values)]) if values else 0
 
 
 def _not_noisy(covariance: Array, passages: int, depth: int) -> Booleans:
@@ -245,277 +268,117 @@ def _not_noisy(covariance: Array, passages: int, depth: int) -> Booleans:
     passages, depth : int
         Number of passages of the beam, and number of those in the mean.
     """
-    quantities = 2 * passages - 1
-    columns = np.r_[:depth, passages : passages + depth - 1]
-    variances = covariance[:, columns * (quantities + 1)]
+    columns = np.r_[:depth, passages : passages + max(depth - 1, 0)]
+    variances = covariance[:, columns * 2 * passages]
     known = np.isfinite(variances)
-    typical = np.median(np.where(known, variances, np.inf), axis=0)
+    typical = np.median(np.where(known, variances, np.inf), axis=0) if len(variances) else 0.0
     return np.asarray((known & (variances <= THRESHOLDS.noisy_profile * typical)).all(axis=1))
 
 
-def _mean_depth(reach: Indices) -> int:
-    """Return the number of passages of a beam in the mean; 0 where too few profiles have two.
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockSolution:
+    """The solutions of a block, of its mean, and of its mean without a prior."""
 
-    Parameters
-    ----------
-    reach : (profile,) intp
-        Number of usable passages of the beam in each profile.
-    """
-    best, best_count = 0, 0
-    for depth in range(2, int(reach.max(initial=0)) + 1):
-        number = int(np.sum(reach >= depth))
-        # At the first passage all values are zero.
-        if number >= THRESHOLDS.fewest_profiles and (depth - 1) * number > best_count:
-            best, best_count = depth, (depth - 1) * number
-    return best
+    profiles: Solution
+    mean: Solution
+    free_mean: Solution
+    contradicted: bool
+    """Whether the beams contradict the prior but cannot replace it."""
 
 
-def _solve_block(problem: _Problem, mean_problem: Callable[[], _Problem | None]) -> PriorSolution:
-    """Solve a block with the strongest prior that neither profiles nor their mean contradict."""
-    without_prior = problem.afresh(np.inf)
-    # Profiles that determine the crossings well alone need no mean.
-    with np.errstate(invalid="ignore"):
-        mean = (
-            None
-            if np.all(without_prior.variance < THRESHOLDS.well_determined**2)
-            else mean_problem()
-        )
-    mean_without_prior = None if mean is None else mean.afresh(np.inf)
-    testable = _can_test_prior(problem, without_prior, mean_without_prior)
+def solve_block(problem: Problem) -> BlockSolution:
+    """Solve a block with the strongest prior that the mean of its profiles does not contradict."""
+    mean = problem.mean()
+    free, free_mean = problem.solve(NO_PRIOR), mean.solve(NO_PRIOR)
+    testable = _can_test_prior(problem, free, free_mean)
     strengths = THRESHOLDS.strengths if testable else THRESHOLDS.strengths[-1:]
-    if mean is None or mean_without_prior is None:
-        return _strongest_prior(problem, without_prior, strengths)[0]
-    result = _solve_with_mean(problem, without_prior, mean, mean_without_prior, strengths)
-    prior_contradicted = not testable and _mean_improbable(mean.afresh(THRESHOLDS.deviations[0]))
-    return replace(
-        result, prior_contradicted=np.full_like(result.prior_contradicted, prior_contradicted)
-    )
-
-
-def _solve_with_mean(
-    problem: _Problem,
-    without_prior: PriorSolution,
-    mean: _Problem,
-    mean_without_prior: PriorSolution,
-    strengths: tuple[float, ...],
-) -> PriorSolution:
-    """Solve a block that has a mean with the strongest prior that is not contradicted."""
-    if mean_without_prior.status[0] == _joint_solution.UNDETERMINED:
-        # An undetermined mean contradicts no prior.
-        result, strength = _strongest_prior(problem, without_prior, strengths)
-        return _add_block_errors(
-            result, strength, _solve_mean(mean, result, strength), mean_without_prior
-        )
-    converged = bool(mean_without_prior.status[0] == _joint_solution.SOLVED)
+    contradicted = not testable and _improbable(mean.solve(Prior(THRESHOLDS.deviations[0])))
     for strength in strengths:
-        smallest = _least_deviation(mean, strength) if converged else 0.0
-        result = _likeliest_deviation(problem, strength, smallest)
-        if _contradicted(result, without_prior) or _off_mean_solution(result, mean_without_prior):
-            continue
-        mean_with_prior = _solve_mean(mean, result, strength)
-        if not _mean_improbable(mean_with_prior):
-            return _add_block_errors(result, strength, mean_with_prior, mean_without_prior)
-    return _add_block_errors(without_prior, 1.0, mean_without_prior, mean_without_prior)
+        solution = _likeliest(problem, strength)
+        mean_solution = mean.solve(solution.prior)
+        # An undetermined mean contradicts no prior.
+        if not free_mean.determined[0] or not (
+            _improbable(mean_solution) or _contradicted(solution, free)
+        ):
+            return BlockSolution(solution, mean_solution, free_mean, contradicted)
+    return BlockSolution(free, free_mean, free_mean, contradicted)
 
 
-def _can_test_prior(
-    problem: _Problem, without_prior: PriorSolution, mean_without_prior: PriorSolution | None
-) -> bool:
+def _can_test_prior(problem: Problem, free: Solution, free_mean: Solution) -> bool:
     """Return whether the beams can test a prior.
 
     With fewer equations than unknowns, or as many that leave crossings undetermined, the prior
     decides the rest, and no test covers that: a steep field looks like large deviations about a
     slight gradient.
     """
-    known = without_prior.status != _joint_solution.UNDETERMINED
-    freedom = 0.0
-    if known.any():
-        # Some profiles are enough: they share the field with those that lost a beam.
-        solved_freedom = without_prior.degrees_of_freedom[known]
-        freedom = float(np.quantile(solved_freedom, THRESHOLDS.testing_quantile, method="higher"))
-    if mean_without_prior is None:
-        return freedom >= 0
-    freedom = max(freedom, float(mean_without_prior.degrees_of_freedom[0]))
-    crossings = np.unique(problem.geometry[2][(problem.data.usable == 1).any(axis=0)])
-    determined = bool(
-        np.all(mean_without_prior.variance[0, crossings] < THRESHOLDS.open_in_mean**2)
-    )
-    return freedom > 0 or (freedom == 0 and determined)
+    # Some profiles are enough: they share the field with those that lost a beam.
+    freedoms = free.degrees_of_freedom[free.determined]
+    freedom = float(free_mean.degrees_of_freedom[0])
+    if freedoms.size:
+        quantile = np.quantile(freedoms, THRESHOLDS.testing_quantile, method="higher")
+        freedom = max(freedom, float(quantile))
+    crossings = np.unique(problem.crossing[problem.data.usable.any(axis=0)])
+    open_crossings = ~(free_mean.variance[0, crossings] < THRESHOLDS.open_in_mean**2)
+    return freedom > 0 or (freedom == 0 and not open_crossings.any())
 
 
-def _strongest_prior(
-    problem: _Problem, without_prior: PriorSolution, strengths: tuple[float, ...]
-) -> tuple[PriorSolution, float]:
-    """Solve with the strongest prior that the profiles do not contradict; return its strength."""
-    for strength in strengths:
-        result = _likeliest_deviation(problem, strength, 0.0)
-        if not _contradicted(result, without_prior):
-            return result, strength
-    return without_prior, 1.0
-
-
-def _solve_mean(mean: _Problem, result: PriorSolution, strength: float) -> PriorSolution:
-    """Solve the mean of profiles with the prior of the profiles."""
-    return mean.afresh(float(result.deviation[0]) / strength, strength)
-
-
-def _mean_improbable(mean_with_prior: PriorSolution) -> bool:
+def _improbable(mean: Solution) -> bool:
     """Return whether the mean of profiles contradicts the prior that each of them fits.
 
-    Noise hides the errors of a prior in each profile; their mean has less noise. The test is in
-    values along beams; the one of `_off_mean_solution` is in extinction, which thin air does not
-    determine.
+    Noise hides the errors of a prior in each profile; their mean has less noise.
     """
-    if mean_with_prior.status[0] != _joint_solution.SOLVED:
+    if not mean.settled[0]:
         return True
-    square, freedom = (
-        float(mean_with_prior.prior_chi_square[0]),
-        float(mean_with_prior.prior_degrees_of_freedom[0]),
-    )
-    if freedom <= 0:
-        return False
+    freedom = mean.total_degrees_of_freedom[0]
+    square = max(float(mean.total_chi_square[0]), 0.0)
     return bool(
-        special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0)
-        < THRESHOLDS.least_probability_of_mean
+        freedom > 0
+        and special.gammaincc(freedom / 2.0, square / 2.0) < THRESHOLDS.least_probability_of_mean
     )
 
 
-def _add_block_errors(
-    result: PriorSolution,
-    strength: float,
-    mean_with_prior: PriorSolution,
-    mean_without_prior: PriorSolution,
-) -> PriorSolution:
-    """Return solutions with the errors that the mean, with and without prior, shows."""
-    noise = _block_errors.noise_bias_variance(
-        result.logarithm, result.variance, mean_with_prior.logarithm[0]
-    )
-    field = _block_errors.excluded_field_variance(
-        result.excluded_variance,
-        mean_with_prior.logarithm[0],
-        mean_without_prior.logarithm[0],
-        mean_without_prior.variance[0],
-    )
-    # Where nothing can contradict a prior, the weakest one may be the true one.
-    doubt = max(THRESHOLDS.strengths[-1] / strength, THRESHOLDS.doubt)
-    untested = (doubt**2 - 1.0) / (THRESHOLDS.doubt**2 - 1.0)
-    factor = np.where(np.isfinite(mean_without_prior.variance[0]), 1.0, untested)
-    prior = (factor - 1.0) * (result.variance - result.prior_true_variance)
-    return replace(result, variance=result.variance + (noise + field + prior))
-
-
-def _likeliest_deviation(problem: _Problem, strength: float, smallest: float) -> PriorSolution:
-    """Solve with the largest deviation that is not much less likely than the likeliest one.
-
-    Where the likelihood does not separate deviations, the weaker prior is used. `smallest` is the
-    deviation that the mean of profiles requires.
-    """
-    costs, constants = _deviation_costs(problem, strength)
-    index = int(np.flatnonzero(costs <= costs.min() + THRESHOLDS.likelihood_tolerance)[-1])
-    index = max(index, int(np.searchsorted(THRESHOLDS.deviations, smallest)))
-    problem.constants[:] = constants[index]
-    return problem.solve(THRESHOLDS.deviations[index], _LAST_PASSES, strength)
-
-
-def _least_deviation(mean: _Problem, strength: float) -> float:
-    """Return the smallest deviation that is not much less likely than the likeliest one."""
-    costs, _ = _deviation_costs(mean, strength)
-    return THRESHOLDS.deviations[
-        int(np.flatnonzero(costs <= costs.min() + THRESHOLDS.likelihood_tolerance)[0])
-    ]
-
-
-def _deviation_costs(problem: _Problem, strength: float) -> tuple[Array, list[Array]]:
-    """Return -2 ln likelihood of each deviation, and the constants of its solution."""
-    problem.constants[:] = problem.start
-    problem.solve(THRESHOLDS.deviations[-1], _FIRST_PASSES, strength)
-    costs = np.empty(len(THRESHOLDS.deviations))
-    constants: list[Array] = []
-    for k in range(len(THRESHOLDS.deviations) - 1, -1, -1):
-        problem.solve(THRESHOLDS.deviations[k], _NEXT_PASSES, strength)
-        costs[k] = problem.likelihood
-        constants.insert(0, problem.constants.copy())
-    return costs, constants
-
-
-def _contradicted(result: PriorSolution, without_prior: PriorSolution) -> bool:
+def _contradicted(solution: Solution, free: Solution) -> bool:
     """Return whether solutions with and without the prior differ at a crossing, on average.
 
     The variance of the difference is the difference of the variances, because one solution uses
     all the information of the other (`hausman1978`). Only crossings that the beams determine well
     can contradict, and only by more than their variance, which is the bias of the solution
-    without prior. A difference below half the reported standard error is harmless.
+    without prior. A difference below half the standard error is harmless.
     """
-    known = np.isfinite(without_prior.variance) & np.isfinite(result.prior_true_variance)
-    known &= (without_prior.status == _joint_solution.SOLVED)[:, np.newaxis]
+    gap = free.logarithm - solution.logarithm
+    known = np.isfinite(gap) & free.settled[:, np.newaxis]
     number = np.maximum(known.sum(axis=0), 1)
-    gap = np.where(known, without_prior.logarithm - result.logarithm, 0.0).sum(axis=0) / number
-    free_variance = np.where(known, without_prior.variance, 0.0).sum(axis=0) / number
-    prior_variance = np.where(known, result.prior_true_variance, 0.0).sum(axis=0) / number
-    allowed = THRESHOLDS.contradiction * np.sqrt(
-        np.maximum(free_variance - prior_variance, 0.0) / number
+    average, free_variance, variance = (
+        np.where(known, values, 0.0).sum(axis=0) / number
+        for values in (gap, free.variance, solution.variance)
     )
-    allowed = np.maximum(allowed, THRESHOLDS.harmless * np.sqrt(prior_variance))
-    determined = (free_variance < THRESHOLDS.well_determined**2) & (
-        known.sum(axis=0) > THRESHOLDS.determined_share * len(known)
-    )
-    return bool(np.any(determined & (np.abs(gap) > allowed + free_variance)))
+    noise = np.sqrt(np.maximum(free_variance - variance, 0.0) / number)
+    allowed = np.maximum(THRESHOLDS.contradiction * noise, THRESHOLDS.harmless * np.sqrt(variance))
+    determined = known.any(axis=0) & (free_variance < THRESHOLDS.well_determined**2)
+    return bool(np.any(determined & (np.abs(average) > allowed + free_variance)))
 
 
-def _off_mean_solution(result: PriorSolution, mean_without_prior: PriorSolution) -> bool:
-    """Return whether the average of solutions differs from the solution of the mean.
+def median(values: Array) -> Array:
+    """Return medians over profiles of the finite values; NaN where there is none."""
+    known = np.isfinite(values)
+    if known.all() and len(values):
+        return np.asarray(np.median(values, axis=0))
+    out = np.full(values.shape[1], np.nan)
+    for column in np.flatnonzero(known.any(axis=0)):
+        out[column] = np.median(values[known[:, column], column])
+    return out
 
-    In the mean, noise is lower and the prior decides less. All profiles share the errors of a
-    prior.
+
+def _likeliest(problem: Problem, strength: float) -> Solution:
+    """Solve with the largest deviation that is not much less likely than the likeliest one.
+
+    Where the likelihood does not separate deviations, the weaker prior is used.
     """
-    known = np.isfinite(result.prior_true_variance)
-    number = np.maximum(known.sum(axis=0), 1)
-    average = np.where(known, result.logarithm, 0.0).sum(axis=0) / number
-    stated = np.where(known, result.prior_true_variance, 0.0).sum(axis=0) / number
-    determined = mean_without_prior.variance[0] < THRESHOLDS.determined_by_mean**2
-    determined &= (known.sum(axis=0) > 0.5 * len(known)) & (
-        mean_without_prior.status[0] == _joint_solution.SOLVED
-    )
-    with np.errstate(invalid="ignore"):
-        spread = np.sqrt(stated + mean_without_prior.variance[0])
-        differs = (
-            np.abs(mean_without_prior.logarithm[0] - average)
-            > THRESHOLDS.largest_mean_gap * spread + 0.5 * mean_without_prior.variance[0]
-        )
-    return bool(np.any(determined & differs))
-
-
-def _gradient_covariance(position: Array) -> Array:
-    """Return the covariance of a linear field of unit variance in any direction."""
-    if position.shape[0] == 0:
-        return np.zeros((0, 0))
-    centred = position - position.mean(axis=0)
-    covariance = np.sum(centred[:, np.newaxis, :] * centred[np.newaxis, :, :], axis=2)
-    size = float(np.trace(covariance))
-    # One crossing has no gradient.
-    return np.asarray(covariance * (len(position) / size if size > 0 else 0.0))
-
-
-def prior_of(position: Array, solution: PriorSolution, profile: int) -> tuple[Array, bool]:
-    """Return the precision of the prior of a solved profile, and whether it had none."""
-    strength = float(solution.strength[profile])
-    deviation = float(solution.deviation[profile]) / strength
-    precision, _, without_prior = _precision(_gradient_covariance(position), deviation, strength)
-    return precision, without_prior
-
-
-def _precision(gradient: Array, deviation: float, strength: float) -> tuple[Array, float, bool]:
-    """Return the precision of a prior, -ln of its determinant, and whether there is none."""
-    if not np.isfinite(deviation):
-        return np.zeros_like(gradient), 0.0, True
-    return *_free_level(gradient, deviation, strength), False
-
-
-def _free_level(gradient: Array, deviation: float, strength: float = 1.0) -> tuple[Array, float]:
-    """Return the precision of the prior with a free level, and -ln |precision|."""
-    covariance = THRESHOLDS.gradient**2 * gradient + deviation**2 * np.eye(len(gradient))
-    covariance *= strength**2
-    precision = np.linalg.inv(covariance)
-    sums = precision.sum(axis=0)
-    norm = float(np.linalg.slogdet(covariance)[1] + np.log(sums.sum()))
-    return precision - np.outer(sums, sums) / sums.sum(), norm
+    solution = problem.solve(Prior(THRESHOLDS.deviations[-1], strength), _FIRST_PASSES)
+    tried = []
+    for deviation in reversed(THRESHOLDS.deviations):
+        solution = problem.solve(Prior(deviation, strength), _NEXT_PASSES, solution.constants)
+        tried.append(solution)
+    limit = min(solution.cost for solution in tried) + THRESHOLDS.likelihood_tolerance
+    likely = next(solution for solution in tried if solution.cost <= limit)
+    return problem.solve(likely.prior, _LAST_PASSES, likely.constants)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network.geometry import Network, Passages
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -39,6 +38,8 @@ class FitLayout:
     """(passage,) first bin of the fit."""
     weights: Array
     """(passage, bin) weights of the logarithms for the value at the crossing."""
+    curvature_weights: Array
+    """(passage, bin) weights for the difference of line and polynomial; 0 for linear functions."""
     cell: Indices
     """(passage,) the bin at or before the crossing."""
     fraction: Array
@@ -49,9 +50,6 @@ class FitLayout:
     """(beam, bin) m."""
     limits: Indices
     """(beam, 2) first usable bin, and the one behind the last."""
-    neighbours: tuple[Indices, Array, Array]
-    """(beam, bin, neighbour) bins that predict a bin, their weights, and (beam, bin) the deviation
-    that air may cause; see `lidarops.retrieve.network.outlying_bins.plan_neighbours`."""
     offset: Indices
     """(beam + 1,) start of the packed covariance of each beam."""
 
@@ -96,9 +94,9 @@ def lay_out_fits(
     offset = np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
     bounds = np.array(limits, dtype=np.intp).reshape(-1, 2)
     return FitLayout(
-        measurable, net.crossings, measured, continues, first, window, weights, cell, fraction,
-        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds,
-        outlying_bins.neighbour_plan(range_, bounds), offset,
+        measurable, net.crossings, measured, continues, first, window, weights,
+        _curvature_weights(measurable, range_, window, weights), cell, fraction,
+        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds, offset,
     )  # fmt: skip
 
 
@@ -130,3 +128,13 @@ def _fits(
         cell[c] = min(cell_start, high - 2)
         fraction[c] = (distance - grid[cell[c]]) / (grid[cell[c] + 1] - grid[cell[c]])
     return window, weights, cell, fraction
+
+
+def _curvature_weights(kept: Passages, range_: Array, window: Indices, weights: Array) -> Array:
+    """Return the weights of the logarithms for the difference of line and polynomial."""
+    bins = weights.shape[1]
+    at = window[:, np.newaxis] + np.arange(bins)
+    distance = range_[kept.beam[:, np.newaxis], at] - kept.range[:, np.newaxis]
+    order = np.arange(min(THRESHOLDS.curvature_degree, bins - 1) + 1)
+    powers = (distance / np.ptp(distance, axis=1, keepdims=True))[..., np.newaxis] ** order
+    return np.asarray(weights - np.linalg.pinv(powers)[:, 0])

@@ -40,14 +40,10 @@ from scipy import special
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.network import (
-    _beam_signals,
-    _block_errors,
-    _curvature_errors,
-    _empirical_prior,
-    _joint_solution,
-)
+from lidarops.retrieve.network import _beam_signals, _block_errors
+from lidarops.retrieve.network._beam_signals import BeamSignals
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
+from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Problem, solve_block
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -200,129 +196,115 @@ def retrieve_network(
         power, range, network, variance=variance, overlap=overlap,
         full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, bins=bins,
     )  # fmt: skip
-    return _flag_result(beams, *_solve_network(beams, network.crossing, field_prior))
+    return _flag_result(beams, _solve_network(beams, network.crossing, field_prior))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Estimate:
-    """(profile, crossing) extinction before flags are set; NaN where there is none."""
+class _Estimates:
+    """What the blocks give, before flags are set; NaN where there is none."""
 
     extinction: Array
-    """m-1."""
+    """(profile, crossing) m-1."""
     variance: Array
-    """m-2."""
-    poorly_determined: Booleans
+    """(profile, crossing) m-2."""
+    prior_true_variance: Array
+    """(profile, crossing) m-2, without the errors that the block shows."""
+    prior_contradicted: Booleans
+    """(profile,) True where the beams contradict the prior but cannot replace it."""
+    settled: Booleans
+    """(profile,)."""
+    left_out: Booleans
+    """(profile, beam) True where the covariance of a beam is singular or missing."""
+    chi_square: Array
+    """(profile, 2) of the beams alone, and of beams and prior together."""
+    degrees_of_freedom: Array
+    """(profile, 2) of these."""
+    deviation: Array
+    """(profile,) standard deviation of the prior; inf without one."""
 
 
-def _solve_network(
-    beams: _beam_signals.BeamSignals, position: Array, prior: FieldPrior
-) -> tuple[_Estimate, _empirical_prior.PriorSolution]:
-    layout = beams.layout
-    measured_index = np.cumsum(layout.measured) - 1
-    crossing = measured_index[layout.passages.crossing].astype(np.intp)
-    position = position[layout.measured]
-    if prior is FieldPrior.NONE or crossing.size == 0:
-        fit = _empirical_prior.solve_without_prior(
-            beams.data, layout, crossing, beams.exponent, position
-        )
-    else:
-        fit = _empirical_prior.solve_blocks(
-            beams.data, layout, crossing, beams.exponent, position, beams.block
-        )
-    shape = (beams.block.size, layout.crossings)
-    extinction, variance = np.full(shape, np.nan), np.full(shape, np.nan)
-    prior_true_variance = np.full(shape, np.nan)
-    with np.errstate(over="ignore", under="ignore"):
-        extinction[:, layout.measured] = np.exp(fit.logarithm)
-        variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
-        prior_true_variance[:, layout.measured] = (
-            np.exp(2.0 * fit.logarithm) * fit.prior_true_variance
-        )
-    if prior is FieldPrior.BLOCK:
-        usable = beams.data.usable == 1
-        variance = _block_errors.at_least_typical(extinction, variance, beams.block, usable)
-    with np.errstate(over="ignore", under="ignore"):
-        curvature = _curvature_variance(beams, fit, crossing, position)
-        variance[:, layout.measured] += extinction[:, layout.measured] ** 2 * curvature
-    # The stated doubt in the prior is no noise that makes values unreliable.
-    poorly_determined = _poorly_determined(extinction, prior_true_variance, beams.block)
-    poorly_determined |= fit.prior_contradicted[:, np.newaxis]
-    return _Estimate(extinction, variance, poorly_determined), fit
+def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> _Estimates:
+    """Solve each block, and return its values with all their errors."""
+    layout, profiles = beams.layout, beams.block.size
+    shape = (profiles, layout.crossings)
+    out = _Estimates(
+        np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
+        np.zeros(profiles, dtype=np.bool_), np.zeros(profiles, dtype=np.bool_),
+        np.zeros((profiles, beams.exponent.size), dtype=np.bool_),
+        np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan), np.full(profiles, np.inf),
+    )  # fmt: skip
+    number = np.cumsum(layout.measured) - 1
+    crossing = number[layout.passages.crossing].astype(np.intp)
+    for block in np.unique(beams.block) if crossing.size else ():
+        rows = np.flatnonzero(beams.block == block)
+        data = beams.data.take(rows)
+        problem = Problem(data, layout, crossing, beams.exponent, position[layout.measured])
+        if prior is FieldPrior.NONE:
+            solution = problem.solve(NO_PRIOR)
+            variance = solution.variance
+        else:
+            solved = solve_block(problem)
+            solution = solved.profiles
+            variance = solution.variance + _block_errors.prior_variance(solved)
+            variance = variance + _block_errors.noise_bias_variance(solved)
+            out.prior_contradicted[rows] = solved.contradicted
+        variance = variance + _block_errors.curvature_variance(data, solution.carried)
+        here = np.ix_(rows, np.flatnonzero(layout.measured))
+        with np.errstate(over="ignore", under="ignore"):
+            extinction = np.exp(solution.logarithm)
+            out.extinction[here] = extinction
+            out.variance[here] = extinction**2 * variance
+            out.prior_true_variance[here] = extinction**2 * solution.variance
+        out.settled[rows], out.left_out[rows] = solution.settled, solution.left_out
+        out.chi_square[rows, 0] = solution.chi_square
+        out.chi_square[rows, 1] = solution.total_chi_square
+        out.degrees_of_freedom[rows, 0] = solution.degrees_of_freedom
+        out.degrees_of_freedom[rows, 1] = solution.total_degrees_of_freedom
+        out.deviation[rows] = solution.prior.strength * solution.prior.deviation
+    return out
 
 
-def _curvature_variance(
-    beams: _beam_signals.BeamSignals,
-    fit: _empirical_prior.PriorSolution,
-    crossing: Indices,
-    position: Array,
-) -> Array:
-    """Return (profile, crossing) variances of ln extinction from curved signals.
-
-    The block shows the curvature; see `lidarops.retrieve.network._curvature_errors`.
-    """
-    variance = np.zeros_like(fit.logarithm)
-    geometry = (beams.layout.first_passage, beams.layout.offset, crossing)
-    for number in np.unique(beams.block):
-        profiles = np.flatnonzero(beams.block == number)
-        precision, without_prior = _empirical_prior.prior_of(position, fit, profiles[0])
-        data, shifts = beams.data.take(profiles), np.zeros((profiles.size, position.shape[0], 4))
-        _curvature_errors.carry_errors(
-            data.log_value, data.integral, data.usable, data.covariance, geometry, precision,
-            without_prior, fit.logarithm[profiles],
-            _curvature_errors.block_medians(data.curvature_error, data.usable),
-            data.curvature_error, shifts,
-        )  # fmt: skip
-        variance[profiles] = _curvature_errors.curvature_variance(shifts)
-    return variance
-
-
-def _flag_result(
-    beams: _beam_signals.BeamSignals,
-    estimate: _Estimate,
-    fit: _empirical_prior.PriorSolution,
-) -> NetworkResult:
+def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
-    shape = estimate.extinction.shape
+    shape, passages = estimate.extinction.shape, beams.layout.passages
     near = beams.layout.near_crossing
     with np.errstate(invalid="ignore"):
         finite = np.isfinite(estimate.variance)
         finite &= np.abs(estimate.extinction) < air_visibility.LARGEST_EXTINCTION
         finite &= estimate.extinction > 0
         uncertain = estimate.variance > estimate.extinction**2
-    extinction = np.where(finite & near, estimate.extinction, np.nan)
-    error = np.sqrt(np.where(finite & near, estimate.variance, np.nan))
-    freedom = fit.degrees_of_freedom
+    # The stated doubt in the prior is no noise that makes values unreliable.
+    doubted = _poorly_determined(estimate.extinction, estimate.prior_true_variance, beams.block)
+    doubted |= estimate.prior_contradicted[:, np.newaxis]
+    poor = np.any(_improbable(estimate.chi_square, estimate.degrees_of_freedom), axis=1)
+    converged = estimate.settled | ~np.isfinite(estimate.chi_square[:, 1])
+    too_weak = beams.weak | (estimate.left_out[:, passages.beam] & beams.data.usable)
+    flags = {
+        "ill_conditioned": doubted & finite,
+        "not_finite": ~finite,
+        "uncertain": uncertain,
+        "signal_not_positive": _lost_signal(beams, NOT_POSITIVE),
+        "signal_missing": _lost_signal(beams, MISSING),
+        "weak_signal": _by_crossing(beams, too_weak),
+        "bridged": _by_crossing(beams, beams.data.bridged[:, passages.beam]),
+        "outlying": _lost_signal(beams, OUTLYING),
+        "unsettled": np.broadcast_to(~converged[:, np.newaxis], shape),
+        "poor_fit": np.broadcast_to(poor[:, np.newaxis], shape),
+        "not_measured": np.broadcast_to(~beams.layout.measured, shape),
+    }
+    crossings = (*beams.leading, shape[1])
+    freedom, chi_square = estimate.degrees_of_freedom[:, 0], estimate.chi_square[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
-        chi_square = np.where(freedom > 0, fit.chi_square / freedom, np.nan)
-    poor = _improbable(fit.chi_square, freedom)
-    poor |= _improbable(fit.prior_chi_square, fit.prior_degrees_of_freedom)
-    not_converged = fit.status == _joint_solution.UNSETTLED
-    dropped = fit.left_out[:, beams.layout.passages.beam] == 1
-    too_weak = beams.weak | (dropped & (beams.data.usable == 1))
-    flags = CrossingFlags(
-        ill_conditioned=estimate.poorly_determined & finite,
-        not_finite=~finite,
-        uncertain=uncertain,
-        signal_not_positive=_lost_signal(beams, NOT_POSITIVE),
-        signal_missing=_lost_signal(beams, MISSING),
-        weak_signal=_by_crossing(beams, too_weak),
-        bridged=_by_crossing(beams, beams.data.bridged[:, beams.layout.passages.beam] == 1),
-        outlying=_lost_signal(beams, OUTLYING),
-        unsettled=np.broadcast_to(not_converged[:, np.newaxis], shape),
-        poor_fit=np.broadcast_to(poor[..., np.newaxis], shape),
-        not_measured=np.broadcast_to(~beams.layout.measured, shape),
-    )
-    leading = beams.leading
-    shaped = CrossingFlags(
-        **{
-            f.name: getattr(flags, f.name).reshape(*leading, shape[1]).copy()
-            for f in fields(CrossingFlags)
-        }
-    )
+        reduced = np.where(freedom > 0, chi_square / freedom, np.nan)
     return NetworkResult(
-        extinction.reshape(*leading, shape[1]), error.reshape(*leading, shape[1]), shaped, near,
-        chi_square.reshape(leading), freedom.reshape(leading), fit.deviation.reshape(leading),
-    )  # fmt: skip
+        np.where(finite & near, estimate.extinction, np.nan).reshape(crossings),
+        np.sqrt(np.where(finite & near, estimate.variance, np.nan)).reshape(crossings),
+        CrossingFlags(**{name: flag.reshape(crossings).copy() for name, flag in flags.items()}),
+        near,
+        reduced.reshape(beams.leading),
+        freedom.reshape(beams.leading),
+        estimate.deviation.reshape(beams.leading),
+    )
 
 
 def _poorly_determined(extinction: Array, variance: Array, block: Indices) -> Booleans:
@@ -351,7 +333,7 @@ def _poorly_determined(extinction: Array, variance: Array, block: Indices) -> Bo
 
 
 def _improbable(chi_square: Array, freedom: Array) -> Booleans:
-    """Return where a chi-square this large has a probability below `_LEAST_PROBABILITY`."""
+    """Return where a chi-square this large has a probability below `least_probability`."""
     known = np.isfinite(chi_square) & (freedom > 0)
     probability = special.gammaincc(
         np.where(known, freedom, 1.0) / 2.0, np.where(known, np.maximum(chi_square, 0.0), 0.0) / 2.0
@@ -359,14 +341,13 @@ def _improbable(chi_square: Array, freedom: Array) -> Booleans:
     return np.asarray(known & (probability < THRESHOLDS.least_probability))
 
 
-def _lost_signal(beams: _beam_signals.BeamSignals, reason: int) -> Booleans:
+def _lost_signal(beams: BeamSignals, reason: int) -> Booleans:
     """Return where a beam of a crossing lost its signal for the given reason."""
     status = beams.data.status[:, beams.layout.passages.beam]
-    lost = (beams.data.usable == 0) & ~beams.weak
-    return _by_crossing(beams, (status == reason) & lost)
+    return _by_crossing(beams, (status == reason) & ~beams.data.usable & ~beams.weak)
 
 
-def _by_crossing(beams: _beam_signals.BeamSignals, passages: Booleans) -> Booleans:
+def _by_crossing(beams: BeamSignals, passages: Booleans) -> Booleans:
     """Return (profile, crossing) whether any passage of the crossing is True."""
     out = np.zeros((passages.shape[0], beams.layout.crossings), dtype=np.bool_)
     for c, crossing in enumerate(beams.layout.passages.crossing):

@@ -36,10 +36,8 @@ class Thresholds:
     negative: float = 4.0
     """Standard errors below zero at which a mean signal is faulty, not weak; assumed."""
     noisy_profile: float = 10.0
-    """Ratio to the median variance of a block, beyond which a profile does not count for it. Where
-    its signal is stronger, up to this factor more is allowed; assumed."""
-    energy_bins: int = 31
-    """Bins over which the energy of a profile is compared with that of its block; assumed."""
+    """Ratio to the median variance of a block, beyond which a profile does not count for it;
+    assumed."""
 
     # Outlying bins: ablation
     outlier: float = 6.0
@@ -51,12 +49,11 @@ class Thresholds:
     """Bins on either side among which neighbours are searched; assumed."""
     margin: int = 4
     """Bins before and behind the used ones of a beam that help to test these; assumed."""
-    air_deviation: tuple[float, float, float, float] = (5e-2, 1e-3, 5e-4, 5e-4)
-    """Largest relative deviation that air causes, with 0 to 3 neighbours on the side with fewer; a
-    plume of 50 m in bins of 7.5 m causes less than 1e-5 with 3."""
-    noisy_bin: float = 0.02
-    """Relative standard error of a bin, beyond which logarithms are not normal in their tails;
-    assumed."""
+    air_deviation: float = 1e-3
+    """Largest relative deviation that air causes, with one neighbour on one side; a plume of 50 m
+    in bins of 7.5 m; calculated."""
+    air_deviation_beyond: float = 5e-2
+    """The same at an end of a beam, where all neighbours are on one side; assumed."""
     widest_bin: float = 10.0
     """m. A layer may fill a wider bin; assumed."""
     step: float = 0.1
@@ -68,8 +65,8 @@ class Thresholds:
 
     # Curved signals: ablation
     curvature_degree: int = 4
-    """Degree of the polynomial. Over 35 m it gives the error from a layer with a standard deviation
-    of 10 m to within 10 percent, a parabola to within 50 percent; calculated."""
+    """Degree of the polynomial. A parabola leaves half of the error from a layer of 10 m over 35 m;
+    calculated."""
     shared_noise: float = 4.0
     """Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08
     of one variance on average; normal distribution."""
@@ -77,14 +74,10 @@ class Thresholds:
     """The same for a single profile, which leaves 0.005 of one variance; normal distribution."""
     chance: float = 3.0
     """Standard deviations by which a mean square of noise may be larger by chance; assumed."""
-    least_remainder: float = 1e-3
-    """Smallest share of signal / extinction at a crossing that remains after the integrals;
-    assumed."""
 
     # The prior: ablation
     gradient: float = 0.15
-    """Standard deviation of ln extinction over the crossings by a gradient. With 0.1 to 0.2, 99
-    percent of values are within 3 standard errors in gradients and plumes; simulations."""
+    """Standard deviation of ln extinction over the crossings by a gradient; simulations."""
     deviations: tuple[float, ...] = tuple(float(s) for s in np.geomspace(0.01, 1.0, 9))
     """Standard deviations of ln extinction at single crossings that are tried; assumed."""
     strengths: tuple[float, ...] = (1.0, 2.0, 4.0)
@@ -96,22 +89,12 @@ class Thresholds:
     assumed."""
     well_determined: float = 0.15
     """Standard error of ln extinction below which beams alone determine a crossing; assumed."""
-    determined_share: float = 0.9
-    """Share of the profiles in which a crossing that contradicts a prior is determined; assumed."""
     contradiction: float = 3.5
     """Standard errors of the difference at which beams contradict a prior; assumed."""
     harmless: float = 0.5
     """Share of the stated error that a difference may reach without effect; assumed."""
-    fewest_profiles: int = 8
-    """Smallest number of profiles of a beam for a mean; assumed."""
     testing_quantile: float = 0.75
     """Quantile of the degrees of freedom that decides whether profiles test the prior; assumed."""
-    determined_by_mean: float = 0.3
-    """Standard error of ln extinction below which the mean of profiles determines a crossing;
-    assumed."""
-    largest_mean_gap: float = 2.5
-    """Largest difference of the mean of solutions and the solution of the mean, in standard errors
-    of both; assumed."""
     least_probability_of_mean: float = 1e-2
     """Probability of the chi-square of the mean with the prior, below which the prior is rejected;
     chosen."""
@@ -131,17 +114,8 @@ class Thresholds:
     """Precision of ln extinction in place of a prior: a standard deviation of 10; assumed."""
     largest_variance: float = 4.0
     """Variance of ln extinction beyond which it is not determined; assumed."""
-    series_below: float = 0.03
-    """Logarithmic step of a cell below which its integral comes from a series of 8 terms;
-    rounding."""
 
     # Errors that the block shows: ablation
-    bend: float = 0.15
-    """Standard deviation of ln extinction over the crossings by the curvature of a field: that of a
-    gradient; assumed."""
-    nonlinear_error: float = 0.1
-    """Typical relative error of a block, beyond which the error of a profile depends on its noise;
-    assumed."""
     largest_deviation: float = 8.0
     """Limit of the deviation of a profile from the median, in median standard errors; assumed."""
 

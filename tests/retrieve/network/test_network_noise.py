@@ -5,23 +5,22 @@ from __future__ import annotations
 import numpy as np
 from support.oracles.network import grid, homogeneous, noisy, plume, signals, three_by_two
 
-from lidarops.retrieve.network import _beam_signals
 from lidarops.retrieve.network.extinction_field import retrieve_network
 
 FULL = {"full_overlap_range": 100.0}
 
 
-def test_profiles_are_noisy_only_beyond_the_noise_of_their_signal():
+def test_a_profile_far_noisier_than_its_block_is_weak_only_where_its_own_signal_is():
     """The noise of photon counts grows with the signal; this is no detector fault."""
-    signal, variances = np.ones((50, 40)), np.ones((50, 40))
-    variances[3] = 90.0
-    np.testing.assert_allclose(_beam_signals._typical_variance(variances, signal, signal[0]), 1.0)
-    signal[3] = 4.0
-    np.testing.assert_allclose(
-        _beam_signals._typical_variance(variances, signal, signal[0]), (49.0 + 90.0) / 50.0
-    )
-    variances[3] = 110.0
-    np.testing.assert_allclose(_beam_signals._typical_variance(variances, signal, signal[0]), 1.0)
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.02, 50)
+    variances = np.broadcast_to(variance, power.shape).copy()
+    power[3], variances[3] = 30.0 * power[3], 900.0 * variances[3]
+    variances[7] = power[7] ** 2
+    weak = retrieve_network(power, r, net, variance=variances, **FULL).flags.weak_signal
+    assert weak[7].any()
+    assert not weak[np.arange(50) != 7].any()
 
 
 def test_an_unknown_beam_is_missing_and_not_weak():

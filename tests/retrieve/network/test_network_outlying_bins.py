@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from scipy.interpolate import BarycentricInterpolator
@@ -17,7 +20,6 @@ from support.oracles.network import (
 
 from lidarops.retrieve.network import _condensed_signals, _fit_layout, outlying_bins
 from lidarops.retrieve.network.extinction_field import retrieve_network
-from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 BINS = 7
 
@@ -46,11 +48,10 @@ def solved(net, r, power, variance, **settings):
 def condensed(net, r, power, variance, *, screened=True, nearest=100.0):
     ranges = np.tile(r, (net.beams, 1))
     layout = _fit_layout.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
-    rows = np.broadcast_to(variance, (1, *power.shape[1:]))
-    data = _condensed_signals.condense(
-        power, np.ascontiguousarray(rows), np.zeros(len(power), dtype=np.intp),
-        np.ones(net.beams), layout, screened=screened,
-    )  # fmt: skip
+    variances = np.broadcast_to(variance, power.shape)
+    patched = nullcontext() if screened else patch.object(outlying_bins, "search")
+    with patched:
+        data = _condensed_signals.condense(power, variances, np.ones(net.beams), layout)
     return data, layout
 
 
@@ -83,42 +84,10 @@ def test_air_and_noise_do_not_change_at_all(name, step):
         screened, _ = condensed(net, r, power, variance)
         unscreened, _ = condensed(net, r, power, variance, screened=False)
         assert not screened.bridged.any()
-        for quantity in ("log_value", "integral", "usable", "covariance", "slope", "status"):
+        for quantity in ("log_value", "integral", "usable", "covariance", "status"):
             np.testing.assert_array_equal(
                 getattr(screened, quantity), getattr(unscreened, quantity)
             )
-
-
-@pytest.mark.parametrize("relative", [2e-3, 0.01, 0.05, 0.2])
-def test_deviations_of_bins_are_normal(relative):
-    """The threshold of 6 is then exceeded once in 5e8 bins."""
-    rng = np.random.default_rng(5)
-    rows, count = 400, 200
-    slope = -0.01 * np.arange(count)
-    power = np.exp(slope) * (1 + relative * rng.standard_normal((rows, count)))
-    codes, limits = np.zeros(count, dtype=np.uint8), np.array([[0, count]])
-    ranges = 5.0 * np.arange(1.0, count + 1)
-    plan = np.zeros((1, count, 6), np.intp), np.zeros((1, count, 6)), np.zeros((1, count))
-    outlying_bins.plan_neighbours(ranges[None], limits, *plan)
-    nodes, weights, air = (array[0] for array in plan)
-    deviations = np.empty((rows, count))
-    for n in range(rows):
-        noise = (relative * np.exp(slope) / power[n]) ** 2
-        row = np.log(np.maximum(power[n], 1e-9)), noise, power[n], (relative * np.exp(slope)) ** 2
-        outlying_bins._measure_deviations(
-            row,
-            1.0,
-            ranges,
-            codes,
-            (0, count, 0, count),
-            (nodes, weights, 0.0 * air),
-            deviations[n],
-        )
-    for sigmas, chance in ((2.0, 4.55e-2), (3.0, 2.7e-3), (4.0, 6.3e-5)):
-        expected = chance * deviations.size
-        # The noise of a bin is in 7 deviations: fewer are independent.
-        assert abs(np.sum(deviations > sigmas) - expected) < 4 * np.sqrt(7 * expected) + 3
-    assert deviations.max() < THRESHOLDS.outlier
 
 
 def test_low_photon_counts_are_no_outliers():
@@ -370,10 +339,10 @@ def test_weights_agree_with_polynomials():
     x = np.cumsum(rng.uniform(3.0, 9.0, 9))
     nodes, weights = np.array([0, 1, 3, 5, 6, 8, 0, 0]), np.empty(8)
     y = rng.standard_normal(9)
-    outlying_bins._fit_weights(x, 4, nodes, 6, 5, weights)
+    outlying_bins.fit_weights(x, 4, nodes, 6, 5, weights)
     through = BarycentricInterpolator(x[nodes[:6]], y[nodes[:6]])(x[4])
     assert weights[:6] @ y[nodes[:6]] == pytest.approx(through, rel=1e-10)
-    outlying_bins._fit_weights(x, 4, nodes, 6, 3, weights)
+    outlying_bins.fit_weights(x, 4, nodes, 6, 3, weights)
     fitted = np.polynomial.Polynomial.fit(x[nodes[:6]], y[nodes[:6]], 3)(x[4])
     assert weights[:6] @ y[nodes[:6]] == pytest.approx(fitted, rel=1e-10)
 

@@ -112,3 +112,17 @@ def root_mean_square(values):
     count = known.sum(axis=0)
     total = np.where(known, values, 0.0) ** 2
     return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def cycle_start(start, end, integral, multiplier=1.0):
+    """Return 1 / extinction at the start of a cycle of beams, equations 11 and 12 of drabenko2021.
+
+    Rows, on the last axis, lead from each crossing to the next one and back to the first:
+    start / sigma - end / sigma_next = integral, which is negative towards a lidar.
+    """
+    powers = multiplier ** np.arange(start.shape[-1])
+    product = np.cumprod(end / start, axis=-1)
+    before = np.concatenate([np.ones_like(product[..., :1]), product[..., :-1]], axis=-1)
+    return np.sum(powers * before * integral / start, axis=-1) / (
+        1.0 - powers[-1] * product[..., -1]
+    )

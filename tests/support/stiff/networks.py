@@ -1,4 +1,4 @@
-"""Stiff and extreme cases of networks of lidars, of cycles and of visibility."""
+"""Stiff and extreme cases of networks of lidars and of visibility."""
 
 from __future__ import annotations
 
@@ -19,16 +19,13 @@ from lidarops.bench.accuracy.network_cases import (
 )
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import visibility
-from lidarops.retrieve.network import cycles, extinction_field
+from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import NetworkQuality
 from support.stiff.cases import (
-    Accepted,
     Answer,
-    Array,
     Between,
     Covered,
-    Flagged,
     Missing,
     Near,
     Refused,
@@ -196,70 +193,6 @@ def _network_cases() -> tuple[StiffCase, ...]:
     )  # fmt: skip
 
 
-# Cycles in closed form ------------------------------------------------------------------------
-
-
-def _against_lu(beams: int) -> Answer:
-    rng = np.random.default_rng(beams)
-    start = rng.uniform(1.0, 2.0, (500, beams))
-    end, integral = start * rng.uniform(0.6, 0.9, start.shape), rng.uniform(0.1, 0.3, start.shape)
-    matrix = np.zeros((500, beams, beams), dtype=np.longdouble)
-    rows_index = np.arange(beams)
-    matrix[:, rows_index, rows_index] = start
-    matrix[:, rows_index, (rows_index + 1) % beams] -= end
-    exact = np.linalg.solve(matrix.astype(np.float64), integral[..., np.newaxis])[:, 0, 0]
-    value = cycles.solve_cycle(start, end, integral).value
-    return Answer({"change": np.max(np.abs(value / exact - 1.0))})
-
-
-def _cycle(**arguments: Any) -> Answer:
-    result = cycles.solve_cycle(**arguments)
-    bits = np.where(result.flagged, np.int32(FLAGGED), np.int32(0))
-    return Answer({"value": result.value}, np.atleast_1d(bits))
-
-
-def _rows(**more: Any) -> dict[str, Any]:
-    arguments = {"start": [1.0, 1.2, 0.9], "end": [0.8, 1.1, 0.7], "integral": [0.2, 0.1, 0.2],
-             "relative_variance": np.full((3, 3), 1e-6)}  # fmt: skip
-    return arguments | more
-
-
-def _cycle_cases() -> tuple[StiffCase, ...]:
-    flat = {"start": [1.0, 1.0, 1.0], "end": [1.0, 1.0, 1.0]}
-    return (
-        *(
-            _case(f"closed form against LU, {beams} beams", build=partial(dict, beams=beams),
-                  solve=_against_lu, expected=(Near("change", 0.0, 1e-13, relative=False),))
-            for beams in (3, 5, 12, 40)
-        ),
-        _case("cycle without attenuation", build=lambda: _rows(**flat), solve=_cycle,
-              expected=(Flagged(FLAGGED),)),
-        *(
-            _case(f"cycle with a signal of {value:g}",
-                  build=partial(_rows, start=[value, 1.2, 0.9]), solve=_cycle,
-                  expected=(Flagged(FLAGGED),))
-            for value in (np.nan, 0.0, -1.0, np.inf)
-        ),
-        _case("A j closed form beyond its pole", solve=_cycle,
-              build=lambda: _rows(start=[1.0, 1.0, 1.0], end=[1.5, 1.5, 1.5], multiplier=0.9),
-              expected=(Flagged(FLAGGED), Missing("value"))),
-        _case("cycle in denormal signals", solve=_cycle,
-              build=lambda: _rows(start=np.array([1.0, 1.2, 0.9]) * 1e-300,
-                                  end=np.array([0.8, 1.1, 0.7]) * 1e-300,
-                                  integral=np.array([0.2, 0.1, 0.2]) * 1e-300),
-              expected=(Near("value", _value_of_rows, 1e-12), Accepted())),
-        _case("multiplier above 1", build=lambda: _rows(multiplier=1.1), solve=_cycle,
-              expected=(Refused(RetrievalInputError, "multiplier"),)),
-        _case("negative variances of a cycle", solve=_cycle,
-              build=lambda: _rows(relative_variance=-np.ones((3, 3))),
-              expected=(Refused(RetrievalInputError, "relative_variance"),)),
-    )  # fmt: skip
-
-
-def _value_of_rows() -> Array:
-    return np.asarray(cycles.solve_cycle(**_rows()).value)
-
-
 # Visibility -----------------------------------------------------------------------------------
 
 
@@ -316,5 +249,5 @@ def _refused_cases() -> tuple[StiffCase, ...]:
 
 
 def stiff_network_cases() -> tuple[StiffCase, ...]:
-    """Return all stiff cases of networks, cycles and visibility."""
-    return (*_network_cases(), *_cycle_cases(), *_visibility_cases(), *_refused_cases())
+    """Return all stiff cases of networks and visibility."""
+    return (*_network_cases(), *_visibility_cases(), *_refused_cases())
