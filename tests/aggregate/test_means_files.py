@@ -28,7 +28,7 @@ from lidarops.errors import ProductError
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import ErrorKind, layout_of
 from lidarops.records import DetectionMode
-from lidarops.retrieve.air.labeled import Definition, visibility_of_extinction
+from lidarops.retrieve.air.labeled import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.air.visibility import WavelengthLaw
 
 
@@ -196,7 +196,7 @@ def test_the_systematic_error_of_visibility_does_not_average_out(
     law: WavelengthLaw, tmp_path: Path
 ):
     """Extinction is too large by its stated systematic error in all profiles."""
-    definition = Definition(wavelength=532e-9, law=law)
+    definition = VisibilityDefinition(wavelength=532e-9, law=law)
     true, random, declared = 2e-4, 6e-6, 2e-5
 
     def off(data: xr.Dataset) -> xr.Dataset:

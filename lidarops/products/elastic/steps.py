@@ -85,7 +85,7 @@ class KnownShape(Step[Case, NoSettings]):
         data[KNOWN_SHAPE] = True
 
 
-class WindowSettings(SettingsModel):
+class ReferenceWindowSettings(SettingsModel):
     """Settings of the step ``reference``."""
 
     lowest: float
@@ -98,17 +98,17 @@ class WindowSettings(SettingsModel):
     relative_error: float
 
 
-class ReferenceWindow(Step[Case, WindowSettings]):
+class ReferenceWindow(Step[Case, ReferenceWindowSettings]):
     """State where the reference window may lie."""
 
     name = "reference"
-    settings = WindowSettings
+    settings = ReferenceWindowSettings
     outputs = (REFERENCE,)
 
     def decide(self, case: Case) -> Decisions:
         """Run always."""
         limits, window = _reference_limits(case), case.request.reference
-        settings = WindowSettings(
+        settings = ReferenceWindowSettings(
             lowest=limits.bottom,
             highest=limits.top,
             width=limits.width,
@@ -118,7 +118,7 @@ class ReferenceWindow(Step[Case, WindowSettings]):
         reason = "windows within the campaign's limits are tested against the molecular profile"
         yield Run(reason, settings, number=limits.top - limits.bottom)
 
-    def carry_out(self, settings: WindowSettings, data: Data) -> None:
+    def carry_out(self, settings: ReferenceWindowSettings, data: Data) -> None:
         """Give the limits."""
         data[REFERENCE] = labeled.Reference(**dict(settings))
 

@@ -22,7 +22,7 @@ from lidarops.products.homogeneous.look import (
 from lidarops.products.homogeneous.settings import HomogeneousSettings
 from lidarops.records import DetectionMode, LeftOut, PlannedStep
 from lidarops.retrieve.air import labeled as labeled_visibility
-from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import channel_unit
@@ -320,7 +320,7 @@ class _Sections(WholeProduct):
         """Yield all profiles, with visibility along the sections where it is requested."""
         sections, requested = self._joined(), self._settings.visibility
         if requested is not None:
-            definition = Definition(self._data[WAVELENGTH], **dict(requested))
+            definition = VisibilityDefinition(self._data[WAVELENGTH], **dict(requested))
             sections = _with_visibility(sections, definition)
         return in_one_batch(sections)
 
@@ -343,7 +343,7 @@ def _in_order(
     return joined.isel(section=places).assign_coords(section=("section", number))
 
 
-def _with_visibility(sections: xr.Dataset, definition: Definition) -> xr.Dataset:
+def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:
     visibility = labeled_visibility.visibility_of_extinction(
         sections["extinction"],
         sections["extinction_standard_error"],

@@ -23,7 +23,7 @@ from lidarops.products.visibility.network import (
 )
 from lidarops.products.visibility.settings import PriorName, VisibilityProductSettings
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene
-from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BeamAverages
@@ -114,10 +114,10 @@ class NetworkSettings(VisibilitySettings):
     overlap_relative_error: float
 
     @property
-    def definition(self) -> Definition:
+    def definition(self) -> VisibilityDefinition:
         """Definition of visibility."""
         values = {name: getattr(self, name) for name in VisibilitySettings.model_fields}
-        return Definition(self.wavelength, **values)
+        return VisibilityDefinition(self.wavelength, **values)
 
 
 _AVERAGE: Final = Average(

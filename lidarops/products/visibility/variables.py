@@ -122,11 +122,8 @@ LAYOUT: Final = Layout(
     " beam_latitude, beam_longitude and beam_altitude are the positions of the lidars. A gradient"
     " over the whole network mimics attenuation where the air is optically thin or the noise is"
     " high, and no test detects it there: extinction_standard_error allows for twice the typical"
-    " gradient, and for a curved field where the mean of a block of profiles permits it. In"
-    " simulated random networks 0.01(1) percent of the values without a rejecting flag deviated by"
-    " more than 4 standard errors, 0.005(3) percent in plumes that drift within a block. More"
-    " profiles in a block and more beams constrain the field better. The error that the prior"
-    " leaves is common to all profiles, so that a mean over time does not reduce it.",
+    " gradient. More profiles in a block and more beams constrain the field better. The error that"
+    " the prior leaves is common to all profiles, so that a mean over time does not reduce it.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=(

@@ -22,7 +22,7 @@ NAMES: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Definition:
+class VisibilityDefinition:
     """Definition of visibility: wavelength of extinction, contrast threshold, wavelength law."""
 
     wavelength: float
@@ -49,7 +49,7 @@ def visibility_of_extinction(
     extinction: xr.DataArray,
     standard_error: xr.DataArray,
     systematic_error: xr.DataArray,
-    definition: Definition,
+    definition: VisibilityDefinition,
 ) -> xr.Dataset:
     """Return visibility, its random standard error, and its interval from both errors.
 
@@ -57,7 +57,7 @@ def visibility_of_extinction(
     ----------
     extinction, standard_error, systematic_error : xr.DataArray
         m-1, in memory.
-    definition : Definition
+    definition : VisibilityDefinition
 
     Returns
     -------
@@ -87,7 +87,7 @@ def _visibility(
     extinction: npt.NDArray[Any],
     standard_error: npt.NDArray[Any],
     systematic_error: npt.NDArray[Any],
-    definition: Definition,
+    definition: VisibilityDefinition,
 ) -> tuple[Array, ...]:
     total_error = np.hypot(standard_error.astype(np.float64), systematic_error)
     random, total = (
@@ -107,7 +107,10 @@ def _visibility(
 
 
 def _at_550_nm(
-    extinction: npt.NDArray[Any], error: npt.NDArray[Any], spread: float, definition: Definition
+    extinction: npt.NDArray[Any],
+    error: npt.NDArray[Any],
+    spread: float,
+    definition: VisibilityDefinition,
 ) -> visibility.VisibilityResult:
     reference = visibility.at_reference_wavelength(
         extinction,

@@ -8,23 +8,13 @@ far one v therefore
     a_n / extinction_n - a_v / extinction_v = 2 m (integral of a from n to v).
 
 No calibration is needed: the constant of a lidar multiplies the whole row. The overlap does not
-cancel: an error of 1, 3 and 10 percent at the first crossing changes extinction there by 5, 14
-and 34 percent.
+cancel.
 
 In thin air or high noise, a gradient over the whole network looks like attenuation, and no test
 can separate them. The standard error is then mostly what the prior allows and what the rest of
-the block shows (`lidarops.retrieve.network._block_errors`). In 800 random networks, 0.01(1)
-percent of the unflagged values differed from the truth by more than 4 standard errors, and
-0.005(3) percent in plumes that drift within a block (`lidarops bench stability`). The remaining
-ones are single crossings in dense plumes. More profiles per block and more beams reduce them.
-
-In a layer so thin that the signal is curved within the bins of a fit, the fitted values are
-biased. The block shows this error too (`lidarops.retrieve.network._curvature_errors`).
-
-Scale heights in these networks are 300 m or more. In steeper fields the signals at far crossings
-may be too weak, which leaves fewer equations than unknowns. Errors are then stated with a prior
-of 0.6 for ln extinction over the crossings, and values are flagged where the beams contradict
-the usual prior. A still steeper field goes undetected where so few beams cannot show it.
+the block shows (`lidarops.retrieve.network._block_errors`). Where the beams leave fewer equations
+than unknowns, values are flagged if the beams contradict the prior; a field so steep that few
+beams cannot show it goes undetected. ``docs/algorithms/network.md`` has the rates.
 """
 
 from __future__ import annotations
@@ -113,11 +103,10 @@ class NetworkResult:
     extinction: Array
     """(..., crossing) m-1; NaN without a value, and at crossings that are far on all beams."""
     extinction_standard_error: Array
-    """m-1. From noise, from the error of a straight-line fit where the signal is curved, and from
-    deviations of the field from the prior: twice the prior's standard deviation is assumed, eight
-    times where the beams are too few to test the prior, and a curvature of the field over the
-    network where the mean of the block's beams allows it. In thin air it is at least the typical
-    error of the block, and includes the bias that noise gives all its profiles."""
+    """m-1. From noise, from the error of a straight-line fit where the signal is curved, from a
+    field that deviates by twice the prior's standard deviation, or by four times the strongest
+    prior where the beams leave a crossing open, and from the bias that noise gives all profiles
+    of a block."""
     flags: CrossingFlags
     near_crossing: Booleans
     """(crossing,) True where extinction is reported."""

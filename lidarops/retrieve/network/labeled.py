@@ -13,7 +13,7 @@ import xarray as xr
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air import labeled
-from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.estimate import from_tail
 from lidarops.retrieve.background.left_signal import shifts
 from lidarops.retrieve.network import extinction_field
@@ -77,7 +77,7 @@ class NetworkSettings:
 
     block_intervals: int
     """Number of clock intervals that share a mean field."""
-    visibility: Definition
+    visibility: VisibilityDefinition
     prior: str = "block"
     exponent_relative_error: float = 0.1
     """Relative error of the exponent m."""

@@ -12,13 +12,13 @@ from support.products.made_network import EXTINCTION, beam, network, product, wi
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
-from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.network import labeled
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.labeled import NetworkSettings, retrieve_network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
-PLAIN = NetworkSettings(block_intervals=72, visibility=Definition(wavelength=532e-9))
+PLAIN = NetworkSettings(block_intervals=72, visibility=VisibilityDefinition(wavelength=532e-9))
 
 
 def solved(beams, **changes):
@@ -132,12 +132,12 @@ def test_pile_up_is_kept_where_the_signal_is_used():
 
 
 def test_visibility_follows_the_definition():
-    koschmieder = product(visibility=Definition(wavelength=532e-9, contrast=0.02))
+    koschmieder = product(visibility=VisibilityDefinition(wavelength=532e-9, contrast=0.02))
     np.testing.assert_allclose(
         koschmieder["visibility_in_air"] * koschmieder["extinction"], -np.log(0.02)
     )
     angstrom = product(
-        visibility=Definition(
+        visibility=VisibilityDefinition(
             wavelength=1064e-9, law="angstrom", angstrom_exponent=1.3, exponent_standard_error=0.2
         )
     )

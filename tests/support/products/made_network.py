@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.labeled import (
     BeamAverages,
@@ -78,7 +78,10 @@ def beam(
 
 def product(intervals: int = 6, **settings: Any) -> xr.Dataset:
     """Return the product of all three beams."""
-    values = {"block_intervals": 72, "visibility": Definition(wavelength=532e-9)} | settings
+    values = {
+        "block_intervals": 72,
+        "visibility": VisibilityDefinition(wavelength=532e-9),
+    } | settings
     beams = [beam(number, intervals=intervals) for number in range(3)]
     return retrieve_network(beams, network(), NetworkSettings(**values))
 
