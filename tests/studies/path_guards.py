@@ -14,7 +14,7 @@ from studies.ablation import Guard, measure, table
 
 from lidarops.bench.stability import random_homogeneous
 from lidarops.flags import Quality
-from lidarops.retrieve.homogeneous import _fit_quality, _routing, path_fit
+from lidarops.retrieve.homogeneous import _fit_quality, _methods, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -37,7 +37,7 @@ def limits(**changes: float) -> Iterator[None]:
         return replace(own, **{k: np.full_like(own.widening, v) for k, v in fields.items()})
 
     with (
-        mock.patch.object(_routing, "common_limits", changed_common),
+        mock.patch.object(_methods, "common_limits", changed_common),
         mock.patch.object(_fit_quality, "_limits", changed),
     ):
         yield

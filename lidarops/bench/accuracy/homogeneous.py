@@ -11,6 +11,7 @@ import numpy as np
 from lidarops.bench.accuracy.homogeneous_cases import (
     BACKGROUND,
     QUANTITIES,
+    TAIL_MEAN,
     Estimates,
     PathSolver,
     Scenario,
@@ -197,7 +198,7 @@ def _summary(scores: Scores) -> Scores:
 
 
 def _works(scores: Scores) -> list[Work]:
-    peers = {*iterative_peers(), HomogeneousMethod.TAIL_MEAN.value}
+    peers = {*iterative_peers(), TAIL_MEAN}
     works = []
     for method in dict.fromkeys(method for _, method in scores):
         columns = _columns(scores, method)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from lidarops.bench.harness.rows import Array, Mask
 from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
@@ -25,6 +26,8 @@ QUANTITIES: Final = ("extinction", "background", "log_amplitude")
 is nearly normally distributed, with the relative error of B."""
 SOLVED: Final = ("extinction", "background", "amplitude")
 """The unknowns as the solvers return them."""
+TAIL_MEAN: Final = "tail_mean"
+"""Solver: the mean of the last tenth of the bins as the background, as is usual."""
 WRONG_PRIOR: Final = 0.8
 """Prior extinction, where one is needed, as a share of the truth."""
 
@@ -190,12 +193,27 @@ def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str,
 
 
 def methods() -> dict[str, PathSolver]:
-    """Return a solver for every method of `fit_homogeneous_path`, by name."""
-    return {
+    """Return a solver for every method of `fit_homogeneous_path` and for `TAIL_MEAN`, by name."""
+    solvers = {
         str(method): _solver(method)
         for method in HomogeneousMethod
         if method is not HomogeneousMethod.AUTO
     }
+    return solvers | {TAIL_MEAN: _fit_above_tail}
+
+
+def _fit_above_tail(power: Any, scenario: Scenario) -> Estimates:
+    tail = cubic_and_tail.tail_mean(power, scenario.range, variance=1.0)
+    return estimates(
+        path_fit.fit_homogeneous_path(
+            power,
+            scenario.range,
+            variance=1.0,
+            method="known_background",
+            background=tail.background,
+            background_standard_error=tail.background_standard_error,
+        )
+    )
 
 
 def _solver(method: HomogeneousMethod) -> PathSolver:

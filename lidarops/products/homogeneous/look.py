@@ -23,6 +23,7 @@ from lidarops.retrieve.background.detectable_light import (
     spaced_indices,
 )
 from lidarops.retrieve.homogeneous import labeled
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.steps.step import Look
 
 if TYPE_CHECKING:
@@ -32,11 +33,6 @@ LOOKED_AT: Final = 16
 """Number of profiles of a scene that are sampled first."""
 GAP: Final = timedelta(minutes=10)
 """Longest time between sampled profiles where the first sample shows no signal."""
-DARK: Final = 3.0
-"""Significance below which no profile of the first sample shows a signal; a retrieval is accepted
-above 5. Noise alone lifts the largest of 16 above 3 in 2 % of scenes, above 1.7 in half."""
-STILL_DARK: Final = 3.5
-"""The same for the second sample, which has more profiles and so larger noise maxima."""
 OmittedBit = Literal["SATURATED", "LOW_SIGNAL"]
 """Name of the quality bit of a section that is left out."""
 REFINEMENTS: Final[Mapping[str, OmittedBit]] = {
@@ -75,7 +71,7 @@ def omitted_sections(
     doubtful = [
         section
         for section, seen in first.items()
-        if seen.profiles and (seen.significance < DARK or not seen.unsaturated)
+        if seen.profiles and (seen.significance < THRESHOLDS.dark or not seen.unsaturated)
     ]
     if not doubtful:
         return {}
@@ -117,11 +113,14 @@ class _SectionLook:
         if self.first.unsaturated == self.all.unsaturated == 0:
             reason = f"all {self.all.profiles} profiles, at most {minutes} apart, are saturated"
             return self._without("section_saturated", reason, 0.0)
-        if self.first.significance < DARK and self.all.significance < STILL_DARK:
+        if (
+            self.first.significance < THRESHOLDS.dark
+            and self.all.significance < THRESHOLDS.still_dark
+        ):
             most = max(self.first.significance, self.all.significance)
             reason = (
                 f"no signal in {self.all.profiles} profiles at most {minutes} apart: at most"
-                f" {most:.1f} standard errors (limit {STILL_DARK:g})"
+                f" {most:.1f} standard errors (limit {THRESHOLDS.still_dark:g})"
             )
             return self._without("section_dark", reason, most)
         return None

@@ -48,8 +48,6 @@ from lidarops.steps.workload import Workload
 
 Case = ProductCase[HomogeneousSettings]
 
-FULL_OVERLAP: Final = 0.99
-"""Smallest overlap at which a homogeneous section may begin."""
 _ROUNDING: Final = 1e-6
 """Relative tolerance: headers and campaign files round angles differently."""
 
@@ -327,7 +325,7 @@ class _Sections(WholeProduct):
 
 def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:
     """Return the quality bit of bins with partial overlap."""
-    bits = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
+    bits = np.where(overlap >= THRESHOLDS.full_overlap, 0, int(Quality.INCOMPLETE_OVERLAP))
     return xr.DataArray(bits.astype(np.int32), dims="range")
 
 

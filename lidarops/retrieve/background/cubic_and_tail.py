@@ -220,40 +220,6 @@ def tail_mean(
     return BackgroundResult(mean.reshape(leading), error.reshape(leading), quality.reshape(leading))
 
 
-def solve_tail(
-    power: inputs.Floats, range_: Array, start: float | None, noise: Array
-) -> tuple[BackgroundResult, Array]:
-    """Return the result of `tail_mean` and its gradients, for arrays checked by `common.inputs`.
-
-    Parameters
-    ----------
-    power : (profile, bin) float
-    range_ : (bin,) float
-        m, ascending.
-    start : float, optional
-        m.
-    noise : (profile or 1, bin) float
-        Variances or weights; a bin is skipped where these are not positive and finite.
-
-    Returns
-    -------
-    BackgroundResult
-        (profile,), without standard errors, which follow from the gradients.
-    gradients : (profile, bin) float
-        Derivatives of the backgrounds with respect to the power.
-    """
-    first = first_of_tail(range_, start, "tail_start")
-    gradients = np.zeros(power.shape)
-    usable = np.isfinite(power) & np.isfinite(noise) & (noise > 0)
-    bins = usable[:, first:].sum(axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        gradients[:, first:] = usable[:, first:] / bins[:, np.newaxis]
-        values = np.where(usable[:, first:], power[:, first:].astype(np.float64), 0.0)
-        mean = values.sum(axis=-1) / bins
-    quality = _tail_quality(bins)
-    return BackgroundResult(mean, np.full(mean.shape, np.nan), quality), gradients
-
-
 def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:
     quality = np.zeros(bins.shape, dtype=np.int32)
     quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
@@ -261,13 +227,13 @@ def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:
     return quality
 
 
-def first_of_tail(range_: Array, start: float | None = None, field: str = "start") -> int:
+def first_of_tail(range_: Array, start: float | None = None) -> int:
     """Return the first bin of the tail, by default of the last tenth of the bins."""
     if start is None:
         return int(range_.size - max(int(THRESHOLDS.tail_share * range_.size), 1))
     if not np.isfinite(start) or start > range_[-1]:
         raise RetrievalInputError(
-            f"is {start} m, but the range ends at {range_[-1]:g} m", field=field
+            f"is {start} m, but the range ends at {range_[-1]:g} m", field="start"
         )
     return int(np.searchsorted(range_, start, side="left"))
 

@@ -1,14 +1,14 @@
 """Background, amplitude and extinction of a homogeneous path.
 
-`fit_homogeneous_path` checks its input (`path_fit`), cuts the sections (`_sections`) and passes a
-`_problem.PathProblem` to the solver of the chosen `HomogeneousMethod`:
+`fit_homogeneous_path` (`path_fit`) checks its input and passes a `_problem.PathProblem` to the
+solver of the chosen `HomogeneousMethod` in `_methods`:
 
-1. `_routing`: the default. Profiles without gaps are solved from a few linear functionals
-   (`_functional_tables`, `_compressed`), all others by Newton steps over their bins (`_masked`).
-2. `_methods`: the direct fit (`_direct`), which serves as reference, and the variants with a
-   prior, a known background or a known extinction.
-3. `_fit_quality` judges the residuals, estimates the noise and sets the quality bits.
-4. `_robust` repeats the fit without outlying bins, where requested.
+1. `_compressed`: the default for profiles without gaps and with common weights, from a few linear
+   functionals (`_functional_tables`, `_vector_loops`).
+2. `_direct`: all others, by Newton steps over their bins (`_projection`).
+3. `_given`, `_linearized`, `_propagation`: with a given background, extinction or prior.
+
+`_misfit` sums the residuals, `_fit_quality` estimates the noise and sets the quality bits.
 
 `labeled.fit_homogeneous_path` does the same on `xarray` data; import it from its module, so that
 the numerics stay free of xarray.

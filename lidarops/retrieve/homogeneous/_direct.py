@@ -1,9 +1,10 @@
 """Compiled least squares of the homogeneous path, one profile at a time.
 
-The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
-evaluated on fixed nodes. A fixed number of Newton steps, with explicit residuals, improves the
-best node. Every sum runs over the bins of one profile in a fixed order: a result does not depend
-on the rest of the batch.
+For profiles with gaps, weights of their own and any spacing of the bins. The objective of
+`lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is evaluated at fixed
+nodes, mostly on sums over groups of bins. Newton steps over all bins, with explicit residuals,
+improve the best node until they are negligible. Every sum runs over the bins of one profile in a
+fixed order: a result does not depend on the rest of the batch.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -38,13 +40,10 @@ from lidarops.retrieve.homogeneous._estimate import (
     TOO_SHORT,
     TREND,
 )
-from lidarops.retrieve.homogeneous._misfit import (
-    describe_bend,
-    describe_bend_given,
-    judge_residuals,
-)
+from lidarops.retrieve.homogeneous._misfit import judge_residuals
 from lidarops.retrieve.homogeneous._projection import (
-    NODE_SCALE,
+    BLOCK,
+    GROUPED,
     NODES,
     Grid,
     Point,
@@ -63,20 +62,16 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-STEPS: Final = 7
-"""Newton steps from a start that is off by some hundredths of the spacing of nodes."""
+_MOST_STEPS: Final = 12
+"""Newton steps; most profiles need three or four."""
+_SMALL: Final = 1e-7
+"""Step over extinction after which the search ends: each step squares the error."""
 HUGE: Final = 1e300
 TINY: Final = 1e-280
 _FLAT: Final = 1e-13
 """Squared share of a shape besides its mean, below which it is flat within rounding."""
 _LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
 _FEWEST_BINS: Final = THRESHOLDS.fewest_solved_bins
-
-# Treatment of the extinction.
-FREE: Final = 0
-GIVEN: Final = 1
-STEP: Final = 2
-"""One linear step from a prior, expanded about the centroid of information."""
 
 
 @compiled
@@ -110,31 +105,47 @@ def _load(
     return count
 
 
+@compiled
+def _fold(values: Array, out: Array) -> None:
+    """Fill the sums over the groups of bins, of which the first `BLOCK` are single bins."""
+    for i in range(BLOCK):
+        out[i] = values[i]
+    for k in range(BLOCK, out.size):
+        i = GROUPED * k - (GROUPED - 1) * BLOCK
+        out[k] = values[i] + values[i + 1] + values[i + 2] + values[i + 3]
+
+
 @summing
-def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float) -> float:
+def _project(shape: Array, w: Array, wz: Array, sums: tuple[float, float, float]) -> float:
     """Return the signed length of the profile along a shape, background projected out."""
+    total_weight, total_value, free = sums
     s1 = s2 = sz = 0.0
     for i in range(shape.size):
         weighted = w[i] * shape[i]
         s1 += weighted
         s2 += weighted * shape[i]
-        sz += weighted * z[i]
-    norm = s2 - free * s1 * s1 / w0
+        sz += wz[i] * shape[i]
+    norm = s2 - free * s1 * s1 / total_weight
     # A shape that is flat over the valid bins, or gone before the first, holds no information.
     if not (norm > _FLAT * s2 and s2 > TINY):
         return 0.0
-    return float((sz - free * s1 * wz / w0) / math.sqrt(norm))
+    return float((sz - free * s1 * total_value / total_weight) / math.sqrt(norm))
 
 
 @compiled
-def _start(
-    g: Grid, s: ProjectionScratch, w0: float, wz: float, free: float
-) -> tuple[float, float, float]:
-    """Return tau at the peak of a parabola through the best node, and the nodes that bracket it."""
-    shapes, nodes, w, z, lengths = g.shapes, g.nodes, s.w, s.z, s.lengths
+def _start(g: Grid, s: ProjectionScratch, sums: tuple[float, float, float]) -> float:
+    """Return tau at the peak of a parabola through the best node."""
+    shapes, lengths, weights, values = g.shapes, s.lengths, s.w, s.residual
+    for i in range(values.size):
+        values[i] = s.w[i] * s.z[i]
+    # Opaque shapes differ in their first bins only, which groups cannot resolve.
+    if s.values.size < values.size and total_of(s.w[:BLOCK]) > 0.0:
+        _fold(s.w, s.weights)
+        _fold(values, s.values)
+        shapes, weights, values = g.group_shapes, s.weights, s.values
     best = 0
     for j in range(NODES):
-        lengths[j] = _project(shapes[j], w, z, w0, wz, free)
+        lengths[j] = _project(shapes[j], weights, values, sums)
         if abs(lengths[j]) > abs(lengths[best]):
             best = j
     # At an end of the grid, the peak is extrapolated from the last three nodes.
@@ -145,30 +156,50 @@ def _start(
         sign * lengths[middle],
         sign * lengths[middle + 1],
     )
-    low, high = nodes[max(best - 1, 0)], nodes[min(best + 1, NODES - 1)]
-    start = nodes[best]
     bend = before - 2.0 * centre + after
-    if bend < 0.0:
-        peak = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
-        start = min(max(NODE_SCALE * math.sinh(peak), low), high)
-    return start, low, high
+    if not bend < 0.0:
+        return float(g.nodes[best])
+    peak = g.scale * math.sinh(g.first + (middle + 0.5 * (before - after) / bend) * g.spacing)
+    return float(min(max(peak, g.nodes[max(best - 1, 0)]), g.nodes[min(best + 1, NODES - 1)]))
 
 
 @compiled
-def _newton(tau: float, point: Point, low: float, high: float) -> float:
+def _newton(tau: float, point: Point, g: Grid) -> float:
+    """Return tau after one Newton step, of at most the distance to the next node."""
     gauss = point.b * point.b * point.slope_norm
     step = point.gradient / (
         point.curvature if point.curvature > _LEAST_CURVATURE * gauss else gauss
     )
-    moved = tau + step
-    if not math.isfinite(moved):
-        return tau
-    return float(min(max(moved, low), high))
+    reach = g.spacing * math.sqrt(tau * tau + g.scale * g.scale)
+    moved = tau + min(max(step, -reach), reach)
+    return float(min(max(moved, g.nodes[0]), g.nodes[-1])) if math.isfinite(step) else tau
 
 
 @compiled
-def _describe(g: Grid, p: Point, tau: float, w0: float, free: float, row: Array) -> None:
+def search(g: Grid, s: ProjectionScratch, sums: tuple[float, float, float]) -> tuple[float, Point]:
+    """Return the best extinction of a loaded profile, and the linear fit there."""
+    following, settled = _start(g, s, sums), False
+    for _ in range(_MOST_STEPS):
+        tau = following
+        p = evaluate(tau, g, s, sums)
+        if settled:
+            break
+        following = _newton(tau, p, g)
+        settled = abs(following - tau) <= _SMALL * (abs(tau) + g.scale)
+    return tau, p
+
+
+@compiled
+def describe(
+    g: Grid,
+    s: ProjectionScratch,
+    p: Point,
+    tau: float,
+    sums: tuple[float, float, float],
+    row: Array,
+) -> None:
     """Write parameters and variances of a least-squares fit, in the scaled variables."""
+    w0, _, free = sums
     row[BACKGROUND] = p.mean_z - p.b * p.mean_phi
     row[AMPLITUDE] = p.b
     row[EXTINCTION] = tau
@@ -182,72 +213,8 @@ def _describe(g: Grid, p: Point, tau: float, w0: float, free: float, row: Array)
     row[AMPLITUDE_RELATIVE_VARIANCE] = (
         1.0 / row[SIGNAL_ENERGY] + lever * lever * row[EXTINCTION_VARIANCE]
     )
-
-
-@compiled
-def _describe_given(p: Point, w0: float, free: float, row: Array) -> None:
-    """Overwrite the variances for a given extinction, whose variance is 0."""
-    row[EXTINCTION_VARIANCE] = 0.0
-    row[BACKGROUND_VARIANCE] = free / w0 + p.mean_phi * p.mean_phi / p.norm
-    row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / row[SIGNAL_ENERGY]
-
-
-@compiled
-def _step(g: Grid, p: Point, tau: float, row: Array) -> None:
-    """Write the linear step from a prior, with errors to first order in the two coefficients.
-
-    About the centroid, the coefficients of shape and slope are independent.
-    """
-    slope = p.gradient / (p.b * p.slope_norm)
-    step, lever = slope / p.b, 2.0 * (g.start / g.length + p.centroid)
-    by_slope, by_shape = 1.0 / p.b, -step / p.b
-    row[EXTINCTION_VARIANCE] = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
-    by_slope, by_shape = lever * by_slope, 1.0 / p.b + lever * by_shape
-    row[AMPLITUDE_RELATIVE_VARIANCE] = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
-    row[BACKGROUND] -= slope * p.mean_t
-    row[EXTINCTION] = tau + step
-    row[AMPLITUDE] = p.b * math.exp(2.0 * step * p.centroid)
-
-
-@compiled
-def _moved(p: Point, row: Array) -> Point:
-    """Return the point with the background and amplitude of a row."""
-    return Point(
-        row[AMPLITUDE],
-        row[BACKGROUND] + row[AMPLITUDE] * p.mean_phi,
-        p.mean_phi,
-        p.mean_t,
-        p.centroid,
-        p.norm,
-        p.slope_norm,
-        p.gradient,
-        p.curvature,
-    )
-
-
-@compiled
-def _fit(g: Grid, s: ProjectionScratch, free: float, kind: int, tau: float, row: Array) -> None:
-    """Fit one loaded profile and write its row, in the scaled variables."""
-    w0, wz = total_of(s.w), product(s.w, s.z)
-    if kind == FREE:
-        tau, low, high = _start(g, s, w0, wz, free)
-        for _ in range(STEPS):
-            tau = _newton(tau, evaluate(tau, g, s, w0, wz, free), low, high)
-    p = evaluate(tau, g, s, w0, wz, free)
-    _describe(g, p, tau, w0, free, row)
-    if kind == GIVEN:
-        _describe_given(p, w0, free, row)
-    elif kind != FREE:
-        _step(g, p, tau, row)
-        tau = row[EXTINCTION]
-        p = _moved(evaluate(tau, g, s, w0, wz, free), row)
-    describe_bend(g, s, p, w0, free, row)
-    if kind == GIVEN:
-        describe_bend_given(p, row)
     row[MEAN_RANGE] = product(s.w, g.x) / w0
-    judge_residuals(g, s, p, tau, (w0, wz, free), row)
-    if kind == GIVEN:
-        row[BOUNDED] = 0.0
+    row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
 
 
 @compiled
@@ -273,22 +240,31 @@ def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> 
 
 
 @compiled
-def _solve_profile(
+def begin(
     power: Any,
     noise: Array,
-    mode: tuple[bool, float, float, int, float],
-    g: Grid,
+    mode: tuple[bool, float, float],
     s: ProjectionScratch,
     row: Array,
-) -> None:
-    is_variance, background, rounding, kind, extinction = mode
+) -> tuple[float, float, float]:
+    """Load a profile and write its status; return its reference, scale and unit of the weights.
+
+    Parameters
+    ----------
+    power, noise : (bin,) float
+    mode : (bool, float, float)
+        Whether the noise is a variance; the relative rounding error of the power; the given
+        background, or NaN.
+    s : ProjectionScratch
+    row : (column,) float64
+    """
+    is_variance, rounding, background = mode
     last = _last_valid(power, noise, is_variance)
-    fixed = not math.isnan(background)
-    reference = background if fixed else np.float64(power[last])
+    reference = np.float64(power[last]) if math.isnan(background) else background
     row[BINS] = 0 if last < 0 else _load(power, noise, is_variance, reference, s)
     if row[BINS] < _FEWEST_BINS:
         row[STATUS] = EMPTY if last < 0 else TOO_SHORT
-        return
+        return reference, 1.0, 1.0
     unit, largest = power_of_two(largest_of(s.w)), largest_of(s.z)
     scale_in_place(s.w, 1.0 / unit)
     row[ROUNDING] = (rounding * (abs(reference) + largest)) ** 2 * unit * total_of(s.w) / row[BINS]
@@ -296,25 +272,16 @@ def _solve_profile(
         row[STATUS] = CONSTANT
         row[BACKGROUND] = reference
         row[BACKGROUND_VARIANCE] = 1.0 / (total_of(s.w) * unit)
-        return
+        return reference, 1.0, unit
+    row[STATUS] = FITTED
     scale = power_of_two(largest)
     scale_in_place(s.z, 1.0 / scale)
-    row[STATUS] = FITTED
-    _fit(g, s, 0.0 if fixed else 1.0, kind, extinction * g.length, row)
-    unscale(g, reference, scale, unit, row)
+    return reference, scale, unit
 
 
-@compiled
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve_direct(
-    power: Any,
-    noise: Array,
-    is_variance: bool,
-    background: Array,
-    kind: int,
-    extinction: Array,
-    rounding: float,
-    g: Grid,
-    out: Array,
+    power: Any, noise: Array, is_variance: bool, rounding: float, g: Grid, out: Array
 ) -> None:
     """Fit every profile of a batch.
 
@@ -324,12 +291,6 @@ def solve_direct(
     noise : (profile or 1, bin) float64
         Variances or weights; a bin is left out where its weight is not positive and finite.
     is_variance : bool
-    background : (profile or 1,) float64
-        Given backgrounds; NaN where the background is fitted.
-    kind : int
-        `FREE`, `GIVEN` or `STEP`.
-    extinction : (profile or 1,) float64
-        m-1; not used where it is free.
     rounding : float
         Relative rounding error of the power.
     g : Grid
@@ -337,8 +298,14 @@ def solve_direct(
     out : (profile, column) float64
         Filled with NaN; receives the columns of `lidarops.retrieve.homogeneous._estimate`.
     """
-    s = make_scratch(g.x.size)
+    s = make_scratch(g.x.size, g.group_shapes.shape[1])
     for k in range(power.shape[0]):
-        prior = extinction[k % extinction.size]
-        mode = (is_variance, background[k % background.size], rounding, kind, prior)
-        _solve_profile(power[k], noise[k % noise.shape[0]], mode, g, s, out[k])
+        row = out[k]
+        mode = (is_variance, rounding, math.nan)
+        reference, scale, unit = begin(power[k], noise[k % noise.shape[0]], mode, s, row)
+        if row[STATUS] == FITTED:
+            sums = (total_of(s.w), product(s.w, s.z), 1.0)
+            tau, p = search(g, s, sums)
+            describe(g, s, p, tau, sums, row)
+            judge_residuals(g, s, p, tau, sums, is_variance, row)
+            unscale(g, reference, scale, unit, row)

@@ -1,21 +1,27 @@
-"""Solvers of the homogeneous path on top of the compiled direct fit."""
+"""Solvers of the homogeneous path, one for each method."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic, solve_tail
-from lidarops.retrieve.homogeneous import _direct, _linearized, _masked, _propagation
+from lidarops.flags import Quality
+from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
+from lidarops.retrieve.homogeneous import _compressed, _direct, _given, _linearized, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
-from lidarops.retrieve.homogeneous._fit_quality import judge_fit
+from lidarops.retrieve.homogeneous._fit_quality import common_limits, judge_fit
+from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
 from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
 from lidarops.retrieve.homogeneous._projection import make_grid
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
+_UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
+"""Deviation from even spacing by rounding, over the last range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,38 +33,65 @@ class _AddedVariances:
     extinction: Array
 
 
+def solve_by_compression(problem: PathProblem) -> PathSolution:
+    """Solve by a few functionals of each profile where they apply, else by the direct fit."""
+    tables = _tables(problem)
+    if tables is None:
+        return solve_by_direct_fit(problem)
+    count, bins = problem.power.shape
+    out = np.empty((len(_compressed.RESULTS), count))
+    quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
+    _compressed.solve_compressed(
+        problem.power,
+        _compressed.weight_roots(tables, problem.common_weights, problem.power),
+        tables.envelope.astype(problem.power.dtype),
+        tables,
+        _compressed.Mode(problem.known_variance, problem.rounding),
+        common_limits(bins, _compressed.CURVATURES - 2, known_variance=problem.known_variance),
+        out,
+        quality,
+        state,
+    )
+    solution = PathSolution(
+        **dict(zip(_compressed.RESULTS, out, strict=True)),
+        mean_range=np.where(quality & int(Quality.NO_SIGNAL), np.nan, tables.mean_range),
+        valid_bins=np.full(count, bins, np.int32),
+        quality=quality,
+    )
+    routed = np.flatnonzero(state == _compressed.ROUTED)
+    if routed.size == 0:
+        return solution
+    return solution.updated(routed, solve_by_direct_fit(problem.select(routed)))
+
+
+def _tables(problem: PathProblem) -> Tables | None:
+    """Return the tables of the functionals, or None where they do not apply."""
+    range_, limits = problem.range, THRESHOLDS
+    if not limits.fewest_compressed_bins <= range_.size <= limits.most_compressed_bins:
+        return None
+    even = np.linspace(range_[0], range_[-1], range_.size)
+    if (
+        not problem.common_noise
+        or range_[-1] - range_[0] < limits.thinnest * range_[0]
+        or np.max(np.abs(range_ - even)) > _UNIFORM * range_[-1]
+    ):
+        return None
+    weights = problem.common_weights
+    if not np.all((weights > 0.0) & (weights < _compressed.HUGE)):
+        return None
+    tables = make_tables(range_, weights, problem.bounds)
+    return tables if tables.monotonic else None
+
+
 def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
     """Solve by least squares for all three unknowns."""
-    return _solution(_estimate(problem), problem)
-
-
-def solve_by_masked_fit(problem: PathProblem) -> PathSolution:
-    """Solve as `solve_by_direct_fit`, in fewer passes over the bins; the range must be uniform."""
-    tables = _masked.make_masked_tables(problem.range, problem.bounds)
-    count = problem.power.shape[0]
-    table, solved = np.empty((count, len(COLUMNS))), np.empty(count, np.bool_)
-    with np.errstate(divide="ignore"):
-        weights = 1.0 / problem.noise if problem.known_variance else problem.noise
-    _masked.solve_masked(
-        problem.power,
-        weights,
-        not problem.known_variance,
-        problem.rounding,
-        tables,
-        table,
-        solved,
-    )
-    others = np.flatnonzero(~solved)
-    if others.size:
-        rest = problem.select(others, problem.power[others])
-        table[others] = _table(rest, np.full(1, np.nan), _direct.FREE, np.full(1, np.nan))
-    return _solution(PathEstimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
+    return _solution(_estimate(problem, _direct.solve_direct), problem)
 
 
 def solve_by_linearization(problem: PathProblem) -> PathSolution:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
-    fit = _estimate(problem, kind=_direct.STEP, extinction=prior)
+    fit = _estimate(problem, _given.solve_step, prior)
     shifts = _linearized.neglected_shifts(problem, prior, fit.extinction, fit.amplitude)
     with np.errstate(over="ignore", invalid="ignore"):
         added = _AddedVariances(*(shift**2 for shift in shifts))
@@ -67,7 +100,7 @@ def solve_by_linearization(problem: PathProblem) -> PathSolution:
 
 def solve_with_known_extinction(problem: PathProblem) -> PathSolution:
     """Solve for background and amplitude at the given extinction."""
-    fit = _estimate(problem, kind=_direct.GIVEN, extinction=problem.extinction)
+    fit = _estimate(problem, _given.solve_at, problem.extinction)
     return _solution(fit, problem, unknowns=2)
 
 
@@ -75,7 +108,7 @@ def solve_with_known_background(problem: PathProblem) -> PathSolution:
     """Solve for amplitude and extinction above the given background."""
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
-    fit = _estimate(problem, background=background)
+    fit = _estimate(problem, _given.solve_above, background)
     spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
         added = _AddedVariances(
@@ -99,15 +132,10 @@ def solve_by_cubic(problem: PathProblem) -> PathSolution:
     return _fit_above(problem, estimate, gradients)
 
 
-def solve_by_tail_mean(problem: PathProblem) -> PathSolution:
-    """Take the background from the tail mean and propagate its noise into the other parameters."""
-    return _fit_above(problem, *solve_tail(problem.power, problem.range, None, problem.noise))
-
-
 def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Array) -> PathSolution:
     """Fit amplitude and extinction above a background that depends on the same power."""
     background = estimate.background
-    fit = _estimate(problem, background=background)
+    fit = _estimate(problem, _given.solve_above, background)
     spread = _propagated(problem, fit, gradients)
     fit = replace(
         fit,
@@ -138,37 +166,14 @@ def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Ar
 
 
 def _estimate(
-    problem: PathProblem,
-    *,
-    background: Array | None = None,
-    kind: int = _direct.FREE,
-    extinction: Array | None = None,
+    problem: PathProblem, solve: Callable[..., None], *given: Array | None
 ) -> PathEstimate:
-    """Run the kernel; the background is fitted where none is given."""
-    free = np.full(1, np.nan)
-    table = _table(
-        problem,
-        free if background is None else background,
-        kind,
-        free if extinction is None else extinction,
-    )
-    return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
-
-
-def _table(problem: PathProblem, background: Array, kind: int, extinction: Array) -> Array:
+    """Run a kernel with what is given beside the profiles."""
     table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
-    _direct.solve_direct(
-        problem.power,
-        problem.noise,
-        problem.known_variance,
-        background,
-        kind,
-        extinction,
-        problem.rounding,
-        make_grid(problem.range, problem.bounds),
-        table,
-    )
-    return table
+    grid = make_grid(problem.range, problem.bounds)
+    noise = (problem.noise, problem.known_variance, problem.rounding)
+    solve(problem.power, *noise, *given, grid, table)
+    return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
 
 
 def _solution(

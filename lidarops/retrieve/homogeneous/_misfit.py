@@ -1,16 +1,16 @@
 """Compiled tests of the residuals of a homogeneous path."""
 
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.homogeneous._estimate import (
     BACKGROUND_BEND,
-    BOUNDED,
     DIFFERENCE_COUNT,
     EXTINCTION_BEND,
     LARGEST,
@@ -26,7 +26,6 @@ from lidarops.retrieve.homogeneous._projection import (
     compiled,
     evaluate,
     largest_of,
-    product,
     summing,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -36,13 +35,67 @@ Array = npt.NDArray[np.float64]
 INDEPENDENT: Final = THRESHOLDS.independent
 
 
-@compiled
-def _residuals(s: ProjectionScratch, p: Point) -> None:
-    """Fill the residuals in units of the noise, and times weight; 0 for unused bins."""
+class _TestShapes(NamedTuple):
+    """Weighted products of two shapes that the model lacks with its orthogonal shapes.
+
+    The bent signal is ``phi (x - centroid)^2``, as of backscatter that bends along the path, the
+    square ``phi^2``, as of a nonlinear detector.
+    """
+
+    bent: tuple[float, float, float]
+    """With level, shape and slope."""
+    square: tuple[float, float, float]
+    bent_norm: float
+    shared: float
+    square_norm: float
+
+
+@summing
+def _sum_test_shapes(x: Array, w: Array, phi: Array, p: Point) -> _TestShapes:
+    b0 = b1 = b2 = q0 = q1 = q2 = bb = bq = qq = 0.0
+    for i in range(phi.size):
+        lever = x[i] - p.centroid
+        bent, square = lever * lever * phi[i], phi[i] * phi[i]
+        shape, slope = phi[i] - p.mean_phi, -2.0 * lever * phi[i] - p.mean_t
+        weighted_bent, weighted_square = w[i] * bent, w[i] * square
+        b0 += weighted_bent
+        b1 += weighted_bent * shape
+        b2 += weighted_bent * slope
+        q0 += weighted_square
+        q1 += weighted_square * shape
+        q2 += weighted_square * slope
+        bb += weighted_bent * bent
+        bq += weighted_bent * square
+        qq += weighted_square * square
+    return _TestShapes((b0, b1, b2), (q0, q1, q2), bb, bq, qq)
+
+
+class _Residuals(NamedTuple):
+    """Weighted sums over the residuals."""
+
+    energy: float
+    model: tuple[float, float, float]
+    """Products with level, shape and slope."""
+    bent: float
+    square: float
+
+
+@summing
+def _sum_residuals(g: Grid, s: ProjectionScratch, fit: Point, p: Point) -> _Residuals:
+    """Fill the residuals in units of the noise; return their sums."""
+    energy = level = shape = slope = bent = square = 0.0
     for i in range(s.z.size):
-        residual = s.z[i] - p.mean_z - p.b * (s.phi[i] - p.mean_phi)
+        phi, lever = s.phi[i], g.x[i] - p.centroid
+        residual = s.z[i] - fit.mean_z - fit.b * (phi - fit.mean_phi)
+        pull = s.w[i] * residual
+        energy += pull * residual
         s.residual[i] = math.sqrt(s.w[i]) * residual
-        s.pull[i] = s.w[i] * residual
+        level += pull
+        shape += pull * (phi - p.mean_phi)
+        slope += pull * (-2.0 * lever * phi - p.mean_t)
+        bent += pull * lever * lever * phi
+        square += pull * phi * phi
+    return _Residuals(energy, (level, shape, slope), bent, square)
 
 
 @summing
@@ -60,17 +113,6 @@ def _second_differences(s: ProjectionScratch) -> tuple[float, float]:
     return total, terms
 
 
-@summing
-def _model_products(weighted: Array, g: Grid, phi: Array, p: Point) -> tuple[float, float, float]:
-    """Return the products of a weighted vector with the orthogonal shapes of the model."""
-    level = shape = slope = 0.0
-    for i in range(weighted.size):
-        level += weighted[i]
-        shape += weighted[i] * (phi[i] - p.mean_phi)
-        slope += weighted[i] * (-2.0 * (g.x[i] - p.centroid) * phi[i] - p.mean_t)
-    return level, shape, slope
-
-
 @compiled
 def _remainder(
     product: float,
@@ -84,67 +126,34 @@ def _remainder(
 
 
 @compiled
-def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, float]:
-    """Return the energy of the residuals in two shapes that the model lacks, and their number.
+def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, float]:
+    """Return the energy of the residuals in the two test shapes, and their number.
 
-    One is backscatter that bends along the path, ``phi x^2``, the other a nonlinear detector,
-    ``phi^2``; both are orthogonalised against the model.
+    Both are orthogonalised against the model, and the square against the bent signal.
     """
-    bent, square, weighted_bent, weighted_square = s.tests
-    for i in range(g.x.size):
-        lever = g.x[i] - p.centroid
-        bent[i] = lever * lever * s.phi[i]
-        square[i] = s.phi[i] * s.phi[i]
-        weighted_bent[i] = s.w[i] * bent[i]
-        weighted_square[i] = s.w[i] * square[i]
-    bent_products = _model_products(weighted_bent, g, s.phi, p)
-    square_products = _model_products(weighted_square, g, s.phi, p)
-    residual_products = _model_products(s.pull, g, s.phi, p)
     energy = count = shared = 0.0
-    square_norm = product(bent, weighted_bent)
-    norm = _remainder(square_norm, bent_products, bent_products, p, w0)
-    pulled = _remainder(product(bent, s.pull), bent_products, residual_products, p, w0)
-    if norm > INDEPENDENT * square_norm:
+    norm = _remainder(t.bent_norm, t.bent, t.bent, p, w0)
+    pulled = _remainder(r.bent, t.bent, r.model, p, w0)
+    if norm > INDEPENDENT * t.bent_norm:
         energy += pulled * pulled / norm
         count += 1.0
-        shared = (
-            _remainder(product(bent, weighted_square), bent_products, square_products, p, w0) / norm
-        )
-    square_norm = product(square, weighted_square)
-    norm = _remainder(square_norm, square_products, square_products, p, w0) - shared * shared * norm
-    if norm > INDEPENDENT * square_norm:
-        along = (
-            _remainder(product(square, s.pull), square_products, residual_products, p, w0)
-            - shared * pulled
-        )
+        shared = _remainder(t.shared, t.bent, t.square, p, w0) / norm
+    norm = _remainder(t.square_norm, t.square, t.square, p, w0) - shared * shared * norm
+    if norm > INDEPENDENT * t.square_norm:
+        along = _remainder(r.square, t.square, r.model, p, w0) - shared * pulled
         energy += along * along / norm
         count += 1.0
     return energy, count
 
 
-@summing
-def _bent_signal_products(g: Grid, s: ProjectionScratch, p: Point) -> tuple[float, float, float]:
-    """Return the products of ``phi (x - centroid)^2`` with the orthogonal shapes of the model."""
-    level = shape = slope = 0.0
-    for i in range(g.x.size):
-        lever = g.x[i] - p.centroid
-        weighted = s.w[i] * s.phi[i] * lever * lever
-        level += weighted
-        shape += weighted * (s.phi[i] - p.mean_phi)
-        slope += weighted * (-2.0 * lever * s.phi[i] - p.mean_t)
-    return level, shape, slope
-
-
 @compiled
-def describe_bend(
-    g: Grid, s: ProjectionScratch, p: Point, w0: float, free: float, row: Array
-) -> None:
+def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Array) -> None:
     """Write the effect of a bent signal on the fit, relative to the amplitude.
 
     Parabolas about different ranges differ by shapes of the model only: the background is the
     same, and the extinction is converted to the middle of the section.
     """
-    level, shape, slope = _bent_signal_products(g, s, p)
+    level, shape, slope = t.bent
     across = slope / p.slope_norm
     row[BACKGROUND_BEND] = free * level / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
     row[EXTINCTION_BEND] = across + 0.5 - p.centroid
@@ -168,15 +177,22 @@ def judge_residuals(
     p: Point,
     tau: float,
     sums: tuple[float, float, float],
+    known_variance: bool,
     row: Array,
 ) -> None:
-    """Write the tests of the fit, in units of the scaled noise."""
+    """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal."""
     w0, wz, free = sums
-    _residuals(s, p)
-    row[MISFIT] = product(s.residual, s.residual)
-    row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s)
+    shapes = _sum_test_shapes(g.x, s.w, s.phi, p)
+    _describe_bend(shapes, p, w0, free, row)
+    full = p
+    if free == 0.0:
+        # The test shapes are orthogonal to the background even where it is given.
+        full = evaluate(tau, g, s, (w0, wz, 1.0))
+        shapes = _sum_test_shapes(g.x, s.w, s.phi, full)
+    residuals = _sum_residuals(g, s, p, full)
+    row[MISFIT] = residuals.energy
     row[LARGEST] = largest_of(s.residual)
-    # The test shapes are orthogonal to the background even where it is given.
-    full = p if free > 0.0 else evaluate(tau, g, s, w0, wz, 1.0)
-    row[TREND], row[TREND_COUNT] = _trend(g, s, full, w0)
-    row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
+    row[TREND], row[TREND_COUNT] = _trend(shapes, residuals, full, w0)
+    row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
+    if not known_variance:
+        row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s)

@@ -46,20 +46,17 @@ class PathProblem:
         """Relative rounding error of the power and the kernels, as a standard deviation."""
         return 0.3 * float(np.finfo(self.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
-    def select(self, rows: npt.NDArray[np.intp], power: Floats) -> PathProblem:
-        """Return the problem of the selected profiles, with new power."""
+    @property
+    def common_weights(self) -> Array:
+        """(bin,): weights of all profiles where the noise is common."""
+        with np.errstate(divide="ignore"):
+            weights: Array = 1.0 / self.noise[0] if self.known_variance else self.noise[0]
+        return weights
 
-        def selected(values: Array | None) -> Array | None:
-            return values if values is None or values.shape[0] == 1 else values[rows]
-
-        return replace(
-            self,
-            power=power,
-            noise=self.noise if self.noise.shape[0] == 1 else self.noise[rows],
-            extinction=selected(self.extinction),
-            background=selected(self.background),
-            background_variance=selected(self.background_variance),
-        )
+    def select(self, rows: npt.NDArray[np.intp]) -> PathProblem:
+        """Return the problem of the selected profiles, for methods that need the power alone."""
+        noise = self.noise if self.noise.shape[0] == 1 else self.noise[rows]
+        return replace(self, power=self.power[rows], noise=noise)
 
 
 @dataclass(frozen=True, slots=True)

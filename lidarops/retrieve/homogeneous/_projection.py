@@ -20,8 +20,11 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 NODES: Final = 24
-NODE_SCALE: Final = 0.3
-"""Nodes are uniform in ``asinh(tau / NODE_SCALE)``."""
+_WIDEST_SCALE: Final = 0.3
+GROUPED: Final = 4
+_MOST_SINGLE: Final = 128
+"""Profiles with more bins are searched on the first `BLOCK` bins and on sums over groups of
+`GROUPED` bins beyond."""
 BLOCK: Final = 16
 """Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
 
@@ -44,12 +47,15 @@ class Grid(NamedTuple):
     """``(R_0 / R)^2``."""
     step: float
     """Spacing of x where it is uniform, else 0."""
-    first: float
-    """First node as ``asinh(tau / NODE_SCALE)``."""
-    spacing: float
     nodes: Array
+    """(node,): tau, uniform in ``asinh(tau / scale)`` from `first` in steps of `spacing`."""
+    first: float
+    spacing: float
+    scale: float
     shapes: Array
-    """phi of every node, (node, bin)."""
+    """(node, bin): phi of every node."""
+    group_shapes: Array
+    """(node, group): the same, averaged over groups of bins."""
     start: float
     """R_0, m."""
     length: float
@@ -61,11 +67,12 @@ class ProjectionScratch(NamedTuple):
     w: Array
     phi: Array
     residual: Array
-    pull: Array
     used: Array
     fine: Array
     lengths: Array
-    tests: tuple[Array, Array, Array, Array]
+    weights: Array
+    """Sums over groups of bins."""
+    values: Array
 
 
 class Point(NamedTuple):
@@ -99,27 +106,35 @@ def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
     uniform = bool(np.all(np.abs(x - step * np.arange(range_.size)) <= rounding))
     x = np.concatenate([x, np.ones(-range_.size % BLOCK)])
     lowest, highest = bounds[0] * length, bounds[1] * length
-    first, last = math.asinh(lowest / NODE_SCALE), math.asinh(highest / NODE_SCALE)
-    nodes = NODE_SCALE * np.sinh(np.linspace(first, last, NODES))
+    # In a thin section the slope of the shape vanishes at tau = -L / R: nodes are finer there.
+    scale = min(_WIDEST_SCALE, _WIDEST_SCALE * length / float(range_[0]))
+    first, last = math.asinh(lowest / scale), math.asinh(highest / scale)
+    nodes = scale * np.sinh(np.linspace(first, last, NODES))
     nodes[0], nodes[-1] = lowest, highest
     envelope = (range_[0] / (range_[0] + length * x)) ** 2
+    shapes = np.exp(-2.0 * nodes[:, np.newaxis] * x) * envelope
+    groups = shapes
+    if range_.size > _MOST_SINGLE:
+        far = shapes[:, BLOCK:].reshape(NODES, -1, GROUPED).mean(axis=2)
+        groups = np.concatenate([shapes[:, :BLOCK], far], axis=1)
     return Grid(
         x=x,
         envelope=envelope,
         step=step if uniform else 0.0,
+        nodes=nodes,
         first=first,
         spacing=(last - first) / (NODES - 1),
-        nodes=nodes,
-        shapes=np.exp(-2.0 * nodes[:, np.newaxis] * x) * envelope,
+        scale=scale,
+        shapes=shapes,
+        group_shapes=groups,
         start=float(range_[0]),
         length=length,
     )
 
 
 @compiled
-def make_scratch(n: int) -> ProjectionScratch:
+def make_scratch(n: int, groups: int) -> ProjectionScratch:
     return ProjectionScratch(
-        np.zeros(n),
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
@@ -127,7 +142,8 @@ def make_scratch(n: int) -> ProjectionScratch:
         np.zeros(n),
         np.zeros(BLOCK),
         np.zeros(NODES),
-        (np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)),
+        np.zeros(groups),
+        np.zeros(groups),
     )
 
 
@@ -230,7 +246,8 @@ def _gradients(
 
 
 @compiled
-def evaluate(tau: float, g: Grid, s: ProjectionScratch, w0: float, wz: float, free: float) -> Point:
+def evaluate(tau: float, g: Grid, s: ProjectionScratch, sums: tuple[float, float, float]) -> Point:
+    w0, wz, free = sums
     x, w, z, phi = g.x, s.w, s.z, s.phi
     _shape(tau, x, g.envelope, g.step, phi, s.fine)
     s1, s2, sz, x1, x2 = _moments(x, w, z, phi)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.homogeneous import _methods, _routing
+from lidarops.retrieve.homogeneous import _methods
 from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -27,18 +27,16 @@ class HomogeneousMethod(StrEnum):
     LINEARIZED = "linearized"
     KNOWN_BACKGROUND = "known_background"
     KNOWN_EXTINCTION = "known_extinction"
-    TAIL_MEAN = "tail_mean"
 
 
 _SOLVERS: Final[dict[HomogeneousMethod, Callable[[PathProblem], PathSolution]]] = {
-    HomogeneousMethod.AUTO: _routing.solve_by_compression,
-    HomogeneousMethod.COMPRESSED: _routing.solve_by_compression,
+    HomogeneousMethod.AUTO: _methods.solve_by_compression,
+    HomogeneousMethod.COMPRESSED: _methods.solve_by_compression,
     HomogeneousMethod.DIRECT: _methods.solve_by_direct_fit,
     HomogeneousMethod.CUBIC: _methods.solve_by_cubic,
     HomogeneousMethod.LINEARIZED: _methods.solve_by_linearization,
     HomogeneousMethod.KNOWN_BACKGROUND: _methods.solve_with_known_background,
     HomogeneousMethod.KNOWN_EXTINCTION: _methods.solve_with_known_extinction,
-    HomogeneousMethod.TAIL_MEAN: _methods.solve_by_tail_mean,
 }
 
 _NEEDS: Final[dict[str, set[HomogeneousMethod]]] = {
@@ -162,19 +160,19 @@ def fit_homogeneous_path(
         "compressed".
     compressed
         The least-squares solution from 11 linear functionals of the profile, where it has no gaps,
-        a uniform range and common weights; other profiles by Newton steps over their bins, short
-        and thin sections by "direct".
+        a uniform range and common weights; all others by "direct".
     direct
-        The least-squares solution by a fixed number of closed-form steps: the best of 24
-        extinctions with background and amplitude eliminated (variable projection, golub1973),
-        the peak of a parabola through it, then seven Newton steps.
+        The least-squares solution by Newton steps over the bins, with background and amplitude
+        eliminated (variable projection, golub1973), from the best of 24 extinctions.
     cubic
-        The background of `lidarops.retrieve.background.cubic` (bobrovsky2024, corrected there),
+        The background of `lidarops.retrieve.background.cubic` (bobrovsky2024, equations (8) and
+        (12) to (16), corrected there),
         then a fit of amplitude and extinction above it. It needs no start value and no search,
         but a uniform range without gaps and a signal that starts well above the noise. Its
         scatter is larger than the least possible one, as its standard errors state.
     linearized
-        Linear least squares for three unknowns about a prior extinction (potapova2021):
+        Linear least squares for three unknowns about a prior extinction, equation (3) of
+        potapova2021:
 
         .. math:: P \approx P^* + [B + G (R - R_c)] R^{-2} e^{-2 \sigma_0 R},
             \qquad \sigma = \sigma_0 - G / 2B
@@ -185,16 +183,12 @@ def fit_homogeneous_path(
         independent. The paper expands about R_c = 0, where B is extrapolated.
     known_background
         Amplitude and extinction above a given background, by converged least squares; equation
-        (5) of the paper, in two unknowns, is one step of it. For a background that is measured
+        (5) of potapova2021, in two unknowns, is one step of it. For a background that is measured
         separately, such as before the laser fires. The error of the background is propagated.
     known_extinction
         Background and amplitude by linear least squares at a given extinction, equation (4) of
-        the paper, weighted here. The extinction counts as exact, with a standard error of 0; the
+        potapova2021, weighted here. The extinction counts as exact, with a standard error of 0; the
         other errors are conditional on it.
-    tail_mean
-        Background as the mean of the far bins, then as "known_background", with its noise
-        propagated. For comparison only: signal that remains in the tail biases the background
-        by many standard errors, which POOR_FIT detects only in part.
 
     References
     ----------

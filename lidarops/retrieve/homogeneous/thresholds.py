@@ -58,14 +58,16 @@ class Thresholds:
     thinnest: float = 0.15
     """Length over first range. In thinner sections shapes are nearly straight lines, for which the
     cells of the tables are too coarse. Assumed."""
-    fewest_masked_bins: int = 16
-    """Bins with data; fewer are left to the direct fit. Assumed."""
-    latest: float = 0.2
-    """Share of the section that may be missing at its start; else the direct fit. Assumed."""
-    deepest: float = 0.5
-    """Optical depth that may be missing at the start; else the direct fit. Assumed."""
 
     # The product
+    full_overlap: float = 0.99
+    """Least overlap of the bins that are used. Assumed."""
+    dark: float = 3.0
+    """Standard errors of the light in a section, below which none of the first 16 sampled profiles
+    shows a signal. Normal noise exceeds it in one of 16 in 2 % of the scenes."""
+    still_dark: float = 3.5
+    """The same for both samples together, which have more profiles and so larger maxima of noise.
+    Assumed."""
     level: float = 100.0
     """m; largest change of height along a section. Aerosol decreases with a scale height of 1 to
     2 km; a larger change mimics an extinction of more than some percent. Assumed."""

@@ -18,7 +18,6 @@ from support.oracles.homogeneous import (
 )
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.background.photon_counts import mean_profile_variance
@@ -207,35 +206,6 @@ def test_wrong_known_extinction_is_flagged():
     assert np.all(fit.quality & HomogeneousQuality.POOR_FIT)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_tail_is_biased_by_its_signal_and_states_its_scatter(known):
-    r = section(2500.0, 8000.0)
-    power = clean(3000, 107.0, seed=9)
-    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None, method="tail_mean")
-    left = np.mean(signal(r, 107.0, 0.03 * KM)[-22:])
-    assert np.mean(fit.background) - 370.0 == pytest.approx(left, abs=0.02)
-    np.testing.assert_allclose(
-        fit.background, cubic_and_tail.tail_mean(power, r).background, rtol=1e-13
-    )
-    for name in NAMES:
-        # To first order about a biased fit: the amplitude scatters somewhat less.
-        stated = np.median(getattr(fit, f"{name}_standard_error"))
-        assert np.std(getattr(fit, name)) == pytest.approx(stated, rel=0.12), name
-    assert np.mean(fit.extinction) > 0.03 * KM + 10 * np.std(fit.extinction)
-
-
-def test_tail_skips_missing_bins():
-    power = clean(5)
-    # The tail is the last 22 of 225 bins.
-    power[1, 210:] = np.nan
-    power[2, 200:] = np.nan
-    fit = fit_homogeneous_path(power, LONG, variance=1.0, method="tail_mean")
-    assert fit.background[1] == pytest.approx(power[1, 203:210].mean(), rel=1e-13)
-    assert fit.quality[1] & Quality.TOO_FEW_BINS
-    assert fit.quality[2] & Quality.INPUT_MISSING
-    assert np.isnan(fit.extinction[2])
-
-
 # Counts -------------------------------------------------------------------------------------
 
 
@@ -351,7 +321,6 @@ CALLS = {
     "linearized": {"extinction": "near"},
     "known_background": {"background": "given", "background_standard_error": 0.2},
     "known_extinction": {"extinction": "near"},
-    "tail_mean": {},
 }
 
 
@@ -378,9 +347,7 @@ def test_no_method_depends_on_the_batch(call, dtype):
         same(solved(rows), rows_of(whole, rows))
 
 
-@pytest.mark.parametrize(
-    "call", [call for call in CALLS if call not in ("tail_mean", "known_extinction")]
-)
+@pytest.mark.parametrize("call", [call for call in CALLS if call != "known_extinction"])
 @pytest.mark.parametrize(("start", "length"), GEOMETRIES)
 def test_unflagged_values_are_right_within_their_errors(call, start, length):
     rng = np.random.default_rng(23)
