@@ -72,7 +72,7 @@ def test_comments_docstrings_and_line_ends_of_any_module_change_nothing(copy: Co
         ("retrieve/elastic/layers.py", "elastic"),
         ("retrieve/elastic/__init__.py", "elastic"),
         ("retrieve/homogeneous/path_fit.py", "homogeneous"),
-        ("retrieve/multiangle/vertical/gaps.py", "multiangle"),
+        ("retrieve/multiangle/vertical/smooth_profile.py", "multiangle"),
         ("retrieve/network/outlying_bins.py", "visibility"),
         *((f"products/{kind}/settings.py", kind) for kind in OWN),
         *((f"products/{kind}/steps.py", kind) for kind in OWN),

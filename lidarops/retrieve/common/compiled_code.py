@@ -13,18 +13,20 @@ from typing import Final
 from numba import config
 
 _SOURCES: Final = Path(__file__).parents[1]
+_CONSTANTS: Final = ("constants.py", "flags.py")
+"""Modules of lidarops beside the sources whose constants are compiled in."""
 
 
 def keep_apart(sources: Path = _SOURCES) -> str:
-    """Set the cache folder of numba to one named after a hash of all compiled sources.
+    """Set the cache folder of numba to one named after a hash of the sources.
 
     Numba checks whether the file of a function has changed, but not the files of the functions
-    that it calls: it would keep using their old code.
+    that it calls, nor those of constants such as thresholds: it would keep their old values.
 
     Parameters
     ----------
     sources : Path
-        Folder of the modules, searched recursively.
+        Folder of the modules, searched recursively; modules of constants lie in the folder above.
 
     Returns
     -------
@@ -34,10 +36,9 @@ def keep_apart(sources: Path = _SOURCES) -> str:
         beside the sources, so that users and workers share what was compiled at installation.
     """
     digest = hashlib.sha256()
-    for path in sorted(sources.rglob("*.py")):
-        content = path.read_bytes()
-        if b"numba" in content:
-            digest.update(content)
+    constants = (path for name in _CONSTANTS if (path := sources.parent / name).exists())
+    for path in (*sorted(sources.rglob("*.py")), *constants):
+        digest.update(path.read_bytes())
     installed = sources / "__pycache__" / f"lidarops-{digest.hexdigest()[:16]}"
     settings = vars(config)
     folder = _base(settings["CACHE_DIR"], sources) / installed.name

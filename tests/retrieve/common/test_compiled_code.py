@@ -22,18 +22,19 @@ from lidarops.retrieve.signal._signal_kernels import photon_profiles
 @pytest.fixture
 def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(config, "CACHE_DIR", "")
-    (tmp_path / "caller.py").write_text("import numba")
-    (tmp_path / "called.py").write_text("import numba  # 1")
-    (tmp_path / "plain.py").write_text("1")
-    return tmp_path
+    folder = tmp_path / "retrieve"
+    folder.mkdir()
+    (folder / "caller.py").write_text("import numba")
+    (folder / "thresholds.py").write_text("1")
+    (tmp_path / "flags.py").write_text("1")
+    return folder
 
 
-def test_a_change_of_any_compiled_module_gives_another_folder(sources: Path):
+@pytest.mark.parametrize("name", ["caller.py", "thresholds.py", "../flags.py"])
+def test_a_change_of_any_source_gives_another_folder(name: str, sources: Path):
     first = keep_apart(sources)
     assert Path(first).parent == sources / "__pycache__"
-    (sources / "plain.py").write_text("2")
-    assert keep_apart(sources) == first
-    (sources / "called.py").write_text("import numba  # 2")
+    (sources / name).write_text("import numba  # changed")
     assert keep_apart(sources) != first
     assert Path(config.CACHE_DIR).parent == sources / "__pycache__"
 
