@@ -34,10 +34,10 @@ def within(folder: Path, path: str) -> Path:
     Raises
     ------
     ProductError
-        If the path is absolute, goes up, or is a link to the outside.
+        If the path is absolute, goes up, holds a backslash, or is a link to the outside.
     """
     pure = PurePosixPath(path)
-    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+    if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in path:
         raise ProductError("is not a path inside its folder", file=path)
     file = folder / pure
     if not file.resolve().is_relative_to(folder.resolve()):

@@ -42,11 +42,11 @@ from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS, Thresholds
 from lidarops.retrieve.multiangle.vertical import (
     _calibration,
-    _correlation,
     _outliers,
     _smoothing_choice,
     smooth_profile,
 )
+from lidarops.retrieve.multiangle.vertical import correlation as air_correlation
 
 CLUSTERS: Final = 50
 PROFILES: Final = 8
@@ -134,10 +134,10 @@ GUARDS: Final = (
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
     Guard("calibration: common altitudes", off=_off((_calibration, "_common", lambda c: c >= 1))),
-    Guard("correlation", off=_off((_correlation, "fit_correlation", lambda *_: (0.0, 1.0)))),
+    Guard("correlation", off=_off((air_correlation, "fit_correlation", lambda *_: (0.0, 1.0)))),
     Guard(
         "correlation: amplitude",
-        off=_at(_correlation, least_amplitude=1.0, largest_amplitude=1.0),
+        off=_at(air_correlation, least_amplitude=1.0, largest_amplitude=1.0),
     ),
 )
 

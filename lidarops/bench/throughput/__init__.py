@@ -1,6 +1,6 @@
 """Time and memory of retrievals, readers, archives and whole campaigns.
 
-`retrievals`, with `scan_kernels`, and `readers` time single functions. `archives` times runs over
+`retrievals` and `readers` time single functions. `archives` times runs over
 archives of many scenes, most of them stand-ins (`stand_in_archives`). `campaigns` times all stages
 of simulated campaigns, `memory` measures the peak of processes, and `orchestration` workers and
 flows.

@@ -176,7 +176,9 @@ def _newton(tau: float, point: Point, g: Grid) -> float:
 
 
 @compiled
-def search(g: Grid, s: ProjectionScratch, sums: tuple[float, float, float]) -> tuple[float, Point]:
+def find_extinction(
+    g: Grid, s: ProjectionScratch, sums: tuple[float, float, float]
+) -> tuple[float, Point]:
     """Return the best extinction of a loaded profile, and the linear fit there."""
     following, settled = _start(g, s, sums), False
     for _ in range(_MOST_STEPS):
@@ -305,7 +307,7 @@ def solve_direct(
         reference, scale, unit = begin(power[k], noise[k % noise.shape[0]], mode, s, row)
         if row[STATUS] == FITTED:
             sums = (total_of(s.w), product(s.w, s.z), 1.0)
-            tau, p = search(g, s, sums)
+            tau, p = find_extinction(g, s, sums)
             describe(g, s, p, tau, sums, row)
             judge_residuals(g, s, p, tau, sums, is_variance, row)
             unscale(g, reference, scale, unit, row)

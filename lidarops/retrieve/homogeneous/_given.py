@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.homogeneous._direct import begin, describe, search, unscale
+from lidarops.retrieve.homogeneous._direct import begin, describe, find_extinction, unscale
 from lidarops.retrieve.homogeneous._estimate import (
     AMPLITUDE,
     AMPLITUDE_RELATIVE_VARIANCE,
@@ -100,7 +100,7 @@ def solve_above(
         reference, scale, unit = begin(power[k], noise[k % noise.shape[0]], mode, s, row)
         if row[STATUS] == FITTED:
             sums = (total_of(s.w), product(s.w, s.z), 0.0)
-            tau, p = search(g, s, sums)
+            tau, p = find_extinction(g, s, sums)
             describe(g, s, p, tau, sums, row)
             judge_residuals(g, s, p, tau, sums, is_variance, row)
             unscale(g, reference, scale, unit, row)

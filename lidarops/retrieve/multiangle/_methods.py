@@ -16,7 +16,7 @@ from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 from lidarops.retrieve.multiangle._result import MultiAngleResult, StepRecord
 from lidarops.retrieve.multiangle.slant_paths import Scan
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical._correlation import residual_moments
+from lidarops.retrieve.multiangle.vertical.correlation import residual_moments
 from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
 
 Array = npt.NDArray[np.float64]
@@ -41,7 +41,7 @@ class BlockSettings:
     """Indices of the altitudes at bottom and top of layers, -1 for the lidar."""
 
 
-def solve_block(signal: Array, variance: Array, settings: BlockSettings) -> MultiAngleResult:
+def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> MultiAngleResult:
     """Return the solution of the profiles of one block, without quality bits.
 
     Parameters

@@ -125,7 +125,7 @@ def retrieve_optical_depth(
         robust,
         _layers(layers, np.append(height, 0.0) + station_altitude),
     )
-    result = _methods.solve_block(rows, noise, settings)
+    result = _methods.solve_cycles(rows, noise, settings)
     observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
     result.quality[:] = _quality(result, observed)
     return result.with_leading_axes(leading)

@@ -31,10 +31,10 @@ class Thresholds:
     """Longest dwells beyond which a pause is longer than one lost file; assumed."""
     spherical_beyond: float = 75.0
     """degree beyond which the path follows the curvature of the Earth; below, the secant errs by
-    less than 0.3 percent of the optical depth, by the formula."""
+    less than 0.3 percent of the path up to 2.7 km, and 1.1 percent up to 10 km, by the formula."""
     longest_path: float = 10.0
-    """Slant over vertical path beyond which a beam is left out: the secant errs by 2 percent at 84
-    degrees, and refraction is not modelled; by the formula."""
+    """Slant over vertical path beyond which a beam is left out, because refraction is not
+    modelled; assumed."""
 
     # Samples (`_common_altitude`, `_sample_mask`).
     clear_bin: float = 30.0

@@ -100,8 +100,9 @@ class RunningMean:
         )
 
     def averages(self) -> Averages:
-        """Return the means of what was added; no more can be added."""
+        """Return the means of what was added; once, because the sums become the means."""
         total, value, noise, systematic = self._sums
+        del self._sums
         with np.errstate(invalid="ignore", divide="ignore"):
             value /= total
             noise /= total**2

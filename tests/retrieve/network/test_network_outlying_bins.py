@@ -20,6 +20,7 @@ from support.oracles.network import (
 
 from lidarops.retrieve.network import _condensed_signals, _fit_layout, outlying_bins
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 BINS = 7
 
@@ -324,14 +325,14 @@ def test_variances_of_bridged_beams_agree_with_their_scatter(where, relative):
 
 
 def test_a_jump_is_seen_from_the_farthest_bins_within_reach():
-    reach = outlying_bins.REACH
+    reach = THRESHOLDS.reach
     bins = 2 * reach + 1
     codes = np.full(bins, outlying_bins.GOOD + 1, dtype=np.uint8)
     codes[[0, -1]] = outlying_bins.GOOD
     logs = np.where(np.arange(bins) < reach, 0.0, -5.0)
     noise = np.full(bins, 1e-6)
-    assert outlying_bins._jumps(logs, noise, 1.0, codes, reach, 0, bins)
-    assert not outlying_bins._jumps(np.zeros(bins), noise, 1.0, codes, reach, 0, bins)
+    assert outlying_bins._jumps(logs, noise, 1.0, codes, reach)
+    assert not outlying_bins._jumps(np.zeros(bins), noise, 1.0, codes, reach)
 
 
 def test_weights_agree_with_polynomials():

@@ -18,11 +18,11 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import (
     _banded,
     _calibration,
-    _correlation,
     _outliers,
     _smoothing_choice,
 )
-from lidarops.retrieve.multiangle.vertical._correlation import ResidualMoments
+from lidarops.retrieve.multiangle.vertical import correlation as air_correlation
+from lidarops.retrieve.multiangle.vertical.correlation import ResidualMoments
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
@@ -267,7 +267,7 @@ def _block(
     correlation, share = 0.0, np.zeros_like(depth)
     gaps = np.zeros(0, dtype=np.int64)
     if moments is not None:
-        correlation, amplitude = _correlation.fit_correlation(
+        correlation, amplitude = air_correlation.fit_correlation(
             moments.lag_products, moments.lag_norms
         )
         share = np.clip(moments.inhomogeneity_share * amplitude, 0.0, 1.0)
@@ -315,10 +315,10 @@ def _fit(block: _Block, information: Array) -> _Fit:
 
 def _precision(block: _Block, information: Array) -> Array:
     share = _reduced_share(block, information)
-    bands = _correlation.correlated_precision(information, share, block.correlation)
+    bands = air_correlation.correlated_precision(information, share, block.correlation)
     rows = block.gaps
     if rows.size and block.correlation > 0.0:
-        bands[:, rows] = _correlation.gap_precision(
+        bands[:, rows] = air_correlation.gap_precision(
             information[rows], share[rows], block.correlation
         )
     return bands
@@ -360,7 +360,7 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
     rough = pilot.solve(right, fit.bands, block.stiffness)[0]
     right = _banded.multiply_rows(fit.bands, rough)
     smooth = fit.candidates.solve(right, fit.bands, block.stiffness)[0]
-    bands = _correlation.correlated_precision(
+    bands = air_correlation.correlated_precision(
         information[np.newaxis], share[np.newaxis], block.correlation
     )
     return _calibration.Calibration(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded
-from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision
+from lidarops.retrieve.multiangle.vertical.correlation import correlated_precision
 
 STATION = 35.0
 

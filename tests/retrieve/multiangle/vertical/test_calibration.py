@@ -10,7 +10,7 @@ from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import _banded, _calibration
-from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision
+from lidarops.retrieve.multiangle.vertical.correlation import correlated_precision
 
 HEIGHTS = 30
 ROWS = np.arange(HEIGHTS)

@@ -13,8 +13,9 @@ from support.oracles.angle_scenes import clear, clear_depth, cloud, estimates
 from support.oracles.banded_matrices import dense
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.multiangle.vertical import _banded, _correlation, _outliers, monotone
-from lidarops.retrieve.multiangle.vertical._correlation import residual_moments
+from lidarops.retrieve.multiangle.vertical import _banded, _outliers, monotone
+from lidarops.retrieve.multiangle.vertical import correlation as correlation_of_air
+from lidarops.retrieve.multiangle.vertical.correlation import residual_moments
 from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
 
 ALTITUDE = 150.0 + 30.0 * np.arange(60)
@@ -444,7 +445,7 @@ def test_common_residuals_in_noise_are_no_correlation_of_the_air():
     weight = np.broadcast_to(1.0 / (noise + variance), shape)
     share, gaps = np.ones((30, 60)), np.zeros(30, dtype=bool)
     moments = residual_moments(residual, weight, np.zeros(shape), variance, share, gaps)
-    rho, _ = _correlation.fit_correlation(moments.lag_products, moments.lag_norms)
+    rho, _ = correlation_of_air.fit_correlation(moments.lag_products, moments.lag_norms)
     assert rho < 0.1
 
 
@@ -484,7 +485,7 @@ def test_correlation_and_amplitude_follow_from_three_lags(ratios, expected):
     if np.isnan(ratios[2]):
         norms[:] = 0.0
     products = np.nan_to_num(np.array(ratios)) * norms
-    fitted = _correlation.fit_correlation(products, norms)
+    fitted = correlation_of_air.fit_correlation(products, norms)
     assert fitted == pytest.approx(expected, abs=0.011)
 
 
@@ -492,7 +493,7 @@ def moments_of(profiles, *, ratio=0.0, share=1.0, freedom=10.0):
     """Return residual moments of the shape of `plain`, with given lag ratios."""
     lags = np.array([ratio, ratio**2, ratio**3])
     shape = (profiles, ALTITUDE.size)
-    return _correlation.ResidualMoments(
+    return correlation_of_air.ResidualMoments(
         np.tile(lags, (profiles, 1)),
         np.ones((profiles, 3)),
         np.full(shape, share),

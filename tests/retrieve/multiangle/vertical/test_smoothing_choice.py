@@ -7,7 +7,6 @@ import pytest
 from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded
-from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision
 from lidarops.retrieve.multiangle.vertical._smoothing_choice import (
     GRID,
     PER_DECADE,
@@ -15,6 +14,7 @@ from lidarops.retrieve.multiangle.vertical._smoothing_choice import (
     choose_smoothing,
     score_smoothing,
 )
+from lidarops.retrieve.multiangle.vertical.correlation import correlated_precision
 
 HEIGHTS = 25
 ALTITUDE = 100.0 + 30.0 * np.arange(HEIGHTS)

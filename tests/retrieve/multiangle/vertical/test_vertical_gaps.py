@@ -8,7 +8,7 @@ from support.oracles.multiangle import ANGLES, clear, cloud, rms, signals
 
 from lidarops.retrieve.multiangle import _sample_mask
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
-from lidarops.retrieve.multiangle.vertical import _correlation
+from lidarops.retrieve.multiangle.vertical import correlation as correlation_of_air
 
 STEEP = np.linspace(0.0, 30.0, 6)
 
@@ -100,7 +100,7 @@ def test_precision_with_gaps_gives_the_variance_of_a_mean(correlation):
     rng, ratios = np.random.default_rng(3), []
     for _ in range(100):
         information, share, covariance = noise_with_gaps(rng, correlation)
-        bands = _correlation.gap_precision(information[None], share[None], correlation)[:, 0]
+        bands = correlation_of_air.gap_precision(information[None], share[None], correlation)[:, 0]
         dense = np.diag(bands[0])
         for step in (1, 2):
             dense += np.diag(bands[step, :-step], step) + np.diag(bands[step, :-step], -step)
@@ -113,15 +113,15 @@ def test_precision_with_gaps_gives_the_variance_of_a_mean(correlation):
 
 def test_precision_of_uniform_noise_is_that_without_gaps():
     information, share = np.full((2, 30), 5.0), np.full((2, 30), 0.8)
-    plain = _correlation.correlated_precision(information, share, 0.9)
-    bands = _correlation.gap_precision(information, share, 0.9)
+    plain = correlation_of_air.correlated_precision(information, share, 0.9)
+    bands = correlation_of_air.gap_precision(information, share, 0.9)
     np.testing.assert_allclose(bands, plain, rtol=1e-12)
 
 
 def test_altitudes_without_correlated_noise_stay_independent():
     information = np.tile([4.0, 0.0, 9.0], (1, 5))
     share = np.where(np.arange(15) % 2 == 0, 0.0, 1e-300)[np.newaxis]
-    bands = _correlation.gap_precision(information, share, 0.9)
+    bands = correlation_of_air.gap_precision(information, share, 0.9)
     np.testing.assert_array_equal(bands[0], information)
     assert not bands[1:].any()
 
