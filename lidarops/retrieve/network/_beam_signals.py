@@ -219,7 +219,10 @@ def _weak_passages(
             known = rows[np.isfinite(level[rows, c]) & np.isfinite(spread[rows, c])]
             if known.size == 0:
                 continue
-            typical = np.median(level[known, c]), np.median(spread[known, c])
+            spreads = spread[known, c]
+            # Where noise rises, more than half of the profiles may be noisy.
+            counted = spreads <= THRESHOLDS.noisy_profile * np.median(spreads)
+            typical = np.median(level[known, c]), np.mean(spreads[counted])
             error = np.sqrt(_MEDIAN_OVER_MEAN * typical[1] / (known.size * bins))
             negative[rows, c] = typical[0] < -THRESHOLDS.negative * error
             noisy = spread[rows, c] > THRESHOLDS.noisy_profile * typical[1]

@@ -1,10 +1,11 @@
-"""Errors of ln extinction that the profiles of a block show together.
+"""Errors of extinction that the profiles of a block show together.
 
 In thin air a single profile shows little of its own error: amplified noise raises its logarithm of
 extinction, and the error computed there is too small. A field that the prior excludes shifts all
 profiles alike, and no profile can separate it from attenuation. The curvature of a signal within
-the bins of a fit is hidden by noise. The block shows all three. Values do not change here, only
-their errors.
+the bins of a fit is hidden by noise. The block shows all three: by the difference of profiles and
+their mean and by the median error, by what the mean leaves open without a prior, and by the median
+curvature. Values do not change here, only their errors.
 """
 
 from __future__ import annotations
@@ -19,11 +20,73 @@ from lidarops.retrieve.network._empirical_prior import BlockSolution, median
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
 
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""
 _ROUNDING: Final = 1e-9
 """Relative size of a field below which it is rounding."""
+
+
+def bent_fields(position: Array) -> Array:
+    """Return (field, crossing) quadratic fields of ln extinction without level and gradient.
+
+    They span curvature in any direction: the sum of their squares, averaged over the crossings,
+    is `bend` squared. The fields of r_i r_j, i < j, count twice, as in the squares of r' H r with
+    a random symmetric H. There is none where a gradient describes any field of so few crossings.
+
+    Parameters
+    ----------
+    position : (crossing, 3) float64
+        m.
+    """
+    centred = position - position.mean(axis=0)
+    # A single crossing has no size.
+    centred = centred / max(float(np.sqrt(np.mean(centred**2))), np.finfo(float).tiny)
+    first, second = np.triu_indices(3)
+    weight = np.where(first == second, 1.0, np.sqrt(2.0))
+    fields = (weight * centred[:, first] * centred[:, second]).T
+    axes, scale, _ = np.linalg.svd(np.insert(centred, 0, 1.0, axis=1), full_matrices=False)
+    axes = axes[:, scale > _ROUNDING * scale[0]]
+    fields = fields - (fields @ axes) @ axes.T
+    fields[np.mean(fields**2, axis=1) <= _ROUNDING**2] = 0.0
+    total = float(np.sqrt(np.sum(fields**2) / len(centred)))
+    return np.asarray(fields * (THRESHOLDS.bend / total if total > 0.0 else 0.0))
+
+
+def excluded_field_variance(block: BlockSolution, position: Array) -> Array:
+    """Return (profile, crossing) variances by curved fields that the prior excludes.
+
+    All profiles share such an error, so it is at most what the mean of the beams leaves
+    undetermined without a prior.
+    """
+    shifts = block.profiles.prior_response @ bent_fields(position).T
+    gap = block.free_mean.logarithm[0] - block.mean.logarithm[0]
+    allowed = block.free_mean.variance[0] + gap**2
+    return np.asarray(np.fmin((shifts**2).sum(axis=2), allowed))
+
+
+def at_least_typical(extinction: Array, variance: Array, usable: Booleans) -> Array:
+    """Return variances raised to at least the median of their block, in m-2.
+
+    The error of an attenuation does not depend on the extinction that noise makes of it, so the
+    error of a profile with a high value is too small. Each profile is compared with those that
+    have at least its usable passages, because missing passages make errors larger. Small errors
+    stay as they are.
+
+    Parameters
+    ----------
+    extinction, variance : (profile, crossing) float64
+        m-1 and m-2; NaN where there is none.
+    usable : (profile, passage) bool
+    """
+    raised = variance.copy()
+    for pattern in np.unique(usable, axis=0):
+        alike, peers = (usable == pattern).all(axis=1), (usable >= pattern).all(axis=1)
+        typical, level = median(variance[peers]), median(extinction[peers])
+        large = typical > (THRESHOLDS.nonlinear_error * level) ** 2
+        raised[alike] = np.maximum(variance[alike], np.where(large, typical, 0.0))
+    return raised
 
 
 def prior_variance(block: BlockSolution) -> Array:

@@ -91,6 +91,9 @@ class Solution:
     """(profile, crossing) if the prior is true."""
     prior_share: Array
     """(profile, crossing) variance by a field that deviates as the prior states."""
+    prior_response: Array
+    """(profile, crossing, crossing) shifts of the solution by fields that the prior excludes: C P,
+    with the covariance C of the solution and the precision P of the prior."""
     carried: Array
     """(profile, crossing, passage) derivatives by the log values."""
     chi_square: Array
@@ -143,13 +146,16 @@ class Problem:
         ranges = np.append(self.layout.passages.range, 0.0)
         passages = np.minimum(last, ranges.size - 2)
         usable = counts > 0
-        fall = np.where(usable, -np.expm1(self.data.log_value[rows, passages]), 0.0)
+        # A start need only be finite.
+        rise = np.minimum(self.data.log_value[rows, passages], THRESHOLDS.thickest_beam)
+        fall = np.where(usable, -np.expm1(rise), 0.0)
         sums = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(self.data.integral, 1)], axis=1)
         total = np.where(usable, sums[rows, last] - sums[rows, first], 0.0)
         with np.errstate(all="ignore"):
             extinction = fall.sum(axis=1, keepdims=True) / total.sum(axis=1, keepdims=True)
             depth = 2.0 * self.exponent * extinction * (ranges[last] - ranges[first])
-            constants = np.log(total / np.expm1(np.fmax(depth, THRESHOLDS.thinnest_beam)))
+            depth = np.fmin(np.fmax(depth, THRESHOLDS.thinnest_beam), THRESHOLDS.thickest_beam)
+            constants = np.log(total / np.expm1(depth))
         return np.where(usable, constants, 0.0)
 
     def solve(
@@ -176,7 +182,8 @@ class Problem:
         cost = summary[:, _joint_solution.LIKELIHOOD] + norm
         determined = np.isfinite(cost)
         known = determined[:, np.newaxis] & seen & (variance < THRESHOLDS.largest_variance)
-        shares = np.diagonal(covariance @ precision @ covariance, axis1=1, axis2=2)
+        response = covariance @ precision
+        shares = np.diagonal(response @ covariance, axis1=1, axis2=2)
         chi_square = summary[:, _joint_solution.CHI_SQUARE]
         spare = counts.sum(axis=1) - (counts > 0).sum(axis=1)
         free = spare - seen.sum(axis=1)
@@ -187,6 +194,7 @@ class Problem:
             np.where(known, logarithm, np.nan),
             np.where(known, variance, np.nan),
             np.where(known, np.maximum(shares, 0.0), np.nan),
+            response,
             carried,
             chi_square,
             free.astype(np.float64),
@@ -354,7 +362,9 @@ def _contradicted(solution: Solution, free: Solution) -> bool:
     )
     noise = np.sqrt(np.maximum(free_variance - variance, 0.0) / number)
     allowed = np.maximum(THRESHOLDS.contradiction * noise, THRESHOLDS.harmless * np.sqrt(variance))
-    determined = known.any(axis=0) & (free_variance < THRESHOLDS.well_determined**2)
+    # Profiles that are left are no fair sample of the block.
+    determined = known.sum(axis=0) > THRESHOLDS.determined_share * len(known)
+    determined &= free_variance < THRESHOLDS.well_determined**2
     return bool(np.any(determined & (np.abs(average) > allowed + free_variance)))
 
 

@@ -236,13 +236,17 @@ def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> _E
             solution = solved.profiles
             variance = solution.variance + _block_errors.prior_variance(solved)
             variance = variance + _block_errors.noise_bias_variance(solved)
+            variance = variance + _block_errors.excluded_field_variance(solved, problem.position)
             out.prior_contradicted[rows] = solved.contradicted
-        variance = variance + _block_errors.curvature_variance(data, solution.carried)
+        curvature = _block_errors.curvature_variance(data, solution.carried)
         here = np.ix_(rows, np.flatnonzero(layout.measured))
         with np.errstate(over="ignore", under="ignore"):
             extinction = np.exp(solution.logarithm)
+            variance = extinction**2 * variance
+            if prior is FieldPrior.BLOCK:
+                variance = _block_errors.at_least_typical(extinction, variance, data.usable)
             out.extinction[here] = extinction
-            out.variance[here] = extinction**2 * variance
+            out.variance[here] = variance + extinction**2 * curvature
             out.prior_true_variance[here] = extinction**2 * solution.variance
         out.settled[rows], out.left_out[rows] = solution.settled, solution.left_out
         out.chi_square[rows, 0] = solution.chi_square

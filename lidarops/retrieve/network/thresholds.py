@@ -89,6 +89,8 @@ class Thresholds:
     assumed."""
     well_determined: float = 0.15
     """Standard error of ln extinction below which beams alone determine a crossing; assumed."""
+    determined_share: float = 0.9
+    """Share of the profiles in which a crossing that contradicts a prior is determined; assumed."""
     contradiction: float = 3.5
     """Standard errors of the difference at which beams contradict a prior; assumed."""
     harmless: float = 0.5
@@ -108,6 +110,8 @@ class Thresholds:
     """Largest change of a logarithm in the last pass of a converged solution; assumed."""
     thinnest_beam: float = 1e-3
     """Smallest optical depth of a beam for the start constants; assumed."""
+    thickest_beam: float = 30.0
+    """The largest one; assumed."""
     smallest_pivot: float = 1e-13
     """Smallest pivot of a regular matrix over its diagonal; rounding."""
     weak_precision: float = 1e-2
@@ -116,6 +120,12 @@ class Thresholds:
     """Variance of ln extinction beyond which it is not determined; assumed."""
 
     # Errors that the block shows: ablation
+    nonlinear_error: float = 0.1
+    """Typical relative error of a block, beyond which the error of a profile depends on its noise;
+    assumed."""
+    bend: float = 0.15
+    """Standard deviation of ln extinction over the crossings by the curvature of a field: that of a
+    gradient; assumed."""
     largest_deviation: float = 8.0
     """Limit of the deviation of a profile from the median, in median standard errors; assumed."""
 

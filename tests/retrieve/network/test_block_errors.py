@@ -11,6 +11,7 @@ from support.oracles.network import gradient, grid, noisy, plume, signals, three
 
 from lidarops.retrieve.network import _block_errors
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 # Errors ---------------------------------------------------------------------------------------
 
@@ -29,6 +30,68 @@ def test_bias_by_noise_counts_where_it_is_significant():
     logarithm[::2, 1] = np.nan
     result = noise_bias(logarithm, variance, [-7.09, -7.5, np.nan])
     np.testing.assert_allclose(result, [0.0, 0.25, 0.0], rtol=0.01)
+
+
+def positions(crossings, axes=3):
+    position = np.random.default_rng(1).normal(0.0, 200.0, (crossings, axes))
+    return np.pad(position, ((0, 0), (0, 3 - axes)))
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_bent_fields_have_no_level_and_no_gradient(axes):
+    position = positions(14, axes)
+    fields = _block_errors.bent_fields(position)
+    linear = np.column_stack([np.ones(14), position])
+    np.testing.assert_allclose(fields @ linear, 0.0, atol=1e-9)
+    assert np.sum(fields**2) / 14 == pytest.approx(THRESHOLDS.bend**2)
+    # Every quadratic field is a sum of them and a linear field.
+    quadratic = (position[:, 0] - 0.3 * position[:, 1] + 20.0) ** 2 / 1e4
+    design = np.column_stack([linear, fields.T])
+    fitted, *_ = np.linalg.lstsq(design, quadratic, rcond=None)
+    np.testing.assert_allclose(design @ fitted, quadratic, atol=1e-9)
+
+
+@pytest.mark.parametrize("crossings", [1, 2, 3])
+def test_few_crossings_in_a_plane_have_no_bent_fields(crossings):
+    np.testing.assert_array_equal(_block_errors.bent_fields(positions(crossings, 2)), 0.0)
+
+
+def test_excluded_fields_count_only_as_far_as_the_mean_allows():
+    position = positions(14)
+    gap, variance = np.zeros(14), np.zeros(14)
+    gap[1], variance[2], variance[3] = 0.2, 1e-4, np.nan
+    block = SimpleNamespace(
+        profiles=SimpleNamespace(prior_response=np.eye(14)[np.newaxis]),
+        mean=SimpleNamespace(logarithm=np.zeros((1, 14))),
+        free_mean=SimpleNamespace(logarithm=gap[np.newaxis], variance=variance[np.newaxis]),
+    )
+    result = _block_errors.excluded_field_variance(block, position)[0]
+    fields = (_block_errors.bent_fields(position) ** 2).sum(axis=0)
+    assert result[0] == 0.0
+    np.testing.assert_allclose(result[1:4], [min(fields[1], 0.04), 1e-4, fields[3]])
+
+
+def test_a_profile_with_high_values_has_at_least_the_error_of_its_block():
+    extinction = np.array([[1.0, 1.0], [1.1, 1.1], [4.0, 4.0], [np.nan, 1.0]]) * 1e-4
+    relative = np.array([[0.4, 0.04], [0.5, 0.05], [0.1, 0.01], [np.nan, 0.04]])
+    variance = (relative * extinction) ** 2
+    result = _block_errors.at_least_typical(extinction, variance, np.ones((4, 3), dtype=bool))
+    np.testing.assert_allclose(np.sqrt(result[:3, 0]), [4e-5, 5.5e-5, 4e-5])
+    # Small errors do not change.
+    np.testing.assert_array_equal(result[:, 1], variance[:, 1])
+    assert np.isnan(result[3, 0])
+
+
+def test_a_profile_is_compared_with_profiles_of_at_least_its_passages():
+    extinction = np.full((6, 1), 1e-4)
+    variance = (np.array([[0.2], [0.3], [0.8], [0.9], [0.1], [0.7]]) * 1e-4) ** 2
+    # All beams (twice), one beam missing (4 times).
+    usable = np.array([[1, 1, 1]] * 2 + [[1, 1, 0]] * 3 + [[0, 1, 1]], dtype=bool)
+    result = _block_errors.at_least_typical(extinction, variance, usable)
+    typical = np.sqrt((0.2**2 + 0.3**2) / 2.0)
+    # The last but one has high values and gets the error of those with at least its beams.
+    expected = [typical, 0.3, 0.8, 0.9, 0.3, 0.7]
+    np.testing.assert_allclose(np.sqrt(result[:, 0]), np.array(expected) * 1e-4)
 
 
 # Networks -------------------------------------------------------------------------------------
@@ -54,6 +117,8 @@ def test_block_errors_change_no_value_and_hardly_a_clear_case(monkeypatch):
 
     value, stated = solve_all()
     monkeypatch.setattr(_block_errors, "noise_bias_variance", lambda *_: 0.0)
+    monkeypatch.setattr(_block_errors, "excluded_field_variance", lambda *_: 0.0)
+    monkeypatch.setattr(_block_errors, "at_least_typical", lambda _, variance, *__: variance)
     value_without, stated_without = solve_all()
     np.testing.assert_array_equal(value, value_without)
     known = np.isfinite(stated_without)
