@@ -47,6 +47,7 @@ from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneErro
 from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import run_page
+from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
 from lidarops.run.archive import Options, Result, Selection, bring_up_to_date, report_run
 from lidarops.run.options import missing_report
@@ -308,8 +309,13 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
         "good files in no scene": result.set_aside,
         "requested channels in no file": {
             f"{request.channel} of {request.instrument}, for {request.requested_by}": request.reason
-            for request in result.unmet
+            for request in result.findings.unmet
             if request.nowhere
+        },
+        "findings on files": {
+            f"{row.instrument}, {row.subject}": row.problem
+            for row in finding_rows(result.findings)
+            if row.fails
         },
         "products without a raw file (reprocess --remove-orphans removes them)": result.lost,
     }

@@ -76,6 +76,8 @@ class Granule:
     """Why the granule is refused; empty when good."""
     notes: tuple[str, ...] = ()
     """Peculiarities of a good granule, in words."""
+    contradictions: tuple[str, ...] = ()
+    """Statements of the campaign on the station that the header contradicts, in words."""
     start: datetime | None = None
     stop: datetime | None = None
     zenith_angle: float | None = None
@@ -125,6 +127,8 @@ class Scene:
     members: tuple[Scene, ...] = ()
     """Scenes of the instruments of a network, which together hold the granules of this scene;
     `station` and `instrument` are the key of the network. Empty for a single instrument."""
+    notes: tuple[str, ...] = ()
+    """Notes and contradictions of its signal granules, each with the number of granules."""
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:
@@ -333,6 +337,60 @@ class Unmet:
 
 
 @dataclass(frozen=True, slots=True)
+class FileNote:
+    """A note on good files of an instrument."""
+
+    instrument: str
+    text: str
+    contradicts: bool
+    """Whether the headers contradict what the campaign states about the station."""
+    files: int
+
+
+@dataclass(frozen=True, slots=True)
+class IdlePattern:
+    """A file pattern of an instrument that matches no file of the archive."""
+
+    instrument: str
+    key: str
+    """``files`` or ``dark_files``."""
+    pattern: str
+    near: tuple[str, ...]
+    """Files of the archive with similar names that no instrument claims."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unmade:
+    """A kind of product that is requested of an instrument or network, and that no scene gives."""
+
+    instrument: str
+    kind: str
+    reason: str
+    """Why a scene that was planned for it does not give it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """Where an archive is not what the campaign states, names and requests."""
+
+    unmet: tuple[Unmet, ...] = ()
+    """Those that no file holds come first."""
+    file_notes: tuple[FileNote, ...] = ()
+    """Contradictions come first."""
+    idle_patterns: tuple[IdlePattern, ...] = ()
+    unmade: tuple[Unmade, ...] = ()
+
+    @property
+    def failed(self) -> bool:
+        """Whether a channel or pattern is in no file, or headers contradict a station."""
+        return (
+            bool(self.idle_patterns)
+            or any(request.nowhere for request in self.unmet)
+            or any(note.contradicts for note in self.file_notes)
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class RunRecord:
     """One execution over many scenes."""
 
@@ -350,9 +408,7 @@ class RunRecord:
     """Granules that the catalog refused."""
     truth: str = ""
     """Path of the truth file of a simulated campaign, empty for real data."""
-    unmet: tuple[Unmet, ...] = ()
-    """Channels that are requested or have facts, but are missing in files; those that no file
-    holds come first."""
+    findings: Findings = field(default_factory=Findings)
     empty_scenes: Mapping[str, str] = field(default_factory=dict)
     """Scene -> why it can give no product; the first of those that the run examined."""
     more_empty_scenes: int = 0
@@ -360,9 +416,9 @@ class RunRecord:
 
     @property
     def failed(self) -> bool:
-        """Whether a file was refused, a scene failed or is unusable, or a channel is in no file."""
+        """Whether a file was refused, a scene failed or is unusable, or the findings failed."""
         return (
             bool(self.refused or self.empty_scenes)
-            or any(request.nowhere for request in self.unmet)
+            or self.findings.failed
             or any(scene.error or scene.refused or scene.unusable for scene in self.scenes)
         )

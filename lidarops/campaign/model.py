@@ -161,7 +161,17 @@ class Instrument(SettingsModel):
     name: str = ""
     files: Patterns
     dark_files: Patterns = Field(default=[])
-    header_position: Literal["longitude_first", "latitude_first", "ignore"] = "longitude_first"
+    header_position: Literal["longitude_first", "latitude_first", "ignore"] = Field(
+        default="longitude_first",
+        description="order of the coordinates in headers; with ignore, a header may state any"
+        " position and altitude",
+    )
+    position_tolerance: float = quantity(
+        0.5, unit="degree", ge=0, le=180, description="of headers that differ from the station"
+    )
+    altitude_tolerance: float = quantity(
+        100.0, unit="m", ge=0, le=1e4, description="of headers that differ from the station"
+    )
     facts: list[InstrumentFacts] = Field(default=[InstrumentFacts()])
     products: Products = Products()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -12,9 +13,9 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import BATCH, Database
-from lidarops.catalog.rows import GranuleRow, naive
+from lidarops.catalog.rows import NO_NOTES, GranuleRow, naive
 from lidarops.catalog.schema import GRANULE, LAYOUT
-from lidarops.records import ChannelLayout, DetectionMode, Granule, Holding, Role, Status
+from lidarops.records import ChannelLayout, DetectionMode, FileNote, Granule, Holding, Role, Status
 
 _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
@@ -222,6 +223,30 @@ class Granules(Database):
                 for instrument, index, _, files, channels in connection.execute(query)
             ]
 
+    def file_notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
+        """Return the notes on good signal granules, contradictions first, then by frequency.
+
+        Parameters
+        ----------
+        instruments : collection of str
+        """
+        noted = sa.or_(_C.notes != NO_NOTES, _C.contradictions != NO_NOTES)
+        columns = (_C.instrument, _C.notes, _C.contradictions)
+        query = (
+            sa.select(*columns, sa.func.count()).where(*self._signals(), noted).group_by(*columns)
+        )
+        files: Counter[tuple[bool, str, str]] = Counter()
+        with self.transaction() as connection:
+            for instrument, notes, contradictions, count in connection.execute(query):
+                for stored, contradicts in ((notes, False), (contradictions, True)):
+                    for text in _sentences(stored) if instrument in instruments else ():
+                        files[contradicts, instrument, text] += count
+        ordered = sorted(files.items(), key=lambda item: (not item[0][0], -item[1], item[0]))
+        return tuple(
+            FileNote(instrument, text, contradicts, count)
+            for (contradicts, instrument, text), count in ordered
+        )
+
     def paths_by_digest(self, digests: Collection[str]) -> dict[str, str]:
         """Return SHA-256 -> path of the granules with these digests."""
         paths: dict[str, str] = {}
@@ -248,15 +273,19 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
     )
 
 
+def _sentences(stored: str) -> tuple[str, ...]:
+    # Skip the parsing for most of the millions of granules.
+    return () if stored == NO_NOTES else tuple(json.loads(stored))
+
+
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
     (
-        path, size, mtime_ns, instrument, role, status, reason, notes, start, stop,
+        path, size, mtime_ns, instrument, role, status, reason, notes, contradictions, start, stop,
         zenith_angle, azimuth, latitude, longitude, altitude, layout, *others,
     ) = row  # fmt: skip
     return Granule(
         path, size, mtime_ns, instrument, _ROLES[role], _STATUSES[status], reason,
-        # Skip the parsing for most of the millions of granules.
-        () if notes == "[]" else tuple(json.loads(notes)),
+        _sentences(notes), _sentences(contradictions),
         None if start is None else start.replace(tzinfo=UTC),
         None if stop is None else stop.replace(tzinfo=UTC),
         zenith_angle, azimuth, latitude, longitude, altitude, layouts[layout], *others,

@@ -5,9 +5,10 @@ Processes that read headers import only this module, so it imports little, to st
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
@@ -18,15 +19,17 @@ from lidarops.raw.header import HeaderOrder, RawHeader
 from lidarops.records import Granule, Role, Status
 
 if TYPE_CHECKING:
-    from lidarops.campaign.model import Campaign
+    from lidarops.campaign.model import Campaign, Instrument, Station
 
 _UNREADABLE: Final = "cannot be read"
 _TRY_AGAIN: Final = (_UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
 
 _HEADER_BYTES = 16384
-_FAR_FROM_STATION = 0.5
-"""degree; a header position farther from the station gets a note."""
+_ROUNDING_OF_ANGLES: Final = 1.0
+"""degree; headers hold whole degrees."""
+_ROUNDING_OF_WAVELENGTHS: Final = 1e-9
+"""m; headers hold whole nanometres."""
 
 
 class UnreadFile(NamedTuple):
@@ -41,27 +44,41 @@ class UnreadFile(NamedTuple):
     """Digest of the settings that affect its granule."""
 
 
-class _Pointing(NamedTuple):
-    valid_from: datetime
-    valid_to: datetime
-    zenith_angle: float | None
-    azimuth: float | None
+class _Facts(NamedTuple):
+    """What the campaign states in one period that headers state too."""
+
+    valid_from: datetime = datetime.min.replace(tzinfo=UTC)
+    valid_to: datetime = datetime.max.replace(tzinfo=UTC)
+    zenith_angle: float | None = None
+    azimuth: float | None = None
+    wavelengths: tuple[tuple[str, float], ...] = ()
+    """Channel and m."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Position and pointing of an instrument, as far as the campaign gives them."""
+    """Position and facts of an instrument, as far as headers hold them too."""
 
     latitude: float
     longitude: float
+    altitude: float
     header_position: HeaderOrder | Literal["ignore"]
-    pointings: tuple[_Pointing, ...]
+    position_tolerance: float
+    """degree."""
+    altitude_tolerance: float
+    """m."""
+    facts: tuple[_Facts, ...]
 
-    def pointing(self, moment: datetime) -> tuple[float | None, float | None]:
-        for fact in self.pointings:
+    def facts_at(self, moment: datetime) -> _Facts:
+        for fact in self.facts:
             if fact.valid_from <= moment < fact.valid_to:
-                return fact.zenith_angle, fact.azimuth
-        return None, None
+                return fact
+        return _Facts()
+
+    def is_near(self, latitude: float, longitude: float) -> bool:
+        """Return whether a position is that of the station, within the tolerance."""
+        eastward = (longitude - self.longitude + 180.0) % 360.0 - 180.0
+        return max(abs(latitude - self.latitude), abs(eastward)) <= self.position_tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +96,7 @@ class Headers:
         Rows get the name `entered_as`, by which the catalog knows the campaign.
         """
         places = {
-            name: _Place(
-                campaign.stations[instrument.station].latitude,
-                campaign.stations[instrument.station].longitude,
-                instrument.header_position,
-                tuple(
-                    _Pointing(fact.valid_from, fact.valid_to, fact.zenith_angle, fact.azimuth)
-                    for fact in instrument.facts
-                ),
-            )
+            name: _place(campaign.stations[instrument.station], instrument)
             for name, instrument in campaign.instruments.items()
         }
         return cls(source, entered_as, places)
@@ -138,17 +147,10 @@ def _refused(due: UnreadFile, reason: str) -> Granule:
 
 
 def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
-    zenith_angle, azimuth = place.pointing(header.start)
-    notes = header.notes
-    latitude, longitude = place.latitude, place.longitude
+    facts = place.facts_at(header.start)
     order = place.header_position
     position = None if order == "ignore" else header.position(order)
-    if position is not None:
-        latitude, longitude = position
-        distance = max(abs(latitude - place.latitude), abs(longitude - place.longitude))
-        if distance > _FAR_FROM_STATION:
-            note = _position_note(latitude, longitude, place.latitude, place.longitude)
-            notes = (*notes, note)
+    latitude, longitude = position or (place.latitude, place.longitude)
     return Granule(
         path=due.file.path,
         size=due.file.size,
@@ -156,11 +158,12 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
         instrument=due.instrument,
         role=due.role,
         status=Status.GOOD,
-        notes=notes,
+        notes=(*header.notes, *_overridden(header, facts)),
+        contradictions=() if order == "ignore" else tuple(_contradictions(header, position, place)),
         start=header.start,
         stop=header.stop,
-        zenith_angle=header.zenith_angle if zenith_angle is None else zenith_angle,
-        azimuth=header.azimuth if azimuth is None else azimuth,
+        zenith_angle=header.zenith_angle if facts.zenith_angle is None else facts.zenith_angle,
+        azimuth=header.azimuth if facts.azimuth is None else facts.azimuth,
         latitude=latitude,
         longitude=longitude,
         altitude=header.altitude,
@@ -170,14 +173,66 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
     )
 
 
-def _position_note(latitude: float, longitude: float, north: float, east: float) -> str:
-    swapped = max(abs(longitude - north), abs(latitude - east)) <= _FAR_FROM_STATION
-    remedy = (
-        "they look swapped: set header_position of the instrument"
-        if swapped
-        else "the position of the campaign is used; header_position: ignore silences this"
-    )
-    return (
-        f"header position {latitude:.1f} N {longitude:.1f} E is not that of the station"
-        f" {north:.1f} N {east:.1f} E ({remedy})"
+def _contradictions(
+    header: RawHeader, position: tuple[float, float] | None, place: _Place
+) -> Iterator[str]:
+    """Yield what the header states otherwise than the station of the campaign."""
+    if position is not None and not place.is_near(*position):
+        latitude, longitude = position
+        remedy = "correct the station, or set header_position: ignore or position_tolerance"
+        if place.is_near(longitude, latitude):
+            remedy = "they look swapped: set header_position, or correct the station"
+        yield (
+            f"the header states the position {latitude:.1f} N {longitude:.1f} E, the station of the"
+            f" campaign {place.latitude:.1f} N {place.longitude:.1f} E ({remedy})"
+        )
+    altitude = header.altitude
+    if altitude is not None and abs(altitude - place.altitude) > place.altitude_tolerance:
+        remedy = "correct the station, or set header_position: ignore or altitude_tolerance"
+        if abs(altitude - 1e3 * place.altitude) <= place.altitude_tolerance:
+            remedy = "that of the station looks like km: give m"
+        yield (
+            f"the header states the altitude {altitude:.0f} m, the station of the campaign"
+            f" {place.altitude:.5g} m ({remedy})"
+        )
+
+
+def _overridden(header: RawHeader, facts: _Facts) -> Iterator[str]:
+    """Yield facts of the campaign that override what the header states."""
+    stated, given = header.zenith_angle, facts.zenith_angle
+    if stated is not None and given is not None and abs(stated - given) > _ROUNDING_OF_ANGLES:
+        yield f"zenith_angle {given:g} degree of the campaign overrides {stated:g} of the header"
+    wavelengths = dict(facts.wavelengths)
+    for channel in header.layout if wavelengths else ():
+        wavelength = wavelengths.get(channel.name, math.nan)
+        # Not where the wavelength of the header is implausible, and so NaN.
+        if abs(wavelength - channel.wavelength) > _ROUNDING_OF_WAVELENGTHS:
+            yield (
+                f"wavelength {wavelength * 1e9:.5g} nm of {channel.name} in the campaign overrides"
+                f" {channel.wavelength * 1e9:.5g} nm of the header"
+            )
+
+
+def _place(station: Station, instrument: Instrument) -> _Place:
+    return _Place(
+        station.latitude,
+        station.longitude,
+        station.altitude,
+        instrument.header_position,
+        instrument.position_tolerance,
+        instrument.altitude_tolerance,
+        tuple(
+            _Facts(
+                fact.valid_from,
+                fact.valid_to,
+                fact.zenith_angle,
+                fact.azimuth,
+                tuple(
+                    (name, channel.wavelength)
+                    for name, channel in fact.channels.items()
+                    if channel.wavelength is not None
+                ),
+            )
+            for fact in instrument.facts
+        ),
     )

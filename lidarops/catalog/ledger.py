@@ -382,6 +382,26 @@ class Ledger(Granules):
         with self.stream(query) as rows:
             yield (_made_from(row) for row in rows)
 
+    def has_product(self, folder: str, first: int, last: int) -> bool:
+        """Return whether there is a product in a folder, of the days `first` to `last`.
+
+        Parameters
+        ----------
+        folder : str
+            Its path with a slash at the end.
+        first, last : int
+            Days since 1970-01-01, both included.
+        """
+        query = (
+            sa.select(_P.path)
+            # A range of the primary key; "0" follows "/".
+            .where(_P.campaign == self.campaign, _P.path >= folder, _P.path < f"{folder[:-1]}0")
+            .where(_P.day.between(first, last))
+            .limit(1)
+        )
+        with self.transaction() as connection:
+            return connection.scalar(query) is not None
+
     def products(self) -> list[Mapping[str, Any]]:
         """Return the rows of all products, ordered by path."""
         query = sa.select(PRODUCT).where(_P.campaign == self.campaign).order_by(_P.path)

@@ -16,6 +16,8 @@ from lidarops.records import ChannelLayout, Granule
 
 RETRY: Final = ""
 """Scan key of a file that could not be read: every scan tries it again."""
+NO_NOTES: Final = "[]"
+"""Stored notes of a file that has none."""
 
 _AS_THEY_ARE: Final = (
     "path", "size", "mtime_ns", "instrument", "reason", "zenith_angle", "azimuth", "latitude",
@@ -103,7 +105,8 @@ def _values(granule: Granule, campaign: str, scan_key: str, layout: str) -> dict
         "scan_key": scan_key,
         "role": granule.role.value,
         "status": granule.status.value,
-        "notes": json.dumps(granule.notes) if granule.notes else "[]",
+        "notes": json.dumps(granule.notes),
+        "contradictions": json.dumps(granule.contradictions),
         "start": naive(granule.start),
         "stop": naive(granule.stop),
         "layout": layout,

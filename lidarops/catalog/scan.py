@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import re
@@ -9,6 +10,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
@@ -17,7 +19,7 @@ from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.records import Role, Status
+from lidarops.records import IdlePattern, Role, Status
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import Processes
 from lidarops.system.stores import without_keys
@@ -29,6 +31,10 @@ _WORTH_PROCESSES = 5000
 """Least number of headers to read for which further processes are started."""
 _MOST_PROCESSES = 8
 """Further processes would wait for the one that writes the catalog."""
+
+_NAMES_REMEMBERED: Final = 1000
+_NAMES_OF_FOLDER: Final = 3
+_NAMES_SHOWN: Final = 3
 
 Progress = Callable[[int], None]
 
@@ -46,6 +52,8 @@ class ScanSummary:
     """Refused granules in the whole catalog, not only the new ones."""
     moved: int = 0
     """Files with a new path and known content; they count neither as added nor as vanished."""
+    idle_patterns: tuple[IdlePattern, ...] = ()
+    """Patterns of the campaign that match no file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +65,7 @@ class _Claim:
     folder: re.Pattern[str] | None
     name: re.Pattern[str]
     """Pattern of the path after the folder; of the whole path if `folder` is None."""
+    pattern: str
     scan_key: str
 
 
@@ -157,6 +166,8 @@ class _Scan:
         self._claims = _claims(campaign)
         self._folder: str | None = None
         self._near: list[_Claim] = []
+        self._idle = set(self._claims)
+        self._unclaimed = _Unclaimed()
         self._files = self._changed = 0
         self._reported = 0
         self._judged: deque[Fingerprint | None] = deque()
@@ -172,6 +183,10 @@ class _Scan:
         """Compare each file with the catalog, and yield those whose header must be read."""
         for file, before in pairs:
             owners = [] if file is None else self._owners(file.path)
+            if self._idle and file is not None:
+                self._idle.difference_update(owners)
+                if not owners:
+                    self._unclaimed.add(file.path)
             if file is None or not owners:
                 if before is not None:
                     self._gone.append(before)
@@ -264,6 +279,16 @@ class _Scan:
             vanished=len(self._gone) - len(moved),
             refused=self._store.count(status=Status.REFUSED),
             moved=len(moved),
+            idle_patterns=tuple(
+                IdlePattern(
+                    claim.instrument,
+                    "dark_files" if claim.role is Role.DARK else "files",
+                    claim.pattern,
+                    self._unclaimed.near(claim.pattern),
+                )
+                for claim in self._claims
+                if claim in self._idle
+            ),
         )
 
     def _emptied(self) -> CatalogError:
@@ -297,6 +322,30 @@ class _Scan:
         return moved
 
 
+class _Unclaimed:
+    """Some names of files that no instrument claims, from every folder."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._folders: Counter[str] = Counter()
+
+    def add(self, path: str) -> None:
+        """Remember the name of a file, if few of its folder are remembered."""
+        folder = path.rpartition("/")[0]
+        if len(self._names) < _NAMES_REMEMBERED and self._folders[folder] < _NAMES_OF_FOLDER:
+            self._folders[folder] += 1
+            self._names.append(path)
+
+    def near(self, pattern: str) -> tuple[str, ...]:
+        """Return the names that resemble a pattern most, one of each folder first."""
+        plain = {name.lower(): name for name in self._names}
+        wanted = pattern.lower()
+        return tuple(
+            plain[name]
+            for name in difflib.get_close_matches(wanted, plain, n=_NAMES_SHOWN, cutoff=0.0)
+        )
+
+
 def scan_keys(campaign: Campaign) -> dict[tuple[str, Role], str]:
     """Return a digest of the settings that affect the granules of each instrument and role.
 
@@ -323,14 +372,23 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 role.value,
                 patterns,
                 instrument.header_position,
+                instrument.position_tolerance,
+                instrument.altitude_tolerance,
                 station.model_dump(),
                 [
-                    (str(fact.valid_from), fact.zenith_angle, fact.azimuth)
+                    (
+                        str(fact.valid_from),
+                        fact.zenith_angle,
+                        fact.azimuth,
+                        [(name, channel.wavelength) for name, channel in fact.channels.items()],
+                    )
                     for fact in instrument.facts
                 ],
             ]
             digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16]
-            claims.extend(_Claim(key, role, *_split(pattern), digest) for pattern in patterns)
+            claims.extend(
+                _Claim(key, role, *_split(pattern), pattern, digest) for pattern in patterns
+            )
     return claims
 
 

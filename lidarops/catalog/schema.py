@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 7
+SCHEMA_VERSION: Final = 8
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -38,7 +38,9 @@ GRANULE = sa.Table(
     sa.Column("role", sa.String(8), nullable=False),
     sa.Column("status", sa.String(8), nullable=False),
     sa.Column("reason", sa.Text, nullable=False),
+    # JSON lists of sentences.
     sa.Column("notes", sa.Text, nullable=False),
+    sa.Column("contradictions", sa.Text, nullable=False),
     sa.Column("start", sa.DateTime),
     sa.Column("stop", sa.DateTime),
     *(

@@ -43,7 +43,15 @@ if TYPE_CHECKING:
 
     from lidarops.campaign.model import Campaign
     from lidarops.plan.cost_estimate import RunTime
-    from lidarops.records import Granule, LeftOut, Plan, PlannedStep, RunRecord, SceneOutcome
+    from lidarops.records import (
+        Findings,
+        Granule,
+        LeftOut,
+        Plan,
+        PlannedStep,
+        RunRecord,
+        SceneOutcome,
+    )
     from lidarops.run.archive import Result
     from lidarops.run.selection import Selection
     from lidarops.run.staleness import Judgement
@@ -88,11 +96,12 @@ def catalog(
     wait: WaitOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Create or update the catalog of the archive; list refused files and why.
+    """Create or update the catalog of the archive; list refused files, notes on files, and why.
 
     Example: lidarops catalog catalogs/demo.yaml
     """
     from lidarops.catalog.store import Store
+    from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
 
     settings = _loaded(campaign, archive, out, catalog)
@@ -100,17 +109,22 @@ def catalog(
         summary = update_catalog(settings, progress=bar.advance, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
+        notes = store.file_notes(settings.instruments)
+    findings = Findings(file_notes=notes, idle_patterns=summary.idle_patterns)
     if as_json:
         reasons = [{"path": granule.path, "reason": granule.reason} for granule in refused]
-        typer.echo(json.dumps({**asdict(summary), "refused_files": reasons}, indent=2))
+        notes_found = {"file_notes": [asdict(note) for note in notes]}
+        document = {**asdict(summary), "refused_files": reasons, **notes_found}
+        typer.echo(json.dumps(document, indent=2))
     else:
         _show_refused(refused)
+        _show_findings(findings)
         typer.echo(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
             f" {summary.refused} refused"
         )
-    exit_with_status(failed=bool(refused))
+    exit_with_status(failed=bool(refused) or findings.failed)
 
 
 @command("plan")
@@ -134,18 +148,20 @@ def show_plan(
     """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
 
     Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
-    code 1 if a scene cannot be planned.
+    code 1 if a scene cannot be planned, a pattern or channel is in no file, or headers contradict a
+    station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.plan.cost_estimate import RunTime
-    from lidarops.run.archive import assess
+    from lidarops.run.archive import assess, survey
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     selection = _selection(instrument, station, product, since, until)
-    judgements = assess(settings, selection=selection, everything=not stale, wait=wait)
+    findings = survey(settings, selection=selection, wait=wait)
+    judgements = assess(settings, selection=selection, everything=not stale, update=False)
     making, everything = RunTime(), RunTime()
     scenes = []
     no_scene = True
@@ -182,13 +198,19 @@ def show_plan(
             name.partition(",")[0].replace(" ", "_"): run.parts for name, run in runs.items()
         }
         no_scene_found = {"no_scene_selected": no_scene}
-        document = {"scenes": scenes, **no_scene_found, "estimated_cpu_seconds": estimate}
+        document = {
+            "scenes": scenes,
+            **no_scene_found,
+            **_findings(findings),
+            "estimated_cpu_seconds": estimate,
+        }
         typer.echo(json.dumps(document, indent=2))
     else:
         if no_scene:
             typer.echo(_NO_SCENE)
+        _show_findings(findings)
         _show_times(runs)
-    exit_with_status(failed=failed)
+    exit_with_status(failed=failed or findings.failed)
 
 
 @command()
@@ -478,15 +500,25 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
         "more_of_both": result.more_unused,
-        "not_in_files": [
-            {**asdict(request), "nowhere": request.nowhere} for request in result.unmet
-        ],
+        **_findings(result.findings),
         "orphans": {
             orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
         },
         "kept_products": {
             orphan.path: orphan.reason for orphan in result.orphans if orphan.requested
         },
+    }
+
+
+def _findings(findings: Findings) -> dict[str, Any]:
+    """Return the findings as plain JSON types."""
+    return {
+        "not_in_files": [
+            {**asdict(request), "nowhere": request.nowhere} for request in findings.unmet
+        ],
+        "patterns_without_file": [asdict(idle) for idle in findings.idle_patterns],
+        "file_notes": [asdict(note) for note in findings.file_notes],
+        "never_made": [asdict(unmade) for unmade in findings.unmade],
     }
 
 
@@ -524,7 +556,7 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     refused = _refused(campaign, result)
     _show_refused(refused)
     _show_unused(result, {granule.path for granule in refused})
-    _show_unmet(result)
+    _show_findings(result.findings)
     if not removing:
         _show_orphans(result, None)
     kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
@@ -535,9 +567,18 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         typer.echo(_NO_SCENE)
     elif result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
-        typer.echo(f"products: {campaign.products_root}{ended}")
+        typer.echo(f"products: {campaign.products_root}{ended}{_never_made(result.findings)}")
     else:
-        typer.echo("nothing to do: every requested product is fresh or cannot be made")
+        never = _never_made(result.findings)
+        typer.echo(f"nothing to do: every requested product is fresh or cannot be made{never}")
+
+
+def _never_made(findings: Findings) -> str:
+    """Return the requested products that no scene gives, for the end of a line."""
+    from lidarops.reports.findings import unmade_words
+
+    names = ", ".join(unmade_words(findings))
+    return f"; requested, but made in no scene: {names}" if names else ""
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
@@ -556,15 +597,18 @@ def _show_unused(result: Result, listed: Collection[str]) -> None:
     show_rows(f"Not used{more}", ("file or scene", "reason"), rows)
 
 
-def _show_unmet(result: Result) -> None:
-    from lidarops.figures.wording import lacking
+def _show_findings(findings: Findings) -> None:
+    from lidarops.reports.findings import finding_rows, lacking
 
-    columns = ("instrument", "channel", "requested by", "reason", "missing in")
-    rows = (
+    columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
+    unmet = (
         (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
-        for unmet in result.unmet
+        for unmet in findings.unmet
     )
-    show_rows("Requested, but not in the files", columns, rows)
+    show_rows("Requested, but not in the files", columns, unmet)
+    columns = ("instrument", "what", "finding")
+    rows = ((row.instrument, row.subject, row.problem) for row in finding_rows(findings))
+    show_rows("The archive is not what the campaign states", columns, rows)
 
 
 def _show_orphans(result: Result, removed: int | None) -> None:

@@ -8,8 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.records import Unmet
-
 _REORDERING: Final = frozenset(
     "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
     "\N{LEFT-TO-RIGHT OVERRIDE}\N{RIGHT-TO-LEFT OVERRIDE}"
@@ -58,14 +56,6 @@ def utc(time: np.datetime64) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, in the plural with an s."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
-def lacking(unmet: Unmet) -> str:
-    """Return how many files lack a requested channel."""
-    expected = unmet.files_expected
-    if unmet.nowhere:
-        return "the only file" if expected == 1 else f"all {expected:,} files"
-    return f"{unmet.files:,} of {expected:,} files"
 
 
 def visible(text: str) -> str:

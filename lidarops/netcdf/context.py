@@ -34,6 +34,8 @@ class Context:
     start: datetime
     """Start of the scene's window, not of its first profile."""
     stop: datetime
+    notes: tuple[str, ...]
+    """Notes on its raw files."""
     provenance: Provenance
     raw_format: str
     """Raw format of its files, in words."""

@@ -214,6 +214,7 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_plan_sha256": provenance.plan.hash,
         "lidarops_code_version": provenance.code_version,
         "lidarops_input_count": np.int32(len(provenance.inputs)),
+        **({"lidarops_input_notes": "\n".join(context.notes)} if context.notes else {}),
     }
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -110,6 +110,7 @@ def _of_network(
                     granules=_in_time(g for member in members for g in member.granules),
                     dark=_in_time(g for member in members for g in member.dark),
                     members=members,
+                    notes=tuple(dict.fromkeys(note for member in members for note in member.notes)),
                 )
             )
     return scenes
@@ -257,9 +258,17 @@ def _by_layout(
                     <= _start(granule)
                     <= _start(group[-1]) + DARK_REACH
                 ),
+                notes=_notes(group),
             )
         )
     return scenes
+
+
+def _notes(granules: Sequence[Granule]) -> tuple[str, ...]:
+    files = Counter(
+        note for granule in granules for note in (*granule.contradictions, *granule.notes)
+    )
+    return tuple(f"{note}: {count} of {len(granules)} files" for note, count in files.items())
 
 
 def _layout_key(granule: Granule) -> str:

@@ -57,6 +57,7 @@ def product_context(
         scene=scene.id,
         start=scene.start,
         stop=scene.stop,
+        notes=scene.notes,
         provenance=Provenance(
             campaign=campaign.name,
             scene=scene.id,
@@ -70,6 +71,7 @@ def product_context(
                 "keys": {"station": scene.station, "instrument": scene.instrument},
                 "campaign": {"title": campaign.title, "summary": campaign.summary},
                 "window": [scene.start.isoformat(), scene.stop.isoformat()],
+                "notes": list(scene.notes),
             },
             versions=provenance.package_versions(),
             code_version=code_version(kind),

@@ -15,9 +15,10 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops.errors import CatalogError
-from lidarops.figures.wording import duration, lacking, percent, size, visible
+from lidarops.figures.wording import duration, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
+from lidarops.reports.findings import finding_rows, lacking
 from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME
 from lidarops.reports.sources import Compared
@@ -139,6 +140,8 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         record=record,
         summary=run_tables.summary(record),
         verdict=run_tables.verdict(record),
+        outcome=run_tables.outcome_class(record),
+        findings=finding_rows(record.findings),
         instruments=run_tables.instruments(record),
         stages=stages,
         scenes=[

@@ -22,7 +22,7 @@ FILE_NAME: Final = "run.json"
 """Name of the record inside a run's report folder."""
 
 _FORMAT: Final = "lidarops run record"
-_VERSION: Final = 2
+_VERSION: Final = 3
 _T = TypeVar("_T")
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
 # JSON has no such numbers, and only Python reads Python's spelling of them.

@@ -13,6 +13,7 @@ from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome
+from lidarops.reports.findings import finding_rows, unmade_words
 from lidarops.steps.reading import idle_window
 
 _MOST_NAMES: Final = 8
@@ -147,35 +148,68 @@ def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def verdict(record: RunRecord) -> str:
-    """Return the outcome of the run in one sentence."""
-    failed, internal = len(failed_scenes(record)), len(internal_errors(record))
-    refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
+    """Return the outcome of the run in one sentence, and what to look at in others."""
     if not record.scenes:
-        tail = f" {counted(refused, 'granule')} refused." if refused else ""
-        return f"There was no scene to process.{tail}"
+        refused = _refused_granules(record)
+        return f"There was no scene to process.{f' {refused}.' if refused else ''}"
+    problems = list(_problems(record))
+    if not problems:
+        sentence = "Every scene was processed and no granule was refused"
+    else:
+        *first, last = problems
+        words = f"{', '.join(first)} and {last}" if first else last
+        sentence = f"{words[0].upper()}{words[1:]}"
+    return " ".join(f"{part}." for part in (sentence, *_cautions(record)))
+
+
+def outcome_class(record: RunRecord) -> str:
+    """Return ``bad`` for a run with problems, ``care`` where there is something to look at."""
+    if record.failed:
+        return "bad"
+    return "care" if any(_cautions(record)) else "good"
+
+
+def _problems(record: RunRecord) -> Iterator[str]:
+    """Yield what makes a run fail."""
+    failed, internal = len(failed_scenes(record)), len(internal_errors(record))
+    if internal:
+        yield f"{counted(internal, 'scene')} ended with an internal error"
+    if failed:
+        yield f"{counted(failed, 'scene')} failed"
+    refused = _refused_granules(record)
+    if refused:
+        yield refused
     unusable = [scene.scene for scene in record.scenes if scene.unusable]
-    rest = sum(
-        p.usable == 0 for scene in record.scenes if not scene.unusable for p in scene.products
-    )
-    tail = f" {counted(rest, 'product')} without a usable value." if rest else ""
-    parts = [f"{counted(internal, 'scene')} ended with an internal error"] if internal else []
-    parts += [f"{counted(failed, 'scene')} failed"] if failed else []
-    parts += [f"{counted(refused, 'granule')} refused"] if refused else []
     if unusable:
-        number = counted(len(unusable), "scene")
-        parts.append(f"{number} without a usable value: {listed(unusable)}")
+        yield f"{counted(len(unusable), 'scene')} without a usable value: {listed(unusable)}"
     no_product = len(record.empty_scenes) + record.more_empty_scenes
-    parts += [f"{counted(no_product, 'scene')} without product"] if no_product else []
-    nowhere = {(unmet.instrument, unmet.channel) for unmet in record.unmet if unmet.nowhere}
+    if no_product:
+        yield f"{counted(no_product, 'scene')} without product"
+    unmet = record.findings.unmet
+    nowhere = {(request.instrument, request.channel) for request in unmet if request.nowhere}
     if nowhere:
         channels = listed({channel for _, channel in nowhere})
-        number = counted(len(nowhere), "requested channel")
-        parts.append(f"{number} in no file: {channels}")
-    if not parts:
-        return f"Every scene was processed and no granule was refused.{tail}"
-    *first, last = parts
-    sentence = f"{', '.join(first)} and {last}" if first else last
-    return f"{sentence[0].upper()}{sentence[1:]}.{tail}"
+        yield f"{counted(len(nowhere), 'requested channel')} in no file: {channels}"
+    contradicting = {row.instrument for row in finding_rows(record.findings) if row.fails}
+    if contradicting:
+        yield f"the archive is not what the campaign states of {listed(contradicting)}"
+
+
+def _cautions(record: RunRecord) -> Iterator[str]:
+    """Yield what fails no run, but needs a look."""
+    empty = sum(
+        p.usable == 0 for scene in record.scenes if not scene.unusable for p in scene.products
+    )
+    if empty:
+        yield f"{counted(empty, 'product')} without a usable value"
+    unmade = unmade_words(record.findings)
+    if unmade:
+        yield f"Requested, but made in no scene: {listed(unmade)}"
+
+
+def _refused_granules(record: RunRecord) -> str:
+    refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
+    return f"{counted(refused, 'granule')} refused" if refused else ""
 
 
 def instruments(record: RunRecord) -> list[InstrumentRow]:

@@ -23,7 +23,7 @@ from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.process.job import Job
-from lidarops.records import Granule, RunRecord, Unmet
+from lidarops.records import Findings, Granule, RunRecord
 from lidarops.reports import run_page, run_record
 from lidarops.run.executor import (
     EndedScene,
@@ -33,9 +33,10 @@ from lidarops.run.executor import (
     process_one_by_one,
     read_bytes,
 )
+from lidarops.run.findings import find
 from lidarops.run.leftovers import Orphan
 from lidarops.run.options import Options, Result
-from lidarops.run.selection import Selection, check_selection, unmet_requests
+from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
@@ -52,6 +53,7 @@ __all__ = [
     "remove_orphans",
     "report_run",
     "reprocess",
+    "survey",
     "update_catalog",
 ]
 
@@ -135,11 +137,10 @@ def assess(
     *,
     selection: Selection | None = None,
     everything: bool = False,
+    update: bool = True,
     wait: float = 0.0,
 ) -> Iterator[Judgement]:
-    """Judge what every scene needs, and why.
-
-    Updates the catalog, and processes nothing.
+    """Judge what every scene needs, and why. Processes nothing.
 
     Parameters
     ----------
@@ -148,6 +149,8 @@ def assess(
         What to process; default everything.
     everything : bool
         Whether to yield also scenes that need nothing.
+    update : bool
+        Whether to update the catalog first.
     wait : float
         s to wait for another run on the same catalog.
 
@@ -157,7 +160,8 @@ def assess(
     """
     selection = selection or Selection()
     check_selection(campaign, selection)
-    update_catalog(campaign, wait=wait)
+    if update:
+        update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection)
         days = _days_to_judge(judge, store, selection, force=everything)
@@ -165,6 +169,27 @@ def assess(
             for judged in judge.days(batch).judgements:
                 if everything or judged.due or judged.held:
                     yield judged
+
+
+def survey(
+    campaign: Campaign, *, selection: Selection | None = None, wait: float = 0.0
+) -> Findings:
+    """Update the catalog, and return where the archive is not what the campaign states.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    selection : Selection, optional
+        Limits the findings to its instruments, kinds and times; default everything.
+    wait : float
+        s to wait for another run on the same catalog.
+    """
+    selection = selection or Selection()
+    check_selection(campaign, selection)
+    summary = update_catalog(campaign, wait=wait)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        judge = Judge(campaign, store, selection=selection)
+        return find(judge, store, selection, summary.idle_patterns)
 
 
 def update_catalog(
@@ -260,8 +285,8 @@ class _Pass:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
-        unmet = unmet_requests(self.campaign, self.store, self.selection)
-        record = self._conclude(status, unmet)
+        findings = find(self.judge, self.store, self.selection, summary.idle_patterns)
+        record = self._conclude(status, findings)
         gathered = self.gathered
         self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])
         return Result(
@@ -279,7 +304,7 @@ class _Pass:
             empty_scenes={judged.scene.id: judged.empty_reason for judged in gathered.empty_scenes},
             set_aside={granule.path: granule.reason for granule in gathered.set_aside},
             more_unused=sum(verdicts[day].unused for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
-            unmet=unmet,
+            findings=findings,
             signal=caught,
         )
 
@@ -468,7 +493,7 @@ class _Pass:
         done = self.session.settled if self.session else set()
         return self.gathered.open[day] <= done
 
-    def _conclude(self, status: RunStatus, unmet: tuple[Unmet, ...]) -> RunRecord | None:
+    def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:
             return None
         for held in self.gathered.held:
@@ -480,7 +505,7 @@ class _Pass:
             judged.scene.id: judged.empty_reason for judged in self.gathered.empty_scenes
         }
         return self.session.finish(
-            status, self.gathered.set_aside, empty_scenes=empty_scenes, unmet=unmet
+            status, self.gathered.set_aside, findings, empty_scenes=empty_scenes
         )
 
 

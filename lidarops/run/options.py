@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
-from lidarops.records import RunRecord, SceneOutcome, Unmet
+from lidarops.records import Findings, RunRecord, SceneOutcome
 from lidarops.reports import run_page, run_record
 from lidarops.run.leftovers import Orphan
 
@@ -65,9 +65,7 @@ class Result:
     """Path of a good granule that belongs to no scene -> why."""
     more_unused: int = 0
     """Number of further empty scenes and granules set aside, on unchanged days."""
-    unmet: tuple[Unmet, ...] = ()
-    """What products or facts of the campaign name and the files do not hold; what no file holds
-    comes first."""
+    findings: Findings = field(default_factory=Findings)
     signal: int = 0
     """The signal that stopped the run."""
 
@@ -111,7 +109,7 @@ class Result:
             or self.empty_scenes
             or self.set_aside
             or self.more_unused
-            or any(request.nowhere for request in self.unmet)
+            or self.findings.failed
             or self.lost
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)

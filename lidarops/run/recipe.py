@@ -154,6 +154,7 @@ class Recipe:
             instrument=keys["instrument"],
             start=start,
             stop=stop,
+            notes=tuple(self.settings["notes"]),
             granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
             dark=tuple(granule for granule in granules if granule.role is Role.DARK),
         )

@@ -14,9 +14,8 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.kinds import kinds
-from lidarops.plan import availability
 from lidarops.plan.scenes import cut_scenes, parse_scene_id, scene_stop, select_scenes
-from lidarops.records import Scene, Unmet
+from lidarops.records import Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +46,7 @@ class Selection:
         owner, start = parse_scene_id(made.scene)
         return (
             (not self.kinds or made.kind in self.kinds)
-            and self.owner(owner, _station(campaign, owner))
+            and self.owner(owner, station_of(campaign, owner))
             and (self.since is None or scene_stop(made.scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
@@ -156,41 +155,7 @@ def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
         )
 
 
-def unmet_requests(campaign: Campaign, store: Store, selection: Selection) -> tuple[Unmet, ...]:
-    """Return what products or facts of the campaign name and the files do not hold.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    store : Store
-        Its catalog.
-    selection : Selection
-        Limits the result to these instruments and members of these networks.
-    """
-    # Usually no file lacks anything, which is faster to find out than to count files.
-    if not (
-        availability.names_channels(campaign)
-        and availability.lacks_channels(campaign, store.layouts())
-    ):
-        return ()
-    owners: dict[str, tuple[str, ...]] = {name: (name,) for name in campaign.instruments}
-    owners |= {name: tuple(network.instruments) for name, network in campaign.networks.items()}
-    selected = {
-        member
-        for name, members in owners.items()
-        for member in members
-        if selection.owner(name, _station(campaign, name))
-    }
-    return availability.unavailable_channels(
-        campaign,
-        store.holdings(availability.validity_edges(campaign)),
-        instruments=selected,
-        kinds=selection.kinds,
-        since=selection.since,
-        until=selection.until,
-    )
-
-
-def _station(campaign: Campaign, name: str) -> str:
+def station_of(campaign: Campaign, name: str) -> str:
+    """Return the station of an instrument; of a network, its name."""
     owner = campaign.instruments.get(name)
     return owner.station if owner else name

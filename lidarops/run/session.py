@@ -17,7 +17,15 @@ from lidarops.catalog import versions
 from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
+from lidarops.records import (
+    Findings,
+    Granule,
+    LeftOut,
+    ProductRecord,
+    RunRecord,
+    Scene,
+    SceneOutcome,
+)
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps.dependence import ProductKey
 from lidarops.system.code_version import joint_code_version
@@ -144,9 +152,9 @@ class Session:
         self,
         status: RunStatus,
         set_aside: Sequence[Granule],
+        findings: Findings,
         *,
         empty_scenes: Mapping[str, str] | None = None,
-        unmet: tuple[Unmet, ...] = (),
     ) -> RunRecord:
         """Close the run in the ledger and return its record.
 
@@ -155,9 +163,9 @@ class Session:
         status : RunStatus
         set_aside : sequence of Granule
             Good granules that belong to no scene.
+        findings : Findings
         empty_scenes : mapping of str to str, optional
             Scene -> why it can give no product.
-        unmet : tuple of Unmet
         """
         refused = (*self._store.refused(), *set_aside)
         self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
@@ -174,7 +182,7 @@ class Session:
             scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
             refused=refused,
             truth=_truth(self._campaign),
-            unmet=unmet,
+            findings=findings,
             empty_scenes=dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES)),
             more_empty_scenes=max(len(empty_scenes or {}) - MOST_EMPTY_SCENES, 0),
         )

@@ -148,7 +148,7 @@ class Judge:
         selection: Selection | None = None,
         force: bool = False,
     ) -> None:
-        self._campaign = campaign
+        self.campaign = campaign
         self._store = store
         self._selection = selection or Selection()
         self._force = force
@@ -187,7 +187,7 @@ class Judge:
         return signatures
 
     def _product_days(self) -> tuple[dict[int, Any], set[int]]:
-        root = str(self._campaign.products_root)
+        root = str(self.campaign.products_root)
         products: dict[int, Any] = defaultdict(hashlib.sha256)
         broken: set[int] = set()
         with self._store.all_products() as rows:
@@ -198,11 +198,11 @@ class Judge:
         return products, broken
 
     def _base(self) -> str:
-        settings = as_settings(self._campaign)
+        settings = as_settings(self.campaign)
         return dependence.digest(
             [
                 {key: value for key, value in settings.items() if key not in _OPERATION},
-                joint_code_version(requested_kinds(self._campaign), *_PLANNING),
+                joint_code_version(requested_kinds(self.campaign), *_PLANNING),
             ]
         )
 
@@ -249,7 +249,7 @@ class Judge:
             self._judged(scene, made, tried.get(scene.id), touched) for scene in cut.scenes
         ]
         planned = [(judged.scene, judged.plan) for judged in judgements]
-        empty_reasons = leftovers.scenes_without_product(planned, self._campaign)
+        empty_reasons = leftovers.scenes_without_product(planned, self.campaign)
         judgements = [
             replace(judged, empty_reason=empty_reasons.get(judged.scene.id, ""))
             if judged.planned
@@ -259,7 +259,7 @@ class Judge:
         selected = {scene.id for scene in self._selection.scenes(cut.scenes)}
         fates = leftovers.Fates(cut, self._store.refused, self._signals)
         orphans = leftovers.orphaned_products(
-            planned, made.values(), self._campaign, self._other_files, fates.of
+            planned, made.values(), self.campaign, self._other_files, fates.of
         )
         unplanned = {judged.scene.id for judged in judgements if not judged.planned}
         orphans = [orphan for orphan in orphans if orphan[0].scene not in unplanned]
@@ -283,7 +283,7 @@ class Judge:
             orphans=tuple(
                 orphan
                 for product, orphan in orphans
-                if self._selection.product(product, self._campaign)
+                if self._selection.product(product, self.campaign)
             ),
             set_aside=cut.set_aside,
             verdicts=_unsigned(
@@ -306,7 +306,7 @@ class Judge:
     def _cut(self, first: int, last: int, days: set[int]) -> Cut:
         granules = self._store.granules_of(first, last, dark_days=DARK_DAYS)
         return cut_scenes(
-            self._campaign,
+            self.campaign,
             [
                 granule
                 for granule in granules
@@ -344,7 +344,7 @@ class Judge:
         made: Mapping[tuple[str, str, str], RecordedProduct],
         touched: dict[str, int],
     ) -> Judgement:
-        whole = plan_scene(scene, self._campaign)
+        whole = plan_scene(scene, self.campaign)
         judged = self.judgement(scene, whole)
         stale = []
         requested = dependence.plan_of_kinds(whole, self._selection.kinds)
@@ -468,7 +468,7 @@ class Judge:
         return self._file_reason(known, touched)
 
     def _file_reason(self, made: RecordedProduct, touched: dict[str, int]) -> str:
-        path = self._campaign.products_root / made.path
+        path = self.campaign.products_root / made.path
         try:
             status = path.stat()
             if (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns):
@@ -505,7 +505,7 @@ class Judge:
         """Return the SHA-256 of an ancillary file when it was first needed."""
         if name not in self._ancillaries:
             try:
-                self._ancillaries[name] = sha256_of(self._campaign.folder / name)
+                self._ancillaries[name] = sha256_of(self.campaign.folder / name)
             except (OSError, ValueError):
                 # The processing of the scene reports the problem.
                 self._ancillaries[name] = "unreadable"

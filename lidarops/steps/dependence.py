@@ -30,7 +30,10 @@ _OF_CAMPAIGN: Final = frozenset(
     {"all_steps", "archive", "output", "catalog", "superseded", "scenes", "simulation", "stations",
      "instruments", "networks"}
 )  # fmt: skip
-_OF_INSTRUMENT: Final = frozenset({"files", "dark_files", "header_position", "facts", "products"})
+_OF_INSTRUMENT: Final = frozenset(
+    {"files", "dark_files", "header_position", "position_tolerance", "altitude_tolerance", "facts",
+     "products"}
+)  # fmt: skip
 """Settings that affect products only through plan, scene and inputs. All others count."""
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
 
@@ -187,6 +190,7 @@ class Settings:
                 else None
             ),
             "scene": [scene.id, scene.start.isoformat(), scene.stop.isoformat()],
+            "notes": scene.notes,
             "members": [
                 {
                     "station": self._stations[member.station],

@@ -1,0 +1,52 @@
+"""Findings about archive and campaign in words, for the terminal, the log and the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from lidarops.figures.wording import counted
+from lidarops.records import Findings, Unmet
+
+
+@dataclass(frozen=True, slots=True)
+class FindingRow:
+    """One finding about an instrument or network."""
+
+    instrument: str
+    subject: str
+    """Key of the campaign or number of files that it is about."""
+    problem: str
+    fails: bool
+    """Whether the run counts as failed for it."""
+
+
+def finding_rows(findings: Findings) -> list[FindingRow]:
+    """Return the findings besides missing channels, those that fail a run first."""
+    return sorted(_rows(findings), key=lambda row: not row.fails)
+
+
+def unmade_words(findings: Findings) -> list[str]:
+    """Return the products that no scene gives, such as ``elastic of hill-lidar``."""
+    return [f"{unmade.kind} of {unmade.instrument}" for unmade in findings.unmade]
+
+
+def lacking(unmet: Unmet) -> str:
+    """Return how many files lack a requested channel."""
+    expected = unmet.files_expected
+    if unmet.nowhere:
+        return "the only file" if expected == 1 else f"all {expected:,} files"
+    return f"{unmet.files:,} of {expected:,} files"
+
+
+def _rows(findings: Findings) -> Iterator[FindingRow]:
+    for idle in findings.idle_patterns:
+        near = f"; unclaimed files with similar names: {', '.join(idle.near)}" if idle.near else ""
+        problem = f"matches no file of the archive{near}"
+        yield FindingRow(idle.instrument, f"{idle.key}: {idle.pattern}", problem, fails=True)
+    for note in findings.file_notes:
+        files = counted(note.files, "file")
+        yield FindingRow(note.instrument, files, note.text, fails=note.contradicts)
+    for unmade in findings.unmade:
+        problem = f"no scene gives it: {unmade.reason}"
+        yield FindingRow(unmade.instrument, f"products: {unmade.kind}", problem, fails=False)
