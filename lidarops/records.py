@@ -370,6 +370,17 @@ class Unmade:
 
 
 @dataclass(frozen=True, slots=True)
+class UnusableFile:
+    """A sounding or overlap function that the campaign names and that cannot be used."""
+
+    instrument: str
+    key: str
+    """Fact that names it: ``molecular_profile`` or ``overlap_profile``."""
+    path: str
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
     """Where an archive is not what the campaign states, names and requests."""
 
@@ -378,13 +389,14 @@ class Findings:
     file_notes: tuple[FileNote, ...] = ()
     """Contradictions come first."""
     idle_patterns: tuple[IdlePattern, ...] = ()
+    unusable_files: tuple[UnusableFile, ...] = ()
     unmade: tuple[Unmade, ...] = ()
 
     @property
     def failed(self) -> bool:
-        """Whether a channel or pattern is in no file, or headers contradict a station."""
+        """Whether channels, patterns or headers contradict the campaign, or a file is unusable."""
         return (
-            bool(self.idle_patterns)
+            bool(self.idle_patterns or self.unusable_files)
             or any(request.nowhere for request in self.unmet)
             or any(note.contradicts for note in self.file_notes)
         )

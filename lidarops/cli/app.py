@@ -71,6 +71,9 @@ _P = ParamSpec("_P")
 _LEAST_COLUMN_WIDTH = 12
 """Least width of a table column, in characters."""
 
+_FILE_WIDTH = 10_000
+"""Width of tables that are not printed on a terminal: no cell folds."""
+
 WRONG_USE = 2
 REFUSED = 1
 
@@ -97,15 +100,24 @@ def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[
     return registered
 
 
-@app.callback()
-def _main(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-) -> None:
-    if version:
+def _print_version(requested: bool) -> None:  # noqa: FBT001 - typer calls it so
+    if requested:
         from lidarops import __version__
 
         typer.echo(__version__)
         raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    pass
 
 
 def no_url(folder: str | None) -> str | None:
@@ -178,9 +190,10 @@ def show(table: Table) -> None:
     from rich.console import Console
 
     if table.row_count:
-        # In narrower columns words would fold to single letters.
+        # In narrower columns words would fold to single letters. A file has no width.
         least_width = _LEAST_COLUMN_WIDTH * len(table.columns)
-        Console(width=max(Console().width, least_width)).print(table)
+        width = max(Console().width, least_width) if Console().is_terminal else _FILE_WIDTH
+        Console(width=width).print(table)
 
 
 def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:

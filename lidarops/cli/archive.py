@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -29,11 +27,11 @@ from lidarops.cli.app import (
     progress_bar,
     show_error,
     show_rows,
-    utc,
 )
+from lidarops.cli.findings import findings_document, never_made, show_findings
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
+from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
@@ -42,31 +40,15 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from lidarops.campaign.model import Campaign
-    from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import (
-        Findings,
         Granule,
-        LeftOut,
-        Plan,
-        PlannedStep,
         RunRecord,
         SceneOutcome,
     )
     from lidarops.run.archive import Result
-    from lidarops.run.selection import Selection
-    from lidarops.run.staleness import Judgement
 
 _LEAST_MEMORY = 2**20
 """Bytes; a smaller size probably lacks its unit."""
-
-_NO_SCENE = "nothing to do: the selection contains no scene of the archive"
-
-AllStepsOption = Annotated[
-    bool,
-    typer.Option(
-        "--all-steps", help="Run every step, even those without effect, and read files in full."
-    ),
-]
 
 
 def _size(text: str | None) -> str | None:
@@ -104,7 +86,7 @@ def catalog(
     from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
 
-    settings = _loaded(campaign, archive, out, catalog)
+    settings = loaded_campaign(campaign, archive, out, catalog)
     with progress_bar("catalog", None) as bar:
         summary = update_catalog(settings, progress=bar.advance, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
@@ -118,99 +100,13 @@ def catalog(
         typer.echo(json.dumps(document, indent=2))
     else:
         _show_refused(refused)
-        _show_findings(findings)
+        show_findings(findings)
         typer.echo(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
             f" {summary.refused} refused"
         )
     exit_with_status(failed=bool(refused) or findings.failed)
-
-
-@command("plan")
-def show_plan(
-    campaign: CampaignFile,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
-    instrument: InstrumentOption = None,
-    station: StationOption = None,
-    product: ProductOption = None,
-    since: SinceOption = None,
-    until: UntilOption = None,
-    stale: Annotated[
-        bool, typer.Option("--stale", help="Show only the products to be made, and why.")
-    ] = False,
-    wait: WaitOption = 0.0,
-    all_steps: AllStepsOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
-
-    Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
-    code 1 if a scene cannot be planned, a pattern or channel is in no file, or headers contradict a
-    station.
-
-    Example: lidarops plan catalogs/demo.yaml
-    """
-    from lidarops.plan.cost_estimate import RunTime
-    from lidarops.run.archive import assess, survey
-    from lidarops.run.selection import selects_no_scene
-    from lidarops.steps.memory import scene_memory
-
-    settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
-    selection = _selection(instrument, station, product, since, until)
-    findings = survey(settings, selection=selection, wait=wait)
-    judgements = assess(settings, selection=selection, everything=not stale, update=False)
-    making, everything = RunTime(), RunTime()
-    scenes = []
-    no_scene = True
-    failed = False
-    for judged in judgements:
-        no_scene = False
-        failed |= not judged.planned
-        scene, whole = judged.scene, settings.all_steps
-        times = {
-            "to_be_made": making.add(scene, judged.needed(), whole=whole),
-            "everything": everything.add(scene, judged.requested, whole=whole),
-        }
-        memory = {
-            "to_be_made": scene_memory(scene, judged.needed()).total,
-            "everything": scene_memory(scene, judged.requested).total,
-        }
-        if as_json:
-            estimates = {"estimated_cpu_seconds": times, "estimated_memory_bytes": memory}
-            scenes.append({**_plain(judged), **estimates})
-            continue
-        title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
-        needs = {
-            name: f"about {times[name]:.2g} s of CPU time and {memory[name] / 1e6:.0f} MB of memory"
-            for name in times
-        }
-        if not stale:
-            _show_plan(f"{title}, {needs['everything']}", judged.requested)
-        _show_stale(f"{title}, {needs['to_be_made']}", judged)
-    no_scene = no_scene and selects_no_scene(settings, selection)
-    # With --stale, fresh scenes were not judged.
-    runs = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
-    if as_json:
-        estimate = {
-            name.partition(",")[0].replace(" ", "_"): run.parts for name, run in runs.items()
-        }
-        no_scene_found = {"no_scene_selected": no_scene}
-        document = {
-            "scenes": scenes,
-            **no_scene_found,
-            **_findings(findings),
-            "estimated_cpu_seconds": estimate,
-        }
-        typer.echo(json.dumps(document, indent=2))
-    else:
-        if no_scene:
-            typer.echo(_NO_SCENE)
-        _show_findings(findings)
-        _show_times(runs)
-    exit_with_status(failed=failed or findings.failed)
 
 
 @command()
@@ -287,8 +183,8 @@ def reprocess(
     from lidarops.run.selection import selects_no_scene
 
     set_up(log_level, as_json=log_json, file=log_file)
-    settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
-    selection = _selection(instrument, station, product, since, until)
+    settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
+    selection = selection_of(instrument, station, product, since, until)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with progress_bar("reprocess", None, "granules") as bar:
         options = pipeline.Options(
@@ -341,22 +237,6 @@ def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
         return None
 
 
-def _loaded(
-    campaign: Path,
-    archive: str | None,
-    out: str | None,
-    catalog: str | None,
-    *,
-    all_steps: bool = False,
-) -> Campaign:
-    from lidarops.campaign.model import load_campaign
-    from lidarops.run.selection import check_archive_and_catalog
-
-    settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
-    check_archive_and_catalog(settings, archive=archive)
-    return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
-
-
 def _cluster(
     workers: int | None,
     scheduler: str | None,
@@ -381,104 +261,9 @@ def _cluster(
     return partial(clusters.connect_client, chosen)
 
 
-def _selection(
-    instruments: list[str] | None,
-    stations: list[str] | None,
-    products: list[str] | None,
-    since: datetime | None,
-    until: datetime | None,
-) -> Selection:
-    from lidarops.run.selection import Selection
-
-    for name in products or ():
-        if name not in kinds():
-            raise typer.BadParameter(
-                f"{name!r} is not a kind of product; the kinds are {', '.join(kinds())}"
-            )
-    return Selection(
-        stations=tuple(stations or ()),
-        instruments=tuple(instruments or ()),
-        kinds=tuple(products or ()),
-        since=utc(since),
-        until=utc(until),
-    )
-
-
 def _show_refused(refused: list[Granule]) -> None:
     rows = ((granule.path, granule.instrument, granule.reason) for granule in refused)
     show_rows("Refused", ("file", "instrument", "reason"), rows)
-
-
-def _show_plan(title: str, plan: Plan) -> None:
-    from lidarops.steps.dependence import needed_places
-
-    taken = [", ".join(str(place + 1) for place in places) for places in needed_places(plan)]
-    steps = zip(plan.steps, taken, strict=True)
-    show_rows(
-        f"{title}, plan {plan.hash[:12]}",
-        ("", "channel", "step", "needs", "does", "reason", "rule, number"),
-        [
-            *((number, *_cells(step, needs, _effect(step, plan)))
-              for number, (step, needs) in enumerate(steps, 1)),
-            *(("", *_cells(omission, "", "left out")) for omission in plan.left_out),
-        ],
-    )  # fmt: skip
-
-
-def _cells(entry: PlannedStep | LeftOut, needs: str, does: str) -> tuple[str, ...]:
-    from lidarops.figures.wording import decided_on
-
-    rule = f"{entry.rule} {decided_on(entry.number)}"
-    return entry.channel, entry.name, needs, does, entry.reason, rule
-
-
-def _effect(step: PlannedStep, plan: Plan) -> str:
-    from lidarops.steps.reading import idle_window
-
-    idle = idle_window(step, plan.steps)
-    settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-    return f"no effect: {idle}" if idle else settings or "yes"
-
-
-def _show_times(runs: Mapping[str, RunTime]) -> None:
-    rows = (
-        (name, run.count, *(f"{seconds:.2g}" for seconds in run.parts.values()))
-        for name, run in runs.items()
-    )
-    columns = ("", "scenes", "processing", "start", "report", "all")
-    show_rows("Estimated CPU time in s on a common server core", columns, rows)
-
-
-def _show_stale(title: str, judged: Judgement) -> None:
-    rows = [(product.kind, product.channel, product.reason) for product in judged.stale]
-    if judged.failure:
-        unchanged = "not tried again, because nothing has changed: " if judged.held else ""
-        rows.append(("none", "", f"{unchanged}{judged.failure.error}"))
-    show_rows(f"{title}: to be made", ("product", "channel", "reason"), rows)
-
-
-def _plain(judged: Judgement) -> dict[str, Any]:
-    from lidarops.steps.reading import idle_window
-
-    stale = [
-        {"kind": product.kind, "channel": product.channel, "reason": product.reason}
-        for product in judged.stale
-    ]
-    plan = judged.requested
-    idle = [idle_window(step, plan.steps) for step in plan.steps]
-    steps = [
-        {**step.as_dict(), **({"no_effect": why} if why else {})}
-        for step, why in zip(plan.steps, idle, strict=True)
-    ]
-    return {
-        **plan.as_dict(),
-        "hash": plan.hash,
-        "steps": steps,
-        "stale": stale,
-        "fresh": judged.fresh,
-        "failure": asdict(judged.failure) if judged.failure else None,
-        "held": judged.held,
-    }
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
@@ -500,25 +285,13 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
         "more_of_both": result.more_unused,
-        **_findings(result.findings),
+        **findings_document(result.findings),
         "orphans": {
             orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
         },
         "kept_products": {
             orphan.path: orphan.reason for orphan in result.orphans if orphan.requested
         },
-    }
-
-
-def _findings(findings: Findings) -> dict[str, Any]:
-    """Return the findings as plain JSON types."""
-    return {
-        "not_in_files": [
-            {**asdict(request), "nowhere": request.nowhere} for request in findings.unmet
-        ],
-        "patterns_without_file": [asdict(idle) for idle in findings.idle_patterns],
-        "file_notes": [asdict(note) for note in findings.file_notes],
-        "never_made": [asdict(unmade) for unmade in findings.unmade],
     }
 
 
@@ -556,7 +329,7 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     refused = _refused(campaign, result)
     _show_refused(refused)
     _show_unused(result, {granule.path for granule in refused})
-    _show_findings(result.findings)
+    show_findings(result.findings)
     if not removing:
         _show_orphans(result, None)
     kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
@@ -564,21 +337,13 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     show_rows(title, ("file", "reason"), kept)
     _show_scenes_with_problems(result)
     if no_scene:
-        typer.echo(_NO_SCENE)
+        typer.echo(NO_SCENE)
     elif result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
-        typer.echo(f"products: {campaign.products_root}{ended}{_never_made(result.findings)}")
+        typer.echo(f"products: {campaign.products_root}{ended}{never_made(result.findings)}")
     else:
-        never = _never_made(result.findings)
+        never = never_made(result.findings)
         typer.echo(f"nothing to do: every requested product is fresh or cannot be made{never}")
-
-
-def _never_made(findings: Findings) -> str:
-    """Return the requested products that no scene gives, for the end of a line."""
-    from lidarops.reports.findings import unmade_words
-
-    names = ", ".join(unmade_words(findings))
-    return f"; requested, but made in no scene: {names}" if names else ""
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
@@ -595,20 +360,6 @@ def _show_unused(result: Result, listed: Collection[str]) -> None:
     set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
     rows = (*set_aside, *result.empty_scenes.items())
     show_rows(f"Not used{more}", ("file or scene", "reason"), rows)
-
-
-def _show_findings(findings: Findings) -> None:
-    from lidarops.reports.findings import finding_rows, lacking
-
-    columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
-    unmet = (
-        (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
-        for unmet in findings.unmet
-    )
-    show_rows("Requested, but not in the files", columns, unmet)
-    columns = ("instrument", "what", "finding")
-    rows = ((row.instrument, row.subject, row.problem) for row in finding_rows(findings))
-    show_rows("The archive is not what the campaign states", columns, rows)
 
 
 def _show_orphans(result: Result, removed: int | None) -> None:

@@ -47,6 +47,9 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
     for note in findings.file_notes:
         files = counted(note.files, "file")
         yield FindingRow(note.instrument, files, note.text, fails=note.contradicts)
+    for unusable in findings.unusable_files:
+        subject = f"{unusable.key}: {unusable.path}"
+        yield FindingRow(unusable.instrument, subject, unusable.problem, fails=True)
     for unmade in findings.unmade:
         problem = f"no scene gives it: {unmade.reason}"
         yield FindingRow(unmade.instrument, f"products: {unmade.kind}", problem, fails=False)

@@ -50,6 +50,7 @@ __all__ = [
     "Selection",
     "assess",
     "bring_up_to_date",
+    "failed_before",
     "remove_orphans",
     "report_run",
     "reprocess",
@@ -190,6 +191,12 @@ def survey(
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection)
         return find(judge, store, selection, summary.idle_patterns)
+
+
+def failed_before(campaign: Campaign) -> dict[str, str]:
+    """Return the scenes whose last try failed, with the errors; a catalog must exist."""
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        return dict(store.failures())
 
 
 def update_catalog(

@@ -8,10 +8,11 @@ from typing import Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan import availability
-from lidarops.records import Findings, IdlePattern, Unmade, Unmet
+from lidarops.records import Findings, IdlePattern, Role, Unmade, Unmet, UnusableFile
 from lidarops.run.selection import Selection, station_of
 from lidarops.run.staleness import Judge
 from lidarops.steps import dependence
+from lidarops.steps.step import REQUEST
 
 _DAYS_EXAMINED: Final = 3
 """Days whose plans are searched for the reason why a product is never made."""
@@ -43,6 +44,7 @@ def find(
         unmet=_unmet(campaign, store, selection, instruments),
         file_notes=store.file_notes(instruments),
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
+        unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
         unmade=tuple(_unmade(judge, store, selection, owners)),
     )
 
@@ -71,6 +73,24 @@ def _unmet(
         since=selection.since,
         until=selection.until,
     )
+
+
+def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[UnusableFile]:
+    """Yield the files that facts name and that cannot be used."""
+    for name in instruments:
+        named = {
+            (key, path): role
+            for fact in judge.campaign.instruments[name].facts
+            for key, path, role in (
+                ("molecular_profile", fact.molecular_profile, Role.MOLECULAR),
+                ("overlap_profile", fact.overlap_profile, Role.OVERLAP),
+            )
+            if path is not None
+        }
+        for (key, path), role in named.items():
+            problem = judge.file_problem(path, role)
+            if problem:
+                yield UnusableFile(name, key, path, problem)
 
 
 def _unmade(
@@ -112,6 +132,8 @@ def _why_never(judge: Judge, days: list[int], owner: str, kind: str) -> str:
             if any(made == kind for made, _ in dependence.planned_products(judged.requested)):
                 return ""
             reasons |= dict.fromkeys(
-                left.reason for left in judged.requested.left_out if left.name == kind
+                left.reason
+                for left in judged.requested.left_out
+                if left.name == kind and left.rule != REQUEST
             )
     return "; ".join(reasons)

@@ -12,7 +12,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RecordedProduct
 from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.process.scene import nothing_to_do
-from lidarops.records import Granule, InputRecord, Plan, Scene
+from lidarops.records import Granule, InputRecord, LeftOut, Plan, Scene
 from lidarops.steps import dependence
 from lidarops.steps.channels import GLUED
 
@@ -160,7 +160,12 @@ def orphaned_products(
         if _requests(campaign, product):
             if product.scene in scenes:
                 scene, plan = scenes[product.scene]
-                reason, kept = _why_left_out(plan, product), other_files(product, scene)
+                omissions = _omissions(plan, product)
+                reason = "; ".join(dict.fromkeys(left.reason for left in omissions))
+                reason = reason or "its plan leaves it out"
+                # The file may be mended, and the product is right.
+                unusable = any(left.rule == dependence.UNUSABLE_FILE for left in omissions)
+                kept = unusable or other_files(product, scene)
             else:
                 missing = _missing_members(product, planned, campaign)
                 file_fate = fate(product)
@@ -184,14 +189,13 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
     return settings is not None and settings.covers(product.channel, of_files=of_files)
 
 
-def _why_left_out(plan: Plan, product: RecordedProduct) -> str:
-    """Return why a plan leaves out a requested product."""
-    reasons = dict.fromkeys(
-        omission.reason
+def _omissions(plan: Plan, product: RecordedProduct) -> list[LeftOut]:
+    """Return the omissions of a plan because of which it does not give a requested product."""
+    return [
+        omission
         for omission in plan.left_out
         if omission.channel == product.channel and omission.name in (product.kind, "read")
-    )
-    return "; ".join(reasons) or "its plan leaves it out"
+    ]
 
 
 def _missing_members(

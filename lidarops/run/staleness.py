@@ -16,11 +16,13 @@ from datetime import UTC, datetime
 from math import ceil
 from typing import Any, Final, NamedTuple
 
+from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, as_settings
 from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdict
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
+from lidarops.errors import AncillaryError
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
@@ -154,6 +156,7 @@ class Judge:
         self._force = force
         self._settings = dependence.Settings(campaign)
         self._ancillaries: dict[str, str] = {}
+        self._problems: dict[str, str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
 
@@ -344,8 +347,14 @@ class Judge:
         made: Mapping[tuple[str, str, str], RecordedProduct],
         touched: dict[str, int],
     ) -> Judgement:
-        whole = plan_scene(scene, self.campaign)
-        judged = self.judgement(scene, whole)
+        planned = plan_scene(scene, self.campaign)
+        files = ancillary_files(planned.steps)
+        problems = {name: self.file_problem(name, role) for name, role in files.items()}
+        whole = dependence.without_unusable_files(
+            planned, {name: problem for name, problem in problems.items() if problem}
+        )
+        # Also files that cannot be used: the day is judged again when they change.
+        judged = replace(self.judgement(scene, whole), ancillaries=self._ancillary_records(planned))
         stale = []
         requested = dependence.plan_of_kinds(whole, self._selection.kinds)
         products = dependence.planned_products(requested)
@@ -361,11 +370,23 @@ class Judge:
         """Return a judgement by which every product of a scene is stale."""
         products = dependence.planned_products(whole)
         stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
-        ancillaries = tuple(
+        return Judgement(scene, whole, whole, self._ancillary_records(whole), stale)
+
+    def _ancillary_records(self, plan: Plan) -> tuple[InputRecord, ...]:
+        return tuple(
             InputRecord(name, role, self._ancillary(name))
-            for name, role in sorted(ancillary_files(whole.steps).items())
+            for name, role in sorted(ancillary_files(plan.steps).items())
         )
-        return Judgement(scene, whole, whole, ancillaries, stale)
+
+    def file_problem(self, name: str, role: Role) -> str:
+        """Return why an ancillary file cannot be used; empty if it can."""
+        if name not in self._problems:
+            try:
+                Ancillaries.read(self.campaign.folder, {name: role})
+                self._problems[name] = ""
+            except AncillaryError as error:
+                self._problems[name] = str(error).removeprefix(f"{name}: ")
+        return self._problems[name]
 
     def key(self, judged: Judgement, *, internal: bool = False) -> str:
         """Return the digest of everything that may change the outcome of a scene.

@@ -23,6 +23,9 @@ from lidarops.steps.registry import definition, gives
 from lidarops.steps.step import Definition
 from lidarops.steps.workload import Workload
 
+UNUSABLE_FILE: Final = "ancillary"
+"""Rule by which a product is left out because a file that it needs cannot be used."""
+
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
@@ -81,6 +84,30 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         steps=tuple(_with_requesters(step, steps) for step in steps),
         left_out=tuple(entry for entry in kept if isinstance(entry, LeftOut)),
     )
+
+
+def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
+    """Return a plan without the products that need an ancillary file that cannot be used.
+
+    Parameters
+    ----------
+    plan : Plan
+    problems : mapping of str to str
+        Path of a file -> why it cannot be used.
+    """
+    kept, left_out = [], []
+    for kind, channel in planned_products(plan):
+        files = ancillary_files(plan_closure(plan, [(kind, channel)]).steps)
+        reasons = [f"{name}: {problems[name]}" for name in files if name in problems]
+        if reasons:
+            reason = "; ".join(reasons)
+            left_out.append(LeftOut(kind, channel, reason, rule=UNUSABLE_FILE, product=kind))
+        else:
+            kept.append((kind, channel))
+    if not left_out:
+        return plan
+    steps = plan_closure(plan, kept).steps
+    return replace(plan, steps=steps, left_out=(*plan.left_out, *left_out))
 
 
 def needed_places(plan: Plan) -> list[list[int]]:

@@ -1,0 +1,224 @@
+"""The command that shows scenes, their plans, and what is stale."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidarops.cli.app import (
+    ArchiveOption,
+    CampaignFile,
+    CatalogOption,
+    InstrumentOption,
+    JsonOption,
+    OutOption,
+    ProductOption,
+    SinceOption,
+    StationOption,
+    UntilOption,
+    WaitOption,
+    command,
+    exit_with_status,
+    show_rows,
+)
+from lidarops.cli.findings import findings_document, show_findings
+from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
+
+if TYPE_CHECKING:
+    from lidarops.plan.cost_estimate import RunTime
+    from lidarops.records import LeftOut, Plan, PlannedStep
+    from lidarops.run.staleness import Judgement
+
+
+@command("plan")
+def show_plan(
+    campaign: CampaignFile,
+    archive: ArchiveOption = None,
+    out: OutOption = None,
+    catalog: CatalogOption = None,
+    instrument: InstrumentOption = None,
+    station: StationOption = None,
+    product: ProductOption = None,
+    since: SinceOption = None,
+    until: UntilOption = None,
+    stale: Annotated[
+        bool, typer.Option("--stale", help="Show only the products to be made, and why.")
+    ] = False,
+    wait: WaitOption = 0.0,
+    all_steps: AllStepsOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
+
+    Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
+    code 1 if a scene cannot be planned or failed before, a pattern or channel is in no file, or
+    headers contradict a station.
+
+    Example: lidarops plan catalogs/demo.yaml
+    """
+    from lidarops.plan.cost_estimate import RunTime
+    from lidarops.run.archive import assess, failed_before, survey
+    from lidarops.run.selection import selects_no_scene
+    from lidarops.steps.memory import scene_memory
+
+    settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
+    selection = selection_of(instrument, station, product, since, until)
+    findings = survey(settings, selection=selection, wait=wait)
+    judgements = assess(settings, selection=selection, everything=not stale, update=False)
+    making, everything = RunTime(), RunTime()
+    scenes = []
+    no_scene = True
+    failed = False
+    waiting = failed_before(settings)
+    for judged in judgements:
+        no_scene = False
+        failed |= not judged.planned
+        if judged.due:
+            waiting.pop(judged.scene.id, None)
+        scene, whole = judged.scene, settings.all_steps
+        times = {
+            "to_be_made": making.add(scene, judged.needed(), whole=whole),
+            "everything": everything.add(scene, judged.requested, whole=whole),
+        }
+        memory = {
+            "to_be_made": scene_memory(scene, judged.needed()).total,
+            "everything": scene_memory(scene, judged.requested).total,
+        }
+        if as_json:
+            estimates = {"estimated_cpu_seconds": times, "estimated_memory_bytes": memory}
+            scenes.append({**_plain(judged), **estimates})
+            continue
+        title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+        needs = {
+            name: f"about {times[name]:.2g} s of CPU time and {memory[name] / 1e6:.0f} MB of memory"
+            for name in times
+        }
+        if not stale:
+            _show_plan(f"{title}, {needs['everything']}", judged.requested)
+        _show_stale(f"{title}, {needs['to_be_made']}", judged)
+    no_scene = no_scene and selects_no_scene(settings, selection)
+    # With --stale, fresh scenes were not judged.
+    runs = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
+    if as_json:
+        estimate = {
+            name.partition(",")[0].replace(" ", "_"): run.parts for name, run in runs.items()
+        }
+        no_scene_found = {"no_scene_selected": no_scene}
+        document = {
+            "scenes": scenes,
+            **no_scene_found,
+            "failed_before": waiting,
+            **findings_document(findings),
+            "estimated_cpu_seconds": estimate,
+        }
+        typer.echo(json.dumps(document, indent=2))
+    else:
+        if no_scene:
+            typer.echo(NO_SCENE)
+        show_findings(findings)
+        _show_failed(waiting)
+        _show_times(runs)
+    exit_with_status(failed=failed or bool(waiting) or findings.failed)
+
+
+def _show_plan(title: str, plan: Plan) -> None:
+    """Print the steps of a plan, and what it leaves out; equal lines of channels are one."""
+    columns = ("step", "channels", "what, and why")
+    steps = _by_channels(
+        (step.name, _words(_effect(step, plan), step, _needs(step)), step.channel)
+        for step in plan.steps
+    )
+    show_rows(f"{title}, plan {plan.hash[:12]}", columns, steps)
+    left_out = _by_channels(
+        (left.name, _words("", left, ""), left.channel) for left in plan.left_out
+    )
+    show_rows("Left out", columns, left_out)
+
+
+def _by_channels(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    """Yield name, channels and text for lines of name, text and channel, grouped by name."""
+    channels: dict[str, dict[str, dict[str, None]]] = {}
+    for name, text, channel in lines:
+        channels.setdefault(name, {}).setdefault(text, {})[channel] = None
+    for name, texts in channels.items():
+        for text, names in texts.items():
+            yield name, ", ".join(filter(None, names)), text
+
+
+def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
+    from lidarops.figures.wording import decided_on
+
+    number = decided_on(entry.number)
+    rule = f"[{entry.rule} {number}]" if number else f"[{entry.rule}]" if entry.rule else ""
+    member = f"of {entry.instrument}" if entry.instrument else ""
+    reason = " ".join(filter(None, (entry.reason, rule)))
+    return "; ".join(filter(None, (member, effect, reason, needs)))
+
+
+def _needs(step: PlannedStep) -> str:
+    return f"after {', '.join(step.needs)}" if step.needs else ""
+
+
+def _effect(step: PlannedStep, plan: Plan) -> str:
+    from lidarops.steps.reading import idle_window
+
+    idle = idle_window(step, plan.steps)
+    return f"no effect: {idle}" if idle else ", ".join(_settings(step.settings))
+
+
+def _settings(settings: Mapping[str, Any]) -> Iterator[str]:
+    for key, value in settings.items():
+        yield f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}"
+
+
+def _show_times(runs: Mapping[str, RunTime]) -> None:
+    rows = (
+        (name, run.count, *(f"{seconds:.2g}" for seconds in run.parts.values()))
+        for name, run in runs.items()
+    )
+    columns = ("", "scenes", "processing", "start", "report", "all")
+    show_rows("Estimated CPU time in s on a common server core", columns, rows)
+
+
+def _show_failed(failed: Mapping[str, str]) -> None:
+    """Print the scenes that failed in earlier runs and are not due."""
+    title = "Failed before; not tried again, because nothing has changed"
+    show_rows(title, ("scene", "error"), failed.items())
+
+
+def _show_stale(title: str, judged: Judgement) -> None:
+    rows = list(
+        _by_channels((product.kind, product.reason, product.channel) for product in judged.stale)
+    )
+    if judged.failure:
+        unchanged = "not tried again, because nothing has changed: " if judged.held else ""
+        rows.append(("none", "", f"{unchanged}{judged.failure.error}"))
+    show_rows(f"{title}: to be made", ("product", "channels", "reason"), rows)
+
+
+def _plain(judged: Judgement) -> dict[str, Any]:
+    from lidarops.steps.reading import idle_window
+
+    stale = [
+        {"kind": product.kind, "channel": product.channel, "reason": product.reason}
+        for product in judged.stale
+    ]
+    plan = judged.requested
+    idle = [idle_window(step, plan.steps) for step in plan.steps]
+    steps = [
+        {**step.as_dict(), **({"no_effect": why} if why else {})}
+        for step, why in zip(plan.steps, idle, strict=True)
+    ]
+    return {
+        **plan.as_dict(),
+        "hash": plan.hash,
+        "steps": steps,
+        "stale": stale,
+        "fresh": judged.fresh,
+        "failure": asdict(judged.failure) if judged.failure else None,
+        "held": judged.held,
+    }
