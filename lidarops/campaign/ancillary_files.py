@@ -216,7 +216,9 @@ def _columns(
     for name in names:
         if name not in raw:
             raise AncillaryError(
-                f"has no column {name!r}; its columns are {', '.join(raw) or 'none'}", file=file
+                f"has no column {name!r}; its columns are {', '.join(raw) or 'none'}",
+                file=file,
+                remedy=f"give {', '.join(names)} in its first line, with units in brackets",
             )
         unit, values = raw[name]
         scale = _SCALE[name].get(unit or next(iter(_SCALE[name])))

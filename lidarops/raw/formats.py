@@ -107,7 +107,7 @@ def _recognised(head: bytes, file: str) -> RawFormat:
             remedy="remove the package of one of them",
         )
     raise RawFormatError(
-        UNKNOWN_FORMAT,
+        UNKNOWN_FORMAT + (": it is text" if head.isascii() else ""),
         file=file,
         remedy=f"formats are {', '.join(raw_formats())}; install the package of any other format,"
         " or make the pattern of the instrument leave the file out",

@@ -36,6 +36,9 @@ CONVENTION: Final = (
 
 _LINE_LIMIT = 1024
 _CACHED_BLOCK = 4 * 1024
+_LEAST_TEXT = 64
+"""Bytes; the counts of 16 bins are not printable by chance."""
+_TEXT = bytes(range(0x20, 0x7F)) + b"\t\r\n"
 _MAX_DATASETS = 1000
 _MAX_BINS = 1_000_000
 _MAX_BIN_WIDTH = 1000.0
@@ -289,7 +292,16 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     data_start = block_end + 2
     block = buffer[block_start:block_end]
     parse = _parse_datasets if len(block) <= _CACHED_BLOCK else _parse_datasets.__wrapped__
-    datasets, dataset_notes = parse(block, data_start, size)
+    try:
+        datasets, dataset_notes = parse(block, data_start, size)
+    except RawFormatError:
+        if holds_text(buffer[data_start:]):
+            raise RawFormatError(
+                "holds numbers as text where a Licel file holds binary counts: it is an export",
+                field="data",
+                remedy="make the pattern of the instrument leave it out",
+            ) from None
+        raise
     return Header(
         name=first.strip(),
         site=second[: dates.start()].strip(),
@@ -312,6 +324,11 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         path=file,
         source=buffer[:data_start],
     )
+
+
+def holds_text(data: bytes) -> bool:
+    """Return whether bytes are printable text; False where there are too few to tell."""
+    return len(data) >= _LEAST_TEXT and not data.translate(None, _TEXT)
 
 
 def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:

@@ -28,6 +28,17 @@ _LONG: Final = {"comment", "history", "references"}
 """Attributes too long for a table; the JSON output has them."""
 _CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits", "device")
 """Channel properties in the table; the JSON output has all."""
+_UNITS: Final = {
+    **dict.fromkeys(("altitude", "bin_width", "wavelength"), "m"),
+    **dict.fromkeys(("zenith_as_written", "zenith_angle", "azimuth"), "degree"),
+    **dict.fromkeys(("latitude", "longitude"), "degree"),
+    **dict.fromkeys(("size", "data_start"), "bytes"),
+    "temperature": "K",
+    "pressure": "Pa",
+}
+"""Units of what raw headers hold."""
+_HEADER: Final = "source"
+"""Key of the header as written."""
 _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
@@ -63,12 +74,15 @@ def tables(file: Path) -> list[Table]:
     description = describe(file)
     about = _table(file.name, "field", "value")
     for key, value in description.items():
-        if isinstance(value, str | int | float) or value is None:
-            _row(about, key.replace("_", " "), "not known" if value is None else value)
+        if key != _HEADER and (isinstance(value, str | int | float) or value is None):
+            _row(about, key.replace("_", " "), _with_unit(key, value))
     if description["type"] == "raw":
         for note in description["notes"] or ["none"]:
             _row(about, "notes", note)
-        return [about, _listed("Channels", description["channels"], _CHANNEL)]
+        header = _table("Header as written", "line")
+        for line in description.get(_HEADER, "").splitlines():
+            _row(header, line)
+        return [about, _listed("Channels", description["channels"], _CHANNEL), header]
     for key, value in description["attributes"].items():
         if key not in _LONG:
             _row(about, key, value)
@@ -76,6 +90,12 @@ def tables(file: Path) -> list[Table]:
     shown = [about, _listed("Variables", description["variables"], columns)]
     flags = ("name", "severity", "values", "share", "description")
     return [*shown, _listed("Quality", description["quality"], flags)]
+
+
+def _with_unit(key: str, value: object) -> str:
+    if value is None:
+        return "not known"
+    return f"{value} {_UNITS[key]}" if key in _UNITS else str(value)
 
 
 def provenance(file: Path) -> str:
@@ -185,16 +205,23 @@ def _plain_scalar(value: Any) -> Any:
         return value.isoformat()
     if isinstance(value, float) and not math.isfinite(value):
         return None
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return str(value)
 
 
 def _listed(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
-    table = _table(title, *(column.replace("_", " ") for column in columns))
+    table = _table(title, *(_title(column) for column in columns))
     for item in items:
         _row(table, *(_cell(item.get(column)) for column in columns))
     return table
+
+
+def _title(column: str) -> str:
+    unit = f" ({_UNITS[column]})" if column in _UNITS else ""
+    return f"{column.replace('_', ' ')}{unit}"
 
 
 def _cell(value: Any) -> str:
