@@ -21,6 +21,8 @@ from pydantic_core import PydanticCustomError, PydanticUndefined
 
 NO_UNIT: Final = "1"
 """Unit of a pure number or count."""
+_LEAST_RANGE: Final = 10.0
+"""m; bins of lidars are 3.75 to 15 m long, and nothing is known within the first."""
 IDENTIFIER: Final = r"^[A-Za-z0-9][A-Za-z0-9-]*$"
 
 
@@ -106,6 +108,14 @@ def as_interval(value: Any) -> Any:
     return value
 
 
+def _no_kilometres(value: float) -> float:
+    if 0 < value < _LEAST_RANGE:
+        raise ValueError(
+            f"must be 0, or at least {_LEAST_RANGE:g} m, not {value:g} m: is it in km?"
+        )
+    return value
+
+
 Instant = Annotated[
     datetime,
     BeforeValidator(_written_date),
@@ -140,7 +150,8 @@ Identifier = Annotated[
         },
     ),
 ]
-Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Metres = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_no_kilometres)]
+"""Range or height: 0, or at least `_LEAST_RANGE`."""
 
 
 class SettingsModel(BaseModel):

@@ -201,10 +201,13 @@ def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]])
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title, title_justify="left")
+    table = Table()
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
         # Text, because rich would read brackets in a path or reason as markup.
         table.add_row(*(Text(str(cell)) for cell in row))
-    show(table)
+    if table.row_count:
+        # As the title of the table it would fold at the width of the table.
+        typer.echo(title)
+        show(table)

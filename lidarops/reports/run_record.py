@@ -205,6 +205,12 @@ def _integer(value: object, place: str) -> int:
     return _checked(value, int, "a whole number", place)
 
 
+def _boolean(value: object, place: str) -> bool:
+    if not isinstance(value, bool):
+        raise _MismatchError(place, f"true or false, not {value!r:.80}")
+    return value
+
+
 def _float(value: object, place: str) -> float:
     if isinstance(value, str) and value in _NOT_FINITE:
         return _NOT_FINITE[value]
@@ -231,6 +237,7 @@ def _anything(value: object, _: str) -> object:
 
 _SCALARS: Final[Mapping[object, Callable[[object, str], object]]] = {
     str: _text,
+    bool: _boolean,
     int: _integer,
     float: _float,
     datetime: _datetime,

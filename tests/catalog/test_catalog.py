@@ -167,14 +167,14 @@ def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None
     root = Path(campaign.archive)
     raw_archives.write(root / "coast" / "h0", raw_archives.content(0, position=(30.7, 46.4)))
     scan_archive(campaign, store)
-    assert "swapped" in store.granules()[0].notes[-1]
+    assert "swapped" in store.granules()[0].contradictions[-1]
     changed = {
         "lidar": campaign.instruments["lidar"].model_copy(
             update={"header_position": "latitude_first"}
         )
     }
     scan_archive(campaign.model_copy(update={"instruments": changed}), store)
-    assert store.granules()[0].notes == ()
+    assert store.granules()[0].contradictions == ()
     assert store.granules()[0].latitude == 46.4
 
 
@@ -208,7 +208,9 @@ def test_granules_round_trip(store: Store) -> None:
     granules = [
         factories.granule(0),
         factories.granule(1, status=Status.REFUSED, reason="odd", start=None, layout=()),
-        factories.granule(2, notes=("a", "b"), azimuth=12.5, sha256="0" * 64),
+        factories.granule(
+            2, notes=("a", "b"), contradictions=("c",), azimuth=12.5, sha256="0" * 64
+        ),
     ]
     store.replace([row_of(granule, store.campaign, "key") for granule in granules])
     assert sorted(store.granules(), key=lambda g: g.path) == granules

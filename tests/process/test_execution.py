@@ -275,6 +275,7 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "stop": datetime(2026, 3, 1, tzinfo=UTC) + timedelta(days=1),
         "provenance": Provenance("test", plan.scene, "elastic", channel, (), plan, {}, {}, "0"),
         "raw_format": "Licel",
+        "notes": (),
     }
     product = build_product(retrieved, Context(**settings))
     assert product["backscatter"].dims == ("time", "range")

@@ -56,7 +56,7 @@ def test_raw_files_show_all_their_channels(tmp_path: Path):
     assert set(widths.values()) == {(4000, 7.5)}, widths
     green = {row["wavelength"] for row in description["channels"] if "532" in row["name"]}
     assert list(green) == [pytest.approx(532e-9)]
-    _, channels = tables(path)
+    _, channels, _ = tables(path)
     for column in channels.columns:
         assert any(str(cell) for cell in column.cells), column.header
     table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})

@@ -28,7 +28,18 @@ from lidarops.errors import CatalogError
 from lidarops.figures.wording import counted, duration, percent, size
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of
-from lidarops.records import LeftOut, Plan, PlannedStep, ProductRecord, Unmet
+from lidarops.records import (
+    FileNote,
+    Findings,
+    IdlePattern,
+    LeftOut,
+    Plan,
+    PlannedStep,
+    ProductRecord,
+    Unmade,
+    Unmet,
+    UnusableFile,
+)
 from lidarops.reports import run_page, run_tables
 from lidarops.reports import run_record as record
 
@@ -377,9 +388,15 @@ class TestManyScenes:
             scenes=tuple(replace(scene, left_out=(idle,)) for scene in many.scenes),
             empty_scenes={f"idle_{k}": "nothing to do: it climbs" for k in range(7)},
             more_empty_scenes=1200,
-            unmet=(
-                Unmet("vertical", "photon_533o", "facts", "the files hold no such", 150, 150, 0),
-                Unmet("vertical", "photon_607o", "signal", "the files hold no such", 20, 150, 130),
+            findings=Findings(
+                unmet=(
+                    Unmet(
+                        "vertical", "photon_533o", "facts", "the files hold no such", 150, 150, 0
+                    ),
+                    Unmet(
+                        "vertical", "photon_607o", "signal", "the files hold no such", 20, 150, 130
+                    ),
+                )
             ),
         )
         page = built(more, tmp_path / "report")
@@ -476,7 +493,14 @@ def nasty_run(nasty: str, archive):
     return run_record(
         archive.root, [scene, failed], id=nasty, campaign=nasty, title=nasty, version=nasty,
         archive=nasty, truth=nasty, refused=(fab.granule(nasty, nasty, instrument=nasty),),
-        empty_scenes={nasty: nasty}, unmet=(Unmet(nasty, nasty, nasty, nasty, 3, 4, 1),),
+        empty_scenes={nasty: nasty},
+        findings=Findings(
+            unmet=(Unmet(nasty, nasty, nasty, nasty, 3, 4, 1),),
+            file_notes=(FileNote(nasty, nasty, True, 3),),
+            idle_patterns=(IdlePattern(nasty, nasty, nasty, (nasty,)),),
+            unusable_files=(UnusableFile(nasty, nasty, nasty, nasty),),
+            unmade=(Unmade(nasty, nasty, nasty),),
+        ),
     )  # fmt: skip
 
 

@@ -18,7 +18,10 @@ from lidarops.kinds import kinds
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
+    FileNote,
+    Findings,
     Granule,
+    IdlePattern,
     InputRecord,
     LeftOut,
     Plan,
@@ -28,7 +31,9 @@ from lidarops.records import (
     RunRecord,
     SceneOutcome,
     Status,
+    Unmade,
     Unmet,
+    UnusableFile,
 )
 from lidarops.reports.run_record import FILE_NAME, load_run_record, save_run_record
 
@@ -68,6 +73,7 @@ granules = st.builds(
     status=st.sampled_from(Status),
     reason=text,
     notes=some(text),
+    contradictions=some(text),
     start=st.none() | when,
     stop=st.none() | when,
     zenith_angle=st.none() | number,
@@ -112,6 +118,14 @@ outcomes = st.builds(
     seconds=st.dictionaries(text, st.floats(allow_nan=False, allow_infinity=False), max_size=3),
     left_out=some(left_out),
 )
+findings = st.builds(
+    Findings,
+    unmet=some(st.builds(Unmet, text, text, text, text, whole, whole, whole)),
+    file_notes=some(st.builds(FileNote, text, text, st.booleans(), whole)),
+    idle_patterns=some(st.builds(IdlePattern, text, text, text, some(text))),
+    unusable_files=some(st.builds(UnusableFile, text, text, text, text)),
+    unmade=some(st.builds(Unmade, text, text, text)),
+)
 records = st.builds(
     RunRecord,
     id=text,
@@ -125,7 +139,7 @@ records = st.builds(
     scenes=some(outcomes),
     refused=some(granules),
     truth=text,
-    unmet=some(st.builds(Unmet, text, text, text, text, whole, whole, whole)),
+    findings=findings,
     empty_scenes=st.dictionaries(text, text, max_size=2),
     more_empty_scenes=whole,
 )

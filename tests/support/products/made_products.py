@@ -89,6 +89,7 @@ def context(kind: str = "homogeneous", **changes: Any) -> Context:
         "stop": START + timedelta(days=1),
         "provenance": provenance(kind),
         "raw_format": "Licel",
+        "notes": (),
     }
     return Context(**(fields | changes))
 
