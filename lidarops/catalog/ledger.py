@@ -152,6 +152,10 @@ class Run:
     holder: str
     version: str
     code_version: str
+    archive: str
+    """Folder or URL of the raw files, without keys."""
+    folder: str
+    """Folder of the campaign file."""
     scenes: int = 0
     products: int = 0
     granules: int = 0

@@ -74,6 +74,9 @@ RUN = sa.Table(
     sa.Column("holder", sa.Text, nullable=False),
     sa.Column("version", _NAME, nullable=False),
     sa.Column("code_version", _NAME, nullable=False),
+    # Folder or URL of the raw files, without keys, and folder of the campaign file.
+    sa.Column("archive", sa.Text, nullable=False),
+    sa.Column("folder", sa.Text, nullable=False),
     *(sa.Column(name, sa.Integer, nullable=False) for name in RUN_COUNTS),
     sa.Index("run_by_time", "campaign", "started"),
 )

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.campaign.model import CATALOG_VARIABLE
+from lidarops.catalog.ledger import Run
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
 from lidarops.netcdf.provenance import EPOCH_VARIABLE, package_versions
@@ -77,13 +78,13 @@ def reproduce_product(
         A product of an instrument or of a network.
     archive : path or str, optional
         Folder or URL of the raw files; default the nearest folder above the product that holds
-        them, directly or in one of its subfolders.
+        them, directly or in one of its subfolders, or the archive of the last run in the catalog.
     ancillary : path or str, optional
         Folder of the campaign file, to which the paths of soundings and overlap functions are
         relative; searched for like the archive by default.
     catalog : str, optional
-        SQLAlchemy URL of a catalog that knows where raw files were moved; default that of
-        ``LIDAROPS_CATALOG``, or the nearest ``catalog.sqlite`` above the product.
+        SQLAlchemy URL of a catalog that knows the archive, and where raw files were moved; default
+        that of ``LIDAROPS_CATALOG``, or the nearest ``catalog.sqlite`` above the product.
 
     Returns
     -------
@@ -101,12 +102,15 @@ def reproduce_product(
         if folder is not None and not Path(folder).is_dir():
             raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
     recipe = Recipe.of(Path(product))
+    last = _last_run(recipe, catalog)
     raw = [record for record in recipe.inputs if record.role in RAW]
     others = [record for record in recipe.inputs if record.role not in RAW]
-    with _staged(recipe, raw, archive, catalog) as (root, wrong):
+    place = archive or _folder(recipe, raw, "--archive", catalog, last.archive if last else "")
+    with _staged(recipe, raw, str(place), catalog) as (root, wrong):
         ancillaries = root
         if others:
-            ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog))
+            known = last.folder if last else ""
+            ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog, known))
         changed = [*wrong, *_changed(ancillaries, others, str(ancillaries))]
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
@@ -121,17 +125,16 @@ def reproduce_product(
 
 @contextmanager
 def _staged(
-    recipe: Recipe, records: Sequence[InputRecord], archive: str | Path | None, catalog: str | None
+    recipe: Recipe, records: Sequence[InputRecord], archive: str, catalog: str | None
 ) -> Iterator[tuple[Path, list[Difference]]]:
     """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
         staged = Path(name)
-        if is_url(str(archive)):
-            store = RemoteStore(str(archive))
+        if is_url(archive):
+            store = RemoteStore(archive)
             place, bring = store.url, _from_store(store, staged)
         else:
-            folder = Path(archive) if archive else _folder(recipe, records, "--archive", catalog)
-            place, bring = str(folder), _from_folder(folder, staged)
+            place, bring = archive, _from_folder(Path(archive), staged)
         bring({record.path: record.path for record in records})
         changed = list(_changed(staged, records, place))
         wrong = {difference.name for difference in changed}
@@ -176,7 +179,7 @@ def _cleared(target: Path) -> Path:
 
 def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
     """Return recorded name -> present name of files that a catalog knows under another name."""
-    url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(recipe.file)
+    url = _catalog_url(recipe, catalog)
     if not lost or not url:
         return {}
     try:
@@ -199,21 +202,46 @@ def _nearest_catalog(file: Path) -> str:
 
 
 def _folder(
-    recipe: Recipe, records: Sequence[InputRecord], option: str, catalog: str | None
-) -> Path:
-    """Return the nearest folder above the product, or subfolder of one, that holds any input."""
+    recipe: Recipe, records: Sequence[InputRecord], option: str, catalog: str | None, known: str
+) -> str:
+    """Return the nearest folder above the product, or subfolder of one, that holds any input.
+
+    If there is none, the `known` folder or URL of the last run, if it may hold an input.
+    """
     for paths in (
         [record.path for record in records],
         list(_moved(recipe, records, catalog).values()),
     ):
         folder = _folder_with(recipe.file, paths)
         if folder is not None:
-            return folder
+            return str(folder)
+        if is_url(known) or any((Path(known) / path).is_file() for path in paths if known):
+            return known
+    elsewhere = f", nor in {known}, which the last run read" if known else ""
     raise ProductError(
-        f"was made from {records[0].path}, which is in no folder above the product",
+        f"was made from {records[0].path}, which is in no folder above the product{elsewhere}",
         file=recipe.file,
         remedy=f"give its folder with {option}",
     )
+
+
+def _last_run(recipe: Recipe, catalog: str | None) -> Run | None:
+    """Return the last run of the campaign in the catalog; None where no catalog is found."""
+    url = _catalog_url(recipe, catalog)
+    if not url:
+        return None
+    try:
+        with Store(url, recipe.campaign_name, create=False) as store:
+            return next(iter(store.runs(limit=1)), None)
+    except CatalogError:
+        # A catalog that was not given but only found may be unusable.
+        if catalog is not None:
+            raise
+        return None
+
+
+def _catalog_url(recipe: Recipe, catalog: str | None) -> str:
+    return catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(recipe.file)
 
 
 def _folder_with(file: Path, paths: Sequence[str]) -> Path | None:

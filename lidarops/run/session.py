@@ -29,6 +29,7 @@ from lidarops.records import (
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps.dependence import ProductKey
 from lidarops.system.code_version import joint_code_version
+from lidarops.system.stores import without_keys
 
 MOST_INPUTS: Final = 100_000
 """Granules that the record of a run names; the ledger names all."""
@@ -83,6 +84,8 @@ class Session:
             holder=Lock.holder_name(),
             version=__version__,
             code_version=joint_code_version(),
+            archive=without_keys(self._campaign.archive),
+            folder=str(self._campaign.folder),
         )
         self._store.begin_run(run, self._lock.token)
 

@@ -1,4 +1,4 @@
-"""Notes on raw files reach the products, and reproduction repeats them."""
+"""What the archive says of itself reaches the products, and `reproduce` finds the archive."""
 
 from __future__ import annotations
 
@@ -35,3 +35,16 @@ def test_a_product_states_the_notes_on_its_files(tmp_path: Path) -> None:
     assert reprocess(archive.write()) is not None
     with xr.open_dataset(next(iter(notes))) as product:
         assert "lidarops_input_notes" not in product.attrs
+
+
+def test_a_product_is_reproduced_where_the_archive_lies_elsewhere(tmp_path: Path) -> None:
+    archive = Archive(tmp_path / "campaigns/coast", days=1)
+    archive.tree |= {"archive": str(tmp_path / "disk/raw"), "output": str(tmp_path / "results")}
+    (tmp_path / "disk").mkdir()
+    (archive.folder / "raw").rename(tmp_path / "disk/raw")
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    products = sorted(campaign.products_root.rglob("*.nc"))
+    assert {path.parts[-3] for path in products} >= {"signal", "elastic"}
+    for path in products:
+        assert reproduce_product(path).identical

@@ -75,7 +75,7 @@ def write_stand_ins(size: StandIns, path: Path) -> Campaign:
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
         store.begin_run(
-            Run(_RUN, _FIRST, _FIRST, RunStatus.FINISHED, "nobody", "0", "0"), lock.token
+            Run(_RUN, _FIRST, _FIRST, RunStatus.FINISHED, "nobody", "0", "0", "", ""), lock.token
         )
         judge = Judge(campaign, store)
         for day in range(size.days):
