@@ -317,6 +317,10 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
             for row in finding_rows(result.findings)
             if row.fails
         },
+        "requested products that no scene gives": {
+            f"{unmade.kind} {unmade.channel} of {unmade.instrument}": unmade.reason
+            for unmade in result.findings.unmade
+        },
         "products without a raw file (reprocess --remove-orphans removes them)": result.lost,
     }
     logger = get_run_logger()

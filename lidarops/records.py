@@ -361,12 +361,13 @@ class IdlePattern:
 
 @dataclass(frozen=True, slots=True)
 class Unmade:
-    """A kind of product that is requested of an instrument or network, and that no scene gives."""
+    """A product that is requested of an instrument or network, and that does not exist."""
 
     instrument: str
     kind: str
+    channel: str
     reason: str
-    """Why a scene that was planned for it does not give it."""
+    """Why examined scenes do not give it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,7 +150,9 @@ Identifier = Annotated[
         },
     ),
 ]
-Metres = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_no_kilometres)]
+Metres = Annotated[
+    float, Field(ge=0, le=150_000, allow_inf_nan=False), AfterValidator(_no_kilometres)
+]
 """Range or height: 0, or at least `_LEAST_RANGE`."""
 
 

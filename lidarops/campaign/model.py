@@ -79,7 +79,7 @@ class ChannelFacts(SettingsModel):
     wavelength: float | None = quantity(
         None, unit="m", gt=1e-7, lt=2e-5, description="where the header is wrong"
     )
-    dead_time: float | None = quantity(None, unit="s", ge=1e-10, lt=1e-6)
+    dead_time: float | None = quantity(None, unit="s", ge=1e-10, le=2e-7)
     range_offset: float | None = quantity(
         None, unit="m", ge=-500, le=500, description="added to the range of every bin"
     )

@@ -21,6 +21,10 @@ _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 
+MOST_NOTES: Final = 100
+"""Different notes on files that are reported; others are counted."""
+
+
 class Fingerprint(NamedTuple):
     """What the catalog knows of a file, for comparison in a scan."""
 
@@ -223,6 +227,16 @@ class Granules(Database):
                 for instrument, index, _, files, channels in connection.execute(query)
             ]
 
+    def days_of_instruments(self) -> dict[str, tuple[int, int]]:
+        """Return the first and the last day with good signal granules, by instrument."""
+        query = (
+            sa.select(_C.instrument, sa.func.min(_C.day), sa.func.max(_C.day))
+            .where(*self._signals())
+            .group_by(_C.instrument)
+        )
+        with self.transaction() as connection:
+            return {name: (first, last) for name, first, last in connection.execute(query)}
+
     def file_notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
         """Return the notes on good signal granules, contradictions first, then by frequency.
 
@@ -242,10 +256,19 @@ class Granules(Database):
                     for text in _sentences(stored) if instrument in instruments else ():
                         files[contradicts, instrument, text] += count
         ordered = sorted(files.items(), key=lambda item: (not item[0][0], -item[1], item[0]))
-        return tuple(
+        notes = [
             FileNote(instrument, text, contradicts, count)
             for (contradicts, instrument, text), count in ordered
+        ]
+        # Notes that state a value of each file would fill the report.
+        more: Counter[tuple[str, bool]] = Counter()
+        for note in notes[MOST_NOTES:]:
+            more[note.instrument, note.contradicts] += note.files
+        others = (
+            FileNote(instrument, "other notes", contradicts, count)
+            for (instrument, contradicts), count in more.items()
         )
+        return (*notes[:MOST_NOTES], *others)
 
     def paths_by_digest(self, digests: Collection[str]) -> dict[str, str]:
         """Return SHA-256 -> path of the granules with these digests."""

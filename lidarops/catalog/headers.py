@@ -208,7 +208,7 @@ def _overridden(header: RawHeader, facts: _Facts) -> Iterator[str]:
         # Not where the wavelength of the header is implausible, and so NaN.
         if abs(wavelength - channel.wavelength) > _ROUNDING_OF_WAVELENGTHS:
             yield (
-                f"wavelength {wavelength * 1e9:.5g} nm of {channel.name} in the campaign overrides"
+                f"{channel.name}: wavelength {wavelength * 1e9:.5g} nm of the campaign overrides"
                 f" {channel.wavelength * 1e9:.5g} nm of the header"
             )
 

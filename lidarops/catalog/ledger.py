@@ -386,25 +386,26 @@ class Ledger(Granules):
         with self.stream(query) as rows:
             yield (_made_from(row) for row in rows)
 
-    def has_product(self, folder: str, first: int, last: int) -> bool:
-        """Return whether there is a product in a folder, of the days `first` to `last`.
+    def has_product(self, owner: str, kind: str, channel: str, *, without: Collection[str]) -> bool:
+        """Return whether there is a product of an instrument or network.
 
         Parameters
         ----------
-        folder : str
-            Its path with a slash at the end.
-        first, last : int
-            Days since 1970-01-01, both included.
+        owner : str
+            Key of the instrument or network.
+        kind, channel : str
+        without : collection of str
+            Paths of products that do not count.
         """
+        # Keys hold no underscore, which stands before the time in the id of a scene.
         query = (
             sa.select(_P.path)
-            # A range of the primary key; "0" follows "/".
-            .where(_P.campaign == self.campaign, _P.path >= folder, _P.path < f"{folder[:-1]}0")
-            .where(_P.day.between(first, last))
-            .limit(1)
+            .where(_P.campaign == self.campaign, _P.kind == kind, _P.channel == channel)
+            .where(_P.scene.startswith(f"{owner}_", autoescape=True))
+            .limit(len(without) + 1)
         )
         with self.transaction() as connection:
-            return connection.scalar(query) is not None
+            return any(path not in without for (path,) in connection.execute(query))
 
     def products(self) -> list[Mapping[str, Any]]:
         """Return the rows of all products, ordered by path."""

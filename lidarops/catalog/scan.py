@@ -32,8 +32,10 @@ _WORTH_PROCESSES = 5000
 _MOST_PROCESSES = 8
 """Further processes would wait for the one that writes the catalog."""
 
-_NAMES_REMEMBERED: Final = 1000
 _NAMES_OF_FOLDER: Final = 3
+"""Files of a folder that are compared with patterns that match nothing."""
+_LEAST_LIKENESS: Final = 0.5
+"""Share of equal characters in names that count as similar; assumed."""
 _NAMES_SHOWN: Final = 3
 
 Progress = Callable[[int], None]
@@ -186,7 +188,7 @@ class _Scan:
             if self._idle and file is not None:
                 self._idle.difference_update(owners)
                 if not owners:
-                    self._unclaimed.add(file.path)
+                    self._unclaimed.compare(file.path, {claim.pattern for claim in self._idle})
             if file is None or not owners:
                 if before is not None:
                     self._gone.append(before)
@@ -323,27 +325,27 @@ class _Scan:
 
 
 class _Unclaimed:
-    """Some names of files that no instrument claims, from every folder."""
+    """The names of files without claim that resemble patterns without file."""
 
     def __init__(self) -> None:
-        self._names: list[str] = []
-        self._folders: Counter[str] = Counter()
+        self._best: dict[str, list[tuple[float, str]]] = defaultdict(list)
+        self._folder = ""
+        self._names = 0
 
-    def add(self, path: str) -> None:
-        """Remember the name of a file, if few of its folder are remembered."""
+    def compare(self, path: str, patterns: Iterable[str]) -> None:
+        """Compare a file with patterns, if it is among the first of its folder."""
         folder = path.rpartition("/")[0]
-        if len(self._names) < _NAMES_REMEMBERED and self._folders[folder] < _NAMES_OF_FOLDER:
-            self._folders[folder] += 1
-            self._names.append(path)
+        self._names = self._names + 1 if folder == self._folder else 1
+        self._folder = folder
+        for pattern in patterns if self._names <= _NAMES_OF_FOLDER else ():
+            likeness = difflib.SequenceMatcher(None, pattern.lower(), path.lower()).ratio()
+            if likeness >= _LEAST_LIKENESS:
+                best = sorted({*self._best[pattern], (-likeness, path)})
+                self._best[pattern] = best[:_NAMES_SHOWN]
 
     def near(self, pattern: str) -> tuple[str, ...]:
-        """Return the names that resemble a pattern most, one of each folder first."""
-        plain = {name.lower(): name for name in self._names}
-        wanted = pattern.lower()
-        return tuple(
-            plain[name]
-            for name in difflib.get_close_matches(wanted, plain, n=_NAMES_SHOWN, cutoff=0.0)
-        )
+        """Return the names that resemble a pattern most."""
+        return tuple(path for _, path in self._best[pattern])
 
 
 def scan_keys(campaign: Campaign) -> dict[tuple[str, Role], str]:
@@ -380,7 +382,11 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                         str(fact.valid_from),
                         fact.zenith_angle,
                         fact.azimuth,
-                        [(name, channel.wavelength) for name, channel in fact.channels.items()],
+                        [
+                            (name, channel.wavelength)
+                            for name, channel in fact.channels.items()
+                            if channel.wavelength is not None
+                        ],
                     )
                     for fact in instrument.facts
                 ],

@@ -95,8 +95,9 @@ def catalog(
     findings = Findings(file_notes=notes, idle_patterns=summary.idle_patterns)
     if as_json:
         reasons = [{"path": granule.path, "reason": granule.reason} for granule in refused]
-        notes_found = {"file_notes": [asdict(note) for note in notes]}
-        document = {**asdict(summary), "refused_files": reasons, **notes_found}
+        numbers = asdict(summary)
+        del numbers["idle_patterns"]
+        document = {**numbers, "refused_files": reasons, **findings_document(findings)}
         typer.echo(json.dumps(document, indent=2))
     else:
         _show_refused(refused)
@@ -342,8 +343,10 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         ended = f" ({result.status.value})" if result.status != "finished" else ""
         typer.echo(f"products: {campaign.products_root}{ended}{never_made(result.findings)}")
     else:
-        never = never_made(result.findings)
-        typer.echo(f"nothing to do: every requested product is fresh or cannot be made{never}")
+        state = "the archive is not what the campaign states, see above"
+        if not result.findings.failed:
+            state = "every requested product is fresh or cannot be made"
+        typer.echo(f"nothing to do: {state}{never_made(result.findings)}")
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:

@@ -33,8 +33,12 @@ def show_findings(findings: Findings) -> None:
     )
     show_rows("Requested, but not in the files", columns, unmet)
     columns = ("instrument", "what", "finding")
-    rows = ((row.instrument, row.subject, row.problem) for row in finding_rows(findings))
-    show_rows("The archive is not what the campaign states", columns, rows)
+    for title, fails in (
+        ("The archive is not what the campaign states", True),
+        ("Notes on files and products", False),
+    ):
+        rows = [row for row in finding_rows(findings) if row.fails is fails]
+        show_rows(title, columns, ((row.instrument, row.subject, row.problem) for row in rows))
 
 
 def never_made(findings: Findings) -> str:

@@ -73,12 +73,13 @@ def show_plan(
     scenes = []
     no_scene = True
     failed = False
-    waiting = failed_before(settings)
+    waiting = failed_before(settings, selection)
     for judged in judgements:
         no_scene = False
         failed |= not judged.planned
-        if judged.due:
+        if judged.due or judged.held:
             waiting.pop(judged.scene.id, None)
+        failed |= judged.held
         scene, whole = judged.scene, settings.all_steps
         times = {
             "to_be_made": making.add(scene, judged.needed(), whole=whole),

@@ -24,6 +24,8 @@ from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
 
 DARK_REACH = timedelta(hours=24)
 """Longest time between a scene and the dark files that it uses."""
+MOST_NOTES = 20
+"""Different notes on the files of a scene that are kept."""
 _STAMP = "%Y%m%dT%H%M%S"
 """Format of the start time in the name of a scene."""
 
@@ -110,7 +112,11 @@ def _of_network(
                     granules=_in_time(g for member in members for g in member.granules),
                     dark=_in_time(g for member in members for g in member.dark),
                     members=members,
-                    notes=tuple(dict.fromkeys(note for member in members for note in member.notes)),
+                    notes=tuple(
+                        f"{member.instrument}: {note}"
+                        for member in members
+                        for note in member.notes
+                    ),
                 )
             )
     return scenes
@@ -268,7 +274,9 @@ def _notes(granules: Sequence[Granule]) -> tuple[str, ...]:
     files = Counter(
         note for granule in granules for note in (*granule.contradictions, *granule.notes)
     )
-    return tuple(f"{note}: {count} of {len(granules)} files" for note, count in files.items())
+    shown = [f"{note}: {count} of {len(granules)} files" for note, count in files.items()]
+    more = [f"{len(shown) - MOST_NOTES} other notes"] if len(shown) > MOST_NOTES else []
+    return (*shown[:MOST_NOTES], *more)
 
 
 def _layout_key(granule: Granule) -> str:

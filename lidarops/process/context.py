@@ -41,6 +41,7 @@ def product_context(
     campaign = job.campaign
     # A product states only what it depends on.
     closure = dependence.plan_closure(job.plan, [(kind, channel.name)])
+    notes = dependence.product_notes(scene, closure, channel.name)
     return Context(
         kind=kind,
         channel=channel.name,
@@ -57,7 +58,7 @@ def product_context(
         scene=scene.id,
         start=scene.start,
         stop=scene.stop,
-        notes=scene.notes,
+        notes=notes,
         provenance=Provenance(
             campaign=campaign.name,
             scene=scene.id,
@@ -71,7 +72,7 @@ def product_context(
                 "keys": {"station": scene.station, "instrument": scene.instrument},
                 "campaign": {"title": campaign.title, "summary": campaign.summary},
                 "window": [scene.start.isoformat(), scene.stop.isoformat()],
-                "notes": list(scene.notes),
+                "notes": list(notes),
             },
             versions=provenance.package_versions(),
             code_version=code_version(kind),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
-from lidarops.raw.header import RawHeader, Stretches
+from lidarops.raw.header import RawHeader, Stretches, holds_text
 from lidarops.registry import RAW_FORMATS, by_name, registered
 
 UNKNOWN_FORMAT: Final = "is of no known raw format"
@@ -107,7 +107,7 @@ def _recognised(head: bytes, file: str) -> RawFormat:
             remedy="remove the package of one of them",
         )
     raise RawFormatError(
-        UNKNOWN_FORMAT + (": it is text" if head.isascii() else ""),
+        UNKNOWN_FORMAT + (": it is text" if holds_text(head) else ""),
         file=file,
         remedy=f"formats are {', '.join(raw_formats())}; install the package of any other format,"
         " or make the pattern of the instrument leave the file out",

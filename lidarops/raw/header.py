@@ -6,13 +6,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.records import ChannelLayout, DetectionMode
+
+_LEAST_TEXT: Final = 64
+"""Bytes; the counts of 16 bins are not printable by chance."""
+_TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\r\n"
 
 _Channel = TypeVar("_Channel")
 HeaderOrder = Literal["longitude_first", "latitude_first"]
@@ -72,6 +76,11 @@ class RawChannel:
         """Counts of a saturated digitiser, ``shots (2^adc_bits - 1)``; None without one."""
         analog = self.mode is DetectionMode.ANALOG
         return self.shots * ((1 << self.adc_bits) - 1) if analog else None
+
+
+def holds_text(data: bytes) -> bool:
+    """Return whether bytes are printable text; False where there are too few to tell."""
+    return len(data) >= _LEAST_TEXT and not data.translate(None, _TEXT)
 
 
 class RawHeader(NamedTuple):

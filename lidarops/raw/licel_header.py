@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
-from lidarops.raw.header import HeaderOrder, IncompleteHeaderError, place_on_earth
+from lidarops.raw.header import HeaderOrder, IncompleteHeaderError, holds_text, place_on_earth
 from lidarops.records import DetectionMode
 
 CONVENTION: Final = (
@@ -36,9 +36,6 @@ CONVENTION: Final = (
 
 _LINE_LIMIT = 1024
 _CACHED_BLOCK = 4 * 1024
-_LEAST_TEXT = 64
-"""Bytes; the counts of 16 bins are not printable by chance."""
-_TEXT = bytes(range(0x20, 0x7F)) + b"\t\r\n"
 _MAX_DATASETS = 1000
 _MAX_BINS = 1_000_000
 _MAX_BIN_WIDTH = 1000.0
@@ -285,6 +282,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     if buffer[block_end : block_end + 2] != b"\r\n":
         if len(buffer) < block_end + 2:
             raise IncompleteHeaderError("the file ends inside the header", field="empty line")
+        _refuse_export(buffer[block_end:])
         raise RawFormatError(
             "no empty line follows the dataset lines: the number of datasets in line 3 is wrong",
             field="number of datasets",
@@ -295,12 +293,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     try:
         datasets, dataset_notes = parse(block, data_start, size)
     except RawFormatError:
-        if holds_text(buffer[data_start:]):
-            raise RawFormatError(
-                "holds numbers as text where a Licel file holds binary counts: it is an export",
-                field="data",
-                remedy="make the pattern of the instrument leave it out",
-            ) from None
+        _refuse_export(buffer[data_start:])
         raise
     return Header(
         name=first.strip(),
@@ -326,9 +319,14 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     )
 
 
-def holds_text(data: bytes) -> bool:
-    """Return whether bytes are printable text; False where there are too few to tell."""
-    return len(data) >= _LEAST_TEXT and not data.translate(None, _TEXT)
+def _refuse_export(data: bytes) -> None:
+    """Refuse a file with text in the place of counts."""
+    if holds_text(data):
+        raise RawFormatError(
+            "holds numbers as text where a Licel file holds binary counts: it is an export",
+            field="data",
+            remedy="make the pattern of the instrument leave it out",
+        ) from None
 
 
 def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:

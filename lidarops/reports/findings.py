@@ -27,8 +27,8 @@ def finding_rows(findings: Findings) -> list[FindingRow]:
 
 
 def unmade_words(findings: Findings) -> list[str]:
-    """Return the products that no scene gives, such as ``elastic of hill-lidar``."""
-    return [f"{unmade.kind} of {unmade.instrument}" for unmade in findings.unmade]
+    """Return the products that no scene gives, such as ``elastic glued_532o of hill-lidar``."""
+    return [f"{unmade.kind} {unmade.channel} of {unmade.instrument}" for unmade in findings.unmade]
 
 
 def lacking(unmet: Unmet) -> str:
@@ -51,5 +51,5 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
         subject = f"{unusable.key}: {unusable.path}"
         yield FindingRow(unusable.instrument, subject, unusable.problem, fails=True)
     for unmade in findings.unmade:
-        problem = f"no scene gives it: {unmade.reason}"
-        yield FindingRow(unmade.instrument, f"products: {unmade.kind}", problem, fails=False)
+        subject = f"products: {unmade.kind} {unmade.channel}"
+        yield FindingRow(unmade.instrument, subject, f"not made: {unmade.reason}", fails=False)

@@ -149,11 +149,10 @@ def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
 
 def verdict(record: RunRecord) -> str:
     """Return the outcome of the run in one sentence, and what to look at in others."""
-    if not record.scenes:
-        refused = _refused_granules(record)
-        return f"There was no scene to process.{f' {refused}.' if refused else ''}"
     problems = list(_problems(record))
-    if not problems:
+    if not record.scenes:
+        sentence = ", ".join(("There was no scene to process", *problems))
+    elif not problems:
         sentence = "Every scene was processed and no granule was refused"
     else:
         *first, last = problems

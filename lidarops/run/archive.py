@@ -193,10 +193,14 @@ def survey(
         return find(judge, store, selection, summary.idle_patterns)
 
 
-def failed_before(campaign: Campaign) -> dict[str, str]:
-    """Return the scenes whose last try failed, with the errors; a catalog must exist."""
+def failed_before(campaign: Campaign, selection: Selection) -> dict[str, str]:
+    """Return the selected scenes whose last try failed, with the errors; a catalog must exist."""
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        return dict(store.failures())
+        return {
+            scene: error
+            for scene, error in store.failures().items()
+            if selection.scene(scene, campaign)
+        }
 
 
 def update_catalog(
@@ -292,7 +296,8 @@ class _Pass:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
-        findings = find(self.judge, self.store, self.selection, summary.idle_patterns)
+        orphans = {orphan.path for orphan in self.gathered.orphans}
+        findings = find(self.judge, self.store, self.selection, summary.idle_patterns, orphans)
         record = self._conclude(status, findings)
         gathered = self.gathered
         self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
-from typing import Final
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan import availability
 from lidarops.records import Findings, IdlePattern, Role, Unmade, Unmet, UnusableFile
 from lidarops.run.selection import Selection, station_of
-from lidarops.run.staleness import Judge
+from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps import dependence
+from lidarops.steps.channels import READ_STEP
+from lidarops.steps.dependence import ProductKey
 from lidarops.steps.step import REQUEST
-
-_DAYS_EXAMINED: Final = 3
-"""Days whose plans are searched for the reason why a product is never made."""
 
 
 def find(
-    judge: Judge, store: Store, selection: Selection, idle_patterns: Iterable[IdlePattern]
+    judge: Judge,
+    store: Store,
+    selection: Selection,
+    idle_patterns: Iterable[IdlePattern],
+    orphans: Collection[str] = (),
 ) -> Findings:
     """Return the findings on the selected instruments and networks.
 
@@ -32,6 +34,8 @@ def find(
     selection : Selection
     idle_patterns : iterable of IdlePattern
         Of the scan.
+    orphans : collection of str
+        Paths of products that would not be made again.
     """
     campaign = judge.campaign
     owners = [
@@ -45,7 +49,7 @@ def find(
         file_notes=store.file_notes(instruments),
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
-        unmade=tuple(_unmade(judge, store, selection, owners)),
+        unmade=tuple(_unmade(judge, store, selection, owners, orphans)),
     )
 
 
@@ -94,46 +98,66 @@ def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[Unusab
 
 
 def _unmade(
-    judge: Judge, store: Store, selection: Selection, owners: Iterable[str]
+    judge: Judge,
+    store: Store,
+    selection: Selection,
+    owners: Iterable[str],
+    orphans: Collection[str],
 ) -> Iterator[Unmade]:
-    """Yield the kinds that are requested, have files, and are made in no scene of the selection."""
-    campaign = judge.campaign
-    have_files = {instrument for instrument, _ in store.layouts()}
-    days: list[int] | None = None
-    for owner in owners:
-        for kind in _requested(campaign, owner):
-            folder = f"{station_of(campaign, owner)}/{owner}/{kind}/"
-            if (selection.kinds and kind not in selection.kinds) or not have_files.intersection(
-                _members(campaign, owner)
-            ):
-                continue
-            if days is None:
-                days = selection.days(sorted({day_sum.day for day_sum in store.day_sums()}))
-            if days and not store.has_product(folder, days[0], days[-1]):
-                reason = _why_never(judge, days, owner, kind)
-                if reason:
-                    yield Unmade(owner, kind, reason)
+    """Yield the products that are requested by name, have files, and do not exist."""
+    missing = [
+        (owner, kind, channel)
+        for owner in owners
+        for kind, channel in _requested(judge.campaign, owner)
+        if (not selection.kinds or kind in selection.kinds)
+        and not store.has_product(owner, kind, channel, without=orphans)
+    ]
+    spans = store.days_of_instruments() if missing else {}
+    judged: dict[int, Sequence[Judgement]] = {}
+    for owner, kind, channel in missing:
+        days = _examined(judge.campaign, owner, spans, selection)
+        for day in days:
+            if day not in judged:
+                judged[day] = judge.days([day]).judgements
+        scenes = [scene for day in days for scene in judged[day] if scene.scene.instrument == owner]
+        reason = _why_not(scenes, kind, channel)
+        if days and reason:
+            yield Unmade(owner, kind, channel, reason)
 
 
-def _requested(campaign: Campaign, owner: str) -> Collection[str]:
+def _requested(campaign: Campaign, owner: str) -> Iterator[ProductKey]:
+    """Yield kind and channel of the products that are requested by name."""
     if owner in campaign.networks:
-        return campaign.networks[owner].requested().keys()
-    return campaign.instruments[owner].products.requested().keys()
+        for kind, joint in campaign.networks[owner].requested().items():
+            yield kind, joint.channel
+        return
+    for kind, settings in campaign.instruments[owner].products.requested().items():
+        for channel in settings.named:
+            yield kind, channel
 
 
-def _why_never(judge: Judge, days: list[int], owner: str, kind: str) -> str:
-    """Return why some scenes of an owner do not give a kind; empty if one should, but failed."""
+def _examined(
+    campaign: Campaign,
+    owner: str,
+    spans: Mapping[str, tuple[int, int]],
+    selection: Selection,
+) -> list[int]:
+    """Return the first and last day on which an owner has files, within the selection."""
+    days = [day for name in _members(campaign, owner) for day in spans.get(name, ())]
+    return selection.days(sorted({min(days), max(days)})) if days else []
+
+
+def _why_not(scenes: Sequence[Judgement], kind: str, channel: str) -> str:
+    """Return why no scene gives a product; empty if one should, but failed or is yet to run."""
+    if not scenes:
+        return "its instruments have no files at the same time, on the first and the last day"
     reasons: dict[str, None] = {}
-    examined = {days[0], days[len(days) // 2], days[-1]}
-    for day in sorted(examined)[:_DAYS_EXAMINED]:
-        for judged in judge.days([day]).judgements:
-            if judged.scene.instrument != owner:
-                continue
-            if any(made == kind for made, _ in dependence.planned_products(judged.requested)):
-                return ""
-            reasons |= dict.fromkeys(
-                left.reason
-                for left in judged.requested.left_out
-                if left.name == kind and left.rule != REQUEST
-            )
+    for judged in scenes:
+        if (kind, channel) in dependence.planned_products(judged.requested):
+            return ""
+        reasons |= dict.fromkeys(
+            left.reason
+            for left in judged.requested.left_out
+            if left.name in (kind, READ_STEP) and left.channel == channel and left.rule != REQUEST
+        )
     return "; ".join(reasons)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import xarray as xr
@@ -102,15 +102,13 @@ def reproduce_product(
         if folder is not None and not Path(folder).is_dir():
             raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
     recipe = Recipe.of(Path(product))
-    last = _last_run(recipe, catalog)
     raw = [record for record in recipe.inputs if record.role in RAW]
     others = [record for record in recipe.inputs if record.role not in RAW]
-    place = archive or _folder(recipe, raw, "--archive", catalog, last.archive if last else "")
+    place = archive or _folder(recipe, raw, "--archive", catalog)
     with _staged(recipe, raw, str(place), catalog) as (root, wrong):
         ancillaries = root
         if others:
-            known = last.folder if last else ""
-            ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog, known))
+            ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog))
         changed = [*wrong, *_changed(ancillaries, others, str(ancillaries))]
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
@@ -202,24 +200,29 @@ def _nearest_catalog(file: Path) -> str:
 
 
 def _folder(
-    recipe: Recipe, records: Sequence[InputRecord], option: str, catalog: str | None, known: str
+    recipe: Recipe,
+    records: Sequence[InputRecord],
+    option: Literal["--archive", "--ancillary"],
+    catalog: str | None,
 ) -> str:
     """Return the nearest folder above the product, or subfolder of one, that holds any input.
 
-    If there is none, the `known` folder or URL of the last run, if it may hold an input.
+    If there is none, the folder or URL of the last run in the catalog, if it may hold an input.
     """
-    for paths in (
-        [record.path for record in records],
-        list(_moved(recipe, records, catalog).values()),
-    ):
+    names = [record.path for record in records]
+    moved: list[str] = []
+    for paths in (names, moved):
         folder = _folder_with(recipe.file, paths)
         if folder is not None:
             return str(folder)
-        if is_url(known) or any((Path(known) / path).is_file() for path in paths if known):
-            return known
+        moved += _moved(recipe, records, catalog).values()
+    last = _last_run(recipe, catalog)
+    known = "" if last is None else last.archive if option == "--archive" else last.folder
+    if is_url(known) or any((Path(known) / path).is_file() for path in (*names, *moved) if known):
+        return known
     elsewhere = f", nor in {known}, which the last run read" if known else ""
     raise ProductError(
-        f"was made from {records[0].path}, which is in no folder above the product{elsewhere}",
+        f"was made from {names[0]}, which is in no folder above the product{elsewhere}",
         file=recipe.file,
         remedy=f"give its folder with {option}",
     )

@@ -43,11 +43,14 @@ class Selection:
 
     def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
         """Return whether a product is selected; its scene may no longer exist."""
-        owner, start = parse_scene_id(made.scene)
+        return (not self.kinds or made.kind in self.kinds) and self.scene(made.scene, campaign)
+
+    def scene(self, scene: str, campaign: Campaign) -> bool:
+        """Return whether the scene of an id is selected; it may no longer exist."""
+        owner, start = parse_scene_id(scene)
         return (
-            (not self.kinds or made.kind in self.kinds)
-            and self.owner(owner, station_of(campaign, owner))
-            and (self.since is None or scene_stop(made.scene, campaign) > self.since)
+            self.owner(owner, station_of(campaign, owner))
+            and (self.since is None or scene_stop(scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
 

@@ -156,7 +156,7 @@ class Judge:
         self._force = force
         self._settings = dependence.Settings(campaign)
         self._ancillaries: dict[str, str] = {}
-        self._problems: dict[str, str] = {}
+        self._problems: dict[tuple[str, Role], str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
 
@@ -380,13 +380,13 @@ class Judge:
 
     def file_problem(self, name: str, role: Role) -> str:
         """Return why an ancillary file cannot be used; empty if it can."""
-        if name not in self._problems:
+        if (name, role) not in self._problems:
             try:
                 Ancillaries.read(self.campaign.folder, {name: role})
-                self._problems[name] = ""
+                self._problems[name, role] = ""
             except AncillaryError as error:
-                self._problems[name] = str(error).removeprefix(f"{name}: ")
-        return self._problems[name]
+                self._problems[name, role] = str(error).removeprefix(f"{name}: ")
+        return self._problems[name, role]
 
     def key(self, judged: Judgement, *, internal: bool = False) -> str:
         """Return the digest of everything that may change the outcome of a scene.

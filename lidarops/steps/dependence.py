@@ -217,7 +217,7 @@ class Settings:
                 else None
             ),
             "scene": [scene.id, scene.start.isoformat(), scene.stop.isoformat()],
-            "notes": scene.notes,
+            "notes": product_notes(scene, plan, channel),
             "members": [
                 {
                     "station": self._stations[member.station],
@@ -227,6 +227,22 @@ class Settings:
                 for member in members
             ],
         }
+
+
+def product_notes(scene: Scene, plan: Plan, channel: str) -> tuple[str, ...]:
+    """Return the notes on the files of a scene, without those on channels that a product lacks.
+
+    Parameters
+    ----------
+    scene : Scene
+    plan : Plan
+        Plan of the product, from `plan_closure`.
+    channel : str
+        Channel of the product.
+    """
+    others = {held.name for member in scene.members or (scene,) for held in member.layout}
+    others -= {step.channel for step in plan.steps} | {channel}
+    return tuple(note for note in scene.notes if others.isdisjoint(note.split(": ")))
 
 
 def scene_facts(campaign: Campaign, scene: Scene) -> InstrumentFacts:

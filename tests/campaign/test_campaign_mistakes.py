@@ -60,10 +60,10 @@ def _message(folder: Path, text: str) -> str:
             "dead_time: 3.0e-6",
             (
                 "line 14: instruments.lidar.facts.0.channels.photon_532o.dead_time: must be a"
-                " number at least 1e-10 and below 1e-06 s, not 3.0e-6"
+                " number from 1e-10 to 2e-07 s, not 3.0e-6"
             ),
         ),
-        ("dead_time: 4.0e-9", "dead_time: 3e-6", "at least 1e-10 and below 1e-06 s, not '3e-6'"),
+        ("dead_time: 4.0e-9", "dead_time: 3e-6", "from 1e-10 to 2e-07 s, not '3e-6'"),
         (
             "latitude: 46.4",
             "latitude: north",

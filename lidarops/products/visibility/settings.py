@@ -39,7 +39,7 @@ class VisibilityProductSettings(NetworkProduct):
     )
     smallest_angle: float = quantity(2.0, unit="degree", gt=0, lt=90, description="between beams")
     farthest: float | None = quantity(
-        None, unit="m", gt=0, description="largest range used; by default the last bin"
+        None, unit="m", ge=10, description="largest range used; by default the last bin"
     )
     exponent: float = quantity(
         1.0,
