@@ -130,7 +130,7 @@ def _show_plan(title: str, plan: Plan) -> None:
     """Print the steps of a plan, and what it leaves out; equal lines of channels are one."""
     columns = ("step", "channels", "what, and why")
     steps = _by_channels(
-        (step.name, _words(_effect(step, plan), step, _needs(step)), step.channel)
+        (step.name, _words(_effect(step, plan), step, _needs(step, plan)), step.channel)
         for step in plan.steps
     )
     show_rows(f"{title}, plan {plan.hash[:12]}", columns, steps)
@@ -160,8 +160,10 @@ def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
     return "; ".join(filter(None, (member, effect, reason, needs)))
 
 
-def _needs(step: PlannedStep) -> str:
-    return f"after {', '.join(step.needs)}" if step.needs else ""
+def _needs(step: PlannedStep, plan: Plan) -> str:
+    planned = {other.name for other in plan.steps}
+    needs = [need for need in step.needs if need.rpartition("/")[2] in planned]
+    return f"after {', '.join(needs)}" if needs else ""
 
 
 def _effect(step: PlannedStep, plan: Plan) -> str:

@@ -63,6 +63,10 @@ def _message(folder: Path, text: str) -> str:
                 " number from 1e-10 to 2e-07 s, not 3.0e-6"
             ),
         ),
+        # In ps, km and mm.
+        ("dead_time: 4.0e-9", "dead_time: 4.0e-12", "from 1e-10 to 2e-07 s, not 4.0e-12"),
+        ("[[750, 4500]]", "[[0.75, 4.5]]", "must be 0, or at least 10 m, not 0.75 m: is it in km?"),
+        ("[[750, 4500]]", "[[750, 4500000]]", "from 0 to 150000 m, not 4500000"),
         ("dead_time: 4.0e-9", "dead_time: 3e-6", "from 1e-10 to 2e-07 s, not '3e-6'"),
         (
             "latitude: 46.4",
@@ -111,7 +115,7 @@ def _message(folder: Path, text: str) -> str:
             "[[750, -1]]",
             (
                 "line 18: instruments.lidar.products.homogeneous.sections."
-                "0.1: must be a number at least 0 m, not -1"
+                "0.1: must be a number from 0 to 150000 m, not -1"
             ),
         ),
         ("[[750, 4500]]", "[[750, off]]", "sections: must be a list of at least 1 values, each"),

@@ -14,6 +14,7 @@ from support.licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
+from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.licel_format import raw_header
 from lidarops.records import DetectionMode
 
@@ -433,3 +434,23 @@ def test_physical_values_are_scaled_in_double_precision(tmp_path):
     assert values["analog_532p"][0].tolist() == pytest.approx(expected, rel=6e-8)
     # Full scale is exactly 4095 / 4096 of the input range.
     assert values["analog_532p"][0, 2] == 500 * 4095 / 4096
+
+
+@pytest.mark.parametrize("end", [b"\r\n", b""], ids=["with the empty line", "without"])
+def test_a_text_export_is_named_as_one(end):
+    header = licel.parse_header(raw_file())
+    table = b"\r\n".join(b"%.4e\t%.4e" % (k, k / 7) for k in range(64))
+    whole = header.source.removesuffix(b"\r\n") + end + table
+    with pytest.raises(RawFormatError, match="as text") as caught:
+        licel.parse_header(whole, file="export.txt")
+    assert "leave it out" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [(b"range signal\n" * 20, True), (b"", False), (bytes(5000), False), (b"short", False)],
+)
+def test_a_file_of_no_known_format_is_called_text_only_if_it_is(data, text):
+    with pytest.raises(RawFormatError, match="no known raw format") as caught:
+        parse_raw_header(data, file="x", size=len(data))
+    assert ("it is text" in str(caught.value)) is text

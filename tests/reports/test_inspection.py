@@ -61,6 +61,10 @@ def test_raw_files_show_all_their_channels(tmp_path: Path):
         assert any(str(cell) for cell in column.cells), column.header
     table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})
     assert all(word in table.output for word in ("Channels", "photon_532o", "zenith angle"))
+    assert all(unit in table.output for unit in ("wavelength (m)", "bin width (m)", " degree "))
+    header = description["source"].splitlines()
+    assert header[1].strip() in table.output
+    assert "b'" not in table.output
 
 
 def test_foreign_netcdf_is_shown_too(tmp_path: Path):

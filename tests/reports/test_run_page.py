@@ -499,7 +499,7 @@ def nasty_run(nasty: str, archive):
             file_notes=(FileNote(nasty, nasty, True, 3),),
             idle_patterns=(IdlePattern(nasty, nasty, nasty, (nasty,)),),
             unusable_files=(UnusableFile(nasty, nasty, nasty, nasty),),
-            unmade=(Unmade(nasty, nasty, nasty),),
+            unmade=(Unmade(nasty, nasty, nasty, nasty),),
         ),
     )  # fmt: skip
 

@@ -124,7 +124,7 @@ findings = st.builds(
     file_notes=some(st.builds(FileNote, text, text, st.booleans(), whole)),
     idle_patterns=some(st.builds(IdlePattern, text, text, text, some(text))),
     unusable_files=some(st.builds(UnusableFile, text, text, text, text)),
-    unmade=some(st.builds(Unmade, text, text, text)),
+    unmade=some(st.builds(Unmade, text, text, text, text)),
 )
 records = st.builds(
     RunRecord,

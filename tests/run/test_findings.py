@@ -121,15 +121,15 @@ def test_a_product_that_no_scene_gives_is_named_in_the_last_line_and_the_report(
     for facts in rich["facts"]:
         facts["zenith_angle"] = 90
     shown = invoke(archive, "reprocess", "--remove-orphans")
-    assert "requested, but made in no scene: elastic of rich" in shown.output
+    assert "requested, but made in no scene: elastic analog_532o of rich" in shown.output
     assert "does not reach aerosol-free air" in shown.output
     assert "zenith_angle 90 degree of the campaign overrides 0 of the header" in shown.output
     record, page = last_run(archive)
     assert [unmade.kind for unmade in record.findings.unmade] == ["elastic"]
-    assert "Requested, but made in no scene: elastic of rich." in page
+    assert "Requested, but made in no scene: elastic analog_532o of rich." in page
     assert '<strong class="care">' in page
     again = invoke(archive, "reprocess")
-    assert "requested, but made in no scene: elastic of rich" in again.output
+    assert "requested, but made in no scene: elastic analog_532o of rich" in again.output
     assert document(archive, "plan")["never_made"][0]["kind"] == "elastic"
 
 
@@ -137,7 +137,7 @@ def test_a_wavelength_that_contradicts_the_header_is_told(archive: Archive) -> N
     facts = archive.tree["instruments"]["rich"]["facts"]
     facts[1]["channels"]["photon_532o"]["wavelength"] = 355e-9
     shown = invoke(archive, "catalog")
-    assert "wavelength 355 nm of photon_532o in the campaign overrides 532 nm" in shown.output
+    assert "photon_532o: wavelength 355 nm of the campaign overrides 532 nm" in shown.output
     assert shown.exit_code == 0
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from distributed import Client
 from support import quick
-from support.archives.small_archive import DAY, Archive, made
+from support.archives.small_archive import DAY, SOUNDING, Archive, made
 from typer.testing import CliRunner
 
 from lidarops.catalog.ledger import RunStatus, Verdict
@@ -281,14 +281,13 @@ def test_a_plan_shows_its_hash_and_what_each_step_needs(archive: Archive) -> Non
     shown = CliRunner().invoke(app, command, env={"COLUMNS": "100"}).stdout
     assert f"plan {scene['hash'][:12]}" in " ".join(shown.split())
     rows = [[cell.strip() for cell in line.split("│")] for line in shown.splitlines()]
-    needs = {row[1]: (row[3], row[4]) for row in rows if len(row) > 4 and row[1].isdecimal()}
-    names = {
-        number: {name for name, _ in (needs[n] for n in taken.split(", ") if n)}
-        for number, (_, taken) in needs.items()
-    }
-    for number, step in enumerate(scene["steps"], 1):
-        planned = {other["name"] for other in scene["steps"]}
-        assert names[str(number)] == set(step.get("needs", ())) & planned
+    rows = [row for row in rows if len(row) > 4]
+    lines = {(row[1], channel): row[3] for row in rows for channel in row[2].split(", ")}
+    planned = {other["name"] for other in scene["steps"]}
+    for step in scene["steps"]:
+        needs = [name for name in step.get("needs", ()) if name in planned]
+        line = lines[step["name"], step["channel"]]
+        assert line.partition("; after ")[2] == ", ".join(needs)
 
 
 def test_a_kind_that_nothing_requests_is_wrong_use(archive: Archive) -> None:
@@ -451,7 +450,7 @@ def test_a_cluster_is_started_only_if_something_is_stale(archive: Archive) -> No
 def test_a_scene_that_failed_for_good_is_not_tried_until_something_changes(
     archive: Archive,
 ) -> None:
-    (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
+    _failing(archive)
     first = bring_up_to_date(archive.write())
     assert sum(bool(scene.error) for scene in first.record.scenes) == 2
     before = archive.contents()
@@ -461,8 +460,6 @@ def test_a_scene_that_failed_for_good_is_not_tried_until_something_changes(
     assert "air.csv" in next(iter(again.failures.values()))
     assert again.has_failures
     assert archive.contents() == before
-    from support.archives.small_archive import SOUNDING
-
     (archive.folder / "air.csv").write_text(SOUNDING)
     healed = bring_up_to_date(archive.write())
     assert not healed.has_failures
@@ -531,6 +528,10 @@ def _unreadable_later(archive: Archive) -> None:
 
 
 def _failing(archive: Archive) -> None:
+    (archive.folder / "air.csv").write_text(SOUNDING + quick.REFUSED)
+
+
+def _unusable(archive: Archive) -> None:
     (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
 
 
@@ -554,8 +555,8 @@ def _dark(archive: Archive) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [_title, _sections, _lidar_ratio, _dark, _twin, _vanished, _failing, _unreadable_later,
-     _nothing_requested],
+    [_title, _sections, _lidar_ratio, _dark, _twin, _vanished, _failing, _unusable,
+     _unreadable_later, _nothing_requested],
 )  # fmt: skip
 def test_days_are_settled_as_a_new_judgement_would_settle_them(
     archive: Archive, change: Callable[[Archive], object]
@@ -594,8 +595,6 @@ def test_only_days_with_failures_are_judged_again(
 
 def _elsewhere(archive: Archive) -> None:
     """Change the sounding."""
-    from support.archives.small_archive import SOUNDING
-
     (archive.folder / "air.csv").write_text(SOUNDING.replace("288.15", "287.15"))
 
 

@@ -222,7 +222,7 @@ def test_failures_are_removed_on_days_between_others(archive: Archive) -> None:
 
 
 def test_failures_are_removed_with_the_last_files_of_their_day(archive: Archive) -> None:
-    archive.tree["instruments"]["rich"]["dark_files"] = "none/d*"
+    archive.tree["instruments"]["rich"]["dark_files"] = []
     reprocess(archive.write())
     _fail(archive, "%_20260304T%", unmade=True)
     assert len(bring_up_to_date(archive.write()).failures) == 2
@@ -328,13 +328,16 @@ def test_an_emptied_archive_fails_and_its_catalog_stays(archive: Archive, comman
     assert archive.contents("out/products") == before
     # The remedy of the message.
     other = ["--catalog", f"sqlite:///{archive.folder}/other.sqlite"]
-    assert CliRunner().invoke(app, [command, str(archive.file), *other]).exit_code == 0
+    shown = CliRunner().invoke(app, [command, str(archive.file), *other])
+    assert shown.exit_code == 1
+    assert "matches no file of the archive" in shown.stdout
 
 
 def test_products_without_raw_file_are_failures_until_they_are_removed(
     archive: Archive,
 ) -> None:
     _without(archive, "poor")
+    archive.raw("poor/h90", 9 * 1440, seed=1)
     campaign = archive.write()
     for _ in range(2):
         result = bring_up_to_date(campaign)
@@ -498,7 +501,8 @@ def test_a_run_whose_process_is_gone_is_listed_as_died(archive: Archive) -> None
     with Store(campaign.catalog_url, campaign.name) as store:
         with Lock(store) as lock:
             lock.acquire()
-            begun = Run("x", FIRST.replace(year=2030), None, RunStatus.RUNNING, "me", "0", "0")
+            started = FIRST.replace(year=2030)
+            begun = Run("x", started, None, RunStatus.RUNNING, "me", "0", "0", "", "")
             store.begin_run(begun, lock.token)
             assert store.runs()[0].status is RunStatus.RUNNING
         assert [run.status for run in store.runs()] == [RunStatus.DIED, RunStatus.FINISHED]

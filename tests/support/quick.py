@@ -15,16 +15,21 @@ from lidarops.process.job import Job
 from lidarops.records import ProductRecord, SceneOutcome
 from lidarops.steps import dependence
 
+REFUSED = "\n# The stand-in refuses this file.\n"
+"""End of an ancillary file that can be read, but ends the scenes that use it."""
+
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     """Stand in for `lidarops.process.scene.attempt`."""
     scene, inputs, refused, _ = check_files(
         job.scene, Path(job.campaign.archive), read_all=job.campaign.all_steps
     )
+    files = dependence.ancillary_files(job.plan.steps)
+    for name in files:
+        if (job.campaign.folder / name).read_text().endswith(REFUSED):
+            return Failure(f"{name}: is refused").outcome(job.scene, job.plan), True
     try:
-        inputs += Ancillaries.read(
-            job.campaign.folder, dependence.ancillary_files(job.plan.steps)
-        ).inputs
+        inputs += Ancillaries.read(job.campaign.folder, files).inputs
     except LidarOpsError as error:
         return Failure(str(error)).outcome(job.scene, job.plan), True
     settings = dependence.Settings(job.campaign)
