@@ -130,8 +130,8 @@ def _show_plan(title: str, plan: Plan) -> None:
     """Print the steps of a plan, and what it leaves out; equal lines of channels are one."""
     columns = ("step", "channels", "what, and why")
     steps = _by_channels(
-        (step.name, _words(_effect(step, plan), step, _needs(step, plan)), step.channel)
-        for step in plan.steps
+        (step.name, _words(_effect(step, plan), step, needs), step.channel)
+        for step, needs in zip(plan.steps, _needs(plan), strict=True)
     )
     show_rows(f"{title}, plan {plan.hash[:12]}", columns, steps)
     left_out = _by_channels(
@@ -160,10 +160,16 @@ def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
     return "; ".join(filter(None, (member, effect, reason, needs)))
 
 
-def _needs(step: PlannedStep, plan: Plan) -> str:
-    planned = {other.name for other in plan.steps}
-    needs = [need for need in step.needs if need.rpartition("/")[2] in planned]
-    return f"after {', '.join(needs)}" if needs else ""
+def _needs(plan: Plan) -> Iterator[str]:
+    """Yield, for each step, the steps whose outputs it takes, with the channel if it is another."""
+    from lidarops.steps.dependence import needed_places
+
+    for step, places in zip(plan.steps, needed_places(plan), strict=True):
+        names = [
+            other.name if other.channel in ("", step.channel) else f"{other.channel}/{other.name}"
+            for other in (plan.steps[place] for place in places)
+        ]
+        yield f"after {', '.join(names)}" if names else ""
 
 
 def _effect(step: PlannedStep, plan: Plan) -> str:

@@ -246,10 +246,13 @@ def test_a_profile_without_shots_is_flagged_and_others_are_not(tmp_path: Path) -
         "signal": {},
         "homogeneous": {"channels": ["photon_532o", "analog_532o"], "sections": [[750, 4500]]},
     }
-    campaign = factories.campaign(products=products).model_copy(
+    campaign = factories.campaign(products=products)
+    lidar = campaign.instruments["lidar"].model_copy(update={"dark_files": []})
+    campaign = campaign.model_copy(
         update={
             "archive": str(tmp_path / "raw"),
             "output": str(tmp_path / "out"),
+            "instruments": {"lidar": lidar},
             "all_steps": True,
         }
     )

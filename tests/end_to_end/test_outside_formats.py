@@ -168,7 +168,10 @@ def damaged(text: str) -> dict[str, tuple[str, str]]:
         "h-nan": (text[: text.rindex(",") + 1] + "nan\n", "row 600, photon_532o: 'nan' is not"),
         "h-shots": (text.replace("# shots: 600", "# shots: -600"), "shots: -600 is not a whole"),
         "h-zenith": (text.replace("# zenith_angle", "# zenith"), "zenith_angle: is missing"),
-        "h-bare": ("".join(rows[8:]), "is of no known raw format (formats are csv, licel;"),
+        "h-bare": (
+            "".join(rows[8:]),
+            "is of no known raw format: it is text (formats",
+        ),
     }
 
 

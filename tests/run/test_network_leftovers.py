@@ -59,6 +59,8 @@ class Net:
         self.folder = folder
         self.file = folder / "net.yaml"
         self.tree = _tree()
+        for instrument in self.tree["instruments"].values():
+            instrument["header_position"] = "ignore"
         for seed, name in enumerate(PLACES):
             self.raw(f"{name}/h0", seed)
 

@@ -13,7 +13,7 @@ from support import factories
 from support.archives import raw_archives
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.scan import ScanSummary, scan_archive
+from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
@@ -45,7 +45,8 @@ def campaign(tmp_path: Path) -> Iterator[Campaign]:
 
 def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Path) -> None:
     with Store(campaign.catalog_url, campaign.name) as store:
-        assert scan_archive(campaign, store) == ScanSummary(2, 2, 0, 0, 0, 0)
+        summary = scan_archive(campaign, store)
+        assert (summary.files, summary.added, summary.refused) == (2, 2, 0)
         remote = store.granules()
     in_folder = campaign.model_copy(update={"archive": str(tmp_path / "raw"), "name": "folder"})
     with Store(campaign.catalog_url, "folder") as store:
