@@ -84,5 +84,4 @@ def test_two_hundred_scans(tmp_path):
     assert cycles >= 200
     score = scores(settings, truth, paths)
     assert score.size > 5000
-    # 0.988 with the values that limits of the data share withheld before; normal errors give 0.997.
-    assert (np.abs(score) < 3.0).mean() >= 0.985
+    assert (np.abs(score) < 3.0).mean() >= 0.99
