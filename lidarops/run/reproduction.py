@@ -207,22 +207,23 @@ def _folder(
 ) -> str:
     """Return the nearest folder above the product, or subfolder of one, that holds any input.
 
-    If there is none, the folder or URL of the last run in the catalog, if it may hold an input.
+    If there is none, the folder or URL of the last run in the catalog, if it may hold an input. A
+    folder whose files only bear the names of inputs, with other content, is taken last.
     """
-    names = [record.path for record in records]
-    moved: list[str] = []
-    for paths in (names, moved):
-        folder = _folder_with(recipe.file, paths)
-        if folder is not None:
-            return str(folder)
-        moved += _moved(recipe, records, catalog).values()
+    digests = {record.path: record.sha256 for record in records}
+    moved = {name: digests[old] for old, name in _moved(recipe, records, catalog).items()}
     last = _last_run(recipe, catalog)
     known = "" if last is None else last.archive if option == "--archive" else last.folder
-    if is_url(known) or any((Path(known) / path).is_file() for path in (*names, *moved) if known):
-        return known
+    local = [*_folders_above(recipe.file), *([Path(known)] if known and not is_url(known) else [])]
+    for holds in (_holds_content, _holds_name):
+        for folder in local:
+            if holds(folder, digests) or holds(folder, moved):
+                return str(folder)
+        if is_url(known):
+            return known
     elsewhere = f", nor in {known}, which the last run read" if known else ""
     raise ProductError(
-        f"was made from {names[0]}, which is in no folder above the product{elsewhere}",
+        f"was made from {records[0].path}, which is in no folder above the product{elsewhere}",
         file=recipe.file,
         remedy=f"give its folder with {option}",
     )
@@ -247,13 +248,22 @@ def _catalog_url(recipe: Recipe, catalog: str | None) -> str:
     return catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(recipe.file)
 
 
-def _folder_with(file: Path, paths: Sequence[str]) -> Path | None:
-    """Return the nearest folder above a file, or subfolder of one, that holds any of the paths."""
+def _holds_content(folder: Path, digests: Mapping[str, str]) -> bool:
+    """Return whether any named file has the digest of its name."""
+    return any(
+        (folder / name).is_file() and sha256_of(folder / name) == digest
+        for name, digest in digests.items()
+    )
+
+
+def _holds_name(folder: Path, digests: Mapping[str, str]) -> bool:
+    return any((folder / name).is_file() for name in digests)
+
+
+def _folders_above(file: Path) -> Iterator[Path]:
+    """Yield the folders above a file from the nearest on, each with its subfolders."""
     for parent in file.resolve().parents:
-        for folder in (parent, *_folders_in(parent)):
-            if any((folder / path).is_file() for path in paths):
-                return folder
-    return None
+        yield from (parent, *_folders_in(parent))
 
 
 def _folders_in(parent: Path) -> list[Path]:

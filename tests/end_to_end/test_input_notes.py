@@ -42,6 +42,10 @@ def test_a_product_is_reproduced_where_the_archive_lies_elsewhere(tmp_path: Path
     archive.tree |= {"archive": str(tmp_path / "disk/raw"), "output": str(tmp_path / "results")}
     (tmp_path / "disk").mkdir()
     (archive.folder / "raw").rename(tmp_path / "disk/raw")
+    # A file of another campaign, of the same name, in a folder above the products.
+    raw_archives.write(tmp_path / "campaigns/overlap.csv", b"range [m],overlap\n0,1\n")
+    (tmp_path / "other").mkdir()
+    raw_archives.write(tmp_path / "other/overlap.csv", b"range [m],overlap\n0,1\n")
     campaign = archive.write()
     assert reprocess(campaign) is not None
     products = sorted(campaign.products_root.rglob("*.nc"))
