@@ -12,6 +12,7 @@ import yaml
 from support.archives.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
@@ -85,3 +86,10 @@ def test_two_hundred_scans(tmp_path):
     score = scores(settings, truth, paths)
     assert score.size > 5000
     assert (np.abs(score) < 3.0).mean() >= 0.99
+    # Where smoothing decides more than the data do, the values say so.
+    products = [xr.load_dataset(settings.products_root / path) for path in paths]
+    share = np.concatenate([product["data_share"].values.ravel() for product in products])
+    flags = np.concatenate([product["quality_flag"].values.ravel() for product in products])
+    deviating = np.abs(share - 1.0) > 0.104  # Stored to 8 bits.
+    assert np.count_nonzero(deviating) > 500
+    assert (flags[deviating] & int(MultiAngleQuality.PRIOR_DOMINATED)).all()

@@ -213,6 +213,9 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     flags.interpolated[rows] |= smooth.interpolated
     flags.outlier[rows] |= smooth.downweighted
     flags.prior_dominated[rows] |= smooth.saturated & np.isfinite(smooth.optical_depth)
+    with np.errstate(invalid="ignore"):
+        deviating = np.abs(profiles.data_share - 1.0) > 1.0 - THRESHOLDS.least_share
+    flags.prior_dominated[:] |= deviating
     flags.undersmoothed[rows] |= smooth.undersmoothed[:, np.newaxis]
     flags.high_correlation[rows] |= smooth.high_correlation
     _raise_gradient(profiles, beams, fit, settings, smooth.correlation)

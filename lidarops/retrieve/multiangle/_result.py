@@ -36,8 +36,8 @@ class MultiAngleFlags:
     """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
     explain, as when extinction varies along the horizontal. Extinction is withheld."""
     prior_dominated: Mask
-    """The best fit has the largest smoothness that is allowed; or, with "mld" and "mld_prior", the
-    data share is below 0.9, and extinction is withheld."""
+    """The best fit has the largest smoothness that is allowed; the data share of "joint" is below
+    0.9 or above 1.1; or that of "mld" and "mld_prior" is below 0.9, and extinction is withheld."""
     undersmoothed: Mask
     """More than 10 degrees of freedom and more than 0.4 per altitude: the standard error may be
     too small."""

@@ -67,8 +67,9 @@ class Thresholds:
     least_span: float = 0.1
     """Span of slant paths below which LOW_LEVERAGE is raised: 0 to 25 degrees; assumed."""
     least_share: float = 0.9
-    """Data share below which the prior determines the extinction of "mld" and "mld_prior"; by
-    definition."""
+    """Data share below which the prior determines the extinction of "mld" and "mld_prior", by
+    definition; and the farthest from 1 at which the optical depth of "joint" is not flagged: beyond
+    it, 0.4 percent deviate by more than 4 errors instead of 0.07 (`studies/days_of_scans.py`)."""
 
     # Outlying beams (`_block`, `robust_weights`).
     outlying_residual: float = 4.5
