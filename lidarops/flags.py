@@ -121,8 +121,8 @@ class Quality(FlagBit):
         16,
         Severity.REJECT,
         (
-            "there is no range in which the analog and the photon-counting signal are both linear,"
-            " so they are not glued"
+            "there is no range in which the photon-counting signal is linear in the analog one, so"
+            " they are not glued: one is not linear there, or the lag between them is wrong"
         ),
     )
 

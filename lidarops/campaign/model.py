@@ -94,8 +94,8 @@ class ChannelFacts(SettingsModel):
         None,
         unit="1",
         description="bins by which the analog record lags the photon-counting record of"
-        " the same detector, besides range_offset; or 'estimate', for glued"
-        " channels",
+        " the same detector, besides range_offset; or 'estimate'; for glued channels, of which it"
+        " is estimated by default",
     )
 
 

@@ -567,6 +567,19 @@ SUBTRACTED_BACKGROUND: Final = Row(
 
 GLUING: Final = (
     Row(
+        name="glue_lag",
+        dims=("time",),
+        dtype="f4",
+        units="1",
+        long_name="lag of the analog record behind the photon-counting record in range bins",
+        coverage=Coverage.AUXILIARY,
+        optional=True,
+        uncertain=True,
+        comment="The analog signal is shifted by this lag before gluing. The standard error is"
+        " missing where the lag is not estimated from the noise common to both records, or where"
+        f" their correlation is not significant. {NO_STANDARD_NAME}",
+    ),
+    Row(
         name="glue_slope",
         dims=("time",),
         dtype="f4",

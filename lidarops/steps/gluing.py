@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.retrieve.signal import labeled_gluing
+from lidarops.retrieve.signal.lag import enough_bins, profile_groups
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import LAG_STEP, glued_parts
 from lidarops.steps.conditioning import PROFILES
-from lidarops.steps.data import Data, Profiles
+from lidarops.steps.data import Data
 from lidarops.steps.profiles import GluedProfiles
 from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
 from lidarops.steps.workload import Workload
 
+_Power = npt.NDArray[np.float64]
+
 LAG: Final = Datum[bool]("lag")
 """Whether the lag is to be estimated."""
-_AT_ONCE: Final = 32
-"""Profiles that are conditioned together for an estimate of the lag."""
+_MOST_AT_ONCE: Final = 32
+"""Profiles that are conditioned together for an estimate of the lag (`profile_groups`)."""
 
 
 class LagSettings(SettingsModel):
@@ -42,16 +45,24 @@ class Lag(Step[ChannelCase, LagSettings]):
     outputs = (LAG,)
 
     def decide(self, case: ChannelCase) -> Decisions:
-        """Run where the campaign gives a lag or requests an estimate."""
-        lag = channel_facts(case.facts, glued_parts(case.channel.name)[0]).lag
-        if lag is None:
-            yield Leave("the campaign gives no lag and requests no estimate; headers state 0")
-        elif lag == "estimate":
+        """Run but where the ranges of the campaign state the lag; estimate one that it omits."""
+        analog, photon = (
+            channel_facts(case.facts, part) for part in glued_parts(case.channel.name)
+        )
+        offsets = [part.range_offset or 0.0 for part in (analog, photon)]
+        if isinstance(analog.lag, float):
+            settings = LagSettings(method="given", lag=analog.lag)
+            yield Run("given by the campaign", settings, number=analog.lag)
+        elif not enough_bins(case.channel.bins):
+            yield Leave(f"the {case.channel.bins} bins are too few for an estimate")
+        elif analog.lag == "estimate":
             reason = "the campaign requests an estimate, from noise common to both records"
             yield Run(reason, LagSettings(method="estimate"))
+        elif offsets[0] != offsets[1]:
+            yield Leave("the range offsets that the campaign gives for both channels state the lag")
         else:
-            settings = LagSettings(method="given", lag=lag)
-            yield Run("given by the campaign", settings, number=lag)
+            reason = "the campaign gives none: estimated from noise common to both records"
+            yield Run(reason, LagSettings(method="estimate"))
 
     def carry_out(self, settings: LagSettings, data: Data) -> None:
         """Give whether the lag is to be estimated; a given one has shifted the analog ranges."""
@@ -61,7 +72,7 @@ class Lag(Step[ChannelCase, LagSettings]):
         """Return the bytes of the profiles from which a lag is estimated."""
         if settings.method == "given":
             return 0.0
-        profiles = min(labeled_gluing.LAG_PROFILES, len(work.scene.granules))
+        profiles = min(_MOST_AT_ONCE, len(work.scene.granules))
         return _BYTES_OF_A_LAG_BIN * profiles * work.bins
 
 
@@ -94,25 +105,21 @@ class Glue(Step[ChannelCase, GlueSettings]):
     def carry_out(self, settings: GlueSettings, data: Data) -> None:
         """Give the glued profiles."""
         analog, photon = (data.channels[part] for part in (settings.analog, settings.photon))
-        lag = labeled_gluing.range_lag(analog[PROFILES].range, photon[PROFILES].range)
+        ranges = (part[PROFILES].range for part in (analog, photon))
+        lag = labeled_gluing.ChannelLag(labeled_gluing.range_lag(*ranges))
         if data.get(LAG):
-            powers = (_first_profiles(part) for part in (analog, photon))
-            lag = labeled_gluing.estimate_lag(*powers, known=lag)
+            lag = labeled_gluing.estimate_lag(_groups(analog, photon), known=lag.bins)
         data[PROFILES] = GluedProfiles(analog[PROFILES], photon[PROFILES], lag)
 
 
-def _first_profiles(part: Data) -> npt.NDArray[np.float64]:
-    """Return the power of the first profiles of a scene, (time, range)."""
-    archive, profiles = part[ARCHIVE], part[PROFILES]
-    count = min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])
-    return np.concatenate(
-        [
-            _power(profiles, archive.isel(time=slice(first, min(first + _AT_ONCE, count))))
-            for first in range(0, count, _AT_ONCE)
-        ]
-    )
+def _groups(analog: Data, photon: Data) -> Iterator[tuple[_Power, _Power]]:
+    """Yield the power of the first profiles of a scene in both channels, (time, range)."""
+    count = min(labeled_gluing.LAG_PROFILES, analog[ARCHIVE].sizes["time"])
+    for rows in profile_groups(count):
+        yield _power(analog, rows), _power(photon, rows)
 
 
-def _power(profiles: Profiles, counts: xr.Dataset) -> npt.NDArray[np.float64]:
-    power: npt.NDArray[np.float64] = profiles.of(counts)["power"].to_numpy()
+def _power(part: Data, rows: slice) -> _Power:
+    counts = part[ARCHIVE].isel(time=rows)
+    power: _Power = part[PROFILES].of(counts)["power"].to_numpy()
     return power

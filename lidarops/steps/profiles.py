@@ -101,11 +101,11 @@ class GluedProfiles(Profiles):
     Parameters
     ----------
     analog, photon : Profiles
-    lag : float
-        Bins by which the analog record lags the photon-counting one.
+    lag : ChannelLag
+        Lag of the analog record behind the photon-counting one.
     """
 
-    def __init__(self, analog: Profiles, photon: Profiles, lag: float) -> None:
+    def __init__(self, analog: Profiles, photon: Profiles, lag: labeled_gluing.ChannelLag) -> None:
         self._analog, self._photon, self._lag = analog, photon, lag
 
     @property
@@ -119,7 +119,7 @@ class GluedProfiles(Profiles):
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles, and the variables of the gluing."""
-        return labeled_gluing.glue(self._analog.of(counts), self._photon.of(counts), lag=self._lag)
+        return labeled_gluing.glue(self._analog.of(counts), self._photon.of(counts), self._lag)
 
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""
@@ -133,7 +133,7 @@ class GluedProfiles(Profiles):
 class _GluedAverages(Averages):
     """Means of both parts of a glued channel, which are glued when they are complete."""
 
-    def __init__(self, analog: Averages, photon: Averages, lag: float) -> None:
+    def __init__(self, analog: Averages, photon: Averages, lag: labeled_gluing.ChannelLag) -> None:
         self._analog, self._photon, self._lag = analog, photon, lag
 
     def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
@@ -149,7 +149,7 @@ class _GluedAverages(Averages):
     def completed(self) -> Iterator[xr.Dataset]:
         """Yield the glued means that are complete."""
         for analog, photon in zip(self._analog.completed(), self._photon.completed(), strict=True):
-            glued = labeled_gluing.glue(analog[[*_PARTS]], photon[[*_PARTS]], lag=self._lag)
+            glued = labeled_gluing.glue(analog[[*_PARTS]], photon[[*_PARTS]], self._lag)
             bins = slice(glued.sizes["range"])
             yield photon.isel(range=bins).drop_vars(_PARTS).assign(glued.variables)
 

@@ -66,7 +66,7 @@ ANALOG = with_products(signal={"channels": ["analog_532o"]})
 ELASTIC = with_products(elastic={"channels": ["photon_532o"]})
 TAIL = with_products(elastic={"channels": ["photon_532o"], "background": "tail_mean"})
 GLUED = with_products(elastic={"channels": ["glued_532o"]})
-LATE = {**GLUED, **with_facts(channels={"analog_532o": {"lag": 3}})}
+LATE = {**GLUED, **with_facts(channels={"analog_532o": {"range_offset": -45}})}
 MULTI = with_products(multiangle={"channels": ["photon_532o"]})
 CALM = with_products(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
 FEW = with_products(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
@@ -101,7 +101,7 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
         ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
         ("dark", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
         ("dead_time", ([LEVEL], {}), ([LEVEL], with_facts())),
-        ("lag", ([UP], LATE), ([UP], GLUED)),
+        ("lag", ([UP], GLUED), ([UP], LATE)),
         ("signal", ([LEVEL], ANALOG), ([LEVEL], FEW)),
         ("known_shape", ([UP], ELASTIC), ([UP], TAIL)),
         ("elastic", ([UP], ELASTIC), ([LEVEL], ELASTIC)),

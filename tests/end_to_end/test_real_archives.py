@@ -176,6 +176,9 @@ def test_saopaulo_is_glued_with_the_lag_of_its_noise(saopaulo: RunRecord) -> Non
     product = _open(saopaulo, "signal", "glued_532o")
     slope, error = product["glue_slope"].values, product["glue_slope_standard_error"].values
     assert np.isfinite(slope).all()
+    # Headers and campaign give no lag.
+    assert np.abs(product["glue_lag"].values - 8.6).max() < 0.2
+    assert product["glue_lag_standard_error"].values.max() < 0.2
     # One detector and one recorder: the same slope in all profiles, but for their errors.
     assert np.abs(slope / np.median(slope) - 1.0).max() < 0.1
     assert (np.abs(slope - np.median(slope)) < 8.0 * error).all()

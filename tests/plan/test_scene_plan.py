@@ -382,6 +382,7 @@ class TestGlued:
         steps = _steps(result, "glued_532o")
         assert list(steps) == [
             "read",
+            "lag",
             "glue",
             "molecular",
             "average",
@@ -390,7 +391,7 @@ class TestGlued:
             "elastic",
         ]
         assert steps["glue"] == {"analog": "analog_532o", "photon": "photon_532o"}
-        assert "no lag" in _left_out(result, "glued_532o")["lag"]
+        assert steps["lag"] == {"method": "estimate"}
         assert _steps(result, "photon_532o")["dead_time"] == {"dead_time": 4e-9}
 
     @pytest.mark.parametrize(
@@ -406,10 +407,14 @@ class TestGlued:
         assert _steps(result, "glued_532o")["lag"] == settings
         assert "lag" not in _left_out(result, "glued_532o")
 
+    def test_a_lag_that_range_offsets_state_is_not_estimated(self) -> None:
+        result = self._plan(analog={"range_offset": -45.0})
+        assert "range offsets" in _left_out(result, "glued_532o")["lag"]
+
     def test_a_lag_of_another_channel_is_not_overlooked(self) -> None:
         known_facts = {"channels": {"photon_532o": {"lag": 5}, "analog_532o": {}}}
         result = self._plan(facts=known_facts)
-        assert "lag" not in _steps(result, "glued_532o")
+        assert _steps(result, "glued_532o")["lag"] == {"method": "estimate"}
         assert "analog" in _left_out(result, "photon_532o")["lag"]
 
     def test_facts_of_a_channel_that_the_files_lack_are_not_overlooked(self) -> None:
@@ -439,7 +444,13 @@ class TestGlued:
         result = self._plan(products={"signal": {"channels": "all"}})
         assert not _steps(result, "glued_532o")
         requested = self._plan(products={"signal": {"channels": ["glued_532o"]}})
-        assert list(_steps(requested, "glued_532o")) == ["read", "glue", "background", "signal"]
+        assert list(_steps(requested, "glued_532o")) == [
+            "read",
+            "lag",
+            "glue",
+            "background",
+            "signal",
+        ]
 
     def test_a_glued_channel_has_no_homogeneous_product(self) -> None:
         products = {

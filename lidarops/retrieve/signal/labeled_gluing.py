@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -21,6 +24,7 @@ LAG_PROFILES: Final = 256
 
 _PARTS: Final = ("power", "variance", "quality")
 _LINE: Final = {"glue_slope": "MHz mV-1", "glue_slope_standard_error": "MHz mV-1"}
+_LAG: Final = {"glue_lag": "1", "glue_lag_standard_error": "1"}
 _WINDOW: Final = {"glue_bottom": "m", "glue_top": "m"}
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
@@ -30,27 +34,42 @@ def range_lag(analog_range: Array, photon_range: Array) -> float:
     return float((photon_range[0] - analog_range[0]) / (photon_range[1] - photon_range[0]))
 
 
-def estimate_lag(analog: Array, photon: Array, *, known: float) -> float:
-    """Return the lag of analog behind photon counting in bins, estimated from their noise.
+@dataclass(frozen=True, slots=True)
+class ChannelLag:
+    """Lag of analog behind photon counting."""
+
+    bins: float = 0.0
+    standard_error: float = math.nan
+    """Bins; NaN where the lag is not estimated."""
+
+
+NO_LAG: Final = ChannelLag()
+
+
+def estimate_lag(groups: Iterable[tuple[Array, Array]], *, known: float) -> ChannelLag:
+    """Return the lag of analog behind photon counting, estimated from their noise.
 
     Parameters
     ----------
-    analog, photon : (time, range) float
-        Power of the first `LAG_PROFILES` profiles of a scene.
+    groups : iterable of (analog, photon), (time, range) float
+        Power of the first `LAG_PROFILES` profiles of a scene, in groups
+        (`lidarops.retrieve.signal.lag.profile_groups`).
     known : float
         Bins, where the correlation is not significant
         (`lidarops.retrieve.signal.lag.estimate_lag`).
-
-    Returns
-    -------
-    float
     """
+    estimate = _lag.estimate_lag_of_groups(_same_bins(*group) for group in groups)
+    if not estimate.significant:
+        return ChannelLag(known)
+    return ChannelLag(float(estimate.lag), float(estimate.standard_error))
+
+
+def _same_bins(analog: Array, photon: Array) -> tuple[Array, Array]:
     bins = min(analog.shape[-1], photon.shape[-1])
-    estimate = _lag.estimate_lag(analog[:, :bins], photon[:, :bins])
-    return float(estimate.lag) if estimate.significant else known
+    return analog[:, :bins], photon[:, :bins]
 
 
-def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Dataset:
+def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr.Dataset:
     """Return the glued profiles of two channels that record the same light.
 
     Analog signals are shifted by the lag, the mean of the last tenth of the bins is subtracted
@@ -62,20 +81,20 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
     analog, photon : xr.Dataset
         ``power``, ``variance``, ``quality`` over (time, range), of the same profiles and bins of
         the same width; may be dask-backed.
-    lag : float
-        Lag of analog behind photon counting in bins (`range_lag`, `estimate_lag`).
+    lag : ChannelLag
+        Lag of analog behind photon counting (`range_lag`, `estimate_lag`).
 
     Returns
     -------
     xr.Dataset
         ``power`` (MHz), ``variance`` (MHz2, with the error of the line) and ``quality`` over
-        (time, range); ``glue_slope`` with its standard error, and the ends of the window,
-        ``glue_bottom`` and ``glue_top``, over time. NO_GLUING where there is no line.
+        (time, range); ``glue_lag`` and ``glue_slope`` with their standard errors, and the ends of
+        the window, ``glue_bottom`` and ``glue_top``, over time. NO_GLUING where there is no line.
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
     inputs = [channel[name] for channel in (analog, photon) for name in _PARTS]
-    settings = {"lag": lag, "distance": photon["range"].to_numpy().astype(np.float64)}
+    settings = {"lag": lag.bins, "distance": photon["range"].to_numpy().astype(np.float64)}
     outputs = xr.apply_ufunc(
         _glue,
         *(
@@ -91,7 +110,9 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
     units = dict(zip(_PARTS, ("MHz", "MHz2", None), strict=True)) | _LINE | _WINDOW
     result = xr.Dataset(dict(zip(units, outputs, strict=True)))
     result = result.assign_coords(range=photon["range"])
-    for name, unit in units.items():
+    for name, value in zip(_LAG, (lag.bins, lag.standard_error), strict=True):
+        result[name] = xr.full_like(result["glue_slope"], value)
+    for name, unit in {**units, **_LAG}.items():
         result[name].attrs = {"units": unit} if unit else {}
     return result
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -23,6 +25,11 @@ _PARTS: Final = 16
 """Parts of the range in the jackknife estimate of the standard error."""
 _MARGIN: Final = 2
 """Additional lags on either side, for the neighbours of a peak."""
+_REACH: Final = THRESHOLDS.largest_lag + _MARGIN
+_LAGS: Final = np.arange(-_REACH, _REACH + 1)
+_PROFILES_AT_ONCE: Final = 32
+"""Profiles of a group with a mean of its own, from which noise is taken. In a group of n, a
+profile keeps 1 - 1/n of its noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +58,9 @@ def estimate_lag(
     r"""Return the lag of analog behind photon counting from the correlation of their noise.
 
     Both record the same photoelectrons, so their shot noise is correlated at the lag and nowhere
-    else. The noise of a profile is the profile minus the mean of all profiles, minus its running
-    mean over 17 bins, divided by its standard deviation over 65 bins. A photoelectron at a lag
-    between two bins contributes to both by its distance. With their correlations
+    else. The noise of a profile is the profile minus the mean of up to 32 profiles, minus its
+    running mean over 17 bins, divided by its standard deviation over 65 bins. A photoelectron at a
+    lag between two bins contributes to both by its distance. With their correlations
     :math:`c_k, c_{k+1}`, corrected for the subtracted mean, the lag is
 
     .. math:: L = k + \frac{c_{k+1}}{c_k + c_{k+1}}
@@ -78,20 +85,64 @@ def estimate_lag(
         For shapes that do not match, or fewer than 200 bins between the largest lags.
     """
     first, second = _pair(analog, photon_counting)
-    bins = first.shape[-1]
-    reach = THRESHOLDS.largest_lag + _MARGIN
-    if bins < THRESHOLDS.fewest_lag_bins + 2 * reach:
-        raise RetrievalInputError(
-            f"have {bins} bins for lags up to {THRESHOLDS.largest_lag}",
-            field="analog",
-            remedy="give all bins of the profiles",
-        )
-    lags = np.arange(-reach, reach + 1)
-    sums = _correlate(_noise(first), _noise(second), reach)
-    total = sums.sum(axis=-2)
-    lag, systematic, at_end = _peak(total, lags)
-    scatter = _jackknife(sums, lags)
-    confidence = _confidence(total, lags, lag)
+    return estimate_lag_of_groups(
+        (first[..., profiles, :], second[..., profiles, :])
+        for profiles in profile_groups(first.shape[-2])
+    )
+
+
+def profile_groups(profiles: int) -> list[slice]:
+    """Return groups of about equal size, of at most 32 profiles, from which noise is taken."""
+    groups = max(-(-profiles // _PROFILES_AT_ONCE), 1)
+    edges = np.linspace(0, profiles, groups + 1).astype(int)
+    return [slice(int(first), int(last)) for first, last in itertools.pairwise(edges)]
+
+
+def estimate_lag_of_groups(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
+    """Return the lag of analog behind photon counting from groups of profiles, one after another.
+
+    Parameters
+    ----------
+    groups : iterable of (analog, photon_counting)
+        At least one, as for `estimate_lag`, each of the profiles of one of `profile_groups`.
+
+    Returns
+    -------
+    LagEstimate
+
+    Raises
+    ------
+    RetrievalInputError
+        For fewer than 200 bins between the largest lags.
+    """
+    sums, first_energy, second_energy = (np.zeros(()) for _ in range(3))
+    for first, second in groups:
+        if not enough_bins(first.shape[-1]):
+            raise RetrievalInputError(
+                f"have {first.shape[-1]} bins for lags up to {THRESHOLDS.largest_lag}",
+                field="analog",
+                remedy="give all bins of the profiles",
+            )
+        noise = _noise(first), _noise(second)
+        inner = (..., slice(_REACH, first.shape[-1] - _REACH))
+        sums = sums + _correlate(*noise)
+        first_energy = first_energy + (noise[0][inner] ** 2).sum(axis=(-2, -1))
+        second_energy = second_energy + (noise[1][inner] ** 2).sum(axis=(-2, -1))
+    scale = np.sqrt(first_energy * second_energy)[..., np.newaxis, np.newaxis]
+    return _estimate(sums / np.where(scale > 0, scale, np.inf))
+
+
+def enough_bins(bins: int) -> bool:
+    """Return whether profiles of as many bins allow an estimate of the lag."""
+    return bins >= THRESHOLDS.fewest_lag_bins + 2 * _REACH
+
+
+def _estimate(by_part: Array) -> LagEstimate:
+    """Return the lag from the contributions of each part of the range, (..., part, lag)."""
+    total = by_part.sum(axis=-2)
+    lag, systematic, at_end = _peak(total, _LAGS)
+    scatter = _jackknife(by_part, _LAGS)
+    confidence = _confidence(total, _LAGS, lag)
     undefined = ~np.isfinite(lag)
     return LagEstimate(
         lag=lag,
@@ -99,7 +150,7 @@ def estimate_lag(
         confidence=confidence,
         significant=(confidence >= THRESHOLDS.confidence) & ~undefined & ~at_end,
         correlation=total[..., _MARGIN:-_MARGIN],
-        lags=lags[_MARGIN:-_MARGIN],
+        lags=_LAGS[_MARGIN:-_MARGIN],
     )
 
 
@@ -148,17 +199,14 @@ def _box(values: Array, window: int) -> Array:
     return total
 
 
-def _correlate(first: Array, second: Array, reach: int) -> Array:
-    """Return each part's contribution to the correlation at each lag, (..., part, lag)."""
+def _correlate(first: Array, second: Array) -> Array:
+    """Return the sum of products at each lag in each part of the range, (..., part, lag)."""
     *leading, times, bins = first.shape
     flat = (math.prod(leading), times, bins)
-    edges = np.linspace(reach, bins - reach, _PARTS + 1).astype(np.intp)
-    sums = np.zeros((flat[0], _PARTS, 2 * reach + 1))
-    _add_products(frozen(first.reshape(flat)), frozen(second.reshape(flat)), reach, edges, sums)
-    inner = (..., slice(reach, bins - reach))
-    energy = (first[inner] ** 2).sum(axis=(-2, -1)) * (second[inner] ** 2).sum(axis=(-2, -1))
-    scale = np.sqrt(energy)[..., np.newaxis, np.newaxis]
-    by_part: Array = sums.reshape(*leading, *sums.shape[1:]) / np.where(scale > 0, scale, np.inf)
+    edges = np.linspace(_REACH, bins - _REACH, _PARTS + 1).astype(np.intp)
+    sums = np.zeros((flat[0], _PARTS, _LAGS.size))
+    _add_products(frozen(first.reshape(flat)), frozen(second.reshape(flat)), _REACH, edges, sums)
+    by_part: Array = sums.reshape(*leading, *sums.shape[1:])
     return by_part
 
 

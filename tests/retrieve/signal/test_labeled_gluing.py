@@ -8,6 +8,7 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.signal import labeled_gluing
+from lidarops.retrieve.signal.labeled_gluing import ChannelLag
 
 DIMS = ("time", "range")
 BIN = 7.5
@@ -69,7 +70,7 @@ def recorded(rate, *, profiles=6, lag=0.0, noise=0.02, dark=2.0, seed=0, common=
 @pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 3.4])
 def test_the_truth_is_returned_within_its_errors(lag):
     rate = truth()
-    result = labeled_gluing.glue(*recorded(rate, profiles=60, lag=lag), lag=lag)
+    result = labeled_gluing.glue(*recorded(rate, profiles=60, lag=lag), ChannelLag(lag))
     score = ((result["power"] - rate) / np.sqrt(result["variance"])).to_numpy()
     bottom, top = (float(result[f"glue_{end}"].mean()) for end in ("bottom", "top"))
     near = (distance > 500.0) & (distance < bottom - 300.0)
@@ -90,6 +91,8 @@ def test_the_truth_is_returned_within_its_errors(lag):
         "glue_slope_standard_error": "MHz mV-1",
         "glue_bottom": "m",
         "glue_top": "m",
+        "glue_lag": "1",
+        "glue_lag_standard_error": "1",
     }
 
 
@@ -176,13 +179,13 @@ def test_bits_move_with_the_lag_and_ends_without_source_are_missing():
     analog, photon = recorded(truth(), lag=5.0)
     analog["power"][:, 105] = np.nan
     analog["quality"][:, 105] = int(Quality.INPUT_MISSING)
-    result = labeled_gluing.glue(analog, photon, lag=5.0)
+    result = labeled_gluing.glue(analog, photon, ChannelLag(5.0))
     hit = (result["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
     assert np.flatnonzero(hit).tolist() == [100]
-    between = labeled_gluing.glue(analog, photon, lag=4.5)
+    between = labeled_gluing.glue(analog, photon, ChannelLag(4.5))
     hit = (between["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
     assert np.flatnonzero(hit).tolist() == [100, 101]
-    ahead = labeled_gluing.glue(analog, photon, lag=-3.0)
+    ahead = labeled_gluing.glue(analog, photon, ChannelLag(-3.0))
     hit = (ahead["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
     assert np.flatnonzero(hit).tolist() == [0, 1, 2, 108]
 
@@ -214,9 +217,11 @@ def test_channels_of_unequal_length_are_glued_over_the_shorter():
 @pytest.mark.parametrize("profiles", [1, 4])
 def test_each_profile_is_glued_by_itself(profiles):
     analog, photon = recorded(truth())
-    whole = labeled_gluing.glue(analog, photon, lag=1.5)
+    whole = labeled_gluing.glue(analog, photon, ChannelLag(1.5))
     rows = [slice(first, first + profiles) for first in range(0, whole.sizes["time"], profiles)]
-    parts = [labeled_gluing.glue(analog.isel(time=r), photon.isel(time=r), lag=1.5) for r in rows]
+    parts = [
+        labeled_gluing.glue(analog.isel(time=r), photon.isel(time=r), ChannelLag(1.5)) for r in rows
+    ]
     xr.testing.assert_identical(xr.concat(parts, "time", data_vars="minimal"), whole)
 
 
@@ -228,13 +233,16 @@ class TestLag:
     @pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 2.5])
     def test_estimate_is_the_lag_of_shared_noise(self, lag):
         analog, photon = powers(recorded(truth(), profiles=40, lag=lag, noise=1e-3, common=True))
-        estimate = labeled_gluing.estimate_lag(analog, photon, known=100.0)
-        assert estimate == pytest.approx(lag, abs=0.15)
+        estimate = labeled_gluing.estimate_lag([(analog, photon)], known=100.0)
+        assert estimate.bins == pytest.approx(lag, abs=0.15)
+        assert abs(estimate.bins - lag) < 3.0 * estimate.standard_error < 0.3
 
     @pytest.mark.parametrize("known", [0.0, 3.0])
     def test_estimate_falls_back_on_the_known_lag(self, known):
         analog, photon = powers(recorded(truth(), lag=7.0))
-        assert labeled_gluing.estimate_lag(analog, photon, known=known) == known
+        estimate = labeled_gluing.estimate_lag([(analog, photon)], known=known)
+        assert estimate.bins == known
+        assert np.isnan(estimate.standard_error)
 
     def test_range_lag_is_the_difference_of_the_ranges(self):
         farther = distance - 5.5 * BIN
@@ -246,6 +254,6 @@ class TestLag:
 
     def test_a_wrong_lag_of_a_falling_signal_shows(self):
         analog, photon = recorded(truth(), lag=7.0, profiles=20)
-        right = labeled_gluing.glue(analog, photon, lag=7.0)["glue_slope"]
+        right = labeled_gluing.glue(analog, photon, ChannelLag(7.0))["glue_slope"]
         wrong = labeled_gluing.glue(analog, photon)["glue_slope"]
         assert abs(float(wrong.mean() - right.mean())) > 0.01 * RATIO

@@ -109,6 +109,17 @@ def test_channels_are_independent_of_each_other():
         np.testing.assert_array_equal(both.correlation[k], alone.correlation)
 
 
+def test_groups_one_after_another_give_the_bits_of_all_profiles():
+    analog, photon = recorded(np.random.default_rng(8), 5.3, profiles=70)
+    groups = lag.profile_groups(70)
+    assert [group.stop - group.start for group in groups] == [23, 23, 24]
+    whole = lag.estimate_lag(analog, photon)
+    parts = lag.estimate_lag_of_groups((analog[rows], photon[rows]) for rows in groups)
+    np.testing.assert_array_equal(parts.correlation, whole.correlation)
+    assert parts.lag == whole.lag
+    assert abs(whole.lag - 5.3) < 3.0 * whole.standard_error
+
+
 def test_a_real_station(data_root):
     """Sao Paulo 532 nm: headers say 0."""
     files = sorted((data_root / "saopaulo" / "20170928" / "signals").iterdir())
