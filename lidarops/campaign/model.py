@@ -97,6 +97,15 @@ class ChannelFacts(SettingsModel):
         " the same detector, besides range_offset; or 'estimate'; for glued channels, of which it"
         " is estimated by default",
     )
+    lidar_ratio: float | None = quantity(
+        None,
+        unit="sr",
+        ge=1,
+        le=200,
+        description="of particles, instead of that of elastic; for a glued channel, that of its"
+        " photon-counting channel",
+    )
+    lidar_ratio_standard_error: float | None = quantity(None, unit="sr", ge=0, le=100)
 
 
 class InstrumentFacts(SettingsModel):

@@ -205,6 +205,23 @@ def test_what_the_campaign_gives_replaces_what_is_assumed() -> None:
     assert "biases" in _left_out(result, "photon_532o")["known_shape"]
 
 
+def test_each_channel_may_have_a_lidar_ratio_of_its_own() -> None:
+    of_photon = {"lidar_ratio": 70, "lidar_ratio_standard_error": 5}
+    facts = {"zenith_angle": 0.0, "channels": {"photon_532o": of_photon}}
+    channels = ["photon_532o", "analog_532o", "glued_532o"]
+    result = _elastic(facts=facts, channels=channels, lidar_ratio=28)
+    given = {
+        name: (steps["lidar_ratio"], steps["lidar_ratio_standard_error"])
+        for name in channels
+        if (steps := _steps(result, name)["elastic"])
+    }
+    assert given == {
+        "photon_532o": (70.0, 5.0),
+        "analog_532o": (28.0, 10.0),
+        "glued_532o": (70.0, 5.0),
+    }
+
+
 def test_heights_of_the_reference_become_ranges_along_a_slanted_beam() -> None:
     window = {"lowest": 2000, "highest": 6000, "width": 500}
     steps = _steps(_elastic(facts={"zenith_angle": 60.0}, reference=window), "photon_532o")

@@ -9,6 +9,7 @@ from typing import Final
 
 import xarray as xr
 
+from lidarops.campaign.model import channel_facts
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
@@ -123,6 +124,17 @@ class ReferenceWindow(Step[Case, ReferenceWindowSettings]):
         data[REFERENCE] = labeled.Reference(**dict(settings))
 
 
+def _lidar_ratio(case: Case) -> tuple[float, float]:
+    """Return the lidar ratio and its standard error in sr: facts of the channel, or settings."""
+    facts = channel_facts(case.facts, range_channel(case.channel.name))
+    values = (
+        (facts.lidar_ratio, case.request.lidar_ratio),
+        (facts.lidar_ratio_standard_error, case.request.lidar_ratio_standard_error),
+    )
+    ratio, error = (general if given is None else given for given, general in values)
+    return ratio, error
+
+
 class InversionSettings(SettingsModel):
     """Settings of the step ``elastic``."""
 
@@ -146,18 +158,17 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
 
     def decide(self, case: Case) -> Decisions:
         """Run where a fixed beam reaches aerosol-free air."""
-        settings, limits = case.request, _reference_limits(case)
+        limits = _reference_limits(case)
         if limits.reason:
             yield Leave(limits.reason)
             return
-        yield Run(
-            REQUESTED,
-            InversionSettings(
-                lidar_ratio=settings.lidar_ratio,
-                lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
-                molecular_relative_error=settings.molecular_relative_error,
-            ),
+        ratio, error = _lidar_ratio(case)
+        settings = InversionSettings(
+            lidar_ratio=ratio,
+            lidar_ratio_standard_error=error,
+            molecular_relative_error=case.request.molecular_relative_error,
         )
+        yield Run(REQUESTED, settings)
 
     def stream(self, settings: InversionSettings, data: Data) -> RowProduct:
         """Return the product, whose averages are inverted as they become complete."""
