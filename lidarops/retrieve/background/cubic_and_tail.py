@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -191,7 +192,9 @@ def tail_mean(
     Returns
     -------
     BackgroundResult
-        INPUT_MISSING where no averaged bin is finite, TOO_FEW_BINS where fewer than 8 are.
+        INPUT_MISSING where no averaged bin is finite, TOO_FEW_BINS where fewer than 8 are, or
+        fewer than half. The background is NaN below half: bins that are left out because of their
+        value, as saturated ones are, leave a mean that is too low (`selection_bias`).
 
     Raises
     ------
@@ -215,9 +218,39 @@ def tail_mean(
             error = np.sqrt(scatter.sum(axis=-1) / (bins - 1) / bins)
         else:
             error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / bins
+    few = bins < THRESHOLDS.least_known * values.shape[-1]
     quality = _tail_quality(bins)
-    error[bins < 2 if variance is None else bins < 1] = np.nan
+    quality[few & (bins > 0)] |= np.int32(Quality.TOO_FEW_BINS)
+    mean[few] = np.nan
+    error[few | (bins < 2 if variance is None else bins < 1)] = np.nan
     return BackgroundResult(mean.reshape(leading), error.reshape(leading), quality.reshape(leading))
+
+
+def selection_bias(share: npt.ArrayLike) -> Array:
+    r"""Return the most by which a mean is off where bins were left out because of their value.
+
+    With noise of standard deviation :math:`\sigma`, the mean of the share :math:`q` of lowest
+    values is too low by
+
+    .. math:: \frac{\varphi(z)}{q} \sigma, \qquad \Phi(z) = q,
+
+    with the normal density :math:`\varphi` and distribution :math:`\Phi`. The number of bins does
+    not reduce it.
+
+    Parameters
+    ----------
+    share : (...) float
+        Share of the bins that is left, 0 to 1.
+
+    Returns
+    -------
+    (...) float
+        In standard deviations of a bin; NaN where no bin is left.
+    """
+    left = np.asarray(share, dtype=np.float64)
+    density = np.exp(-0.5 * special.ndtri(left) ** 2) / np.sqrt(2.0 * np.pi)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(density / left)
 
 
 def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:

@@ -24,6 +24,7 @@ from lidarops.retrieve.common import inputs
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
+Counts = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.int32]
 
 
@@ -55,6 +56,10 @@ def from_tail(
 ) -> Background:
     """Return the mean of far bins, and the most signal that it may contain.
 
+    There is no background where fewer than half of the bins are known. Where some are not, they
+    may have been left out because of their value, as saturated ones are: BACKGROUND_UNCERTAIN is
+    raised where this may shift the mean (`selection_bias`) by more than half its standard error.
+
     Parameters
     ----------
     power, variance : (..., range) float
@@ -77,7 +82,16 @@ def from_tail(
     value, error = mean.background, mean.background_standard_error
     left = left_in_tail(power, range, variance, tail, value, error)
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
-    return _judged(value, error, left, np.isnan(left.most), missing)
+    known = np.isfinite(power[..., tail]) & np.isfinite(variance[..., tail])
+    selected = _selected(known.sum(axis=-1), np.asarray(known.shape[-1]))
+    return _judged(value, error, left, np.isnan(left.most) | selected, missing)
+
+
+def _selected(known: Counts, bins: Counts) -> Booleans:
+    """Return where the choice of the known bins may shift their mean beyond its error."""
+    with np.errstate(invalid="ignore"):
+        bias = cubic_and_tail.selection_bias(known / bins)
+    return shifts(bias * np.sqrt(known), np.ones(known.shape))
 
 
 def from_known_shape(
@@ -90,6 +104,9 @@ def from_known_shape(
     mask: Booleans | None = None,
 ) -> Background:
     """Return the background fitted with the shape of clean air; `from_tail` where that fails.
+
+    The fit fails also where fewer than half of the bins that may be fitted, from the start of its
+    window on, are known; BACKGROUND_UNCERTAIN as for `from_tail`.
 
     Parameters
     ----------
@@ -108,6 +125,11 @@ def from_known_shape(
     tail = from_tail(power, range, variance, span)
     fit = known_shape.fit_known_shape(power, range, shape, variance=variance, mask=mask)
     usable = ~fit.singular & np.isfinite(fit.background)
+    fitted = range >= fit.start[..., np.newaxis]
+    fitted = fitted if mask is None else fitted & mask
+    known = (fitted & np.isfinite(power) & np.isfinite(variance)).sum(axis=-1)
+    bins = fitted.sum(axis=-1)
+    usable &= known >= THRESHOLDS.least_known * bins
     value = np.where(usable, fit.background, tail.background)
     error = np.where(usable, fit.background_standard_error, tail.standard_error)
     in_tail = THRESHOLDS.shape_error * np.abs(tail.background - value)
@@ -116,8 +138,9 @@ def from_known_shape(
         np.where(usable, in_tail, tail.left.most),
         np.where(usable, in_tail_error, tail.left.standard_error),
     )
-    unjudged = np.where(usable, fit.poor_fit, tail.unjudged)
-    uncertain = np.where(usable, fit.poor_fit, tail.uncertain)
+    doubtful = fit.poor_fit | _selected(known, bins)
+    unjudged = np.where(usable, doubtful, tail.unjudged)
+    uncertain = np.where(usable, doubtful, tail.uncertain)
     misfit = fit.chi2 / np.maximum(fit.degrees_of_freedom, 1)
     misfit = np.where(usable & np.isfinite(misfit), misfit, 1.0)
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))

@@ -17,6 +17,10 @@ class Thresholds:
     """Share of the bins, the farthest, whose mean is the background by default; usual practice."""
     fewest_bins: int = 8
     """Bins below which a mean, a fit or a test is not trusted; assumed."""
+    least_known: float = 0.5
+    """Least share of the bins of a background that are known. Where saturated bins are left out,
+    the rest is the lower part of the noise, whose mean is phi(z) / share standard deviations of a
+    bin too low (`selection_bias`): 0.8 at a half, within the noise of a bin, and 1.0 at 0.38."""
 
     lag_share: float = 0.4
     """Lag of the cubic over the number of bins: least scatter; benchmark of accuracy."""

@@ -256,7 +256,9 @@ def _signal_and_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _l
 def _subtract_background(
     means: _Means, usable: npt.NDArray[np.bool_], *, known_shape: bool
 ) -> _Signal:
-    raw, noise, r = means.raw, means.noise, means.distance
+    noise, r = means.noise, means.distance
+    # The mean of a bin that was saturated in some profiles is that of the others.
+    raw = np.where((means.quality & np.int32(Quality.SATURATED)) != 0, np.nan, means.raw)
     if not known_shape:
         sky = estimate.from_tail(raw, r, noise)
     else:

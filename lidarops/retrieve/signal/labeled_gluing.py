@@ -135,7 +135,8 @@ def _glue(
         analog, analog_variance = _lag.shift_signal(analog, lag, variance=analog_variance)
         analog_quality = _shifted_quality(analog_quality, lag)
     dark, sky = (
-        cubic_and_tail.tail_mean(power[..., ahead], r).background for power in (analog, photon)
+        cubic_and_tail.tail_mean(_unsaturated(power, quality)[..., ahead], r).background
+        for power, quality in ((analog, analog_quality), (photon, photon_quality))
     )
     glued = gluing.glue(
         (analog - dark[..., np.newaxis])[..., ahead],
@@ -152,6 +153,11 @@ def _glue(
     power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
     line = (glued.slope, glued.slope_standard_error, glued.start, glued.stop)
     return power, variance, quality, *line
+
+
+def _unsaturated(power: _Block, quality: _Block) -> _Block:
+    """Return power without bins that were saturated in some profiles of a mean."""
+    return np.where((quality & np.int32(Quality.SATURATED)) != 0, np.nan, power)
 
 
 def _quality(

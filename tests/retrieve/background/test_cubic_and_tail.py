@@ -18,7 +18,12 @@ from support.oracles.homogeneous import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import _cubic_kernel
-from lidarops.retrieve.background.cubic_and_tail import cubic, default_lag, tail_mean
+from lidarops.retrieve.background.cubic_and_tail import (
+    cubic,
+    default_lag,
+    selection_bias,
+    tail_mean,
+)
 
 LONG = section(2500.0, 8000.0)
 KM = 1e-3
@@ -346,7 +351,9 @@ def test_invalid_arguments_are_refused(arguments, field):
     st.integers(0, 2**32 - 1),
     st.booleans(),
 )
-def test_tail_mean_is_the_mean_of_the_finite_bins(bins, missing, seed, known):
+def test_tail_mean_is_the_mean_of_the_finite_bins_where_these_are_half_or_more(
+    bins, missing, seed, known
+):
     rng = np.random.default_rng(seed)
     r = section(1000.0, 5000.0, bins)
     power = rng.normal(10.0, 2.0, (3, bins))
@@ -361,14 +368,26 @@ def test_tail_mean_is_the_mean_of_the_finite_bins(bins, missing, seed, known):
         strict=True,
     ):
         tail = row[(r >= start) & np.isfinite(row)]
+        minority = 2 * tail.size < np.count_nonzero(r >= start)
         assert bool(quality & Quality.INPUT_MISSING) == (tail.size == 0)
-        assert bool(quality & Quality.TOO_FEW_BINS) == (0 < tail.size < 8)
-        if tail.size > 1:
+        assert bool(quality & Quality.TOO_FEW_BINS) == (
+            tail.size > 0 and (tail.size < 8 or minority)
+        )
+        if minority:
+            assert np.isnan(mean)
+            assert np.isnan(error)
+        elif tail.size > 1:
             assert mean == pytest.approx(tail.mean(), rel=1e-12)
             scatter = 4.0 if known else tail.var(ddof=1)
             assert error == pytest.approx(np.sqrt(scatter / tail.size), rel=1e-9)
-        elif tail.size == 0:
-            assert np.isnan(mean)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.5, 0.9])
+def test_bins_left_out_by_their_value_shift_the_mean_by_the_selection_bias(share):
+    noise = np.sort(np.random.default_rng(3).standard_normal(400_000))
+    kept = noise[: round(share * noise.size)]
+    assert selection_bias(share) == pytest.approx(-kept.mean(), abs=0.01)
+    assert selection_bias(1.0) == 0.0
 
 
 def test_tail_mean_uses_the_last_tenth():

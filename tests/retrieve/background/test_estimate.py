@@ -119,6 +119,22 @@ def test_the_last_tenth_is_the_tail_where_none_is_given():
     np.testing.assert_array_equal(default.background, power[:, 1800:].mean(axis=1))
 
 
+@pytest.mark.parametrize("name", ["tail", "known shape"])
+def test_a_background_of_selected_bins_is_withheld_or_flagged(name):
+    signal = 0.01 * air() / air()[1500]
+    for margin, withheld in ((-0.5, True), (0.5, False), (2.0, False), (6.0, False)):
+        power, variance = noisy(signal, 100)
+        # As a paralysed counter, which leaves out what exceeds a limit.
+        power[power > SKY + margin] = np.nan
+        result = METHODS[name](power, variance)
+        assert np.isnan(result.background).all() == withheld
+        assert flagged(result, Quality.INPUT_MISSING).all() == withheld
+        trusted = ~flagged(result) & np.isfinite(result.background)
+        score = (result.background - SKY) / result.standard_error
+        assert (np.abs(score[trusted]) < 4.0).all()
+        assert trusted.all() == (margin == 6.0)
+
+
 def test_a_shift_matters_from_half_a_standard_error_on():
     share = THRESHOLDS.share_of_error
     shift = np.array([0.99, 1.01, -1.01, np.nan]) * share

@@ -574,3 +574,17 @@ def test_an_outlying_bin_is_bridged_and_flagged():
         np.abs(deviation / bridged["backscatter_standard_error"]).to_numpy()[solved_bins] > 4.0
     )
     assert beyond_four_errors.mean() < 1e-3
+
+
+@pytest.mark.parametrize("known_shape", [True, False])
+def test_a_background_of_bins_that_were_saturated_in_some_profiles_is_withheld(known_shape):
+    far = distance > 4000.0
+    saturated = np.where(far, np.int32(Quality.SATURATED), np.int32(0))
+    # The mean of the profiles in which a bin was not saturated is too low.
+    rate = truth() + SKY - np.where(far, 0.2, 0.0)
+    data = averages(rate, rate / EXPOSURE, quality=saturated[np.newaxis])
+    retrieved = solved(data, known_shape=known_shape)
+    assert np.isnan(retrieved["background"].to_numpy()).all()
+    for name in ("backscatter", "attenuated_backscatter"):
+        assert np.isnan(retrieved[name].to_numpy()).all()
+    assert ((retrieved["quality_flag"].to_numpy() & FLAGS.rejecting) != 0).all()

@@ -257,3 +257,13 @@ class TestLag:
         right = labeled_gluing.glue(analog, photon, ChannelLag(7.0))["glue_slope"]
         wrong = labeled_gluing.glue(analog, photon)["glue_slope"]
         assert abs(float(wrong.mean() - right.mean())) > 0.01 * RATIO
+
+
+def test_a_sky_that_saturates_most_bins_of_the_tail_is_not_glued():
+    analog, photon = recorded(truth())
+    tail = distance > 0.9 * distance[-1]
+    bits = np.where(tail & (np.arange(distance.size) % 3 > 0), np.int32(Quality.SATURATED), 0)
+    photon["quality"] = photon["quality"] | xr.DataArray(bits.astype(np.int32), dims="range")
+    glued = labeled_gluing.glue(analog, photon)
+    assert np.isnan(glued["power"].to_numpy()).all()
+    assert ((glued["quality"].to_numpy() & np.int32(Quality.NO_GLUING)) != 0).all()

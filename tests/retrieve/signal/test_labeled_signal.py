@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import lidarops
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.signal.labeled import condition, correct_for_range
@@ -113,3 +114,24 @@ def test_another_method_is_refused():
     conditioned = condition(archive(), "photon_532o")
     with pytest.raises(RetrievalInputError, match=r"background_method.*tail_mean, cubic"):
         correct_for_range(conditioned, (1e3, 2e3), "median")
+
+
+@pytest.mark.parametrize("channel", ["photon_387o", "photon_532p"])
+def test_a_background_of_the_lowest_bins_of_a_paralysed_counter_is_withheld(data_root, channel):
+    files = sorted((data_root / "pilar" / "20241002").glob("h*"))[:30]
+    data = lidarops.open_archive(files, mask_and_scale=False)
+    conditioned = condition(data, channel).load()
+    span = (0.9 * float(conditioned["range"][-1]), float(conditioned["range"][-1]))
+    result = correct_for_range(conditioned, span)
+    tail = conditioned["quality"].sel(range=slice(*span))
+    saturated = ((tail & np.int32(Quality.SATURATED)) != 0).mean("range").to_numpy()
+    counts, shots = data[channel].to_numpy()[:, -tail.sizes["range"] :], data[f"{channel}_shots"]
+    rate = (counts / (shots.to_numpy()[:, np.newaxis] * 0.05)).mean(axis=1)
+    few = saturated > 0.5
+    # All bins together show more than the few that are left.
+    assert (few & (saturated < 1.0)).sum() > 3
+    assert np.isnan(result["background"].to_numpy()[few]).all()
+    assert has(result, Quality.INPUT_MISSING)[few].all()
+    off = np.abs(result["background"].to_numpy() - rate) / result["background_standard_error"]
+    doubted = has(result, Quality.BACKGROUND_UNCERTAIN).all(axis=-1)
+    assert (off[~few & ~doubted] < 4.0).all()
