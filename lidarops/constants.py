@@ -14,4 +14,4 @@ LICEL_DISCRIMINATOR_STEP: Final = 25.0e-3 / 63.0
 """V per discriminator level of a Licel photon-counting channel (`licel2023`)."""
 
 DEFAULT_DEAD_TIME: Final = 4.0e-9
-"""s. Assumed to flag pile-up where the campaign gives no dead time; never used to correct."""
+"""s. Assumed for noise and flags where the campaign gives no dead time; never used to correct."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.oracles.counter import registered
 
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.counting import count_fast, count_photons, counter_moments
@@ -18,17 +19,6 @@ BIN_TIME = 50e-9
 DEAD_TIME = 4e-9
 
 
-def _registered(arrivals, dead_time, paralyzable):
-    if paralyzable:
-        return arrivals[np.diff(arrivals, prepend=-1.0) >= dead_time]
-    kept, last = [], -1.0
-    for arrival in arrivals.tolist():
-        if arrival - last >= dead_time:
-            kept.append(arrival)
-            last = arrival
-    return np.array(kept)
-
-
 @cache
 def _events(rate, paralyzable, dead_time=DEAD_TIME, windows=300_000):
     """Return photoelectrons and counts in consecutive windows of one bin."""
@@ -36,7 +26,7 @@ def _events(rate, paralyzable, dead_time=DEAD_TIME, windows=300_000):
     span = windows * BIN_TIME
     arrivals = np.sort(random.random(random.poisson(rate * 1e6 * span)) * span)
     edges = np.arange(windows + 1) * BIN_TIME
-    counted = _registered(arrivals, dead_time, paralyzable)
+    counted = registered(arrivals, dead_time, paralyzable)
     return np.histogram(arrivals, edges)[0], np.histogram(counted, edges)[0]
 
 
@@ -129,7 +119,7 @@ def test_a_bright_bin_blinds_the_start_of_the_next(paralyzable):
     sizes = events.poisson(rate * 0.05)
     starts = np.repeat(np.arange(rate.size) * BIN_TIME, sizes)
     arrivals = np.sort(starts + events.random(starts.size) * BIN_TIME)
-    kept = _registered(arrivals, DEAD_TIME, paralyzable)
+    kept = registered(arrivals, DEAD_TIME, paralyzable)
     counted_in_dim = np.histogram(kept, np.arange(rate.size + 1) * BIN_TIME)[0][1::2]
     lost = 1 - counted_in_dim.sum() / sizes[1::2].sum()
     # On their own, the dim bins would lose 2 percent.

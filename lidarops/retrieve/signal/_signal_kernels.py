@@ -395,7 +395,7 @@ class Counter(NamedTuple):
     dead_time: float
     """Microseconds; with 0 nothing is corrected."""
     assumed_dead_time: float
-    """Microseconds; dead time for the flags PILE_UP and SATURATED."""
+    """Microseconds; dead time for the noise and the flags PILE_UP and SATURATED."""
     paralysis: float
     """Measured rate times dead time above which a bin is SATURATED."""
     pile_up: float
@@ -447,15 +447,17 @@ def _photons(counts: npt.NDArray[np.int32], windows: Windows, s: _Sums, out: Arr
 
 @_compiled
 def _photon_variance(
-    exposure: float, dead_time: float, photons: Array, bins: Array, mean: Array, out: Array
+    exposure: float, counter: Counter, photons: Array, bins: Array, mean: Array, out: Array
 ) -> None:
     for i in range(out.size):
         # A window without counts has a rate below that of one count, not exactly zero.
         one_count = 1.0 / (exposure * bins[i])
         measured = photons[i] * one_count
-        rate = mean[i] if dead_time > 0.0 else measured
+        corrected = counter.dead_time > 0.0
+        rate = mean[i] if corrected else measured
         expected = one_count if one_count > rate else rate
-        out[i] = expected / (exposure * (1.0 - measured * dead_time))
+        live = 1.0 - measured * counter.assumed_dead_time
+        out[i] = expected / exposure * (1.0 / live if corrected else live * live)
 
 
 @_compiled
@@ -495,7 +497,7 @@ def photon_profiles(
         if counter.dead_time > 0.0:
             _averages(s.sums, windows, complete, s.mean)
         _photons(counts[k], windows, s.sums, s.local)
-        _photon_variance(exposure[k], counter.dead_time, s.local, bins, s.mean, variance[k])
+        _photon_variance(exposure[k], counter, s.local, bins, s.mean, variance[k])
 
 
 @_compiled

@@ -227,7 +227,8 @@ def photon_signal(
     rate smoothed over +- 10 % of range, so that weights derived from it do not follow the noise
     of the single bin. PILE_UP is raised where the correction exceeds 10 %, SATURATED where
     :math:`m \tau > 0.5`. Without a dead time nothing is corrected: 4 ns are assumed for the
-    flags, and PILE_UP is raised where more than 1 % is left uncorrected.
+    flags and for :math:`\mathrm{var}(m) = m (1 - m\tau)^2 / (N T)`, and PILE_UP is raised where
+    more than 1 % is left uncorrected.
 
     Parameters
     ----------
@@ -239,7 +240,7 @@ def photon_signal(
     bin_width : float
         m.
     dead_time : float, optional
-        s.
+        s; 0 for a counter without.
     full_overlap_range : float
         m; nearer bins are INCOMPLETE_OVERLAP.
 
@@ -256,7 +257,7 @@ def photon_signal(
 
     References
     ----------
-    licel2023
+    licel2023, cox1962
     """
     grid = _grid(range)
     summed = _counts(counts, grid, shots)
@@ -273,7 +274,7 @@ def photon_signal(
         frozen(fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)),
         kernels.Counter(
             dead_time=dead * 1e6,
-            assumed_dead_time=(dead or DEFAULT_DEAD_TIME) * 1e6,
+            assumed_dead_time=(DEFAULT_DEAD_TIME if dead_time is None else dead) * 1e6,
             paralysis=THRESHOLDS.paralysis,
             pile_up=THRESHOLDS.uncorrected_pile_up if dead_time is None else THRESHOLDS.pile_up,
         ),

@@ -79,17 +79,18 @@ def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_rang
     with np.errstate(divide="ignore", invalid="ignore"):
         exposure = fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)
         rate = counts / exposure
-        load = rate * ((dead_time or DEFAULT_DEAD_TIME) * 1e6)
+        assumed = (DEFAULT_DEAD_TIME if dead_time is None else dead_time) * 1e6
+        load = rate * assumed
         correction = load / (1.0 - np.minimum(load, THRESHOLDS.paralysis))
         quality[load > THRESHOLDS.paralysis] |= np.int32(Quality.SATURATED)
         limit = THRESHOLDS.uncorrected_pile_up if dead_time is None else THRESHOLDS.pile_up
         quality[correction > limit] |= np.int32(Quality.PILE_UP)
         rate[(quality & UNUSABLE) != 0] = np.nan
-        live = 1.0 - rate * ((dead_time or 0.0) * 1e6)
-        power = rate / live
+        power = rate / (1.0 - rate * ((dead_time or 0.0) * 1e6))
         floor = 1.0 / (exposure * window_sums(np.isfinite(power).astype(float), range, 0.1))
         expected = np.maximum(smooth(power, range), floor)
-        variance = expected / (exposure * smooth(live, range))
+        live = smooth(1.0 - rate * assumed, range)
+        variance = expected / exposure * (live**2 if dead_time is None else 1.0 / live)
     return Signal(power, variance, quality)
 
 
