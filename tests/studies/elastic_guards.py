@@ -81,6 +81,10 @@ def without_layers() -> Iterator[None]:
         yield
 
 
+def _no_error(window: reference_window.ReferenceWindow) -> Any:
+    return np.zeros_like(window.scale)
+
+
 @contextmanager
 def without_rejection(bit: Rejection) -> Iterator[None]:
     """Skip one test of the reference windows."""
@@ -89,11 +93,11 @@ def without_rejection(bit: Rejection) -> Iterator[None]:
     def fewer_tests(*arguments: Any) -> Any:
         return tests(*arguments) & ~np.int32(bit)
 
-    def any_passing(statistics: Any, rejections: Any) -> Any:
+    def any_passing(statistics: Any, rejections: Any, level_error: Any) -> Any:
         kept = rejections.copy()
-        index = pick(statistics, kept)
+        index, _ = pick(statistics, kept, level_error)
         precision = np.where(rejections == 0, statistics[..., reference_window.SCALE_ERROR], np.inf)
-        return np.where(index >= 0, np.argmin(precision, axis=-1), -1)
+        return np.where(index >= 0, np.argmin(precision, axis=-1), -1), np.zeros(index.size)
 
     changes = [(reference_window, "_rejections", fewer_tests)]
     if bit is Rejection.MORE_PARTICLES:
@@ -119,7 +123,10 @@ GUARDS: Final = (
     ),
     Guard(
         "error by undetected particles",
-        off=partial(replaced, (random_elastic, "_UNDETECTED_PARTICLES", 0.0)),
+        off=partial(
+            replaced,
+            (reference_window.ReferenceWindow, "undetected_particles", property(_no_error)),
+        ),
     ),
     Guard("least denominator", off=threshold(least_denominator=0.0)),
     Guard("least certainty", off=threshold(least_certainty=0.0)),

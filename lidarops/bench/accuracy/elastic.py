@@ -303,7 +303,7 @@ def _inversions(scores: Scores) -> Chapter:
         "Backscatter of particles from 0.5 to 6 km, in percent of its mean there, with the "
         "true lidar ratio. The reference window is given, 7 to 8 km, or chosen from windows of "
         "1 km between 4 and 12 km, some of which hold a tenuous layer of up to 0.4 per Mm and sr. "
-        "Error carried: 1.5 standard errors of the window are stated as error of the reference, "
+        "Error carried: what noise may hide in the window is stated as error of the reference, "
         "for particles hidden by noise. Bins without value are excluded: where few bins are "
         "solved, noise has selected them.",
         [

@@ -275,7 +275,12 @@ def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
 
 
 def choose_window(
-    power: Array, noise: Array, sky: SimulatedSky, exclude: Mask | None = None
+    power: Array,
+    noise: Array,
+    sky: SimulatedSky,
+    exclude: Mask | None = None,
+    *,
+    background_error: npt.ArrayLike = 0.0,
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows chosen from `CANDIDATES`."""
     return reference_window.choose_reference(
@@ -284,6 +289,7 @@ def choose_window(
         noise,
         molecular_attenuated=sky.shape,
         candidates=CANDIDATES,
+        background_standard_error=np.nan_to_num(background_error),
         exclude=exclude,
     )
 
@@ -319,9 +325,8 @@ class Chain:
     """Method of the background."""
     choose: bool = False
     """Whether the reference window is chosen instead of `GIVEN_WINDOW`."""
-    carried: float = 0.0
-    """Standard errors of the mean of a chosen window that are stated as error of the reference,
-    for particles hidden by noise."""
+    carried: bool = False
+    """Whether particles that noise hides in a window are stated as error of the reference."""
 
 
 def chains() -> dict[str, Chain]:
@@ -329,7 +334,7 @@ def chains() -> dict[str, Chain]:
     return {
         "window given": Chain(KNOWN_SHAPE),
         "window chosen": Chain(KNOWN_SHAPE, choose=True),
-        "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=1.5),
+        "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=True),
         "tail_mean, given": Chain(TAIL_MEAN),
     }
 
@@ -351,9 +356,10 @@ def invert(
     edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
     hidden: npt.ArrayLike = 0.0
     if chain.choose:
-        window = choose_window(power, noise, sky, find_clouds(power, noise, sky).mask)
+        clouds = find_clouds(power, noise, sky).mask
+        window = choose_window(power, noise, sky, clouds, background_error=estimates.standard_error)
         edges = window.edges
-        hidden = np.nan_to_num(chain.carried * window.scale_standard_error / window.scale)
+        hidden = np.nan_to_num(window.undetected_particles) if chain.carried else 0.0
     return invert_particles(
         power,
         sky,

@@ -26,8 +26,6 @@ _AIR_ERROR: Final = 0.02
 """Stated relative standard error of the air density."""
 _REFERENCE_ERROR: Final = ReferenceSettings().relative_error
 """Stated relative error of the scattering ratio of the reference window, as in products."""
-_UNDETECTED_PARTICLES: Final = 1.5
-"""Standard errors of the window's mean by which undetected particles may raise it."""
 _CLEAN_FROM: Final = 6000.0
 """m; no particles above."""
 _COMPARED: Final = (500.0, 6000.0)
@@ -171,7 +169,9 @@ def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _
     fit = known_shape.fit_known_shape(counts, r, base.shape, variance=noise)
     power = np.where(base.inverted, counts - fit.background[:, np.newaxis], np.nan)
     clouds = elastic_cases.find_clouds(power, noise, base)
-    window = elastic_cases.choose_window(power, noise, base, clouds.mask)
+    window = elastic_cases.choose_window(
+        power, noise, base, clouds.mask, background_error=fit.background_standard_error
+    )
     solved = _solve(power, noise, base, window.edges, _input_errors(fit, window))
     return _Processed(fit, clouds, window, solved)
 
@@ -180,7 +180,7 @@ def _input_errors(
     fit: known_shape.KnownShapeResult, window: reference_window.ReferenceWindow
 ) -> Array:
     """Return standard errors of the background and relative ones of the reference."""
-    undetected = np.nan_to_num(_UNDETECTED_PARTICLES * window.scale_standard_error / window.scale)
+    undetected = np.nan_to_num(window.undetected_particles)
     background = np.nan_to_num(fit.background_standard_error)
     return np.stack([background, np.hypot(_REFERENCE_ERROR, undetected)])
 

@@ -138,7 +138,7 @@ def invert_elastic(
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
     means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
     signal, clouds = _signal_and_clouds(means, known_shape=known_shape)
-    window = _window(signal.power, distance, means.variance, air, reference, clouds.mask)
+    window = _window(signal, means, reference, clouds.mask)
     solution = _elastic.invert_elastic(
         signal.power,
         distance,
@@ -270,30 +270,24 @@ def _subtract_background(
 
 def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
     """Return the relative error of the scattering ratio: assumed, and by undetected particles."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        undetected = THRESHOLDS.undetected_particles * window.scale_standard_error / window.scale
-    return np.hypot(reference.relative_error, np.nan_to_num(undetected, nan=0.0))
+    return np.hypot(reference.relative_error, np.nan_to_num(window.undetected_particles))
 
 
 def _window(
-    power: Array,
-    distance: Array,
-    variance: Array,
-    air: _Air,
-    reference: Reference,
-    clouds: npt.NDArray[np.bool_],
+    signal: _Signal, means: _Means, reference: Reference, clouds: npt.NDArray[np.bool_]
 ) -> _reference.ReferenceWindow:
-    highest = min(reference.highest, float(distance[-1]))
+    highest = min(reference.highest, float(means.distance[-1]))
     width = min(reference.width, highest - reference.lowest)
     candidates = _reference.candidate_windows(
         reference.lowest, highest, width, reference.width / THRESHOLDS.steps_per_window
     )
     return _reference.choose_reference(
-        power,
-        distance,
-        variance,
-        molecular_attenuated=air.shape,
+        signal.power,
+        means.distance,
+        means.variance,
+        molecular_attenuated=means.air.shape,
         candidates=candidates,
+        background_standard_error=np.nan_to_num(signal.background_standard_error),
         exclude=clouds,
     )
 

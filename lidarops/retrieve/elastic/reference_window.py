@@ -29,7 +29,8 @@ _DEPENDENT: Final = 1e-12
 # Values that `_compare_with_air` writes for each window.
 SCALE, SCALE_ERROR, SLOPE, SLOPE_ERROR = 0, 1, 2, 3
 CURVATURE, SCATTER, COUNT, EXCLUDED_BINS = 4, 5, 6, 7
-FIELDS: Final = 8
+RESPONSE: Final = 8
+FIELDS: Final = 9
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -42,7 +43,7 @@ class Rejection(IntFlag):
     EXCLUDED = 1 << 1
     """A layer or another excluded bin lies in the window."""
     LOW_SIGNAL = 1 << 2
-    """The signal-to-noise ratio of the mean of the window is too low."""
+    """The mean of the window does not exceed zero by enough of its standard errors."""
     SLOPE = 1 << 3
     """The ratio to the air changes linearly along the window."""
     CURVATURE = 1 << 4
@@ -50,7 +51,7 @@ class Rejection(IntFlag):
     SCATTER = 1 << 5
     """The ratio to the air scatters more than its noise explains."""
     MORE_PARTICLES = 1 << 6
-    """Another window that passes all tests has a lower ratio to the air."""
+    """Another window, which may be a noisy one, has a lower ratio to the air."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,9 @@ class ReferenceWindow:
     scale: Array
     """Power over the molecular shape, averaged over the window with inverse variances."""
     scale_standard_error: Array
+    comparison_standard_error: Array
+    """Error of the anchor's scale, and of the background in the difference of both; in the unit of
+    the scale, 0 where the anchor itself is chosen."""
     rejections: Codes
     """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
 
@@ -75,6 +79,15 @@ class ReferenceWindow:
     def edges(self) -> tuple[Array, Array]:
         """Bottom and top in m, the `reference` of `inversion.invert_elastic`."""
         return self.bottom, self.top
+
+    @property
+    def undetected_particles(self) -> Array:
+        """Relative standard error of the scattering ratio by particles that noise hides.
+
+        It is `Thresholds.undetected_particles` standard errors of the comparison with the anchor.
+        """
+        error = np.hypot(self.scale_standard_error, self.comparison_standard_error)
+        return np.asarray(THRESHOLDS.undetected_particles * error / self.scale)
 
 
 def candidate_windows(lowest: float, highest: float, width: float, step: float) -> Array:
@@ -121,6 +134,7 @@ def choose_reference(
     *,
     molecular_attenuated: npt.ArrayLike,
     candidates: npt.ArrayLike,
+    background_standard_error: npt.ArrayLike = 0.0,
     exclude: npt.NDArray[np.bool_] | None = None,
 ) -> ReferenceWindow:
     r"""Return the cleanest window; of equally clean ones, the best determined.
@@ -130,19 +144,23 @@ def choose_reference(
     orthogonal under the noise, so the three tests are independent. A candidate passes where
 
     - at least 8 bins and half of the window hold data, and none is excluded;
-    - :math:`a_0` exceeds `Thresholds.least_signal` of its standard errors;
-    - :math:`a_1` and :math:`a_2` are below k = `Thresholds.most_deviation` of theirs;
+    - :math:`a_0` exceeds k = `Thresholds.most_deviation` of its standard errors;
+    - :math:`a_1` and :math:`a_2` are below k of theirs;
     - chi-square of the power against :math:`\phi a_0` is less than k standard deviations above its
       mean (as Gaussian: :math:`\chi^2/\nu < 1 + k \sqrt{2/\nu}`).
 
-    The anchor is the passing window with the lowest upper bound of :math:`a_0`, at k standard
-    errors. Windows whose :math:`a_0` differs from it by less than k standard errors of the
-    difference count as equally clean. Of these, the one
-    with the smallest standard error of :math:`a_0` is chosen, the nearest one in a tie. That
+    The anchor is the window with the lowest upper bound of :math:`a_0`, at k standard errors, of
+    those that pass all tests but that of :math:`a_0`: a noisy window can show that a less noisy one
+    holds particles. Windows whose :math:`a_0` exceeds that of the anchor by more than k standard
+    errors of the difference are rejected. The rest counts as equally clean. Of these, the passing
+    one with the smallest standard error of :math:`a_0` is chosen, the nearest one in a tie. That
     error follows from the variances and not from the power, so the choice favours no
     fluctuation. The tests favour one slightly, because they keep windows whose noise looks flat.
+    In differences and upper bounds, the error :math:`\sigma_b` of the background is common to all
+    windows: it shifts :math:`a_0` by :math:`g \sigma_b`,
+    :math:`g = \sum(\phi / v) / \sum(\phi^2 / v)`.
     No test of shape detects a thin layer that the noise hides: include it in the error of the
-    reference (`Thresholds.undetected_particles`).
+    reference (`ReferenceWindow.undetected_particles`).
 
     Parameters
     ----------
@@ -157,6 +175,8 @@ def choose_reference(
         `power`.
     candidates : (candidate, 2) float
         m, bottom and top of each window; see `candidate_windows`.
+    background_standard_error : (...) float
+        In the unit of the power.
     exclude : (..., range) bool, optional
         Bins that no window may contain, such as the mask of `layers.find_layers`.
 
@@ -191,8 +211,25 @@ def choose_reference(
         statistics,
     )
     rejections = _rejections(statistics, np.diff(edges)[:, 0])
-    index = _pick(statistics, rejections)
-    return _result(statistics, rejections, index, windows, leading)
+    level_error = np.broadcast_to(
+        inputs.real_array(background_standard_error, "background_standard_error"), leading
+    ).reshape(-1, 1)
+    index, comparison_error = _pick(statistics, rejections, level_error.astype(np.float64))
+    chosen = index >= 0
+    profile = np.arange(index.size)
+
+    def of_chosen(values: Array) -> Array:
+        return np.where(chosen, values, np.nan).reshape(leading)
+
+    return ReferenceWindow(
+        chosen=chosen.reshape(leading),
+        bottom=of_chosen(windows[index, 0]),
+        top=of_chosen(windows[index, 1]),
+        scale=of_chosen(statistics[profile, index, SCALE]),
+        scale_standard_error=of_chosen(statistics[profile, index, SCALE_ERROR]),
+        comparison_standard_error=of_chosen(comparison_error),
+        rejections=rejections.reshape(*leading, windows.shape[0]),
+    )
 
 
 def _edges(
@@ -240,7 +277,7 @@ def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
     passes = {
         Rejection.TOO_FEW_BINS: count >= fewest,
         Rejection.EXCLUDED: ~(f[EXCLUDED_BINS] > 0.0),
-        Rejection.LOW_SIGNAL: f[SCALE] >= THRESHOLDS.least_signal * f[SCALE_ERROR],
+        Rejection.LOW_SIGNAL: f[SCALE] > most * f[SCALE_ERROR],
         Rejection.SLOPE: np.abs(f[SLOPE]) <= most * f[SLOPE_ERROR],
         Rejection.CURVATURE: np.abs(f[CURVATURE]) <= most,
         Rejection.SCATTER: f[SCATTER] <= 1.0 + most * np.sqrt(2.0 / freedom),
@@ -254,43 +291,38 @@ def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
     return rejections
 
 
-def _pick(statistics: Array, rejections: Codes) -> npt.NDArray[np.int64]:
-    """Return the index of the chosen window or -1; mark those with more particles as rejected."""
+def _pick(
+    statistics: Array, rejections: Codes, level_error: Array
+) -> tuple[npt.NDArray[np.int64], Array]:
+    """Return the index of the chosen window or -1, and the error of its comparison with the anchor.
+
+    Windows with more particles than the anchor are marked as rejected.
+
+    Parameters
+    ----------
+    statistics : (profile, window, `FIELDS`) float
+    rejections : (profile, window) int
+    level_error : (profile, 1) float
+        Standard error of the background.
+    """
     scale, error = statistics[..., SCALE], statistics[..., SCALE_ERROR]
+    by_level = level_error * statistics[..., RESPONSE]
     most = THRESHOLDS.most_deviation
-    passed = rejections == 0
-    upper = np.where(passed, scale + most * error, np.inf)
+    comparable = (rejections & ~np.int32(Rejection.LOW_SIGNAL)) == 0
+    upper = np.where(comparable, scale + most * np.hypot(error, by_level), np.inf)
     anchor = np.argmin(upper, axis=-1)[:, np.newaxis]
-    lowest = np.take_along_axis(scale, anchor, axis=-1)
-    lowest_error = np.take_along_axis(error, anchor, axis=-1)
-    has_more_particles = passed & (scale - lowest > most * np.hypot(error, lowest_error))
-    rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
-    precision = np.where(rejections == 0, error, np.inf)
-    best = np.argmin(precision, axis=-1)
-    return np.where(np.any(passed, axis=-1), best, -1).astype(np.int64)
-
-
-def _result(
-    statistics: Array,
-    rejections: Codes,
-    index: npt.NDArray[np.int64],
-    windows: Array,
-    leading: tuple[int, ...],
-) -> ReferenceWindow:
-    chosen = index >= 0
-    rows = np.arange(index.size)
-
-    def chosen_value(field: int) -> Array:
-        return np.where(chosen, statistics[rows, index, field], np.nan).reshape(leading)
-
-    return ReferenceWindow(
-        chosen=chosen.reshape(leading),
-        bottom=np.where(chosen, windows[index, 0], np.nan).reshape(leading),
-        top=np.where(chosen, windows[index, 1], np.nan).reshape(leading),
-        scale=chosen_value(SCALE),
-        scale_standard_error=chosen_value(SCALE_ERROR),
-        rejections=rejections.reshape(*leading, windows.shape[0]),
+    lowest, lowest_error, lowest_by_level = (
+        np.take_along_axis(values, anchor, axis=-1) for values in (scale, error, by_level)
     )
+    comparison_error = np.hypot(lowest_error, by_level - lowest_by_level)
+    np.put_along_axis(comparison_error, anchor, 0.0, axis=-1)
+    most_above = most * np.hypot(error, comparison_error)
+    has_more_particles = comparable & (scale - lowest > most_above)
+    rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
+    passed = rejections == 0
+    best = np.argmin(np.where(passed, error, np.inf), axis=-1)
+    index = np.where(np.any(passed, axis=-1), best, -1).astype(np.int64)
+    return index, comparison_error[np.arange(index.size), index]
 
 
 @_compiled
@@ -305,7 +337,7 @@ def _fit(
     """Fit the molecular shape times polynomials in range that are orthogonal under the noise."""
     middle = 0.5 * (range_[0] + range_[-1])
     half = max(0.5 * (range_[-1] - range_[0]), _SHORTEST)
-    s0 = s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
+    s0 = s1 = s2 = s3 = s4 = y0 = y1 = y2 = level = 0.0
     count, out[EXCLUDED_BINS] = 0, 0.0
     for i in range(range_.size):
         if excluded[i]:
@@ -317,6 +349,7 @@ def _fit(
         w = f * f / variance[i]
         y = f * power[i] / variance[i]
         count += 1
+        level += f / variance[i]
         s0 += w
         s1 += w * t
         s2 += w * t * t
@@ -331,7 +364,7 @@ def _fit(
     # 1, t - a and t^2 - b (t - a) - c are orthogonal.
     scale, a, c = y0 / s0, s1 / s0, s2 / s0
     norm1 = s2 - a * s1
-    out[SCALE], out[SCALE_ERROR] = scale, 1.0 / math.sqrt(s0)
+    out[SCALE], out[SCALE_ERROR], out[RESPONSE] = scale, 1.0 / math.sqrt(s0), level / s0
     residual = 0.0
     for i in range(range_.size):
         if not excluded[i] and _usable(power[i], variance[i]):
@@ -371,7 +404,8 @@ def _compare_with_air(
     out : (profile, window, `FIELDS`) float64
         Output, NaN before: scale of the shape with its error, slope of the logarithm of the
         ratio to the shape in m-1 with its error, curvature over its error, chi-square over the
-        degrees of freedom, number of bins, number of excluded bins.
+        degrees of freedom, number of bins, number of excluded bins, change of the scale per change
+        of the background.
     """
     for k in range(power.shape[0]):
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]

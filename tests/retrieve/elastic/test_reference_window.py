@@ -163,6 +163,21 @@ def test_cleaner_air_is_preferred_to_a_uniform_layer():
     assert np.all(rejections != 0)
 
 
+def test_a_noisy_window_shows_particles_in_less_noisy_ones():
+    # Twice the backscatter of air up to 6 km; beyond, a window has only 8 times its noise.
+    particles = np.where(RANGE < 6e3, BACKSCATTER, 0.0)
+    signal = attenuated(particles, lidar_ratio=8.4)
+    spread = np.where(RANGE < 6e3, 0.02, 1.0) * SHAPE
+    rng = np.random.default_rng(8)
+    power = signal + spread * rng.standard_normal((200, RANGE.size))
+    window = choose_reference(power, RANGE, spread**2, **CLEAN)
+    assert np.mean(window.bottom >= 6e3) > 0.99
+    # A background that may be too low by as much as the far signal explains the difference.
+    unknown = mean_over(signal, (6e3, 7e3))
+    same = choose_reference(power, RANGE, spread**2, **CLEAN, background_standard_error=unknown)
+    assert np.mean(same.bottom <= 5e3) > 0.9
+
+
 def test_profiles_are_independent_and_their_windows_fit_the_inversion():
     rng = np.random.default_rng(7)
     true = attenuated(layered(20, rng))
