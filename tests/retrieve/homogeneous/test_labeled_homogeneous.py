@@ -228,13 +228,16 @@ def test_real_vertical_profiles_are_flagged(data_root):
 
 def test_chunks_do_not_change_a_bit_of_signals(data_root):
     files = sorted((data_root / "pilar" / "20241002").iterdir())[:5]
-    for channel in ("analog_532p", "photon_387o"):
+    # The far range of this counter is not paralysed.
+    for channel, settings in (("analog_532p", {}), ("photon_53200o", {"dead_time": 2e-9})):
         results = []
         for chunk in (1, 2, 5):
             archive = lidarops.open_archive(
                 files, mask_and_scale=False, profiles_per_chunk=chunk, header_position="ignore"
             )
-            conditioned = labeled_signal.condition(archive, channel, full_overlap_range=500.0)
+            conditioned = labeled_signal.condition(
+                archive, channel, full_overlap_range=500.0, **settings
+            )
             far = (27_000.0, 30_000.0)
             results.append(labeled_signal.correct_for_range(conditioned, far).load())
         for other in results[1:]:
