@@ -15,3 +15,5 @@ LICEL_DISCRIMINATOR_STEP: Final = 25.0e-3 / 63.0
 
 DEFAULT_DEAD_TIME: Final = 4.0e-9
 """s. Assumed for noise and flags where the campaign gives no dead time; never used to correct."""
+DEAD_TIME_UNCERTAINTY: Final = 0.2
+"""Relative standard error of a dead time whose campaign gives none."""

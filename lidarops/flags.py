@@ -73,7 +73,10 @@ class Quality(FlagBit):
     SATURATED = (
         1,
         Severity.REJECT,
-        "the digitiser is at full scale in at least some shots, or the photon counter is paralysed",
+        (
+            "the digitiser is at full scale in at least some shots, or the photon counter is"
+            " paralysed, or its dead time is not known well enough for its rate"
+        ),
     )
     PILE_UP = (
         2,

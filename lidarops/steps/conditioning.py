@@ -10,6 +10,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.constants import DEAD_TIME_UNCERTAINTY
 from lidarops.records import DetectionMode, Granule, Role
 from lidarops.retrieve.signal import labeled
 from lidarops.retrieve.signal.dark import DarkSignals
@@ -34,6 +35,8 @@ RANGE_OFFSET: Final = Datum[float]("range_offset")
 DARK: Final = Datum[DarkSignals]("dark")
 DEAD_TIME: Final = Datum[float]("dead_time")
 """s."""
+DEAD_TIME_ERROR: Final = Datum[float]("dead_time_uncertainty")
+"""Relative standard error of the dead time."""
 RELATIVE_VARIANCE: Final = Datum[bool]("relative_variance")
 """Whether the variance is estimated from the profile, and so scatters."""
 PROFILES: Final = Datum[Profiles]("profiles")
@@ -198,6 +201,8 @@ class DeadTimeSettings(SettingsModel):
 
     dead_time: float
     """s."""
+    dead_time_uncertainty: float
+    """Relative standard error."""
 
 
 class DeadTime(Step[ChannelCase, DeadTimeSettings]):
@@ -205,7 +210,7 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
 
     name = "dead_time"
     settings = DeadTimeSettings
-    outputs = (DEAD_TIME,)
+    outputs = (DEAD_TIME, DEAD_TIME_ERROR)
 
     def decide(self, case: ChannelCase) -> Decisions:
         """Run for photon counting with a known dead time."""
@@ -215,12 +220,17 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
         elif dead_time is None:
             yield Leave("the campaign gives no dead_time; pile-up is flagged for an assumed 4 ns")
         else:
-            settings = DeadTimeSettings(dead_time=dead_time)
-            yield Run("given by the campaign", settings, number=dead_time)
+            reason, error = "given by the campaign", case.facts_of_channel.dead_time_uncertainty
+            if error is None:
+                reason += f"; its uncertainty is not, and {DEAD_TIME_UNCERTAINTY:.0%} is assumed"
+                error = DEAD_TIME_UNCERTAINTY
+            settings = DeadTimeSettings(dead_time=dead_time, dead_time_uncertainty=error)
+            yield Run(reason, settings, number=dead_time)
 
     def carry_out(self, settings: DeadTimeSettings, data: Data) -> None:
-        """Give the dead time."""
+        """Give the dead time, and its relative standard error."""
         data[DEAD_TIME] = settings.dead_time
+        data[DEAD_TIME_ERROR] = settings.dead_time_uncertainty
 
 
 class NoiseSettings(SettingsModel):
@@ -236,7 +246,7 @@ class Noise(Step[ChannelCase, NoiseSettings]):
 
     name = "noise"
     settings = NoiseSettings
-    inputs = (ARCHIVE, FULL_OVERLAP_RANGE, RANGE_OFFSET, DARK, DEAD_TIME)
+    inputs = (ARCHIVE, FULL_OVERLAP_RANGE, RANGE_OFFSET, DARK, DEAD_TIME, DEAD_TIME_ERROR)
     outputs = (PROFILES, RELATIVE_VARIANCE)
 
     def decide(self, case: ChannelCase) -> Decisions:
@@ -256,12 +266,16 @@ class Noise(Step[ChannelCase, NoiseSettings]):
 
     def carry_out(self, settings: NoiseSettings, data: Data) -> None:
         """Give the profiles of the channel."""
+        uncertainty = data.get(DEAD_TIME_ERROR)
         data[RELATIVE_VARIANCE] = settings.method == "differences"
         data[PROFILES] = FileProfiles(
             data[ARCHIVE],
             data.channel,
             {
                 "dead_time": data.get(DEAD_TIME),
+                "dead_time_uncertainty": DEAD_TIME_UNCERTAINTY
+                if uncertainty is None
+                else uncertainty,
                 "noise_variance": settings.noise_variance,
                 "dark": data.get(DARK),
                 "range_offset": data.get(RANGE_OFFSET) or 0.0,

@@ -21,6 +21,7 @@ class Conditioning(TypedDict):
     """Arguments of `lidarops.retrieve.signal.labeled.condition`."""
 
     dead_time: float | None
+    dead_time_uncertainty: float
     noise_variance: float | None
     dark: DarkSignals | None
     range_offset: float

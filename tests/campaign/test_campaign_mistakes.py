@@ -63,6 +63,11 @@ def _message(folder: Path, text: str) -> str:
                 " number from 1e-10 to 2e-07 s, not 3.0e-6"
             ),
         ),
+        (
+            "dead_time: 4.0e-9",
+            "dead_time: 4.0e-9, dead_time_uncertainty: 20",
+            "photon_532o.dead_time_uncertainty: must be a number from 0 to 1 (no unit), not 20",
+        ),
         # In ps, km and mm.
         ("dead_time: 4.0e-9", "dead_time: 4.0e-12", "from 1e-10 to 2e-07 s, not 4.0e-12"),
         ("[[750, 4500]]", "[[0.75, 4.5]]", "must be 0, or at least 10 m, not 0.75 m: is it in km?"),

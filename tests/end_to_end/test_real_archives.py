@@ -200,7 +200,7 @@ def test_saopaulo_has_aerosol_in_its_mixed_layer(saopaulo: RunRecord) -> None:
     assert (low < 2e-5).all()
     budget = [
         product[f"backscatter_error_{cause}"]
-        for cause in ("noise", "background", "reference", "lidar_ratio", "molecular")
+        for cause in ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
     ]
     total = np.sqrt(sum(part**2 for part in budget))
     stated = product["backscatter_standard_error"]

@@ -43,7 +43,10 @@ def test_photon_channel() -> None:
         "look",
         "homogeneous",
     ]
-    assert steps["dead_time"] == {"dead_time": 4e-9}
+    assert steps["dead_time"] == {
+        "dead_time": 4e-9,
+        "dead_time_uncertainty": 0.2,
+    }
     assert steps["homogeneous"]["sections"] == [[750.0, 4500.0]]
     assert "photon-counting background" in _left_out(result, "photon_532o")["dark"]
 
@@ -409,7 +412,10 @@ class TestGlued:
         ]
         assert steps["glue"] == {"analog": "analog_532o", "photon": "photon_532o"}
         assert steps["lag"] == {"method": "estimate"}
-        assert _steps(result, "photon_532o")["dead_time"] == {"dead_time": 4e-9}
+        assert _steps(result, "photon_532o")["dead_time"] == {
+            "dead_time": 4e-9,
+            "dead_time_uncertainty": 0.2,
+        }
 
     @pytest.mark.parametrize(
         ("lag", "settings"),

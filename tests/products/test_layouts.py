@@ -72,7 +72,7 @@ def test_every_unit_is_valid_and_no_placeholder_is_left(kind: str, row: Row, mod
         Unit(found["units"].split(" since ")[0])
 
 
-_CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular")
+_CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
 
 
 def test_variables_without_standard_name():
@@ -90,6 +90,7 @@ def test_variables_without_standard_name():
         "signal": {
             "signal",
             "signal_standard_error",
+            "signal_dead_time_error",
             "background",
             "background_standard_error",
             *gluing,

@@ -32,6 +32,7 @@ _CAUSES: Final = {
     "reference": "reference",
     "lidar_ratio": "lidar ratio",
     "molecular": "molecules",
+    "dead_time": "dead time",
 }
 _UNIT: Final = "Mm⁻¹ sr⁻¹"
 _MEGA: Final = 1e6

@@ -53,6 +53,11 @@ _BUDGET: Final = {
         ErrorKind.SYSTEMATIC,
         "Systematic: from the molecular atmosphere.",
     ),
+    "dead_time": (
+        "the dead time",
+        ErrorKind.SYSTEMATIC,
+        "Systematic: from the dead time of photon counting; 0 for analog signals.",
+    ),
 }
 """Source of error -> its name in texts, its kind and a comment, in the order of
 `lidarops.retrieve.elastic.inversion.ErrorBudget`."""
@@ -79,11 +84,12 @@ _BUDGET_TERMS: Final = tuple(f"backscatter_error_{source}" for source in _BUDGET
 _MEANS: Final = ErrorBudget(
     random=("backscatter_error_noise", "backscatter_error_background"),
     comment="Errors from noise and background are independent between profiles. Errors from"
-    " reference, lidar ratio and molecules are assumed to be shared by all profiles, so that they"
-    " are averaged and do not decrease with the number of profiles.",
+    " reference, lidar ratio, molecules and dead time are assumed to be shared by all profiles, so"
+    " that they are averaged and do not decrease with the number of profiles.",
 )
 _SHARED: Final = tuple(
-    f"backscatter_error_{source}" for source in ("reference", "lidar_ratio", "molecular")
+    f"backscatter_error_{source}"
+    for source in ("reference", "lidar_ratio", "molecular", "dead_time")
 )
 
 LAYOUT: Final = Layout(

@@ -43,13 +43,21 @@ class ErrorBudget:
     """Error by the lidar ratio."""
     molecular: Array
     """Error by the density of the air."""
+    dead_time: Array
+    """Error by the dead time of photon counting."""
 
     @property
     def total(self) -> Array:
         """Standard error by all causes, which are independent; NaN where one is unknown."""
-        errors = (self.noise, self.background, self.reference, self.lidar_ratio, self.molecular)
         variance = np.zeros_like(self.noise)
-        for error in errors:
+        for error in (
+            self.noise,
+            self.background,
+            self.reference,
+            self.lidar_ratio,
+            self.molecular,
+            self.dead_time,
+        ):
             variance += error * error
         return np.asarray(np.sqrt(variance))
 
@@ -102,6 +110,7 @@ class ElasticResult:
             ratio * budget.reference,
             ratio * budget.lidar_ratio + self.lidar_ratio_standard_error * self.backscatter,
             ratio * budget.molecular,
+            ratio * budget.dead_time,
         )
 
     @property
@@ -119,6 +128,7 @@ class ElasticResult:
             inverse * budget.reference,
             inverse * budget.lidar_ratio,
             inverse * (budget.molecular - self.molecular_relative_error * self.backscatter),
+            inverse * budget.dead_time,
         )
 
     def _inverse_molecular(self) -> Array:
@@ -139,6 +149,7 @@ def invert_elastic(
     lidar_ratio_standard_error: npt.ArrayLike = 0.0,
     reference_relative_error: npt.ArrayLike = 0.0,
     molecular_relative_error: npt.ArrayLike = 0.0,
+    dead_time_error: npt.ArrayLike = 0.0,
 ) -> ElasticResult:
     r"""Return particle backscatter and extinction of elastic profiles, without iteration.
 
@@ -186,6 +197,9 @@ def invert_elastic(
         signal reveals.
     molecular_relative_error : float or (..., range) float
         Relative standard error of the air density; one error of this shape, common to all bins.
+    dead_time_error : float or (..., range) float
+        In the unit of `power`: its change with one standard error of the dead time, common to all
+        bins; broadcast against `power`. The inversion is repeated with it.
 
     Returns
     -------
@@ -220,23 +234,44 @@ def invert_elastic(
         noise = inputs.variance_rows(variance, grid, leading)
     ratio_error = _errors(lidar_ratio_standard_error, "lidar_ratio_standard_error", grid, leading)
     air_error = _errors(molecular_relative_error, "molecular_relative_error", grid, leading)
-    out = np.empty((_fernald.FIELDS, *rows.shape))
-    scalars = np.empty((len(rows), _fernald.SCALARS))
-    state = np.empty(rows.shape, dtype=np.uint8)
-    _fernald.invert_fernald(
-        frozen(rows.astype(np.float64, copy=False)),
-        frozen(noise),
-        frozen(_window(reference, grid, leading)),
-        frozen(grid.values),
-        (frozen(air[0]), frozen(air[1]), frozen(air[2])),
-        frozen(ratio),
-        (frozen(ratio_error), frozen(air_error)),
-        frozen(_causes((background_standard_error, reference_relative_error), leading)),
-        _limits(),
-        out,
-        scalars,
-        state,
-    )
+    window = _window(reference, grid, leading)
+    causes = _causes((background_standard_error, reference_relative_error), leading)
+
+    def solved(power_rows: Array) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
+        out = np.empty((_fernald.FIELDS, *rows.shape))
+        scalars = np.empty((len(rows), _fernald.SCALARS))
+        state = np.empty(rows.shape, dtype=np.uint8)
+        _fernald.invert_fernald(
+            frozen(power_rows),
+            frozen(noise),
+            frozen(window),
+            frozen(grid.values),
+            (frozen(air[0]), frozen(air[1]), frozen(air[2])),
+            frozen(ratio),
+            (frozen(ratio_error), frozen(air_error)),
+            frozen(causes),
+            _limits(),
+            out,
+            scalars,
+            state,
+        )
+        return out, scalars, state
+
+    rows = rows.astype(np.float64, copy=False)
+    out, scalars, state = solved(rows)
+    dead_time = np.zeros((2, *rows.shape))
+    if np.any(dead_time_error):
+        change = inputs.noise_rows(dead_time_error, "dead_time_error", grid, leading)
+        both = [_fernald.BACKSCATTER, _fernald.ATTENUATED]
+        moved, moved_scalars, _ = solved(rows + change)
+        dead_time = moved[both] - out[both]
+        # Where the changed signal has no solution, the value itself is uncertain.
+        dead_time = np.where(np.isfinite(dead_time), dead_time, out[both])
+        out[_fernald.ATTENUATED_ERROR] = np.hypot(out[_fernald.ATTENUATED_ERROR], dead_time[1])
+        scalars[:, _fernald.CONSTANT_ERROR] = np.hypot(
+            scalars[:, _fernald.CONSTANT_ERROR],
+            moved_scalars[:, _fernald.CONSTANT] - scalars[:, _fernald.CONSTANT],
+        )
     if variance is None:
         out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
         scalars[:, _fernald.CONSTANT_ERROR] = np.nan
@@ -249,7 +284,9 @@ def invert_elastic(
     fields = [profiles(rows) for rows in out]
     return ElasticResult(
         backscatter=fields[_fernald.BACKSCATTER],
-        budget=ErrorBudget(*fields[_fernald.NOISE : _fernald.MOLECULAR + 1]),
+        budget=ErrorBudget(
+            *(*fields[_fernald.NOISE : _fernald.MOLECULAR + 1], profiles(dead_time[0]))
+        ),
         attenuated_backscatter=fields[_fernald.ATTENUATED],
         attenuated_backscatter_standard_error=fields[_fernald.ATTENUATED_ERROR],
         lidar_constant=scalars[:, _fernald.CONSTANT].reshape(leading),

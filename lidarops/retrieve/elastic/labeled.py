@@ -22,6 +22,7 @@ from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic import reference_window as _reference
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.labeled import dead_time_error
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -99,7 +100,8 @@ def invert_elastic(
     averages : xr.Dataset
         ``power``, ``variance``, ``quality`` over (time, range) and ``shots``, ``profiles`` over
         time, with the scalar coordinate ``zenith_angle`` (degree), from
-        `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory.
+        `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. For the error of the
+        dead time, see `lidarops.retrieve.signal.labeled.dead_time_error`.
     molecules : MolecularProfile
     wavelength : float
         m.
@@ -152,6 +154,7 @@ def invert_elastic(
         lidar_ratio_standard_error=lidar_ratio_standard_error,
         reference_relative_error=_reference_error(window, reference),
         molecular_relative_error=molecular_relative_error,
+        dead_time_error=_dead_time_error(averages, means, signal),
     )
     quality = means.quality
     quality |= _solution_flags(solution, window, signal, quality)
@@ -268,6 +271,16 @@ def _subtract_background(
     return _Signal(means.minus(sky.background), sky.background, error, sky.uncertain)
 
 
+def _dead_time_error(averages: xr.Dataset, means: _Means, signal: _Signal) -> Array:
+    """Return the change of the signal with one standard error of the dead time."""
+    bridged = averages.assign(power=averages["power"].copy(data=means.raw))
+    change = dead_time_error(bridged, xr.DataArray(signal.background, dims="time"))
+    if change is None:
+        return np.zeros(1)
+    array = change.transpose("time", "range").to_numpy() / means.overlap
+    return np.nan_to_num(array, posinf=0.0, neginf=0.0)
+
+
 def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
     """Return the relative error of the scattering ratio: assumed, and by undetected particles."""
     return np.hypot(reference.relative_error, np.nan_to_num(window.undetected_particles))
@@ -336,7 +349,14 @@ def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
         "backscatter_standard_error": budget.total,
         **{
             f"backscatter_error_{cause}": getattr(budget, cause)
-            for cause in ("noise", "background", "reference", "lidar_ratio", "molecular")
+            for cause in (
+                "noise",
+                "background",
+                "reference",
+                "lidar_ratio",
+                "molecular",
+                "dead_time",
+            )
         },
         "extinction": solution.extinction,
         "extinction_standard_error": solution.extinction_budget.total,

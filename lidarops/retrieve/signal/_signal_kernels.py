@@ -400,6 +400,10 @@ class Counter(NamedTuple):
     """Measured rate times dead time above which a bin is SATURATED."""
     pile_up: float
     """Relative correction above which a bin has PILE_UP."""
+    largest_load: float
+    """Mean measured rate times dead time above which a bin is SATURATED."""
+    undecided: float
+    """Standard deviations about `largest_load` within which the mean decides."""
 
 
 @_compiled
@@ -461,6 +465,29 @@ def _photon_variance(
 
 
 @_compiled
+def _reject_overloaded(
+    counts: npt.NDArray[np.int32],
+    exposure: float,
+    counter: Counter,
+    photons: Array,
+    bins: Array,
+    power: Array,
+    quality: Flags,
+) -> None:
+    """Mark bins of too large a load, by the mean of the window where noise would decide."""
+    load_of_count = counter.assumed_dead_time / exposure
+    limit = counter.largest_load
+    for i in range(counts.size):
+        load = counts[i] * load_of_count
+        mean = photons[i] / bins[i] * load_of_count
+        margin = counter.undecided * math.sqrt(max(load * load_of_count, 0.0)) * (1.0 - load)
+        overloaded = (load > limit + margin) | ((mean > limit) & (load > limit - margin))
+        if overloaded & ((quality[i] & _MISSING) == 0):
+            power[i] = math.nan
+            quality[i] |= _SATURATED
+
+
+@_compiled
 def photon_profiles(
     counts: npt.NDArray[np.int32],
     shots: Array,
@@ -498,6 +525,8 @@ def photon_profiles(
             _averages(s.sums, windows, complete, s.mean)
         _photons(counts[k], windows, s.sums, s.local)
         _photon_variance(exposure[k], counter, s.local, bins, s.mean, variance[k])
+        if not missing:
+            _reject_overloaded(counts[k], exposure[k], counter, s.local, bins, power[k], quality[k])
 
 
 @_compiled

@@ -17,7 +17,11 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.constants import DEFAULT_DEAD_TIME, LICEL_RANGE_PER_MICROSECOND
+from lidarops.constants import (
+    DEAD_TIME_UNCERTAINTY,
+    DEFAULT_DEAD_TIME,
+    LICEL_RANGE_PER_MICROSECOND,
+)
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
@@ -214,6 +218,7 @@ def photon_signal(
     *,
     bin_width: float,
     dead_time: float | None = None,
+    dead_time_uncertainty: float = DEAD_TIME_UNCERTAINTY,
     full_overlap_range: float = 0.0,
 ) -> Signal:
     r"""Return the count rate, corrected for dead time, and its noise variance of photon counts.
@@ -225,10 +230,15 @@ def photon_signal(
 
     (renewal statistics: :math:`\mathrm{var}(n) = n (1 - m\tau)^2`). The variance is that of the
     rate smoothed over +- 10 % of range, so that weights derived from it do not follow the noise
-    of the single bin. PILE_UP is raised where the correction exceeds 10 %, SATURATED where
-    :math:`m \tau > 0.5`. Without a dead time nothing is corrected: 4 ns are assumed for the
-    flags and for :math:`\mathrm{var}(m) = m (1 - m\tau)^2 / (N T)`, and PILE_UP is raised where
-    more than 1 % is left uncorrected.
+    of the single bin. PILE_UP is raised where the correction exceeds 10 %. Without a dead time
+    nothing is corrected: 4 ns are assumed for the flags and for
+    :math:`\mathrm{var}(m) = m (1 - m\tau)^2 / (N T)`, and PILE_UP is raised where more than 1 % is
+    left uncorrected.
+
+    An error of the dead time changes all rates together, by
+    :math:`\delta r = r^2 \delta\tau` (`dead_time_standard_error`); it is not part of the variance.
+    SATURATED is raised where it exceeds 8 % of the rate, and where :math:`m \tau > 0.5`. Within 5
+    standard deviations of the limit, the smoothed rate decides.
 
     Parameters
     ----------
@@ -241,6 +251,9 @@ def photon_signal(
         m.
     dead_time : float, optional
         s; 0 for a counter without.
+    dead_time_uncertainty : float
+        Relative standard error of the dead time; without a dead time, the whole correction is
+        the error.
     full_overlap_range : float
         m; nearer bins are INCOMPLETE_OVERLAP.
 
@@ -253,7 +266,7 @@ def photon_signal(
     ------
     RetrievalInputError
         For counts that are not 32-bit integers, shapes that do not match, a range that is not
-        finite or repeats a bin, an invalid bin width or dead time.
+        finite or repeats a bin, an invalid bin width, dead time or uncertainty.
 
     References
     ----------
@@ -266,6 +279,7 @@ def photon_signal(
     _require(0.0 < bin_width < np.inf, bin_width, "bin_width", "a positive width in m")
     dead = 0.0 if dead_time is None else dead_time
     _require(0.0 <= dead < np.inf, dead, "dead_time", "a time in s")
+    relative = _relative_error(dead_time, dead_time_uncertainty)
     power, variance = np.empty(summed.shape), np.empty(summed.shape)
     quality = np.empty(summed.shape, np.int32)
     kernels.photon_profiles(
@@ -277,6 +291,10 @@ def photon_signal(
             assumed_dead_time=(DEFAULT_DEAD_TIME if dead_time is None else dead) * 1e6,
             paralysis=THRESHOLDS.paralysis,
             pile_up=THRESHOLDS.uncorrected_pile_up if dead_time is None else THRESHOLDS.pile_up,
+            # The error relative to the rate is the relative one of the dead time times x / (1 - x).
+            largest_load=THRESHOLDS.largest_dead_time_error
+            / (THRESHOLDS.largest_dead_time_error + relative),
+            undecided=THRESHOLDS.undecided,
         ),
         _overlap_bits(grid, full_overlap_range),
         _windows(grid, THRESHOLDS.noise_window),
@@ -286,6 +304,30 @@ def photon_signal(
         _rows(quality),
     )
     return Signal(power, variance, quality)
+
+
+def dead_time_standard_error(
+    dead_time: float | None, uncertainty: float = DEAD_TIME_UNCERTAINTY
+) -> float:
+    r"""Return the standard error of the dead time of a photon counter, s.
+
+    It changes a corrected rate by :math:`\delta r = r^2 \delta\tau`, in all bins and profiles
+    together. Without a dead time, by which nothing is corrected, it is the assumed one of 4 ns.
+
+    Parameters
+    ----------
+    dead_time : float, optional
+        s.
+    uncertainty : float
+        Relative standard error of the dead time.
+    """
+    assumed = DEFAULT_DEAD_TIME if dead_time is None else dead_time
+    return assumed * _relative_error(dead_time, uncertainty)
+
+
+def _relative_error(dead_time: float | None, uncertainty: float) -> float:
+    _require(0.0 <= uncertainty <= 1.0, uncertainty, "dead_time_uncertainty", "a share from 0 to 1")
+    return 1.0 if dead_time is None else uncertainty
 
 
 def _require(valid: bool, value: float, name: str, expected: str) -> None:  # noqa: FBT001

@@ -29,6 +29,8 @@ class GluedSignal:
     """(..., range), MHz2, noise variance."""
     systematic_variance: Array
     """(..., range), MHz2, by the error of the line: common to all bins of a profile."""
+    change: Array
+    """(..., range), MHz: change of `power` with that of photon counting, and of the line by it."""
     slope: Array
     """(...), MHz mV-1."""
     slope_standard_error: Array
@@ -60,6 +62,7 @@ def glue(
     analog_variance: npt.ArrayLike,
     photon_variance: npt.ArrayLike,
     photon_background: npt.ArrayLike = 0.0,
+    photon_change: npt.ArrayLike = 0.0,
 ) -> GluedSignal:
     r"""Return analog signals scaled to photon counting by a line, joined with photon counting.
 
@@ -86,6 +89,9 @@ def glue(
         mV2, MHz2, noise variances; broadcast. They must not follow the noise of the single bin.
     photon_background : (...) float
         MHz, the background that was subtracted from photon counting.
+    photon_change : (..., range) float
+        MHz, a change of photon counting by an error that all bins share, such as that of the dead
+        time; broadcast.
 
     Returns
     -------
@@ -112,10 +118,32 @@ def glue(
     sky = inputs.profile_values(photon_background, "photon_background", leading)
     highest = THRESHOLDS.count_rates[1] - (np.zeros(1) if sky is None else sky)
     first, past = _search(x, y, xv, np.broadcast_to(highest, len(x)))
-    lines = np.full((len(x), _line_fit.COLUMNS), np.nan)
-    _line_fit.fit_lines(x, y, xv, yv, first, past, lines)
     near = np.arange(grid.size) < ((first + past) // 2)[:, np.newaxis]
-    return _result(lines, (first, past), _joined(x, y, xv, yv, lines, near), leading, grid)
+
+    def fitted(photons: Array) -> Array:
+        lines = np.full((len(x), _line_fit.COLUMNS), np.nan)
+        _line_fit.fit_lines(x, photons, xv, yv, first, past, lines)
+        return lines
+
+    lines = fitted(y)
+    change = np.zeros((len(x), 1))
+    if np.any(photon_change):
+        moved = frozen(y + inputs.noise_rows(photon_change, "photon_change", grid, leading))
+        change = _joined_power(x, moved, fitted(moved), near)
+        change -= _joined_power(x, y, lines, near)
+    change = np.broadcast_to(change, y.shape)
+    joined = _joined(x, y, xv, yv, lines, near)
+    return _result(lines, (first, past), (*joined, change), leading, grid)
+
+
+def _joined_power(x: Array, y: Array, lines: Array, near: Booleans) -> Array:
+    """Return the signal of `_joined`."""
+    column = np.where(lines[:, _line_fit.SLOPE, np.newaxis] > 0.0, lines, np.nan).T[..., np.newaxis]
+    slope = column[_line_fit.SLOPE]
+    with np.errstate(invalid="ignore", over="ignore"):
+        power = np.where(near, slope * x + column[_line_fit.INTERCEPT], y)
+        valid = (np.abs(power) < _line_fit.HUGE) & (slope > 0.0)
+    return np.where(valid, power, np.nan)
 
 
 def _joined(
@@ -128,11 +156,10 @@ def _joined(
         lever = x - column[_line_fit.CENTRE]
         of_line = column[_line_fit.SLOPE_VARIANCE] * lever * lever
         of_line = of_line + column[_line_fit.CENTRE_VARIANCE]
-        power = np.where(near, slope * x + column[_line_fit.INTERCEPT], y)
-        valid = (np.abs(power) < _line_fit.HUGE) & (slope > 0.0)
         variance, systematic = np.where(near, slope * slope * xv, yv), np.where(near, of_line, 0.0)
-    joined = (np.where(valid, values, np.nan) for values in (power, variance, systematic))
-    return tuple(joined)  # type: ignore[return-value]
+    power = _joined_power(x, y, lines, near)
+    variance[np.isnan(power)] = systematic[np.isnan(power)] = np.nan
+    return power, variance, systematic
 
 
 def _rows(
@@ -187,7 +214,7 @@ def _smooth(values: Array) -> Array:
 def _result(
     lines: Array,
     window: tuple[Indices, Indices],
-    joined: tuple[Array, Array, Array],
+    joined: tuple[Array, Array, Array, Array],
     leading: tuple[int, ...],
     grid: inputs.RangeGrid,
 ) -> GluedSignal:
@@ -207,13 +234,14 @@ def _result(
     )
     with np.errstate(invalid="ignore"):
         poor_fit = (chi2 > largest) | ~(slope >= THRESHOLDS.least_slope * slope_error)
-    power, variance, systematic = (
+    power, variance, systematic, change = (
         grid.turn(values.reshape(*leading, grid.size)) for values in joined
     )
     return GluedSignal(
         power=power,
         variance=variance,
         systematic_variance=systematic,
+        change=change,
         slope=slope.reshape(leading),
         slope_standard_error=slope_error.reshape(leading),
         intercept=lines[:, _line_fit.INTERCEPT].reshape(leading),

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from lidarops.constants import DEAD_TIME_UNCERTAINTY
 from lidarops.records import DetectionMode
 from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
 from lidarops.retrieve.common import inputs
@@ -21,6 +22,9 @@ from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.dark import DarkSignals
 
 _Block = npt.NDArray[Any]
+
+DEAD_TIME_ERROR: Final = "dead_time_standard_error"
+"""Attribute of the power of photon counting, s."""
 
 _SIGNAL_NAMES = ("power", "variance", "quality")
 _CORRECTED: Final = {
@@ -52,6 +56,7 @@ def condition(
     channel: str,
     *,
     dead_time: float | None = None,
+    dead_time_uncertainty: float = DEAD_TIME_UNCERTAINTY,
     noise_variance: float | None = None,
     dark: DarkSignals | None = None,
     range_offset: float = 0.0,
@@ -67,6 +72,8 @@ def condition(
         Name of the channel.
     dead_time : float, optional
         s; photon counting only, corrected here.
+    dead_time_uncertainty : float
+        Relative standard error of the dead time; photon counting only.
     noise_variance : float, optional
         mV^2; analog only.
     dark : DarkSignals, optional
@@ -80,7 +87,8 @@ def condition(
     -------
     xr.Dataset
         ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), as lazy as the
-        input.
+        input. The attribute ``dead_time_standard_error`` (s) of the power of photon counting is
+        the input of `dead_time_error`.
     """
     counts = _with_range(archive[channel], range_offset)
     unit = channel_unit(archive, channel)
@@ -90,7 +98,11 @@ def condition(
     }
     arguments = [counts, archive[f"{channel}_shots"]]
     if unit == "MHz":
-        settings |= {"bin_width": counts.attrs["bin_width"], "dead_time": dead_time}
+        settings |= {
+            "bin_width": counts.attrs["bin_width"],
+            "dead_time": dead_time,
+            "dead_time_uncertainty": dead_time_uncertainty,
+        }
     else:
         settings |= {"adc_bits": counts.attrs["adc_bits"], "noise_variance": noise_variance}
         arguments.append(archive[f"{channel}_input_range"])
@@ -110,9 +122,47 @@ def condition(
     variables = {name: array.variable for name, array in zip(_SIGNAL_NAMES, arrays, strict=True)}
     result = xr.Dataset(variables, coords=arrays[0].coords)
     result["power"].attrs = {"units": unit}
+    if unit == "MHz":
+        result["power"].attrs[DEAD_TIME_ERROR] = counts_to_signal.dead_time_standard_error(
+            dead_time, dead_time_uncertainty
+        )
     result["variance"].attrs = {"units": f"{unit}2"}
     result["range"].attrs = counts["range"].attrs
     return result
+
+
+def dead_time_error(profiles: xr.Dataset, background: xr.DataArray) -> xr.DataArray | None:
+    r"""Return the change of signals without background with one standard error of the dead time.
+
+    Power :math:`P` and background :math:`P^*` of photon counting change together, by
+    :math:`(P^2 - P^{*2}) \sigma_\tau`. All bins and profiles share this error.
+
+    Parameters
+    ----------
+    profiles : xr.Dataset
+        From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
+    background : xr.DataArray, (...)
+        MHz.
+
+    Returns
+    -------
+    xr.DataArray or None
+        MHz, over the dimensions of the power; None for analog signals.
+    """
+    power = profiles["power"]
+    if DEAD_TIME_ERROR not in power.attrs:
+        return None
+    per_square = power.attrs[DEAD_TIME_ERROR] * 1e6
+    of_background = background**2 * per_square
+    error: xr.DataArray
+    if "dead_time_error" in profiles:
+        error = profiles["dead_time_error"] - of_background
+        return error
+    # In place, because these are the largest arrays of a chunk.
+    error = power**2
+    error *= per_square
+    error -= of_background
+    return error
 
 
 def _with_range(counts: xr.DataArray, offset: float) -> xr.DataArray:
@@ -147,7 +197,10 @@ def correct_for_range(
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
         over (time, range), ``background`` and ``background_standard_error`` over time; the
-        attribute ``steps`` states the method of the background.
+        attribute ``steps`` states the method of the background. For photon counting,
+        ``signal_dead_time_error`` over (time, range), the change of the signal with one standard
+        error of the dead time (`dead_time_error`), which is not part of
+        ``signal_standard_error``.
         INPUT_MISSING without a background, or NO_REAL_SOLUTION where the cubic has no admissible
         root. BACKGROUND_UNCERTAIN where the background may contain signal.
 
@@ -171,7 +224,12 @@ def correct_for_range(
         output_dtypes=list(_CORRECTED.values()),
     )
     words = background_words(method, background_range)
-    return xr.Dataset(dict(zip(_CORRECTED, arrays, strict=True)), attrs={"steps": words})
+    result = xr.Dataset(dict(zip(_CORRECTED, arrays, strict=True)), attrs={"steps": words})
+    error = dead_time_error(conditioned, result["background"])
+    if error is None:
+        return result
+    error *= conditioned["range"].astype(np.float64) ** 2
+    return result.assign(signal_dead_time_error=error.astype(np.float32))
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:

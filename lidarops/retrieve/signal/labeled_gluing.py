@@ -15,6 +15,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
+from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 
 Array = npt.NDArray[np.float64]
 _Block = npt.NDArray[Any]
@@ -88,13 +89,20 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
     -------
     xr.Dataset
         ``power`` (MHz), ``variance`` (MHz2, with the error of the line) and ``quality`` over
-        (time, range); ``glue_lag`` and ``glue_slope`` with their standard errors, and the ends of
-        the window, ``glue_bottom`` and ``glue_top``, over time. NO_GLUING where there is no line.
+        (time, range); ``dead_time_error`` (MHz), the change of the power with one standard error
+        of the dead time, where the power of photon counting states that; ``glue_lag`` and
+        ``glue_slope`` with their standard errors, and the ends of the window, ``glue_bottom`` and
+        ``glue_top``, over time. NO_GLUING where there is no line.
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
     inputs = [channel[name] for channel in (analog, photon) for name in _PARTS]
-    settings = {"lag": lag.bins, "distance": photon["range"].to_numpy().astype(np.float64)}
+    dead_time_error = photon["power"].attrs.get(DEAD_TIME_ERROR)
+    settings = {
+        "lag": lag.bins,
+        "distance": photon["range"].to_numpy().astype(np.float64),
+        "dead_time_error": (dead_time_error or 0.0) * 1e6,
+    }
     outputs = xr.apply_ufunc(
         _glue,
         *(
@@ -102,18 +110,22 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
             for array in inputs
         ),
         input_core_dims=[["range"]] * 6,
-        output_core_dims=[["range"]] * 3 + [[]] * 4,
+        output_core_dims=[["range"]] * 4 + [[]] * 4,
         kwargs=settings,
         dask="parallelized",
-        output_dtypes=[np.float64, np.float64, np.int32, *[np.float64] * 4],
+        output_dtypes=[np.float64, np.float64, np.int32, *[np.float64] * 5],
     )
-    units = dict(zip(_PARTS, ("MHz", "MHz2", None), strict=True)) | _LINE | _WINDOW
+    units = {"power": "MHz", "variance": "MHz2", "quality": None, "dead_time_error": "MHz"}
+    units |= _LINE | _WINDOW
     result = xr.Dataset(dict(zip(units, outputs, strict=True)))
     result = result.assign_coords(range=photon["range"])
     for name, value in zip(_LAG, (lag.bins, lag.standard_error), strict=True):
         result[name] = xr.full_like(result["glue_slope"], value)
     for name, unit in {**units, **_LAG}.items():
         result[name].attrs = {"units": unit} if unit else {}
+    if dead_time_error is None:
+        return result.drop_vars("dead_time_error")
+    result["power"].attrs[DEAD_TIME_ERROR] = dead_time_error
     return result
 
 
@@ -127,6 +139,7 @@ def _glue(
     *,
     lag: float,
     distance: npt.NDArray[np.float64],
+    dead_time_error: float,
 ) -> tuple[_Block, ...]:
     # Bins at negative ranges hold no light and are not glued.
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
@@ -138,6 +151,10 @@ def _glue(
         cubic_and_tail.tail_mean(_unsaturated(power, quality)[..., ahead], r).background
         for power, quality in ((analog, analog_quality), (photon, photon_quality))
     )
+    sky_change = sky**2 * dead_time_error
+    change = photon**2
+    change *= dead_time_error
+    change -= sky_change[..., np.newaxis]
     glued = gluing.glue(
         (analog - dark[..., np.newaxis])[..., ahead],
         (photon - sky[..., np.newaxis])[..., ahead],
@@ -145,14 +162,16 @@ def _glue(
         analog_variance=np.nan_to_num(analog_variance[..., ahead]),
         photon_variance=np.nan_to_num(photon_variance[..., ahead]),
         photon_background=np.nan_to_num(sky),
+        photon_change=np.nan_to_num(change, copy=False)[..., ahead],
     )
-    power, variance = (np.full(photon.shape, np.nan) for _ in range(2))
+    power, variance, change = (np.full(photon.shape, np.nan) for _ in range(3))
+    change[..., ahead] = glued.change + sky_change[..., np.newaxis]
     power[..., ahead] = glued.power + sky[..., np.newaxis]
     variance[..., ahead] = glued.variance + glued.systematic_variance
     quality = _quality(glued, analog_quality, photon_quality, distance)
     power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
     line = (glued.slope, glued.slope_standard_error, glued.start, glued.stop)
-    return power, variance, quality, *line
+    return power, variance, quality, change, *line
 
 
 def _unsaturated(power: _Block, quality: _Block) -> _Block:

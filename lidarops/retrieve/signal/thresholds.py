@@ -17,6 +17,13 @@ class Thresholds:
     """Relative dead-time correction above which PILE_UP is raised. Assumed."""
     uncorrected_pile_up: float = 0.01
     """The same where the dead time is unknown, so that nothing is corrected. Assumed."""
+    largest_dead_time_error: float = 0.08
+    """Relative error of a rate by one standard error of the dead time above which it is rejected.
+    With 20 %, the rate of a paralyzable counter deviates by 1.5 of these errors here, by 2.4 at
+    0.10, and beyond 0.117 it has none: m tau stays below 1 / e. Computed."""
+    undecided: float = 5.0
+    """Standard deviations of a bin about a limit within which the mean of its neighbours decides:
+    a choice by the noise of the bin would bias every mean of those that are left."""
 
     # Analog
     near_full_scale: float = 0.5

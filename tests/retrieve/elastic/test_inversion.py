@@ -267,6 +267,24 @@ def test_each_cause_propagates_as_finite_differences(setup, name):
         )
 
 
+def test_the_error_of_the_dead_time_is_the_effect_of_its_change_of_power(setup):
+    change = 0.01 * COARSE_POWER**2 / COARSE_POWER[0]
+    stated, still = changed(setup | {"dead_time_error": change}), changed(setup)
+    moved = changed(setup, COARSE_POWER + change)
+    for field in ("backscatter", "extinction", "scattering_ratio"):
+        budget = "budget" if field == "backscatter" else f"{field}_budget"
+        np.testing.assert_allclose(
+            getattr(stated, budget).dead_time,
+            getattr(moved, field) - getattr(still, field),
+            rtol=1e-9,
+            atol=1e-12 * np.nanmax(getattr(still, field)),
+        )
+    shift = moved.lidar_constant - still.lidar_constant
+    expected = np.hypot(still.lidar_constant_standard_error, shift)
+    assert stated.lidar_constant_standard_error == pytest.approx(float(expected), rel=1e-9)
+    assert (stated.budget.total >= still.budget.total).all()
+
+
 def test_errors_of_the_lidar_constant_add_up_to_those_of_its_causes(setup):
     result = changed(setup | ERRORS)
     alone = changed(setup).lidar_constant_standard_error
@@ -307,6 +325,7 @@ def test_total_is_the_quadrature_of_the_budget_and_unknown_noise_stays_unknown()
         budget.reference,
         budget.lidar_ratio,
         budget.molecular,
+        budget.dead_time,
     ]
     np.testing.assert_allclose(budget.total, np.sqrt(np.sum(np.square(errors), axis=0)), rtol=1e-14)
     np.testing.assert_array_equal(result.backscatter_standard_error, budget.total)

@@ -206,7 +206,7 @@ def test_derived_quantities_follow_from_the_backscatter():
         1.0 + retrieved["backscatter"] / retrieved["molecular_backscatter"],
         rtol=1e-12,
     )
-    causes = ("noise", "background", "reference", "lidar_ratio", "molecular")
+    causes = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
     squares = sum(retrieved[f"backscatter_error_{cause}"] ** 2 for cause in causes)
     np.testing.assert_allclose(
         retrieved["backscatter_standard_error"], np.sqrt(squares), rtol=1e-12
@@ -216,6 +216,9 @@ def test_derived_quantities_follow_from_the_backscatter():
 def test_each_error_of_the_budget_is_the_effect_of_its_cause():
     """One cause off by one standard error moves the backscatter by the stated error."""
     signal, inside = noiseless(truth()), between(300.0, 2000.0)
+    # One standard error of the dead time, 0.1 ns, changes a rate by its square times that.
+    signal["power"].attrs["dead_time_standard_error"] = 1e-10
+    longer = signal.assign(power=signal["power"] + 1e-4 * signal["power"] ** 2)
     stated = solved(
         signal,
         lidar_ratio_standard_error=1.0,
@@ -227,6 +230,7 @@ def test_each_error_of_the_budget_is_the_effect_of_its_cause():
         "lidar_ratio": solved(signal, lidar_ratio=LIDAR_RATIO + 1.0),
         "molecular": solved(signal, molecules=denser),
         "reference": solved(signal, reference=Reference(5000.0, 11_000.0, 1000.0, 1.01, 0.0)),
+        "dead_time": solved(longer),
     }
     for cause, other in changed.items():
         moved = (other["backscatter"] - stated["backscatter"]).to_numpy()[0, inside]

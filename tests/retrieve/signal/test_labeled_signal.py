@@ -120,13 +120,15 @@ def test_another_method_is_refused():
 def test_a_background_of_the_lowest_bins_of_a_paralysed_counter_is_withheld(data_root, channel):
     files = sorted((data_root / "pilar" / "20241002").glob("h*"))[:30]
     data = lidarops.open_archive(files, mask_and_scale=False)
-    conditioned = condition(data, channel).load()
+    settings = {"dead_time": 4e-9, "dead_time_uncertainty": 0.0}
+    conditioned = condition(data, channel, **settings).load()
     span = (0.9 * float(conditioned["range"][-1]), float(conditioned["range"][-1]))
     result = correct_for_range(conditioned, span)
     tail = conditioned["quality"].sel(range=slice(*span))
     saturated = ((tail & np.int32(Quality.SATURATED)) != 0).mean("range").to_numpy()
     counts, shots = data[channel].to_numpy()[:, -tail.sizes["range"] :], data[f"{channel}_shots"]
-    rate = (counts / (shots.to_numpy()[:, np.newaxis] * 0.05)).mean(axis=1)
+    measured = counts / (shots.to_numpy()[:, np.newaxis] * 0.05)
+    rate = (measured / (1.0 - measured * 4e-3)).mean(axis=1)
     few = saturated > 0.5
     # All bins together show more than the few that are left.
     assert (few & (saturated < 1.0)).sum() > 3

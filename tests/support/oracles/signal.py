@@ -72,7 +72,16 @@ def rounded(variance, step, shots):
     return result
 
 
-def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_range=0.0):  # noqa: A002
+def photon(
+    counts,
+    shots,
+    range,  # noqa: A002
+    *,
+    bin_width,
+    dead_time=None,
+    dead_time_uncertainty=0.2,
+    full_overlap_range=0.0,
+):
     fired = shots.astype(np.float64)[..., np.newaxis]
     quality = raw_quality(counts, fired, range, full_overlap_range)
     quality[counts < 0] |= np.int32(Quality.INPUT_MISSING)
@@ -91,6 +100,14 @@ def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_rang
         expected = np.maximum(smooth(power, range), floor)
         live = smooth(1.0 - rate * assumed, range)
         variance = expected / exposure * (live**2 if dead_time is None else 1.0 / live)
+        error = dead_time_uncertainty if dead_time is not None else 1.0
+        largest = THRESHOLDS.largest_dead_time_error
+        largest = largest / (largest + error)
+        margin = THRESHOLDS.undecided * np.sqrt(load * assumed / exposure) * (1.0 - load)
+        over = np.where(np.abs(load - largest) < margin, 1.0 - live, load) > largest
+        over &= (quality & np.int32(Quality.INPUT_MISSING)) == 0
+        power[over] = np.nan
+        quality[over] |= np.int32(Quality.SATURATED)
     return Signal(power, variance, quality)
 
 

@@ -157,6 +157,7 @@ def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
         {
             "signal": (dims, values),
             "signal_standard_error": (dims, np.full(shape, 1e4)),
+            "signal_dead_time_error": (dims, np.full(shape, 2e3)),
             "background": ("time", rng.uniform(0.1, 2.0, profiles)),
             "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
             "quality_flag": (dims, flags),
@@ -186,7 +187,14 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     for name, scale in scales.items():
         retrieved[name] = rng.normal(scale, 0.1 * scale, shape)
         retrieved[f"{name}_standard_error"] = np.full(shape, 0.1 * scale)
-    for cause in ("noise", "background", "reference", "lidar_ratio", "molecular"):
+    for cause in (
+        "noise",
+        "background",
+        "reference",
+        "lidar_ratio",
+        "molecular",
+        "dead_time",
+    ):
         retrieved[f"backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
     window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
     return xr.Dataset(

@@ -57,6 +57,7 @@ def photon(counts: Any, **changes: Any) -> Answer:
         "range": RANGE[: np.shape(counts)[-1]],
         "bin_width": 7.5,
         "dead_time": DEAD_TIME,
+        "dead_time_uncertainty": 0.0,
     }
     return _answer(counts_to_signal.photon_signal(counts, **arguments | changes))
 
@@ -179,6 +180,9 @@ def _photon_cases() -> tuple[StiffCase, ...]:
         _case("200 MHz: dead nearly half of the time",
               build=partial(_rate_counts, 200.0), solve=photon,
               expected=(Flagged(_FOLDED), Covered("power", 200.0, errors=5.5))),
+        _case("120 MHz, dead time known to 20 %", solve=photon,
+              build=lambda: _rate_counts(120.0) | {"dead_time_uncertainty": 0.2},
+              expected=(Flagged(Quality.SATURATED), Missing("power"))),
         _case("600 MHz: dead more than half of the time", build=partial(_rate_counts, 600.0),
               solve=photon, expected=(Flagged(Quality.SATURATED), Missing("power"))),
         _case("B c 600 MHz, paralyzable, folded back",
