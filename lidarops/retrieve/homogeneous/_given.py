@@ -107,7 +107,7 @@ def solve_above(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_at(
+def solve_from(
     power: Any,
     noise: Array,
     is_variance: bool,
@@ -115,10 +115,12 @@ def solve_at(
     extinction: Array,
     g: Grid,
     out: Array,
+    is_prior: bool,
 ) -> None:
-    """Fit background and amplitude at given extinctions, (profile or 1,), m-1.
+    """Fit background and amplitude at extinctions, (profile or 1,), m-1: given ones, or priors.
 
-    The other parameters are those of `_direct.solve_direct`.
+    From a prior, one linear step leads to the extinction. The other parameters are those of
+    `_direct.solve_direct`.
     """
     s = make_scratch(g.x.size, g.group_shapes.shape[1])
     for k in range(power.shape[0]):
@@ -130,39 +132,13 @@ def solve_at(
             sums = (total_of(s.w), product(s.w, s.z), 1.0)
             p = evaluate(tau, g, s, sums)
             describe(g, s, p, tau, sums, row)
+            if is_prior:
+                _step(g, p, tau, row)
+                tau = row[EXTINCTION]
+                row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
+                p = _moved(evaluate(tau, g, s, sums), row)
             judge_residuals(g, s, p, tau, sums, is_variance, row)
-            _describe_given(p, sums[0], row)
-            describe_bend_given(p, row)
-            unscale(g, reference, scale, unit, row)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_step(
-    power: Any,
-    noise: Array,
-    is_variance: bool,
-    rounding: float,
-    prior: Array,
-    g: Grid,
-    out: Array,
-) -> None:
-    """Fit by one linear step from prior extinctions, (profile or 1,), m-1.
-
-    The other parameters are those of `_direct.solve_direct`.
-    """
-    s = make_scratch(g.x.size, g.group_shapes.shape[1])
-    for k in range(power.shape[0]):
-        row = out[k]
-        mode = (is_variance, rounding, math.nan)
-        reference, scale, unit = begin(power[k], noise[k % noise.shape[0]], mode, s, row)
-        if row[STATUS] == FITTED:
-            tau = g.length * prior[k % prior.size]
-            sums = (total_of(s.w), product(s.w, s.z), 1.0)
-            p = evaluate(tau, g, s, sums)
-            describe(g, s, p, tau, sums, row)
-            _step(g, p, tau, row)
-            tau = row[EXTINCTION]
-            row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
-            p = _moved(evaluate(tau, g, s, sums), row)
-            judge_residuals(g, s, p, tau, sums, is_variance, row)
+            if not is_prior:
+                _describe_given(p, sums[0], row)
+                describe_bend_given(p, row)
             unscale(g, reference, scale, unit, row)

@@ -91,7 +91,7 @@ def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
 def solve_by_linearization(problem: PathProblem) -> PathSolution:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
-    fit = _estimate(problem, _given.solve_step, prior)
+    fit = _estimate(problem, _given.solve_from, prior, is_prior=True)
     shifts = _linearized.neglected_shifts(problem, prior, fit.extinction, fit.amplitude)
     with np.errstate(over="ignore", invalid="ignore"):
         added = _AddedVariances(*(shift**2 for shift in shifts))
@@ -100,7 +100,7 @@ def solve_by_linearization(problem: PathProblem) -> PathSolution:
 
 def solve_with_known_extinction(problem: PathProblem) -> PathSolution:
     """Solve for background and amplitude at the given extinction."""
-    fit = _estimate(problem, _given.solve_at, problem.extinction)
+    fit = _estimate(problem, _given.solve_from, problem.extinction, is_prior=False)
     return _solution(fit, problem, unknowns=2)
 
 
@@ -166,13 +166,13 @@ def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Ar
 
 
 def _estimate(
-    problem: PathProblem, solve: Callable[..., None], *given: Array | None
+    problem: PathProblem, solve: Callable[..., None], *given: Array | None, **choice: bool
 ) -> PathEstimate:
     """Run a kernel with what is given beside the profiles."""
     table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
     grid = make_grid(problem.range, problem.bounds)
     noise = (problem.noise, problem.known_variance, problem.rounding)
-    solve(problem.power, *noise, *given, grid, table)
+    solve(problem.power, *noise, *given, grid, table, **choice)
     return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
 
 
