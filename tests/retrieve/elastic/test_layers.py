@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from lidarops.errors import RetrievalInputError
+from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic.layers import find_layers
 from lidarops.retrieve.elastic.reference_window import (
@@ -105,6 +106,67 @@ def test_noise_makes_layers_at_most_at_the_stated_rate(contrast):
     layers = detect(power, spread**2, contrast=contrast)
     rate = THRESHOLDS.cloud_false_alarm
     assert np.mean(layers.cloudy) <= rate + 3.0 * np.sqrt(rate / 4000)
+
+
+def correlated_noise(shape, correlation, rng):
+    """Return normal noise of unit variance, each bin correlated with the one before."""
+    white = rng.standard_normal(shape)
+    white[..., 0] /= np.sqrt(1.0 - correlation**2)
+    return signal.lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white)
+
+
+@pytest.mark.parametrize("count", [1000, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6])
+def test_correlated_noise_makes_no_layers(count, correlation):
+    """The variances are of differences of neighbouring bins, as those of analog channels."""
+    rng = np.random.default_rng(5)
+    spread = np.sqrt(SHAPE * SHAPE[300])
+    power = SHAPE + spread * correlated_noise((count, RANGE.size), correlation, rng)
+    layers = detect(power, (1.0 - correlation) * spread**2)
+    assert np.mean(layers.cloudy) <= 1e-3
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3])
+def test_cirrus_of_optical_depth_0_05_is_detected_in_correlated_noise(correlation):
+    """At the base, a bin of air alone has a signal-to-noise ratio of 3."""
+    rng = np.random.default_rng(6)
+    true = attenuated(np.zeros(RANGE.size), (9000.0, 1000.0, 5e-5))
+    spread = np.full(RANGE.size, np.interp(9000.0, RANGE, attenuated(np.zeros(RANGE.size))) / 3.0)
+    power = true + spread * correlated_noise((500, RANGE.size), correlation, rng)
+    layers = detect(power, (1.0 - correlation) * spread**2)
+    assert np.mean(np.abs(layers.cloud_base_range - 9000.0) < 100.0) >= 0.95
+
+
+ANALOG = {
+    "analog_355p": 355e-9,
+    "analog_355s": 355e-9,
+    "analog_532p": 532e-9,
+    "analog_532s": 532e-9,
+}
+
+
+def test_noise_of_analog_channels_makes_no_layers(data_root):
+    """Beyond 22 km, files of 10 s hold noise alone, of which neighbouring bins are correlated."""
+    files = sorted((data_root / "pilar/20241002").iterdir())
+    counts = [licel.read_counts(file, list(ANALOG))[1] for file in files]
+    layers = 0
+    for channel, wavelength in ANALOG.items():
+        power = np.stack([count[channel] for count in counts]).astype(np.float64)[:, 20:]
+        r = 7.5 * (np.arange(20, 20 + power.shape[1]) + 0.5)
+        far = power[:, r > 24e3]
+        variance = 0.5 * np.mean(np.diff(far, axis=1) ** 2, axis=1, keepdims=True)
+        extinction = AIR.extinction(330.0 + r, wavelength)
+        found = find_layers(
+            power - far.mean(axis=1, keepdims=True),
+            r,
+            np.broadcast_to(variance, power.shape),
+            molecular_attenuated=AIR.backscatter(330.0 + r, wavelength)
+            * np.exp(-15.0 * np.cumsum(extinction))
+            / r**2,
+            contrast=max(2.0, 1.0 + 2.0 * (wavelength / 532e-9) ** 3),
+        )
+        layers += np.count_nonzero(found.mask[:, r > 22e3].any(axis=-1))
+    assert layers == 0
 
 
 def test_power_of_the_test_is_what_gaussian_noise_allows():
