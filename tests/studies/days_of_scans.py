@@ -2,8 +2,8 @@
 
 Every day is simulated with a seed of its own, processed from raw files to products, and compared
 with the truth. The table states how often values without flag, and values with one flag only,
-deviate by more than 3 and 4 stated errors, with the Monte Carlo error over the days. A day takes
-about 20 s of CPU time.
+deviate by more than 1.96, 3 and 4 stated errors, with the Monte Carlo error over the days. A day
+takes about 5 s of CPU time.
 """
 
 from __future__ import annotations
