@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
+from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.homogeneous import _compressed, _direct, _given, _linearized, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
 from lidarops.retrieve.homogeneous._fit_quality import common_limits, judge_fit
@@ -42,7 +43,7 @@ def solve_by_compression(problem: PathProblem) -> PathSolution:
     out = np.empty((len(_compressed.RESULTS), count))
     quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
     _compressed.solve_compressed(
-        problem.power,
+        frozen(problem.power),
         _compressed.weight_roots(tables, problem.common_weights, problem.power),
         tables.envelope.astype(problem.power.dtype),
         tables,
@@ -100,7 +101,9 @@ def solve_by_linearization(problem: PathProblem) -> PathSolution:
 
 def solve_with_known_extinction(problem: PathProblem) -> PathSolution:
     """Solve for background and amplitude at the given extinction."""
-    fit = _estimate(problem, _given.solve_from, problem.extinction, is_prior=False)
+    # `fit_homogeneous_path` has checked that it is given.
+    extinction = cast("Array", problem.extinction)
+    fit = _estimate(problem, _given.solve_from, extinction, is_prior=False)
     return _solution(fit, problem, unknowns=2)
 
 
@@ -153,26 +156,26 @@ def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Arra
 def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Array:
     out = np.empty((fit.extinction.size, 6))
     _propagation.propagate(
-        problem.power,
-        problem.noise,
+        frozen(problem.power),
+        frozen(problem.noise),
         problem.known_variance,
-        np.ascontiguousarray(fit.extinction),
-        np.ascontiguousarray(fit.amplitude),
-        problem.range,
-        gradients,
+        frozen(fit.extinction),
+        frozen(fit.amplitude),
+        frozen(problem.range),
+        frozen(gradients),
         out,
     )
     return out
 
 
 def _estimate(
-    problem: PathProblem, solve: Callable[..., None], *given: Array | None, **choice: bool
+    problem: PathProblem, solve: Callable[..., None], *given: Array, **choice: bool
 ) -> PathEstimate:
     """Run a kernel with what is given beside the profiles."""
     table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
     grid = make_grid(problem.range, problem.bounds)
-    noise = (problem.noise, problem.known_variance, problem.rounding)
-    solve(problem.power, *noise, *given, grid, table, **choice)
+    noise = (frozen(problem.noise), problem.known_variance, problem.rounding)
+    solve(frozen(problem.power), *noise, *map(frozen, given), grid, table, **choice)
     return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
 
 
