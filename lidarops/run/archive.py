@@ -241,7 +241,6 @@ def _days_to_judge(judge: Judge, store: Store, selection: Selection, *, force: b
 class _Gathered:
     """What a pass over the archive collects."""
 
-    fresh: int = 0
     orphans: list[Orphan] = field(default_factory=list)
     set_aside: list[Granule] = field(default_factory=list)
     held: list[Judgement] = field(default_factory=list)
@@ -305,7 +304,6 @@ class _Pass:
             record=record,
             status=status,
             summary=summary,
-            fresh=gathered.fresh,
             orphans=tuple(gathered.orphans),
             failures=self.store.failures(),
             internal=self.store.internal_errors(),
@@ -442,7 +440,6 @@ class _Pass:
 
     def _note(self, judged: DaysJudged) -> None:
         gathered = self.gathered
-        gathered.fresh += sum(scene.fresh for scene in judged.judgements)
         gathered.orphans += judged.orphans
         gathered.set_aside += judged.set_aside
         gathered.verdicts.update(judged.verdicts)

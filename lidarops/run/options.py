@@ -50,8 +50,6 @@ class Result:
     """None if there was nothing to do."""
     status: RunStatus
     summary: ScanSummary
-    fresh: int
-    """Number of products that were judged fresh, without those of unchanged days."""
     orphans: tuple[Orphan, ...]
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""

@@ -222,6 +222,21 @@ def test_granules_round_trip(store: Store) -> None:
     assert len(store.granules()) == 3
 
 
+def test_notes_of_files_are_listed_with_contradictions_first_then_by_their_number(
+    store: Store,
+) -> None:
+    granules = [factories.granule(number, notes=("often",)) for number in range(3)]
+    granules += [factories.granule(number, notes=("seldom",)) for number in range(3, 5)]
+    granules.append(factories.granule(5, contradictions=("wrong place",)))
+    store.replace([row_of(granule, store.campaign, "key") for granule in granules])
+    found = store.file_notes({granules[0].instrument})
+    assert [(note.text, note.files, note.contradicts) for note in found] == [
+        ("wrong place", 1, True),
+        ("often", 3, False),
+        ("seldom", 2, False),
+    ]
+
+
 def test_campaigns_share_a_database(campaign: Campaign, store: Store) -> None:
     store.replace([row_of(factories.granule(0), store.campaign, "key")])
     other = Store(campaign.catalog_url, "other")

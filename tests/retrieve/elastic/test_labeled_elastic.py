@@ -325,6 +325,34 @@ def test_a_profile_with_cirrus_is_retrieved():
     assert np.sqrt(np.nanmean(from_noise(retrieved)[:, between(300.0, 2000.0)] ** 2)) < 2.0
 
 
+def test_a_profile_beside_a_cloudy_one_is_retrieved_as_alone():
+    signals = [light(distance), light(distance, backscatter=cloud(9000.0 + STATION, 2e-5))]
+    window = Reference(5000.0, 8200.0, 1000.0, 1.0, 0.0)
+    data = [counted(signal, exposure=100 * EXPOSURE) for signal in signals]
+    both = xr.concat(data, dim="time", data_vars="minimal", coords="minimal")
+    together = solved(both, reference=window)
+    for place, alone in enumerate(solved(each, reference=window) for each in data):
+        for name in ("background", "backscatter", "quality_flag"):
+            np.testing.assert_array_equal(
+                together[name].isel(time=[place]).to_numpy(), alone[name].to_numpy()
+            )
+
+
+@pytest.mark.parametrize(("wavelength", "factor"), [(GREEN, 2.6), (355e-9, 1.75)])
+def test_aerosol_whose_scattering_rises_less_than_that_of_a_cloud_is_none(wavelength, factor):
+    """The limits are 3 at 532 nm and 2 at 355 nm, where air scatters more."""
+    z = STATION + distance
+    ratio = 1.0 + (factor - 1.0) * np.exp(-(np.abs((distance - 8000.0) / 400.0) ** 9))
+    depth = 7.5 * np.cumsum(AIR.extinction(z, wavelength))
+    signal = 1e18 * ratio * AIR.backscatter(z, wavelength) * np.exp(-2.0 * depth) / distance**2
+    signal *= light(distance)[100] / signal[100]
+    for rise, cloudy in ((1.0, False), (1.6, True)):
+        layer = np.where(ratio > 1.5, rise, 1.0)
+        data = counted(signal * layer, exposure=1e4 * EXPOSURE)
+        found = solved(data, wavelength=wavelength, reference=Reference(4e3, 7e3, 1e3, 1.0, 0.0))
+        assert bool(np.isfinite(found["cloud_base_range"]).all()) is cloudy
+
+
 def test_no_reference_window_holds_a_cloud():
     """Two clouds in the search range leave gaps between them."""
 
