@@ -150,9 +150,9 @@ class _GluedAverages(Averages):
     def completed(self) -> Iterator[xr.Dataset]:
         """Yield the glued means that are complete."""
         for analog, photon in zip(self._analog.completed(), self._photon.completed(), strict=True):
-            glued = labeled_gluing.glue(analog[[*_PARTS]], photon[[*_PARTS]], self._lag)
-            bins = slice(glued.sizes["range"])
-            yield photon.isel(range=bins).drop_vars(_PARTS).assign(glued.variables)
+            glued = labeled_gluing.glue(analog, photon, self._lag)
+            kept = photon.isel(range=slice(glued.sizes["range"])).drop_vars(_PARTS)
+            yield kept.assign(glued.variables)
 
 
 def gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:

@@ -220,7 +220,12 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
     power = np.tile(1e6 / distance**2, (len(granules), 1))
     flat = (("time", "range"), np.zeros(power.shape, dtype=np.int32))
     profiles = xr.Dataset(
-        {"power": (("time", "range"), power), "variance": flat, "quality": flat},
+        {
+            "power": (("time", "range"), power),
+            "variance": flat,
+            "quality": flat,
+            "noise_correlation_length": ("time", np.ones(len(power))),
+        },
         coords={"range": distance},
     )
     on_levels = on_altitudes(
@@ -355,6 +360,7 @@ def sky(light, *, saturated=()):
                 "power": (pair, power),
                 "variance": (pair, np.full(power.shape, 0.01)),
                 "quality": (pair, quality),
+                "noise_correlation_length": ("time", np.ones(len(power))),
             },
             coords={"range": RANGE},
         )

@@ -562,6 +562,7 @@ def test_a_scan_goes_from_profiles_to_a_product():
                 "power": (dims, power + noise),
                 "variance": (dims, np.full(noise.shape, 0.05**2)),
                 "quality": (dims, np.zeros(noise.shape, np.int32)),
+                "noise_correlation_length": ("time", np.ones(len(noise))),
             },
             coords={"range": distance},
         ),

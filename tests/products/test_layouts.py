@@ -93,6 +93,7 @@ def test_variables_without_standard_name():
             "signal_dead_time_error",
             "background",
             "background_standard_error",
+            "noise_correlation_length",
             *gluing,
         },
         "elastic": {

@@ -24,6 +24,7 @@ from lidarops.retrieve.background.detectable_light import (
 )
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.steps.step import Look
 
 if TYPE_CHECKING:
@@ -167,9 +168,11 @@ def _looks(
 ) -> dict[Section, LightDetection]:
     looks: dict[Section, LightDetection] = {}
     for profiles in samples:
-        power, variance, quality, distance = (
-            profiles[name].to_numpy() for name in ("power", "variance", "quality", "range")
+        power, quality, distance = (
+            profiles[name].to_numpy() for name in ("power", "quality", "range")
         )
+        # Significance is that of means over many bins.
+        variance = (profiles["variance"] * profiles[CORRELATION_LENGTH]).to_numpy()
         for near, far in sections:
             light = detect_light(power, variance, quality, distance, near, far)
             looks[near, far] = _merged_looks(light, looks.get((near, far)))

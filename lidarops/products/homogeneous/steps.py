@@ -25,7 +25,7 @@ from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import channel_unit
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit
 from lidarops.settings import SettingsModel, VisibilitySettings
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import is_glued
@@ -306,6 +306,7 @@ class _Sections(WholeProduct):
             method=self._settings.method,
             # An estimated variance scatters, which must not count as misfit.
             relative_variance=self._data[RELATIVE_VARIANCE],
+            noise_correlation_length=conditioned[CORRELATION_LENGTH],
         )
 
     def _joined(self) -> xr.Dataset:

@@ -59,6 +59,17 @@ LAYOUT: Final = Layout(
             f" of signal_standard_error. {NO_STANDARD_NAME}",
         ),
         SUBTRACTED_BACKGROUND,
+        Row(
+            name="noise_correlation_length",
+            dims=("time",),
+            dtype="f4",
+            units="1",
+            long_name="integral correlation length of noise along range in range bins",
+            coverage=Coverage.AUXILIARY,
+            comment="Of the far half of the profile; at least 1. The standard error by noise of a"
+            " mean over many bins is that of a bin times the root of this number over the number"
+            f" of bins. {NO_STANDARD_NAME}",
+        ),
         *GLUING,
         quality(("time", "range"), FLAGS),
         shots(of="the profile"),

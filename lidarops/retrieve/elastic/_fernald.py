@@ -446,8 +446,9 @@ def invert_fernald(
         In the reference window.
     errors : two of (profile or 1, bin) float64
         Of the lidar ratio in sr, and of the air, relative.
-    causes : (profile or 1, 2) float64
-        Standard error of the background, relative one of the scattering ratio.
+    causes : (profile or 1, 3) float64
+        Standard error of the background, relative one of the scattering ratio, and the integral
+        correlation length of the noise in bins.
     limits : (4,) float64
         Longest gap that is integrated over, m; least share of the denominator at the reference;
         least square of the denominator over its variance; that over the variance by noise below
@@ -488,6 +489,8 @@ def invert_fernald(
                     power[k], noise, in_window, range_, path, start, direction, calibration,
                     limits[0], work, state[k],
                 )  # fmt: skip
+            # Means and integrals over many bins.
+            work[OTHERS] *= cause[2]
             by_reference = -calibration[0] * cause[1] * calibration[4]
             _solve_bins(power[k], noise, path, by_reference, cause[0], work, k, out)
             _measure_certainty(noise, by_reference, cause[0], path, limits[2:], work, out[NOISE, k])

@@ -150,6 +150,7 @@ def invert_elastic(
     reference_relative_error: npt.ArrayLike = 0.0,
     molecular_relative_error: npt.ArrayLike = 0.0,
     dead_time_error: npt.ArrayLike = 0.0,
+    noise_correlation_length: npt.ArrayLike = 1.0,
 ) -> ElasticResult:
     r"""Return particle backscatter and extinction of elastic profiles, without iteration.
 
@@ -163,8 +164,9 @@ def invert_elastic(
     backscatter times the scattering ratio there. Integrals are trapezoidal, so signals of either
     sign have the same weight. The relative error of the trapezoids is below 1e-4 where scattering
     changes over 100 m or more and bins are 7.5 m apart. Errors are of first order; noise errors
-    are widened where the reference is noisy (`Thresholds.skewed`). Noise is taken as independent
-    from bin to bin, and its correlation through the integrals and the window is propagated.
+    are widened where the reference is noisy (`Thresholds.skewed`). The
+    noise of a bin enters its value, and that of all others its reference and integrals, as the
+    variance of a bin times the correlation length.
     Replace outlying bins before (`outlying_bins.bridge_outliers`).
 
     Parameters
@@ -200,6 +202,9 @@ def invert_elastic(
     dead_time_error : float or (..., range) float
         In the unit of `power`: its change with one standard error of the dead time, common to all
         bins; broadcast against `power`. The inversion is repeated with it.
+    noise_correlation_length : float or (...) float
+        Bins; the integral correlation length of the noise, 1 where bins are independent
+        (`lidarops.retrieve.signal.noise_correlation`).
 
     Returns
     -------
@@ -235,7 +240,9 @@ def invert_elastic(
     ratio_error = _errors(lidar_ratio_standard_error, "lidar_ratio_standard_error", grid, leading)
     air_error = _errors(molecular_relative_error, "molecular_relative_error", grid, leading)
     window = _window(reference, grid, leading)
-    causes = _causes((background_standard_error, reference_relative_error), leading)
+    causes = _causes(
+        (background_standard_error, reference_relative_error, noise_correlation_length), leading
+    )
 
     def solved(power_rows: Array) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
         out = np.empty((_fernald.FIELDS, *rows.shape))
@@ -332,12 +339,16 @@ def _air(
     return backscatter, extinction, ratio
 
 
-def _causes(causes: tuple[npt.ArrayLike, npt.ArrayLike], leading: tuple[int, ...]) -> Array:
-    names = ("background_standard_error", "reference_relative_error")
+def _causes(causes: tuple[npt.ArrayLike, ...], leading: tuple[int, ...]) -> Array:
+    names = (
+        "background_standard_error",
+        "reference_relative_error",
+        "noise_correlation_length",
+    )
     columns = []
     for values, name in zip(causes, names, strict=True):
         column = _profile_values(values, name, leading)
-        _require((column >= 0.0) | np.isnan(column), column, name, "give a standard error")
+        _require((column >= 0.0) | np.isnan(column), column, name, "give 0 or more")
         columns.append(column)
     return np.ascontiguousarray(np.stack(np.broadcast_arrays(*columns), axis=-1))
 

@@ -22,7 +22,7 @@ from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic import reference_window as _reference
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import dead_time_error
+from lidarops.retrieve.signal.labeled import actual_noise, dead_time_error
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -155,6 +155,7 @@ def invert_elastic(
         reference_relative_error=_reference_error(window, reference),
         molecular_relative_error=molecular_relative_error,
         dead_time_error=_dead_time_error(averages, means, signal),
+        noise_correlation_length=means.correlation_length,
     )
     quality = means.quality
     quality |= _solution_flags(solution, window, signal, quality)
@@ -206,7 +207,9 @@ class _Means:
         self.overlap = np.ones(distance.size) if overlap is None else overlap
         partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
         self.quality = quality | partial.astype(np.int32)
-        self.raw, self.noise = averages["power"].to_numpy(), averages["variance"].to_numpy()
+        self.raw = averages["power"].to_numpy()
+        self.noise, length = actual_noise(averages)
+        self.correlation_length = length
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
 
@@ -259,16 +262,14 @@ def _signal_and_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _l
 def _subtract_background(
     means: _Means, usable: npt.NDArray[np.bool_], *, known_shape: bool
 ) -> _Signal:
-    noise, r = means.noise, means.distance
+    noise, r = means.noise * means.correlation_length[:, np.newaxis], means.distance
     # The mean of a bin that was saturated in some profiles is that of the others.
     raw = np.where((means.quality & np.int32(Quality.SATURATED)) != 0, np.nan, means.raw)
     if not known_shape:
         sky = estimate.from_tail(raw, r, noise)
     else:
         sky = estimate.from_known_shape(raw, r, noise, means.air.shape, mask=usable)
-    # Differences of neighbouring bins underestimate noise that is correlated between them.
-    error = sky.standard_error * np.sqrt(np.maximum(sky.reduced_chi2, 1.0))
-    return _Signal(means.minus(sky.background), sky.background, error, sky.uncertain)
+    return _Signal(means.minus(sky.background), sky.background, sky.standard_error, sky.uncertain)
 
 
 def _dead_time_error(averages: xr.Dataset, means: _Means, signal: _Signal) -> Array:
@@ -297,7 +298,7 @@ def _window(
     return _reference.choose_reference(
         signal.power,
         means.distance,
-        means.variance,
+        means.variance * means.correlation_length[:, np.newaxis],
         molecular_attenuated=means.air.shape,
         candidates=candidates,
         background_standard_error=np.nan_to_num(signal.background_standard_error),

@@ -16,13 +16,12 @@ from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.elastic._fernald import HUGE, usable
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 _TOP: Final = THRESHOLDS.top
-_SECTIONS: Final = 8
-"""Parts of the far half of a profile; the noise is the median of theirs."""
 _ROUNDING: Final = 1e-9
 """Relative rise that the rounding of sums can cause."""
 
@@ -64,12 +63,8 @@ def find_layers(
     more than the factor :math:`c`. If that holds everywhere, whatever the aerosol, a profile is
     flagged with a probability below `Thresholds.cloud_false_alarm`, because :math:`t` is the
     quantile of the normal distribution for that rate over the number of bins and lengths
-    (Bonferroni bound), times the factor :math:`\sqrt{f_L}` by which the noise of means over
-    :math:`L` bins exceeds the stated one. The far half of the profile gives
-    :math:`f_L = \chi^2 (1 + 2 \sum_k (1 - k / L) r_k)`, with the chi-square per bin and
-    the correlations :math:`r_k` of bins at the distance :math:`k`, up to the first one that is
-    within its error; chi-square counts as 1 within its error. Each is the median of 8 sections, so
-    that a cloud in some of them does not count as noise.
+    (Bonferroni bound), times the factor by which the noise of means over :math:`L` bins exceeds
+    the stated one in the far half of the profile (`lidarops.retrieve.signal.noise_correlation`).
     The base is where the statistic peaks. The top is where the mean of the next window is again
     within 2 standard errors of the level below the base.
 
@@ -128,7 +123,7 @@ def find_layers(
         frozen(shape),
         lengths.astype(np.int64),
         float(contrast),
-        frozen(-float(ndtri(rate)) * _excess_noise(values, noise, shape, lengths)),
+        frozen(-float(ndtri(rate)) * _excess_noise(values, noise, lengths)),
         mask,
     )
     cloudy = mask.any(axis=-1)
@@ -140,86 +135,10 @@ def find_layers(
     )
 
 
-def _excess_noise(power: Array, variance: Array, shape: Array, lengths: Array) -> Array:
-    """Return the noise of means over each length relative to the stated one, (profile, length).
-
-    Noise that is correlated between neighbouring bins averages less than independent noise, and
-    variances from differences of neighbouring bins are too small for it.
-    """
-    excess = np.ones((power.shape[0], lengths.size))
-    size = power.shape[1] // (2 * _SECTIONS)
-    if size < THRESHOLDS.fewest_noise_bins:
-        return excess
-    far = slice(power.shape[1] - _SECTIONS * size, None)
-    for k in range(power.shape[0]):
-        moments = _moments(
-            power[k, far].reshape(_SECTIONS, size),
-            variance[k % variance.shape[0], far].reshape(_SECTIONS, size),
-            shape[k % shape.shape[0], far].reshape(_SECTIONS, size),
-        )
-        if len(moments) >= _SECTIONS / 2:
-            excess[k] = _relative_noise(np.median(moments, axis=0), lengths, len(moments) * size)
-    return excess
-
-
-def _moments(power: Array, variance: Array, shape: Array) -> Array:
-    """Return the chi-square per bin, and correlations at distances from 1, of each section.
-
-    They are those of the residuals of a constant and the shape of air; of sections without gaps.
-    """
-    usable_bins = (np.abs(power) < HUGE) & (variance > 0.0) & (variance < HUGE)
-    whole = usable_bins.all(axis=-1)
-    noise = np.sqrt(variance[whole])
-    residual = power[whole] / noise
-    highest = np.maximum(shape[whole].max(axis=-1, keepdims=True), 1.0 / HUGE)
-    constant = _unit(1.0 / noise)
-    air = shape[whole] / highest / noise
-    air = _unit(air - constant * _product(constant, air))
-    for fitted in (constant, air):
-        residual = residual - fitted * _product(fitted, residual)
-    size = power.shape[-1]
-    squares = np.maximum(_product(residual, residual), 1.0 / HUGE)
-    correlations = [
-        _product(residual[:, :-d], residual[:, d:]) / squares / (1.0 - d / size)
-        for d in range(1, THRESHOLDS.most_correlated_bins + 1)
-    ]
-    return np.concatenate([squares / (size - 2), *correlations], axis=-1)
-
-
-def _product(left: Array, right: Array) -> Array:
-    return np.asarray(np.sum(left * right, axis=-1, keepdims=True))
-
-
-def _unit(values: Array) -> Array:
-    length = np.sqrt(_product(values, values))
-    return np.asarray(values / np.maximum(length, 1.0 / HUGE))
-
-
-def _relative_noise(moments: Array, lengths: Array, bins: int) -> Array:
-    """Return the noise of means relative to the stated one, for each length."""
-    chi_square, correlations = float(moments[0]), moments[1:]
-    # Two coefficients are fitted in each section, which takes up noise of its whole length.
-    fitted = 2.0 * _SECTIONS / bins * _sum_of(correlations, lengths[-1:], bins)[0]
-    correlations = (correlations + fitted) / (1.0 + fitted)
-    total = chi_square * (1.0 + fitted)
-    if total < 1.0 + THRESHOLDS.significant_correlation * math.sqrt(2.0 / bins):
-        total = 1.0
-    return np.asarray(np.sqrt(total * _sum_of(correlations, lengths, bins)))
-
-
-def _sum_of(correlations: Array, lengths: Array, bins: int) -> Array:
-    """Return the variance of means over each length relative to independent noise.
-
-    Where bins are correlated, plus its standard error (Bartlett).
-    """
-    insignificant = correlations < THRESHOLDS.significant_correlation / math.sqrt(bins)
-    stop = int(np.argmax(insignificant)) if insignificant.any() else correlations.size
-    if stop == 0:
-        return np.ones(lengths.size)
-    distances = np.arange(1, stop + 1)
-    weights = np.maximum(1.0 - distances / lengths[:, np.newaxis], 0.0)
-    error = math.sqrt(2.0 * (2.0 * stop + 1.0) / bins)
-    return np.asarray((1.0 + 2.0 * weights @ correlations[:stop]) * (1.0 + error))
+def _excess_noise(power: Array, variance: Array, lengths: Array) -> Array:
+    """Return the noise of means over each length relative to the stated one, (profile, length)."""
+    noise = estimate_noise_correlation(power, variance)
+    return np.asarray(np.sqrt(noise.excess[:, np.newaxis] * noise.variance_of_means(lengths)))
 
 
 @_compiled

@@ -38,13 +38,6 @@ class Thresholds:
     """The same at short wavelengths, where air scatters more. Assumed."""
     cloud_false_alarm: float = 0.001
     """Probability of a false cloud in a profile. Required of the product."""
-    fewest_noise_bins: int = 32
-    """Bins of each of 8 sections that give the correlation of noise; it is then known within 0.1.
-    Assumed."""
-    most_correlated_bins: int = 10
-    """Greatest distance at which noise is correlated, bins. Assumed."""
-    significant_correlation: float = 3.0
-    """Standard errors beyond which noise is taken as correlated, or larger than stated. Assumed."""
     top: float = 2.0
     """Standard errors of the level below the base within which a layer has ended. Assumed."""
     cloud_margin: float = 300.0

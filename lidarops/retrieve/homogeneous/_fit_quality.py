@@ -28,6 +28,7 @@ _SECOND_DIFFERENCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
 _DIFFERENCE_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
+_INDEPENDENT: Final = np.ones(1)
 _RATIO: Final = 4.611
 """Quantile of the logarithm of the ratio of two estimates of one variance from the same residuals,
 3.353 sqrt(17 / 9), times the root of the number of bins."""
@@ -107,7 +108,13 @@ def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[floa
     return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
 
-def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:
+def judge_fit(
+    fit: PathEstimate,
+    *,
+    known_variance: bool,
+    unknowns: int = 3,
+    correlation_length: Array = _INDEPENDENT,
+) -> Verdict:
     """Judge a batch of fits.
 
     Parameters
@@ -117,18 +124,24 @@ def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> 
         Whether the weights are inverse variances.
     unknowns : int
         Number of fitted parameters.
+    correlation_length : (profile or 1,) float
+        Bins, of the noise.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        noise = np.ones_like(fit.status) if known_variance else _estimated_noise(fit, unknowns)
+        noise = np.ones_like(fit.status)
+        if not known_variance:
+            noise = _estimated_noise(fit, unknowns)
+        # Of means over many bins.
+        mean_noise = noise * correlation_length
         reduced = fit.misfit / _residual_dof(fit.bins, unknowns) / noise
         limits = _limits(fit, unknowns, known_variance=known_variance)
         tests = (
-            (Quality.LOW_SIGNAL, fit.signal_energy / noise > THRESHOLDS.least_signal**2),
-            (HomogeneousQuality.POORLY_DETERMINED, _determined(fit, noise, limits.widening)),
+            (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > THRESHOLDS.least_signal**2),
+            (HomogeneousQuality.POORLY_DETERMINED, _determined(fit, mean_noise, limits.widening)),
             (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
             (HomogeneousQuality.AT_BOUND, fit.bounded == 0),
             (HomogeneousQuality.POOR_FIT, reduced <= limits.misfit),
-            (Quality.NOT_HOMOGENEOUS, fit.trend / noise <= limits.trend),
+            (Quality.NOT_HOMOGENEOUS, fit.trend / mean_noise <= limits.trend),
             (Quality.OUTLIER, fit.largest / np.sqrt(noise) <= limits.outlier),
         )
         # Test for a pass, not for a failure: a comparison with NaN does not pass.

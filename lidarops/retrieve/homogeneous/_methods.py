@@ -19,6 +19,7 @@ from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
 from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
 from lidarops.retrieve.homogeneous._projection import make_grid
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
 _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
@@ -73,6 +74,7 @@ def _tables(problem: PathProblem) -> Tables | None:
     even = np.linspace(range_[0], range_[-1], range_.size)
     if (
         not problem.common_noise
+        or problem.correlation_length is not None
         or range_[-1] - range_[0] < limits.thinnest * range_[0]
         or np.max(np.abs(range_ - even)) > _UNIFORM * range_[-1]
     ):
@@ -173,7 +175,8 @@ def _estimate(
 ) -> PathEstimate:
     """Run a kernel with what is given beside the profiles."""
     table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
-    grid = make_grid(problem.range, problem.bounds)
+    spacing = 1 if problem.correlation_length is None else SIGNAL.most_correlated_bins
+    grid = make_grid(problem.range, problem.bounds, spacing)
     noise = (frozen(problem.noise), problem.known_variance, problem.rounding)
     solve(frozen(problem.power), *noise, *map(frozen, given), grid, table, **choice)
     return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
@@ -190,14 +193,19 @@ def _solution(
     """Judge an estimate and return the solution."""
     if added is None:
         added = _AddedVariances(np.zeros(1), np.zeros(1), np.zeros(1))
-    verdict = judge_fit(fit, known_variance=problem.known_variance, unknowns=unknowns)
+    length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
+    verdict = judge_fit(
+        fit, known_variance=problem.known_variance, unknowns=unknowns, correlation_length=length
+    )
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        level = verdict.noise * verdict.widening**2
+        level = verdict.noise * verdict.widening**2 * length
         background_error = np.sqrt(fit.background_variance * level + added.background)
         relative_error = np.sqrt(fit.amplitude_relative_variance * level + added.amplitude_relative)
         extinction_error = np.sqrt(fit.extinction_variance * level + added.extinction)
-        signal_to_noise = np.copysign(np.sqrt(fit.signal_energy / verdict.noise), fit.amplitude)
+        signal_to_noise = np.copysign(
+            np.sqrt(fit.signal_energy / verdict.noise / length), fit.amplitude
+        )
         amplitude_error = np.abs(fit.amplitude) * relative_error
 
     def masked(values: Array, valid: npt.NDArray[np.bool_]) -> Array:

@@ -99,12 +99,12 @@ def _sum_residuals(g: Grid, s: ProjectionScratch, fit: Point, p: Point) -> _Resi
 
 
 @summing
-def _second_differences(s: ProjectionScratch) -> tuple[float, float]:
-    """Sum the squared second differences of the residuals between neighbours; count them."""
+def _second_differences(s: ProjectionScratch, spacing: int) -> tuple[float, float]:
+    """Sum the squared second differences of residuals that many bins apart; count them."""
     total = terms = 0.0
     # Slices: an index that might be negative keeps a loop from vectorising.
-    last, middle = s.residual[2:], s.residual[1:]
-    used_last, used_middle = s.used[2:], s.used[1:]
+    last, middle = s.residual[2 * spacing :], s.residual[spacing:]
+    used_last, used_middle = s.used[2 * spacing :], s.used[spacing:]
     for i in range(last.size):
         difference = last[i] - 2.0 * middle[i] + s.residual[i]
         valid = used_last[i] * used_middle[i] * s.used[i]
@@ -195,4 +195,4 @@ def judge_residuals(
     row[TREND], row[TREND_COUNT] = _trend(shapes, residuals, full, w0)
     row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
     if not known_variance:
-        row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s)
+        row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s, g.noise_spacing)

@@ -34,6 +34,8 @@ class PathProblem:
     """Whether `noise` holds variances, else weights up to a common factor."""
     bounds: tuple[float, float]
     """Lowest and highest extinction, m-1."""
+    correlation_length: Array | None = None
+    """(profile or 1,), bins, of the noise; None for independent bins."""
     extinction: Array | None = None
     """(profile or 1,), m-1: the prior of the linearised method, or the known extinction."""
     background: Array | None = None

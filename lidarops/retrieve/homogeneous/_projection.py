@@ -60,6 +60,8 @@ class Grid(NamedTuple):
     """R_0, m."""
     length: float
     """L, m."""
+    noise_spacing: int
+    """Bins from one to the next of a second difference, which gives the noise."""
 
 
 class ProjectionScratch(NamedTuple):
@@ -89,7 +91,7 @@ class Point(NamedTuple):
     curvature: float
 
 
-def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
+def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: int = 1) -> Grid:
     """Return the tables common to the profiles of a call.
 
     Parameters
@@ -98,6 +100,8 @@ def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
         m, ascending.
     bounds : (float, float)
         Lowest and highest extinction, m-1.
+    noise_spacing : int
+        Bins; beyond it, noise is independent.
     """
     length = float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
     x = (range_ - range_[0]) / length
@@ -129,6 +133,7 @@ def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
         group_shapes=groups,
         start=float(range_[0]),
         length=length,
+        noise_spacing=noise_spacing,
     )
 
 

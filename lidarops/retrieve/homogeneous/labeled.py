@@ -45,6 +45,7 @@ def fit_homogeneous_path(
     quality: xr.DataArray | None = None,
     method: str = "auto",
     relative_variance: bool = False,
+    noise_correlation_length: xr.DataArray | None = None,
 ) -> xr.Dataset:
     """Return background, amplitude and extinction of sections of range.
 
@@ -67,6 +68,9 @@ def fit_homogeneous_path(
     relative_variance : bool
         Whether `variance` is known up to a factor only, which each section estimates: for a
         variance estimated from the same data.
+    noise_correlation_length : xr.DataArray, optional
+        Bins, over the dimensions of `power` but range; see
+        `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`.
 
     Returns
     -------
@@ -86,7 +90,9 @@ def fit_homogeneous_path(
     used = slice(min(section.start for section in bins), max(section.stop for section in bins))
     inputs = {
         name: array.isel(range=used, missing_dims="ignore")
-        for name, array in _checked_inputs(power, variance, quality).items()
+        for name, array in _checked_inputs(
+            power, variance, quality, noise_correlation_length
+        ).items()
     }
     outputs = xr.apply_ufunc(
         _solve,
@@ -182,12 +188,17 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
 
 
 def _checked_inputs(
-    power: xr.DataArray, variance: xr.DataArray | float | None, quality: xr.DataArray | None
+    power: xr.DataArray,
+    variance: xr.DataArray | float | None,
+    quality: xr.DataArray | None,
+    correlation_length: xr.DataArray | None,
 ) -> dict[str, xr.DataArray]:
     """Return the arrays that are given, each with its range in one chunk."""
     inputs = {"power": power}
     if variance is not None:
         inputs["variance"] = xr.DataArray(variance)
+    if correlation_length is not None:
+        inputs["correlation_length"] = correlation_length
     if quality is not None:
         inputs["quality"] = quality
         if quality.dtype.kind not in "iu":
@@ -245,6 +256,7 @@ def _solve_section(
     power: _Block,
     variance: _Block | None = None,
     quality: _Block | None = None,
+    correlation_length: _Block | None = None,
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
@@ -259,8 +271,14 @@ def _solve_section(
         with np.errstate(divide="ignore"):
             weights = 1.0 / variance
         variance = None
+    length = None if correlation_length is None else correlation_length[..., 0]
     fit = _homogeneous.fit_homogeneous_path(
-        power, range, variance=variance, weights=weights, method=method
+        power,
+        range,
+        variance=variance,
+        weights=weights,
+        method=method,
+        noise_correlation_length=length,
     )
     values = tuple(getattr(fit, name) for name in _VALUES)
     return (*values, fit.valid_bins, fit.quality | carried)

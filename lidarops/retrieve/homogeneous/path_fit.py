@@ -106,6 +106,7 @@ def fit_homogeneous_path(
     extinction: npt.ArrayLike | None = None,
     background: npt.ArrayLike | None = None,
     background_standard_error: npt.ArrayLike | None = None,
+    noise_correlation_length: npt.ArrayLike | None = None,
 ) -> HomogeneousResult:
     r"""Return background, amplitude and extinction of a homogeneous path.
 
@@ -133,6 +134,9 @@ def fit_homogeneous_path(
         For "known_background", in the unit of the power.
     background_standard_error : (...) float, optional
         Of the given background, which must not come from the same bins; 0 where not given.
+    noise_correlation_length : (...) float, optional
+        Bins, at least 1; the integral correlation length of the noise
+        (`lidarops.retrieve.signal.noise_correlation`). Bins are independent where not given.
 
     Returns
     -------
@@ -142,6 +146,10 @@ def fit_homogeneous_path(
         of freedom. They are widened by Student's distribution, so that 4 standard errors have the
         coverage of a known variance: by 4 percent at 225 bins, 20 at 50, 70 at 20, and by a factor
         of 7.6 at 8.
+
+        With a correlation length s, standard errors are sqrt(s) times those of independent bins,
+        and noise is estimated from second differences of bins
+        `lidarops.retrieve.signal.thresholds.Thresholds.most_correlated_bins` apart.
 
         Bits of `quality` and their limits: ``docs/algorithms/homogeneous.md``. A constant profile
         raises NO_SIGNAL: its value is the background, the amplitude is 0 and the extinction NaN.
@@ -160,7 +168,7 @@ def fit_homogeneous_path(
         "compressed".
     compressed
         The least-squares solution from 11 linear functionals of the profile, where it has no gaps,
-        a uniform range and common weights; all others by "direct".
+        a uniform range, common weights and independent bins; all others by "direct".
     direct
         The least-squares solution by Newton steps over the bins, with background and amplitude
         eliminated (variable projection, golub1973), from the best of 24 extinctions.
@@ -217,6 +225,11 @@ def fit_homogeneous_path(
     error = inputs.profile_values(background_standard_error, "background_standard_error", leading)
     if error is not None and np.any(error < 0):
         raise RetrievalInputError("is negative", field="background_standard_error")
+    correlated = inputs.profile_values(
+        noise_correlation_length, "noise_correlation_length", leading
+    )
+    if correlated is not None and np.any(correlated < 1):
+        raise RetrievalInputError("is less than 1 bin", field="noise_correlation_length")
     length = float(grid.values[-1] - grid.values[0]) if grid.size > 1 else 1.0
     problem = PathProblem(
         power=rows,
@@ -228,6 +241,7 @@ def fit_homogeneous_path(
             THRESHOLDS.lowest_extinction / float(grid.values[-1]),
             THRESHOLDS.highest_optical_depth / length,
         ),
+        correlation_length=correlated,
         extinction=_prior(extinction, length, leading),
         background=inputs.profile_values(background, "background", leading),
         background_variance=None if error is None else error**2,

@@ -17,6 +17,7 @@ from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._common_altitude import along_beam
 from lidarops.retrieve.signal.averaging import RunningMean
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -122,15 +123,17 @@ class AltitudeCycles:
         Parameters
         ----------
         conditioned : xr.Dataset
-            ``power``, ``variance`` and ``quality`` over (time, range), from
+            ``power``, ``variance`` and ``quality`` over (time, range), and
+            ``noise_correlation_length`` over time, from
             `lidarops.retrieve.signal.labeled.condition` or
             `lidarops.retrieve.signal.labeled_gluing.glue`.
         first : int
             Number of the first of the profiles in the scene.
         """
         past = first + conditioned.sizes["time"]
-        power, variance, quality = (
-            conditioned[name].to_numpy() for name in ("power", "variance", "quality")
+        profiles = tuple(
+            conditioned[name].to_numpy()
+            for name in ("power", "variance", "quality", CORRELATION_LENGTH)
         )
         while len(self._pieces) < len(self._batches):
             batch = self._batches[len(self._pieces)]
@@ -140,10 +143,7 @@ class AltitudeCycles:
             cycle = self._order.cycle[batch] - self._order.cycle[batch.start]
             self._pieces.append(
                 _batch_on_altitudes(
-                    power,
-                    variance,
-                    quality,
-                    members - first,
+                    tuple(part[members - first] for part in profiles),
                     self._weights[members],
                     cycle,
                     self._order.beam[batch],
@@ -269,10 +269,7 @@ def _batches(order: _Order) -> Iterator[slice]:
 
 
 def _batch_on_altitudes(
-    power: _Block,
-    variance: _Block,
-    quality: _Block,
-    members: Integers,
+    profiles: tuple[_Block, ...],
     shots: Array,
     cycle: Integers,
     beam: Integers,
@@ -283,9 +280,8 @@ def _batch_on_altitudes(
     The fourth array is, as (cycle, beam), the signal that may have been subtracted with the
     background.
     """
-    values, noise, bits, left = _net_bins(
-        power[members], variance[members], quality[members], beam, settings
-    )
+    power, variance, quality, length = profiles
+    values, noise, bits, left = _net_bins(power, variance, quality, length, beam, settings)
     distance = settings.distance[settings.interpolated]
     unexplained = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
@@ -312,7 +308,12 @@ def _batch_on_altitudes(
 
 
 def _net_bins(
-    power: _Block, variance: _Block, quality: _Block, beam: Integers, settings: _Settings
+    power: _Block,
+    variance: _Block,
+    quality: _Block,
+    length: _Block,
+    beam: Integers,
+    settings: _Settings,
 ) -> tuple[Array, Array, Flags, Array]:
     """Return signal without background, variance and bits of the bins to interpolate.
 
@@ -324,7 +325,11 @@ def _net_bins(
         unknown = ~(np.isfinite(overlap) & (overlap > 0))
         bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
-    data = (values[:, front], settings.distance[front], variance[:, front])
+    data = (
+        values[:, front],
+        settings.distance[front],
+        variance[:, front] * length[:, np.newaxis],
+    )
     tail = settings.background_range
     sky = (
         estimate.from_tail(*data, tail)

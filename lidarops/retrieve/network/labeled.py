@@ -21,6 +21,7 @@ from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -193,7 +194,8 @@ def _gather_signals(
         data, distance = beam.averages, beam.averages["range"].to_numpy().astype(np.float64)
         quality = data["quality"].to_numpy()
         values = np.where((quality & int(_UNUSABLE)) != 0, np.nan, data["power"].to_numpy())
-        noise = data["variance"].to_numpy()
+        # Bins are averaged between crossings.
+        noise = (data["variance"] * data[CORRELATION_LENGTH]).to_numpy()
         sky = from_tail(values, distance, noise, beam.background_range)
         beam_bins = slice(distance.size)
         power[rows, index, beam_bins] = values - sky.background[:, np.newaxis]

@@ -27,6 +27,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal import _signal_kernels as kernels
+from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -50,6 +51,9 @@ class Signal:
     """Noise variance in the square of the signal's unit."""
     quality: Flags
     """Bits of `lidarops.flags.Quality`."""
+    correlation_length: Array
+    """(...), bins: integral correlation length of the noise along range, without the last axis;
+    see `lidarops.retrieve.signal.noise_correlation`."""
 
 
 def analog_signal(
@@ -94,7 +98,9 @@ def analog_signal(
         Mean of the dark files in mV, and the variance of that mean in mV^2; common to all
         profiles, or one for each.
     noise_variance : float, optional
-        mV^2, of one profile; where not given, estimated from the profile (`difference_variance`).
+        mV^2, of one profile; where not given, estimated from the profile (`difference_variance`),
+        and raised where the noise of neighbouring bins is correlated
+        (`lidarops.retrieve.signal.noise_correlation`).
     full_overlap_range : float
         m; nearer bins are INCOMPLETE_OVERLAP.
 
@@ -137,13 +143,17 @@ def analog_signal(
         if clipped.size:
             # Clipped bins are less noisy than others and lowered the estimate.
             _rows(variance)[clipped] = difference_variance(_rows(power)[clipped], grid)
-        return Signal(power, _add_rounding(variance, scale), quality)
+        correlation = estimate_noise_correlation(_rows(power), _rows(variance))
+        variance *= correlation.excess.reshape(*leading, 1)
+        length = correlation.length.reshape(leading)
+        return Signal(power, _add_rounding(variance, scale), quality, length)
     _require(0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2")
     noise = np.full(power.shape, noise_variance)
     dark_noise = _per_bin(dark_variance, "dark_variance", summed.shape)
     _flag_clipped(power, quality, scale, (_rows(noise) + dark_noise).reshape(power.shape))
     variance = _rows(_add_rounding(noise, scale)) + dark_noise
-    return Signal(power, variance.reshape(power.shape), quality)
+    length = estimate_noise_correlation(_rows(power), variance).length.reshape(leading)
+    return Signal(power, variance.reshape(power.shape), quality, length)
 
 
 class _Scale(NamedTuple):
@@ -303,7 +313,7 @@ def photon_signal(
         _rows(variance),
         _rows(quality),
     )
-    return Signal(power, variance, quality)
+    return Signal(power, variance, quality, np.ones(leading))
 
 
 def dead_time_standard_error(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,8 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.intp]
+
+_VARIANCES: Final = [_line_fit.SLOPE_VARIANCE, _line_fit.CENTRE_VARIANCE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,7 @@ def glue(
     photon_variance: npt.ArrayLike,
     photon_background: npt.ArrayLike = 0.0,
     photon_change: npt.ArrayLike = 0.0,
+    analog_correlation_length: npt.ArrayLike = 1.0,
 ) -> GluedSignal:
     r"""Return analog signals scaled to photon counting by a line, joined with photon counting.
 
@@ -92,6 +96,9 @@ def glue(
     photon_change : (..., range) float
         MHz, a change of photon counting by an error that all bins share, such as that of the dead
         time; broadcast.
+    analog_correlation_length : (...) float
+        Bins; the integral correlation length of analog noise
+        (`lidarops.retrieve.signal.noise_correlation`), which raises the errors of the line.
 
     Returns
     -------
@@ -126,6 +133,8 @@ def glue(
         return lines
 
     lines = fitted(y)
+    length = inputs.profile_values(analog_correlation_length, "analog_correlation_length", leading)
+    lines[:, _VARIANCES] *= _correlated_share(xv, yv, lines, first, past, length)
     change = np.zeros((len(x), 1))
     if np.any(photon_change):
         moved = frozen(y + inputs.noise_rows(photon_change, "photon_change", grid, leading))
@@ -134,6 +143,19 @@ def glue(
     change = np.broadcast_to(change, y.shape)
     joined = _joined(x, y, xv, yv, lines, near)
     return _result(lines, (first, past), (*joined, change), leading, grid)
+
+
+def _correlated_share(
+    xv: Array, yv: Array, lines: Array, first: Indices, past: Indices, length: Array | None
+) -> Array:
+    """Return the noise of means of both channels over that of independent bins, (profile, 1)."""
+    index = np.arange(xv.shape[1])
+    inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
+    analog = lines[:, _line_fit.SLOPE] ** 2 * np.where(inside, xv, 0.0).sum(axis=-1)
+    photons = np.where(inside, yv, 0.0).sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (analog * (1.0 if length is None else length) + photons) / (analog + photons)
+    return np.where(np.isfinite(share), share, 1.0)[:, np.newaxis]
 
 
 def _joined_power(x: Array, y: Array, lines: Array, near: Booleans) -> Array:

@@ -20,21 +20,25 @@ from lidarops.retrieve.background.estimate import Background, from_cubic, from_t
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.dark import DarkSignals
+from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 
 _Block = npt.NDArray[Any]
 
 DEAD_TIME_ERROR: Final = "dead_time_standard_error"
 """Attribute of the power of photon counting, s."""
 
-_SIGNAL_NAMES = ("power", "variance", "quality")
+CORRELATION_LENGTH: Final = "noise_correlation_length"
+"""Name of the integral correlation length of noise along range, bins."""
+_SIGNAL_NAMES = ("power", "variance", "quality", CORRELATION_LENGTH)
 _CORRECTED: Final = {
     "signal": np.float32,
     "signal_standard_error": np.float32,
     "quality_flag": np.int32,
     "background": np.float64,
     "background_standard_error": np.float64,
+    CORRELATION_LENGTH: np.float64,
 }
-"""Variables of `correct_for_range` and their types; the last two have no range."""
+"""Variables of `correct_for_range` and their types; the last three have no range."""
 
 
 class BackgroundMethod(StrEnum):
@@ -86,9 +90,10 @@ def condition(
     Returns
     -------
     xr.Dataset
-        ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), as lazy as the
-        input. The attribute ``dead_time_standard_error`` (s) of the power of photon counting is
-        the input of `dead_time_error`.
+        ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), and
+        ``noise_correlation_length`` (bins) over time, as lazy as the input. The attribute
+        ``dead_time_standard_error`` (s) of the power of photon counting is the input of
+        `dead_time_error`.
     """
     counts = _with_range(archive[channel], range_offset)
     unit = channel_unit(archive, channel)
@@ -113,10 +118,10 @@ def condition(
         _photons if unit == "MHz" else _analog,
         *arguments,
         input_core_dims=[["range"]] + [[]] * (len(arguments) - 1),
-        output_core_dims=[["range"]] * 3,
+        output_core_dims=[["range"]] * 3 + [[]],
         kwargs=settings,
         dask="parallelized",
-        output_dtypes=[np.float64, np.float64, np.int32],
+        output_dtypes=[np.float64, np.float64, np.int32, np.float64],
     )
     # All parts have the same coordinates; passing them avoids a comparison.
     variables = {name: array.variable for name, array in zip(_SIGNAL_NAMES, arrays, strict=True)}
@@ -127,6 +132,7 @@ def condition(
             dead_time, dead_time_uncertainty
         )
     result["variance"].attrs = {"units": f"{unit}2"}
+    result[CORRELATION_LENGTH].attrs = {"units": "1"}
     result["range"].attrs = counts["range"].attrs
     return result
 
@@ -196,13 +202,19 @@ def correct_for_range(
     -------
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
-        over (time, range), ``background`` and ``background_standard_error`` over time; the
-        attribute ``steps`` states the method of the background. For photon counting,
+        over (time, range), ``background``, ``background_standard_error`` and
+        ``noise_correlation_length`` over time; the attribute ``steps`` states the method of the
+        background. For photon counting,
         ``signal_dead_time_error`` over (time, range), the change of the signal with one standard
         error of the dead time (`dead_time_error`), which is not part of
         ``signal_standard_error``.
         INPUT_MISSING without a background, or NO_REAL_SOLUTION where the cubic has no admissible
         root. BACKGROUND_UNCERTAIN where the background may contain signal.
+
+        The noise of the far half of each profile, and its correlation between bins, raise the
+        standard errors where it exceeds the stated variance
+        (`lidarops.retrieve.signal.noise_correlation`); those of glued channels from the middle of
+        the gluing window on.
 
     Raises
     ------
@@ -212,9 +224,10 @@ def correct_for_range(
     method = inputs.choice(background_method, BackgroundMethod, "background_method")
     arrays = xr.apply_ufunc(
         _corrected,
-        *(conditioned[name] for name in _SIGNAL_NAMES),
-        input_core_dims=[["range"]] * 3,
-        output_core_dims=[["range"]] * 3 + [[]] * 2,
+        *(conditioned[name] for name in ("power", "variance", "quality")),
+        _glued_until(conditioned),
+        input_core_dims=[["range"]] * 3 + [[]],
+        output_core_dims=[["range"]] * 3 + [[]] * 3,
         kwargs={
             "range": conditioned["range"].to_numpy().astype(np.float64),
             "background_range": background_range,
@@ -230,6 +243,46 @@ def correct_for_range(
         return result
     error *= conditioned["range"].astype(np.float64) ** 2
     return result.assign(signal_dead_time_error=error.astype(np.float32))
+
+
+def actual_noise(profiles: xr.Dataset) -> tuple[_Block, _Block]:
+    """Return variances that cover the noise of the far half of profiles, and its correlation.
+
+    Parameters
+    ----------
+    profiles : xr.Dataset
+        ``power`` and ``variance`` over (time, range), of all bins of a channel or their means.
+
+    Returns
+    -------
+    variance : (time, range) float
+        Raised where the noise exceeds it; of glued channels from the middle of the gluing window
+        on, because before it the noise is that of the analog channel.
+    correlation_length : (time,) float
+        Bins; see `lidarops.retrieve.signal.noise_correlation`.
+    """
+    power, variance = profiles["power"].to_numpy(), profiles["variance"].to_numpy()
+    distance = profiles["range"].to_numpy().astype(np.float64)
+    return _raised(power, variance, _glued_until(profiles).to_numpy(), distance)
+
+
+def _glued_until(profiles: xr.Dataset) -> xr.DataArray:
+    """Return the range in m to which profiles are glued; below all ranges where they are not."""
+    if "glue_top" in profiles:
+        middle: xr.DataArray = 0.5 * (profiles["glue_bottom"] + profiles["glue_top"])
+        return middle
+    return xr.full_like(profiles["power"].isel(range=0, drop=True), -np.inf)
+
+
+def _raised(
+    power: _Block, variance: _Block, glued_until: _Block, distance: _Block
+) -> tuple[_Block, _Block]:
+    rows = (-1, distance.size)
+    noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
+    leading = power.shape[:-1]
+    excess = noise.excess.reshape(*leading, 1)
+    raised = variance * np.where(distance > glued_until[..., np.newaxis], excess, 1.0)
+    return raised, noise.length.reshape(leading)
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
@@ -275,9 +328,12 @@ _DARK_TOGETHER: Final = 32
 """Dark files that are converted together, which bounds the memory of the conversion."""
 
 
-def _photons(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, _Block, _Block]:
-    signal = counts_to_signal.photon_signal(counts, shots, **settings)
-    return signal.power, signal.variance, signal.quality
+def _photons(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, ...]:
+    return _parts(counts_to_signal.photon_signal(counts, shots, **settings))
+
+
+def _parts(signal: counts_to_signal.Signal) -> tuple[_Block, ...]:
+    return signal.power, signal.variance, signal.quality, signal.correlation_length
 
 
 def _analog(
@@ -288,24 +344,27 @@ def _analog(
     *,
     dark: DarkSignals | None = None,
     **settings: Any,
-) -> tuple[_Block, _Block, _Block]:
+) -> tuple[_Block, ...]:
     if dark is not None and times is not None:
         at_times = dark.at(times.astype("datetime64[ns]"))
         settings |= {"dark": at_times.dark, "dark_variance": at_times.variance}
-    signal = counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
-    return signal.power, signal.variance, signal.quality
+    return _parts(
+        counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
+    )
 
 
 def _corrected(
     power: _Block,
     variance: _Block,
     quality: _Block,
+    glued_until: _Block,
     *,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
     estimate: Callable[..., Background],
 ) -> tuple[_Block, ...]:
-    sky = estimate(power, range, variance, background_range)
+    variance, length = _raised(power, variance, glued_until, range)
+    sky = estimate(power, range, variance * length[..., np.newaxis], background_range)
     signal, error = counts_to_signal.range_corrected(
         power,
         variance,
@@ -314,4 +373,4 @@ def _corrected(
         background_standard_error=sky.standard_error,
     )
     bits = quality | sky.quality[..., np.newaxis]
-    return signal, error, bits, sky.background, sky.standard_error
+    return signal, error, bits, sky.background, sky.standard_error, length

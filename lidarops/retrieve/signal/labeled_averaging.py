@@ -12,6 +12,7 @@ import xarray as xr
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.signal.averaging import RunningMean
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
 _PROFILES_IN_CACHE: Final = 32
 """Profiles averaged together; they fit the processor cache."""
@@ -97,12 +98,14 @@ class ClockAverage:
         times = self._middles[self._open]
         shape = times.size, self._distance.size
         self._sums, self._bits = RunningMean(shape), np.zeros(shape, dtype=np.int32)
+        self._lengths = RunningMean((times.size, 1))
         shared = self._shared_variance
         self._shared = None if shared is None or not times.size else shared(times)
 
     def add(self, conditioned: xr.Dataset) -> None:
-        """Add the next profiles: ``power``, ``variance`` and ``quality`` over (time, range)."""
-        arrays = [conditioned[name].to_numpy() for name in ("power", "variance", "quality")]
+        """Add the next profiles, from `lidarops.retrieve.signal.labeled.condition`."""
+        names = ("power", "variance", "quality", CORRELATION_LENGTH)
+        arrays = [conditioned[name].to_numpy() for name in names]
         units = {name: dict(conditioned[name].attrs) for name in ("power", "variance", "range")}
         first, count = 0, len(arrays[0])
         while first < count:
@@ -114,7 +117,9 @@ class ClockAverage:
                 self._begin(self._open.stop)
             first = past
 
-    def _add(self, power: Array, variance: Array, quality: npt.NDArray[np.int32]) -> None:
+    def _add(
+        self, power: Array, variance: Array, quality: npt.NDArray[np.int32], length: Array
+    ) -> None:
         profiles = slice(self._added, self._added + len(power))
         group = self._group[profiles] - self._open.start
         common = None if self._shared is None else self._shared[group]
@@ -125,6 +130,8 @@ class ClockAverage:
             weights=self._weights[profiles],
             shared_variance=0.0 if common is None else common,
         )
+        weights = self._weights[profiles]
+        self._lengths.add(length[:, np.newaxis], 0.0, groups=group, weights=weights)
         first = np.flatnonzero(np.diff(group, prepend=-1))
         self._bits[group[first]] |= np.bitwise_or.reduceat(quality & ~_MISSING, first, axis=0)
         self._added += len(power)
@@ -136,7 +143,8 @@ class ClockAverage:
         ------
         xr.Dataset
             ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
-            range), ``shots`` (sum), ``profiles`` (number) over time. ``time`` is the middle of
+            range), ``noise_correlation_length`` (mean), ``shots`` (sum), ``profiles`` (number) over
+            time. ``time`` is the middle of
             ``time_bnds``, which span the profiles of the interval. Intervals without a profile are
             omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
             profile has data.
@@ -149,7 +157,7 @@ class ClockAverage:
         return joined(self.completed())
 
     def _means(self, units: dict[str, dict[str, Any]]) -> xr.Dataset:
-        means = self._sums.averages()
+        means, length = self._sums.averages(), self._lengths.averages().values[:, 0]
         self._bits[~np.isfinite(means.values)] |= _MISSING
         plane = ("time", "range")
         return xr.Dataset(
@@ -158,6 +166,8 @@ class ClockAverage:
                 "power": (plane, means.values.copy(), units["power"]),
                 "variance": (plane, means.variance + means.shared_variance, units["variance"]),
                 "quality": (plane, self._bits),
+                # Without a shot it is not known, and neither is the mean.
+                CORRELATION_LENGTH: ("time", np.nan_to_num(length, nan=1.0), {"units": "1"}),
                 "profiles": ("time", self._counts[self._open].astype(np.int32)),
                 "shots": ("time", self._shots[self._open]),
             },

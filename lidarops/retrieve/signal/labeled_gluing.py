@@ -15,7 +15,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
-from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, DEAD_TIME_ERROR
 
 Array = npt.NDArray[np.float64]
 _Block = npt.NDArray[Any]
@@ -89,14 +89,16 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
     -------
     xr.Dataset
         ``power`` (MHz), ``variance`` (MHz2, with the error of the line) and ``quality`` over
-        (time, range); ``dead_time_error`` (MHz), the change of the power with one standard error
-        of the dead time, where the power of photon counting states that; ``glue_lag`` and
-        ``glue_slope`` with their standard errors, and the ends of the window, ``glue_bottom`` and
-        ``glue_top``, over time. NO_GLUING where there is no line.
+        (time, range); ``noise_correlation_length`` of the analog channel over time;
+        ``dead_time_error`` (MHz), the change of the power with one standard error of the dead
+        time, where the power of photon counting states that; ``glue_lag`` and ``glue_slope`` with
+        their standard errors, and the ends of the window, ``glue_bottom`` and ``glue_top``, over
+        time. NO_GLUING where there is no line.
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
     inputs = [channel[name] for channel in (analog, photon) for name in _PARTS]
+    inputs.append(analog[CORRELATION_LENGTH])
     dead_time_error = photon["power"].attrs.get(DEAD_TIME_ERROR)
     settings = {
         "lag": lag.bins,
@@ -105,11 +107,8 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
     }
     outputs = xr.apply_ufunc(
         _glue,
-        *(
-            array.drop_vars("range").chunk(range=-1) if array.chunks else array.drop_vars("range")
-            for array in inputs
-        ),
-        input_core_dims=[["range"]] * 6,
+        *(_whole_profiles(array) for array in inputs),
+        input_core_dims=[["range"]] * 6 + [[]],
         output_core_dims=[["range"]] * 4 + [[]] * 4,
         kwargs=settings,
         dask="parallelized",
@@ -121,12 +120,20 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
     result = result.assign_coords(range=photon["range"])
     for name, value in zip(_LAG, (lag.bins, lag.standard_error), strict=True):
         result[name] = xr.full_like(result["glue_slope"], value)
+    # That of photon counting is less, so that errors of its part become too large.
+    result[CORRELATION_LENGTH] = analog[CORRELATION_LENGTH].assign_attrs(units="1")
     for name, unit in {**units, **_LAG}.items():
         result[name].attrs = {"units": unit} if unit else {}
     if dead_time_error is None:
         return result.drop_vars("dead_time_error")
     result["power"].attrs[DEAD_TIME_ERROR] = dead_time_error
     return result
+
+
+def _whole_profiles(array: xr.DataArray) -> xr.DataArray:
+    if "range" not in array.dims:
+        return array
+    return array.drop_vars("range").chunk(range=-1) if array.chunks else array.drop_vars("range")
 
 
 def _glue(
@@ -136,6 +143,7 @@ def _glue(
     photon: _Block,
     photon_variance: _Block,
     photon_quality: _Block,
+    correlation_length: _Block,
     *,
     lag: float,
     distance: npt.NDArray[np.float64],
@@ -163,6 +171,7 @@ def _glue(
         photon_variance=np.nan_to_num(photon_variance[..., ahead]),
         photon_background=np.nan_to_num(sky),
         photon_change=np.nan_to_num(change, copy=False)[..., ahead],
+        analog_correlation_length=correlation_length,
     )
     power, variance, change = (np.full(photon.shape, np.nan) for _ in range(3))
     change[..., ahead] = glued.change + sky_change[..., np.newaxis]

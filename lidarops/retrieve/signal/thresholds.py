@@ -43,6 +43,17 @@ class Thresholds:
     leak: float = 0.05
     """Share of a squared third difference that may come from the fall of the signal. Assumed."""
 
+    # Correlation of noise
+    noise_sections: int = 8
+    """Parts of the far half of a profile. Assumed."""
+    fewest_noise_bins: int = 32
+    """Bins of each of them; a correlation is then known within 0.1. Assumed."""
+    most_correlated_bins: int = 10
+    """Greatest distance at which noise is correlated, bins. Assumed."""
+    significant_correlation: float = 3.0
+    """Standard errors beyond which noise is taken as correlated, or larger than stated. Assumed.
+    """
+
     # Dark signals
     session_gap: float = 1800.0
     """s; dark files farther apart belong to different sessions. Assumed."""

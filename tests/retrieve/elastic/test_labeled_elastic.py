@@ -15,6 +15,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import Reference, invert_elastic
+from lidarops.retrieve.signal.counts_to_signal import difference_variance
 
 GREEN = 532e-9
 AIR = MolecularProfile.us_standard()
@@ -351,6 +352,21 @@ def test_aerosol_whose_scattering_rises_less_than_that_of_a_cloud_is_none(wavele
         data = counted(signal * layer, exposure=1e4 * EXPOSURE)
         found = solved(data, wavelength=wavelength, reference=Reference(4e3, 7e3, 1e3, 1.0, 0.0))
         assert bool(np.isfinite(found["cloud_base_range"]).all()) is cloudy
+
+
+def test_correlated_noise_is_stated():
+    """Neighbouring bins of analog signals are correlated, and their differences too small."""
+    rng = np.random.default_rng(3)
+    white = rng.standard_normal((150, distance.size + 1))
+    sigma = 2e-3 * light(distance)[300]
+    noise = sigma * (white[:, 1:] + 0.5 * white[:, :-1]) / np.sqrt(1.25)
+    power = light(distance) + SKY + noise
+    retrieved = solved(averages(power, difference_variance(noise, distance)))
+    assert not np.isfinite(retrieved["cloud_base_range"]).any()
+    background = (retrieved["background"] - SKY) / retrieved["background_standard_error"]
+    assert 0.8 < float(np.sqrt((background**2).mean())) < 1.15
+    score = from_noise(retrieved)[:, between(1000.0, 3000.0)]
+    assert 0.85 < np.sqrt(np.nanmean(score**2)) < 1.15
 
 
 def test_no_reference_window_holds_a_cloud():

@@ -82,6 +82,7 @@ def scan(
             "power": (dims, values),
             "variance": (dims, np.full(values.shape, sigma**2)),
             "quality": (dims, bits),
+            "noise_correlation_length": ("time", np.ones(len(values))),
         },
         coords={"range": RANGE},
     )

@@ -286,7 +286,10 @@ def test_a_profile_depends_neither_on_others_nor_on_order(seed, cut, dead_time) 
             _assert_same_bits(
                 part,
                 counts_to_signal.Signal(
-                    whole.power[rows], whole.variance[rows], whole.quality[rows]
+                    whole.power[rows],
+                    whole.variance[rows],
+                    whole.quality[rows],
+                    whole.correlation_length[rows],
                 ),
             )
 
@@ -295,6 +298,7 @@ def _assert_agree(result, expected) -> None:
     np.testing.assert_array_equal(result.power, expected.power)
     np.testing.assert_array_equal(result.quality, expected.quality)
     np.testing.assert_allclose(result.variance, expected.variance, rtol=1e-9, atol=0.0)
+    np.testing.assert_allclose(result.correlation_length, expected.correlation_length, rtol=1e-9)
 
 
 @pytest.mark.parametrize("bins", [1, 2, 3, 4, 16, 17, 31, 33, 50, 1000, 4096])
@@ -414,7 +418,12 @@ def test_each_profile_may_have_its_own_dark_signal() -> None:
         )
         _assert_same_bits(
             single,
-            counts_to_signal.Signal(whole.power[1, 2], whole.variance[1, 2], whole.quality[1, 2]),
+            counts_to_signal.Signal(
+                whole.power[1, 2],
+                whole.variance[1, 2],
+                whole.quality[1, 2],
+                whole.correlation_length[1, 2],
+            ),
         )
     np.testing.assert_array_equal(whole.variance, np.maximum(1e-3 + spread, whole.variance.min()))
 

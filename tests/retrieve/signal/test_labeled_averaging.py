@@ -38,6 +38,7 @@ def made(minutes, *, seed=0, length=60):
             "power": (("time", "range"), rng.normal(10.0, 1.0, size), {"units": "mV"}),
             "variance": (("time", "range"), rng.uniform(0.5, 1.5, size), {"units": "mV2"}),
             "quality": (("time", "range"), np.zeros(size, np.int32)),
+            "noise_correlation_length": ("time", np.ones(starts.size)),
         },
         coords={
             "time": starts + length * SECOND // 2,

@@ -33,6 +33,7 @@ def channel(power, variance, bits, unit, offset=0.0):
             "power": (DIMS, np.where(bits != 0, np.nan, power), {"units": unit}),
             "variance": (DIMS, variance, {"units": f"{unit}2"}),
             "quality": (DIMS, np.broadcast_to(bits, power.shape).astype(np.int32)),
+            "noise_correlation_length": (DIMS[:-1], np.ones(power.shape[:-1])),
         },
         coords={"range": ("range", distance + offset, {"units": "m"})},
     )
@@ -93,6 +94,7 @@ def test_the_truth_is_returned_within_its_errors(lag):
         "glue_top": "m",
         "glue_lag": "1",
         "glue_lag_standard_error": "1",
+        "noise_correlation_length": "1",
     }
 
 

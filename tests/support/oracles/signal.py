@@ -50,9 +50,59 @@ def analog(
     if noise_variance is None:
         with_clipping = clipped.any(axis=-1)
         variance[with_clipping] = difference_variance(power, range)[with_clipping]
-        return Signal(power, rounded(variance, whole, fired), quality)
-    known = rounded(np.full(power.shape, noise_variance), whole, fired)
-    return Signal(power, known + dark_variance, quality)
+        excess, length = correlated_noise(power, variance)
+        raised = rounded(variance * excess[..., np.newaxis], whole, fired)
+        return Signal(power, raised, quality, length)
+    known = rounded(np.full(power.shape, noise_variance), whole, fired) + dark_variance
+    return Signal(power, known, quality, correlated_noise(power, known)[1])
+
+
+def correlated_noise(power, variance):
+    """Return the excess of the variance in the far half, and the correlation length."""
+    pairs = [
+        _correlated(*rows)
+        for rows in zip(
+            power.reshape(-1, power.shape[-1]),
+            variance.reshape(-1, power.shape[-1]),
+            strict=True,
+        )
+    ]
+    excess, length = np.array(pairs).T
+    return excess.reshape(power.shape[:-1]), length.reshape(power.shape[:-1])
+
+
+def _correlated(power, variance):
+    size = power.size // 16
+    if size < 32:
+        return 1.0, 1.0
+    place = np.arange(size)
+    sections = []
+    for start in range(power.size - 8 * size, power.size, size):
+        x, v = power[start : start + size], variance[start : start + size]
+        if np.isfinite(x).all() and 0 < v.sum() < np.inf:
+            residual = x - np.polyval(np.polyfit(place - place.mean(), x, 2), place - place.mean())
+            # Of a constant, rounding remains.
+            sections.append((residual * (np.ptp(x) > 0), v.mean()))
+    if len(sections) < 4:
+        return 1.0, 1.0
+    number = len(sections) * size
+    r = []
+    for k in range(1, 11):
+        each = [e[k:] @ e[:-k] / (size - k) / (np.mean(e**2) or np.inf) for e, _ in sections]
+        if np.median(each) < 3.0 / np.sqrt(number):
+            break
+        r.append(np.median(each))
+    taken = 3.0 / size * (1.0 + 2.0 * sum(r))
+    chi_square = np.median([e @ e / (size - 3) / v for e, v in sections])
+    chi_square *= 1.0 + taken - 3.0 / size
+    kurtosis = [np.mean(e**4) / np.mean(e**2) ** 2 if e.any() else size for e, _ in sections]
+    kurtosis = np.median(kurtosis)
+    if chi_square < 1.0 + 3.0 * np.sqrt((kurtosis - 1.0) / number):
+        chi_square = 1.0
+    if not r:
+        return chi_square, 1.0
+    length = 1.0 + 2.0 * sum((value + taken) / (1.0 + taken) for value in r)
+    return chi_square, length * (1.0 + np.sqrt(2.0 * (2.0 * len(r) + 1.0) / number))
 
 
 def rounded(variance, step, shots):
@@ -108,7 +158,7 @@ def photon(
         over &= (quality & np.int32(Quality.INPUT_MISSING)) == 0
         power[over] = np.nan
         quality[over] |= np.int32(Quality.SATURATED)
-    return Signal(power, variance, quality)
+    return Signal(power, variance, quality, np.ones(shots.shape))
 
 
 def raw_quality(counts, shots, range, full_overlap_range):  # noqa: A002

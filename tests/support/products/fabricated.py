@@ -136,6 +136,7 @@ def signal(
                 attrs,
             ),
             "background": ("time", level.astype(np.float32), {"units": "MHz"}),
+            "noise_correlation_length": ("time", np.ones(level.size, np.float32), {"units": "1"}),
             "background_standard_error": (
                 "time",
                 np.full(time.size, 4e-3, np.float32),

@@ -51,6 +51,7 @@ def beam(
             "power": (pair, 0.1 + clean + spread * random.standard_normal(shape)),
             "variance": (pair, np.broadcast_to(spread**2, shape).copy()),
             "quality": (pair, np.zeros(shape, dtype=np.int32)),
+            "noise_correlation_length": ("time", np.ones(intervals)),
             "shots": ("time", np.full(intervals, 3000, dtype=np.int32)),
         },
         coords={

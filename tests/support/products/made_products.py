@@ -159,6 +159,7 @@ def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "signal_standard_error": (dims, np.full(shape, 1e4)),
             "signal_dead_time_error": (dims, np.full(shape, 2e3)),
             "background": ("time", rng.uniform(0.1, 2.0, profiles)),
+            "noise_correlation_length": ("time", np.ones(profiles)),
             "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
             "quality_flag": (dims, flags),
             "shots": ("time", np.full(profiles, 600, np.int32)),

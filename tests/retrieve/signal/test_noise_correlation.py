@@ -1,0 +1,161 @@
+"""Stated noise is the actual noise of bins and of means, where noise is correlated too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import lidarops
+from lidarops.retrieve.background.estimate import from_tail
+from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
+from lidarops.retrieve.signal import labeled
+from lidarops.retrieve.signal.counts_to_signal import difference_variance
+from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
+
+RANGE = 7.5 * (np.arange(4000) + 0.5)
+LIGHT = 3e9 * np.exp(-RANGE / 8000.0) / (RANGE + 100.0) ** 2
+FILTERS = {
+    "white": [1.0],
+    "two bins": [1.0, 0.5],
+    "preamplifier": 0.6 ** np.arange(12),
+    "ringing": 0.7 ** np.arange(20) * np.cos(1.2 * np.arange(20)),
+}
+
+
+def noise(kind, shape, rng):
+    """Return filtered noise of unit variance."""
+    taps = np.asarray(FILTERS[kind])
+    white = rng.standard_normal((*shape[:-1], shape[-1] + taps.size - 1))
+    return signal.lfilter(taps / np.sqrt(taps @ taps), [1.0], white)[..., taps.size - 1 :]
+
+
+def means(values, count):
+    bins = values.shape[-1] // count * count
+    return values[..., :bins].reshape(*values.shape[:-1], -1, count).mean(axis=-1)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("kind", FILTERS)
+def test_noise_of_bins_and_of_means_is_as_stated(kind):
+    rng = np.random.default_rng(1)
+    deviations = noise(kind, (200, RANGE.size), rng)
+    power = 5.0 + LIGHT + deviations
+    stated = difference_variance(power, RANGE)
+    found = estimate_noise_correlation(power, stated)
+    far = slice(RANGE.size // 2, None)
+    bins = np.sqrt(stated[:, far].mean(axis=-1) * found.excess)
+    assert 0.95 < rms(deviations[:, far]) / rms(bins) < 1.05
+    for count in (5, 20, 100):
+        of_means = bins * np.sqrt(found.variance_of_means([count])[:, 0] / count)
+        ratio = rms(means(deviations, count)) / rms(of_means)
+        # One standard error is added; negative correlations are left out.
+        assert (0.4 if kind == "ringing" else 0.9) < ratio < 1.05
+    assert rms(means(deviations, 200)) < 1.05 * rms(bins * np.sqrt(found.length / 200.0))
+
+
+def test_white_noise_stays_as_stated():
+    rng = np.random.default_rng(2)
+    power = LIGHT + rng.standard_normal((500, RANGE.size))
+    found = estimate_noise_correlation(power, np.ones((1, RANGE.size)))
+    assert np.mean(found.excess > 1.0) < 0.01
+    assert np.mean(found.length > 1.0) < 0.01
+
+
+@pytest.mark.parametrize("rate", [1e-3, 0.1, 5.0])
+def test_few_counts_are_not_taken_for_excess_noise(rate):
+    rng = np.random.default_rng(3)
+    counts = rng.poisson(rate, (300, RANGE.size)).astype(np.float64)
+    found = estimate_noise_correlation(counts, np.full((1, RANGE.size), rate))
+    assert np.mean(found.excess > 1.0) < 0.03
+    assert np.mean(found.length > 1.0) < 0.03
+
+
+def test_clouds_and_gaps_in_the_far_half_are_not_taken_for_noise():
+    rng = np.random.default_rng(4)
+    deviations = noise("two bins", (100, RANGE.size), rng)
+    clear = estimate_noise_correlation(deviations, np.ones((1, RANGE.size)))
+    cloudy = deviations + 50.0 * np.exp(-0.5 * ((RANGE - 19e3) / 300.0) ** 2)
+    cloudy[:, 3600:3605] = np.nan
+    found = estimate_noise_correlation(cloudy, np.ones((1, RANGE.size)))
+    assert found.length.mean() == pytest.approx(clear.length.mean(), rel=0.05)
+    assert found.excess.mean() == pytest.approx(clear.excess.mean(), rel=0.05)
+
+
+def test_nothing_is_assumed_of_short_or_empty_profiles():
+    for power in (np.ones((2, 100)), np.full((2, 4000), np.nan), np.zeros((2, 4000))):
+        found = estimate_noise_correlation(power, np.ones((1, power.shape[1])))
+        assert (found.excess == 1.0).all()
+        assert (found.length == 1.0).all()
+
+
+@pytest.mark.parametrize("kind", ["white", "two bins", "preamplifier"])
+def test_fits_of_correlated_noise_hold_their_errors(kind):
+    """Backgrounds from the tail, and fits of a homogeneous path, over 500 profiles."""
+    rng = np.random.default_rng(5)
+    extinction, r = 1e-4, RANGE
+    true = 20.0 + 4e8 * np.exp(-2.0 * extinction * r) / r**2
+    deviations = noise(kind, (500, r.size), rng)
+    stated = difference_variance(deviations, r)
+    found = estimate_noise_correlation(deviations, stated)
+    variance = stated * (found.excess * found.length)[:, np.newaxis]
+    sky = from_tail(20.0 + deviations, r, variance)
+    assert 0.9 < rms((sky.background - 20.0) / sky.standard_error) < 1.1
+    section = slice(100, 1500)
+    fit = fit_homogeneous_path(
+        (true + deviations)[:, section],
+        r[section],
+        weights=1.0 / stated[:, section],
+        noise_correlation_length=found.length,
+    )
+    score = (fit.extinction - extinction) / fit.extinction_standard_error
+    assert 0.85 < rms(score) < 1.1
+    assert np.mean(fit.quality != 0) < 0.02
+
+
+ARCHIVES = {
+    "pilar/20241002/h*": {"analog_1064o", "photon_53200o"},
+    "saopaulo/20170928/signals/*": {"analog_1064o"},
+    "manaus/RM*": set(),
+    "manaus_raman/RM*": {"photon_355o"},
+}
+"""Files, and channels of other noise: periodic interference, a counter near paralysis, and bursts
+of 1e-3 counts a bin."""
+
+
+@pytest.mark.parametrize("files", ARCHIVES)
+def test_stated_noise_of_real_archives_is_the_actual_one(files, data_root):
+    """Within 10 %, for bins (differences over 8) and means of 20, beyond half the range."""
+    folder, pattern = files.rsplit("/", 1)
+    paths = sorted((data_root / folder).glob(pattern))[:30]
+    archive = lidarops.open_archive(paths, mask_and_scale=False, header_position="ignore")
+    compared = 0
+    for channel in sorted(str(name) for name in archive if "detection_mode" in archive[name].attrs):
+        photon = archive[channel].attrs["detection_mode"] == "photon"
+        profiles = labeled.condition(archive, channel, dead_time=3.7e-9 if photon else None)
+        variance, length = labeled.actual_noise(profiles)
+        far = slice(profiles.sizes["range"] // 2, None)
+        power, variance = profiles["power"].to_numpy()[:, far], variance[:, far].mean(axis=-1)
+        known = np.isfinite(power).all(axis=-1)
+        if known.sum() < 2:
+            # Rejected, because an error of the dead time would change the rates too much.
+            assert photon
+            continue
+        of_bins = rms(thirds(power[known], 8)) / rms(np.sqrt(variance[known]))
+        of_means = rms(thirds(means(power[known], 20), 1)) * np.sqrt(20.0)
+        of_means /= rms(np.sqrt(variance * length)[known])
+        compared += 1
+        if channel in ARCHIVES[files]:
+            assert max(of_bins, of_means) < 1.25, (channel, of_bins, of_means)
+        else:
+            assert max(abs(of_bins - 1.0), abs(of_means - 1.0)) < 0.1, (channel, of_bins, of_means)
+    assert compared >= 3
+
+
+def thirds(values, distance):
+    """Return third differences, scaled to the variance of white noise."""
+    parts = [values[..., k * distance : values.shape[-1] - (3 - k) * distance] for k in range(4)]
+    return (parts[3] - 3.0 * parts[2] + 3.0 * parts[1] - parts[0]) / np.sqrt(20.0)
