@@ -44,8 +44,6 @@ class Background:
     quality: Flags
     """BACKGROUND_UNCERTAIN where `uncertain`; INPUT_MISSING, or for the cubic NO_REAL_SOLUTION,
     where there is no background."""
-    reduced_chi2: Array
-    """Mean squared residual of a fit over the noise; 1 where nothing is fitted."""
 
 
 def from_tail(
@@ -102,6 +100,7 @@ def from_known_shape(
     span: tuple[float, float] | None = None,
     *,
     mask: Booleans | None = None,
+    exposure: Array | None = None,
 ) -> Background:
     """Return the background fitted with the shape of clean air; `from_tail` where that fails.
 
@@ -116,6 +115,9 @@ def from_known_shape(
         From `lidarops.retrieve.background.molecular_shape`.
     mask : (..., range) bool, optional
         True where a bin may be fitted.
+    exposure : (...) float, optional
+        Counts per unit of power, for photon counting. The fit then takes its variances from the
+        fitted counts: those of few counts follow their noise, which makes the background too low.
 
     Raises
     ------
@@ -123,7 +125,8 @@ def from_known_shape(
         If no bin lies in `span`.
     """
     tail = from_tail(power, range, variance, span)
-    fit = known_shape.fit_known_shape(power, range, shape, variance=variance, mask=mask)
+    noise = {"variance": variance} if exposure is None else {"exposure": exposure}
+    fit = known_shape.fit_known_shape(power, range, shape, mask=mask, **noise)
     usable = ~fit.singular & np.isfinite(fit.background)
     fitted = range >= fit.start[..., np.newaxis]
     fitted = fitted if mask is None else fitted & mask
@@ -141,10 +144,8 @@ def from_known_shape(
     doubtful = fit.poor_fit | _selected(known, bins)
     unjudged = np.where(usable, doubtful, tail.unjudged)
     uncertain = np.where(usable, doubtful, tail.uncertain)
-    misfit = fit.chi2 / np.maximum(fit.degrees_of_freedom, 1)
-    misfit = np.where(usable & np.isfinite(misfit), misfit, 1.0)
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
-    return Background(value, error, left, unjudged, uncertain, _bits(uncertain, missing), misfit)
+    return Background(value, error, left, unjudged, uncertain, _bits(uncertain, missing))
 
 
 def from_cubic(
@@ -214,7 +215,7 @@ def _judged(
     unjudged = unjudged & np.isfinite(value)
     uncertain = unjudged | shifts(left.detected, error)
     bits = _bits(uncertain, absent)
-    return Background(value, error, left, unjudged, uncertain, bits, np.ones(value.shape))
+    return Background(value, error, left, unjudged, uncertain, bits)
 
 
 def _bits(uncertain: Booleans, absent: Flags) -> Flags:

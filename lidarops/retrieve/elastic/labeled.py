@@ -22,7 +22,7 @@ from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic import reference_window as _reference
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import actual_noise, dead_time_error
+from lidarops.retrieve.signal.labeled import actual_noise, counts_per_power, dead_time_error
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -208,8 +208,10 @@ class _Means:
         partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
         self.quality = quality | partial.astype(np.int32)
         self.raw = averages["power"].to_numpy()
-        self.noise, length = actual_noise(averages)
+        self.noise, excess, length = actual_noise(averages)
         self.correlation_length = length
+        counts = counts_per_power(averages, averages["shots"].to_numpy())
+        self.exposure = None if counts is None else counts / (excess * length)
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
 
@@ -268,7 +270,9 @@ def _subtract_background(
     if not known_shape:
         sky = estimate.from_tail(raw, r, noise)
     else:
-        sky = estimate.from_known_shape(raw, r, noise, means.air.shape, mask=usable)
+        sky = estimate.from_known_shape(
+            raw, r, noise, means.air.shape, mask=usable, exposure=means.exposure
+        )
     return _Signal(means.minus(sky.background), sky.background, sky.standard_error, sky.uncertain)
 
 

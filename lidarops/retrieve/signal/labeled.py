@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.constants import DEAD_TIME_UNCERTAINTY
+from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
 from lidarops.records import DetectionMode
 from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
 from lidarops.retrieve.common import inputs
@@ -245,25 +245,48 @@ def correct_for_range(
     return result.assign(signal_dead_time_error=error.astype(np.float32))
 
 
-def actual_noise(profiles: xr.Dataset) -> tuple[_Block, _Block]:
-    """Return variances that cover the noise of the far half of profiles, and its correlation.
+class ActualNoise(NamedTuple):
+    """Noise of profiles as the far half of each shows it.
+
+    See `lidarops.retrieve.signal.noise_correlation`.
+    """
+
+    variance: _Block
+    """(..., range): raised where the noise exceeds it; of glued channels from the middle of the
+    gluing window on, because before it the noise is that of the analog channel."""
+    excess: _Block
+    """(...), the factor."""
+    correlation_length: _Block
+    """(...), bins."""
+
+
+def actual_noise(profiles: xr.Dataset) -> ActualNoise:
+    """Return the noise of profiles.
 
     Parameters
     ----------
     profiles : xr.Dataset
         ``power`` and ``variance`` over (time, range), of all bins of a channel or their means.
-
-    Returns
-    -------
-    variance : (time, range) float
-        Raised where the noise exceeds it; of glued channels from the middle of the gluing window
-        on, because before it the noise is that of the analog channel.
-    correlation_length : (time,) float
-        Bins; see `lidarops.retrieve.signal.noise_correlation`.
     """
     power, variance = profiles["power"].to_numpy(), profiles["variance"].to_numpy()
     distance = profiles["range"].to_numpy().astype(np.float64)
-    return _raised(power, variance, _glued_until(profiles).to_numpy(), distance)
+    return _actual_noise(power, variance, _glued_until(profiles).to_numpy(), distance)
+
+
+def counts_per_power(profiles: xr.Dataset, shots: npt.ArrayLike) -> _Block | None:
+    """Return the counts of a bin per MHz of power, (time,); None for analog signals.
+
+    Parameters
+    ----------
+    profiles : xr.Dataset
+        From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
+    shots : (time,) int
+        Number of shots of each profile; without a shot, one is taken.
+    """
+    if DEAD_TIME_ERROR not in profiles["power"].attrs:
+        return None
+    width = float(np.median(np.diff(profiles["range"].to_numpy().astype(np.float64))))
+    return np.asarray(np.maximum(shots, 1) * (width / LICEL_RANGE_PER_MICROSECOND))
 
 
 def _glued_until(profiles: xr.Dataset) -> xr.DataArray:
@@ -274,15 +297,16 @@ def _glued_until(profiles: xr.Dataset) -> xr.DataArray:
     return xr.full_like(profiles["power"].isel(range=0, drop=True), -np.inf)
 
 
-def _raised(
+def _actual_noise(
     power: _Block, variance: _Block, glued_until: _Block, distance: _Block
-) -> tuple[_Block, _Block]:
+) -> ActualNoise:
     rows = (-1, distance.size)
     noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
     leading = power.shape[:-1]
-    excess = noise.excess.reshape(*leading, 1)
-    raised = variance * np.where(distance > glued_until[..., np.newaxis], excess, 1.0)
-    return raised, noise.length.reshape(leading)
+    excess = noise.excess.reshape(leading)
+    beyond = distance > glued_until[..., np.newaxis]
+    raised = variance * np.where(beyond, excess[..., np.newaxis], 1.0)
+    return ActualNoise(raised, excess, noise.length.reshape(leading))
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
@@ -363,11 +387,12 @@ def _corrected(
     background_range: tuple[float, float],
     estimate: Callable[..., Background],
 ) -> tuple[_Block, ...]:
-    variance, length = _raised(power, variance, glued_until, range)
-    sky = estimate(power, range, variance * length[..., np.newaxis], background_range)
+    noise = _actual_noise(power, variance, glued_until, range)
+    length = noise.correlation_length
+    sky = estimate(power, range, noise.variance * length[..., np.newaxis], background_range)
     signal, error = counts_to_signal.range_corrected(
         power,
-        variance,
+        noise.variance,
         range,
         background=sky.background,
         background_standard_error=sky.standard_error,

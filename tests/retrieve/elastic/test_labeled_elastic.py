@@ -15,7 +15,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import Reference, invert_elastic
-from lidarops.retrieve.signal.counts_to_signal import difference_variance
+from lidarops.retrieve.signal.counts_to_signal import difference_variance, photon_signal
 
 GREEN = 532e-9
 AIR = MolecularProfile.us_standard()
@@ -367,6 +367,26 @@ def test_correlated_noise_is_stated():
     assert 0.8 < float(np.sqrt((background**2).mean())) < 1.15
     score = from_noise(retrieved)[:, between(1000.0, 3000.0)]
     assert 0.85 < np.sqrt(np.nanmean(score**2)) < 1.15
+
+
+def test_the_background_of_few_photons_is_within_its_error():
+    """At night: 1000 counts at 1 km, one in a hundred bins of the sky."""
+    rng = np.random.default_rng(7)
+    r = 7.5 * (np.arange(4000) + 0.5)
+    signal, shots = light(r), np.full(100, 18_000)
+    expected = np.where(r < 250.0, 0.0, 1000.0 * signal / signal[133] + 0.01)
+    scores = []
+    for _ in range(10):
+        counts = rng.poisson(expected, (100, r.size)).astype(np.int32)
+        found = photon_signal(counts, shots, r, bin_width=7.5, dead_time=0.0)
+        data = averages(found.power, found.variance, r)
+        data["power"].attrs["dead_time_standard_error"] = 0.0
+        retrieved = solved(data)
+        deviation = retrieved["background"] - 0.01 / (18_000 * 0.05)
+        scores.append(deviation / retrieved["background_standard_error"])
+    score = np.concatenate(scores)
+    assert np.mean(np.abs(score) > 4.0) <= 1e-3
+    assert abs(score.mean()) < 0.2
 
 
 def test_no_reference_window_holds_a_cloud():

@@ -136,7 +136,7 @@ def test_stated_noise_of_real_archives_is_the_actual_one(files, data_root):
     for channel in sorted(str(name) for name in archive if "detection_mode" in archive[name].attrs):
         photon = archive[channel].attrs["detection_mode"] == "photon"
         profiles = labeled.condition(archive, channel, dead_time=3.7e-9 if photon else None)
-        variance, length = labeled.actual_noise(profiles)
+        variance, _, length = labeled.actual_noise(profiles)
         far = slice(profiles.sizes["range"] // 2, None)
         power, variance = profiles["power"].to_numpy()[:, far], variance[:, far].mean(axis=-1)
         known = np.isfinite(power).all(axis=-1)
