@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from enum import IntFlag, StrEnum
 from functools import cache
 from typing import Any, Final
 
@@ -114,6 +114,8 @@ class Row:
     """Whether the variable gets ``time`` as first dimension where the beam moves."""
     flags: Flags | None = None
     """The bits that a flag variable can carry."""
+    reasons: type[IntFlag] | None = None
+    """Bits of a variable that states reasons, and judges no value."""
     summary: bool = False
     """Whether it is `usable`, which is computed from the flags and never passed in."""
     error_kind: ErrorKind | None = None
@@ -338,6 +340,9 @@ def attributes(
         attrs["flag_meanings"] = "good use_with_care do_not_use"
     if row.flags is not None:
         attrs |= _flag_attributes(row.flags, stored)
+    if row.reasons is not None:
+        attrs["flag_masks"] = np.array([int(reason) for reason in row.reasons], dtype=stored)
+        attrs["flag_meanings"] = " ".join(str(reason.name).lower() for reason in row.reasons)
     attrs["comment"] = (
         " ".join(text for text in (attrs.get("comment"), row.comment) if text) or None
     )

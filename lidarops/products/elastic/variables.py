@@ -23,6 +23,7 @@ from lidarops.netcdf.variables import (
     shots,
 )
 from lidarops.products.elastic.flags import FLAGS
+from lidarops.retrieve.elastic.reference_window import Rejection
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12
@@ -239,6 +240,21 @@ LAYOUT: Final = Layout(
             long_name="range at which the reference window ends",
             coverage=Coverage.AUXILIARY,
             comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="reference_rejections",
+            dims=("time",),
+            dtype="i4",
+            units="1",
+            standard_name="status_flag",
+            long_name="reasons for which candidates of the reference window were rejected",
+            coverage=Coverage.AUXILIARY,
+            reasons=Rejection,
+            comment="Of all candidates together; where none passed, no_reference is raised in"
+            " quality_flag. too_few_bins: data in less than half of the bins; excluded: a cloud;"
+            " low_signal: the signal does not exceed zero by 3 standard errors; slope, curvature,"
+            " scatter: it departs from the shape of clean air; more_particles: another window has a"
+            " lower ratio to air.",
         ),
         Row(
             name="cloud_base_range",

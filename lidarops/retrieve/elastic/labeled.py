@@ -173,6 +173,10 @@ def invert_elastic(
             "lidar_ratio_standard_error": ((), np.float64(lidar_ratio_standard_error)),
             "reference_bottom": ("time", window.bottom),
             "reference_top": ("time", window.top),
+            "reference_rejections": (
+                "time",
+                np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32),
+            ),
             "cloud_base_range": ("time", clouds.cloud_base_range),
             "background": ("time", signal.background),
             "background_standard_error": ("time", signal.background_standard_error),

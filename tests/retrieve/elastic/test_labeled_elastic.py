@@ -15,6 +15,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import Reference, invert_elastic
+from lidarops.retrieve.elastic.reference_window import Rejection
 from lidarops.retrieve.signal.counts_to_signal import difference_variance, photon_signal
 
 GREEN = 532e-9
@@ -387,6 +388,27 @@ def test_the_background_of_few_photons_is_within_its_error():
     score = np.concatenate(scores)
     assert np.mean(np.abs(score) > 4.0) <= 1e-3
     assert abs(score.mean()) < 0.2
+
+
+def test_the_reasons_of_rejected_windows_are_given():
+    def haze(z):
+        return particles(z) + 5e-7 * np.exp(-np.maximum(z - 4000.0, 0.0) / 900.0)
+
+    dusk = light(distance) * np.where(distance > 4500.0, 0.0, 1.0)
+    reasons = {}
+    for name, signal in (
+        ("clean", light(distance)),
+        ("haze", light(distance, backscatter=haze)),
+        ("cloud", light(distance, backscatter=cloud(8000.0 + STATION, 2e-5))),
+        ("dark", dusk),
+    ):
+        retrieved = solved(counted(signal, 3, exposure=30 * EXPOSURE))
+        found = np.bitwise_or.reduce(retrieved["reference_rejections"].to_numpy())
+        reasons[name] = Rejection(int(found))
+    assert Rejection.MORE_PARTICLES not in reasons["clean"]
+    assert Rejection.MORE_PARTICLES in reasons["haze"]
+    assert Rejection.EXCLUDED in reasons["cloud"]
+    assert Rejection.LOW_SIGNAL in reasons["dark"]
 
 
 def test_no_reference_window_holds_a_cloud():
