@@ -207,8 +207,7 @@ def join_errors(chunks: Sequence[CrossingErrors]) -> CrossingErrors:
 def score_crossings(errors: CrossingErrors) -> Score:
     """Return the score of one solver in one case, relative to the truth; None without values.
 
-    Monte Carlo errors come from the scatter between blocks, because profiles of a block share
-    their mean field.
+    Monte Carlo errors come from the scatter between blocks, whose profiles share a field.
     """
     solved = np.isfinite(errors.extinction) & np.isfinite(errors.deviation)
     trusted = solved & ~errors.flagged

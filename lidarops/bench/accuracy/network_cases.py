@@ -32,8 +32,7 @@ PEER_NOISE: Final = NOISES[1]
 ADDITIVE: Final = 0.01
 """Additional standard deviation of every bin, over the power at the first crossing of the beam."""
 BLOCK: Final = 50
-"""Profiles that share a mean field."""
-
+"""Profiles that share a prior."""
 _FIRST_BIN: Final = 100.3
 """m, range of the first bin."""
 _BEYOND: Final = 60.0
@@ -260,8 +259,7 @@ def systematic_error(optical_depth: Array, multiplier: float) -> float:
 
     .. math::
         \frac{S_1 - \tilde S_1}{S_1} = \frac{\sum_{j<k} (\mu_j - \mu_{j+1})
-        e^{-2 \sum_{l \le j} \tau_l}}{1 - \mu_k e^{-2 \sum_l \tau_l}}, \quad
-        \mu_j = \lambda^{j-1}
+        e^{-2 \sum_{l \le j} \tau_l}}{1 - \mu_k e^{-2 \sum_l \tau_l}}, \quad \mu_j = \lambda^{j-1}
 
     It holds in any field, because extinction at the crossings cancels (drabenko2021, equation 17).
 
@@ -293,7 +291,6 @@ def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     # Below the crossing of beams 1 and 3, a cycle in the other direction leads away.
     leads_away = _leads_away(net)
     near = depths if leads_away else depths[[1, 0, 2]]
-
     return FigurePoint(
         first_lidar,
         elevation,

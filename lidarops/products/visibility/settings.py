@@ -30,7 +30,7 @@ class VisibilityProductSettings(NetworkProduct):
         default=timedelta(minutes=10), description="interval over which signals are averaged"
     )
     block: PartOfDay = Field(
-        default=timedelta(hours=6), description="interval of averages that share one mean field"
+        default=timedelta(hours=6), description="interval of averages that share one prior"
     )
     prior: PriorName = "block"
     visibility: VisibilitySettings = VisibilitySettings()

@@ -80,7 +80,7 @@ def _window(case: Case, farthest: float) -> Run | Leave:
 
 
 class Prior(Choice[Case, NoSettings]):
-    """Use a prior about the mean field of a block."""
+    """Use a prior that the profiles of a block share."""
 
     name = "prior"
 
@@ -91,7 +91,7 @@ class Prior(Choice[Case, NoSettings]):
             yield Leave("the campaign requests no prior: gradients along beams mimic attenuation")
         else:
             reason = (
-                "decided from the data: the strongest prior about the mean field of a block that"
+                "decided from the data: the strongest prior about a linear field in a block that"
                 " agrees with its beams"
             )
             yield Run(reason, number=settings.block / settings.average)

@@ -225,7 +225,7 @@ LAYOUT: Final = Layout(
         ),
         _time_series(
             "prior_deviation",
-            "prior standard deviation of ln(extinction) about the mean field",
+            "prior standard deviation of ln(extinction) about a linear field",
             "Most likely value for the block of profiles. Missing where there is no prior.",
         ),
         Row(

@@ -50,7 +50,7 @@ class FieldPrior(StrEnum):
     """Prior knowledge of the field that the network method uses."""
 
     BLOCK = "block"
-    """The mean field of the block of profiles, and how much profiles deviate from it."""
+    """What the profiles of a block share: how much ln extinction deviates from a linear field."""
     NONE = "none"
 
 
@@ -115,7 +115,7 @@ class NetworkResult:
     degrees_of_freedom: Array
     """(...)."""
     prior_deviation: Array
-    """(...) standard deviation of ln extinction about the mean field; inf without prior."""
+    """(...) standard deviation of ln extinction about a linear field; inf without prior."""
 
 
 def retrieve_network(
@@ -154,7 +154,7 @@ def retrieve_network(
     exponent : float or (beam,) float
         m of backscatter ~ extinction^(1/m) along a beam.
     blocks : (...) int or str, optional
-        Labels of the profiles that share a mean field; by default, all. Results
+        Labels of the profiles that share a prior; by default, all. Results
         of a block depend on its own profiles only.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.

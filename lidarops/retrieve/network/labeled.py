@@ -77,7 +77,7 @@ class NetworkSettings:
     """Settings of the retrieval, and relative errors for its systematic errors."""
 
     block_intervals: int
-    """Number of clock intervals that share a mean field."""
+    """Number of clock intervals that share a prior."""
     visibility: VisibilityDefinition
     prior: str = "block"
     exponent_relative_error: float = 0.1

@@ -41,7 +41,8 @@ class Thresholds:
 
     # Outlying bins: ablation
     outlier: float = 6.0
-    """Standard errors by which a bin deviates from its neighbours: by chance once in 5e8 bins."""
+    """Standard errors by which a bin deviates from its neighbours: beyond 6 lies 2e-9 of the
+    normal distribution."""
     suspect: float = 4.5
     """Standard errors of a deviation near a bridged bin, beyond which the bin may be an edge of a
     layer; assumed."""
