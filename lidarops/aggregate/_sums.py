@@ -66,7 +66,6 @@ class Sums:
     squared (`gum2008`, section 5.2).
     """
 
-    inverse_variance: bool
     weight: Array
     value: Array
     random: Array
@@ -79,18 +78,10 @@ class Sums:
     """Sum of squared deviations from `centre`."""
 
     @classmethod
-    def like(cls, sample: Sample, *, inverse_variance: bool) -> Sums:
-        """Return empty sums with the shape of a sample.
-
-        Parameters
-        ----------
-        sample : Sample
-        inverse_variance : bool
-            Whether profiles are weighted by 1 / standard_error^2, else equally.
-        """
+    def like(cls, sample: Sample) -> Sums:
+        """Return empty sums with the shape of a sample."""
         zeros = np.zeros(sample.values.shape[1:])
         return cls(
-            inverse_variance=inverse_variance,
             weight=zeros.copy(),
             value=zeros.copy(),
             random=zeros.copy(),
@@ -101,17 +92,18 @@ class Sums:
             spread=zeros.copy(),
         )
 
-    def add(self, sample: Sample) -> None:
+    def add(self, sample: Sample, weights: Array) -> None:
         """Add the profiles of one product.
 
         Parameters
         ----------
         sample : Sample
+        weights : (time, ...) float
+            Of each value; one that is not positive and finite is not used.
         """
-        used = self._used(sample)
+        used = _used(sample) & (weights > 0.0) & np.isfinite(weights)
         # Unused values must be finite too, because 0 x NaN is NaN.
-        weights = np.zeros(used.shape)
-        weights[used] = sample.errors[used] ** -2.0 if self.inverse_variance else 1.0
+        weights = np.where(used, weights, 0.0)
         self.weight += weights.sum(axis=0)
         self.value += _sum(weights, sample.values, used)
         self.random += _sum(weights**2, sample.random**2, used)
@@ -120,14 +112,6 @@ class Sums:
         if self.systematic is not None and sample.systematic is not None:
             self.systematic += _sum(weights, sample.systematic, used)
         self._spread(np.where(used, sample.values, 0.0), used)
-
-    def _used(self, sample: Sample) -> NDArray[np.bool_]:
-        parts = [sample.values, sample.errors, sample.random, *sample.shared]
-        parts += [] if sample.systematic is None else [sample.systematic]
-        used = sample.usable.copy()
-        for part in parts:
-            used &= np.isfinite(part)
-        return used & (sample.errors > 0.0) if self.inverse_variance else used
 
     def _spread(self, values: Array, used: NDArray[np.bool_]) -> None:
         """Add the spread of a product (`chan1983`)."""
@@ -154,6 +138,15 @@ class Sums:
             None if self.systematic is None else self.systematic / weight,
             self.count,
         )
+
+
+def _used(sample: Sample) -> NDArray[np.bool_]:
+    parts = [sample.values, sample.errors, sample.random, *sample.shared]
+    parts += [] if sample.systematic is None else [sample.systematic]
+    used = sample.usable.copy()
+    for part in parts:
+        used &= np.isfinite(part)
+    return used
 
 
 def _sum(weights: Array, values: Array, used: NDArray[np.bool_]) -> Array:

@@ -34,7 +34,7 @@ class AggregateOptions:
     selection: ProductSelection = EVERYTHING
     period: Period | None = None
     """Period of means; None for no means."""
-    weights: Weights = Weights.PLAIN
+    weights: Weights = Weights.SHOTS
     stac: bool = False
 
 

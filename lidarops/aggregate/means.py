@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate._join import shared_attributes
 from lidarops.aggregate._samples import Profiles, read_profiles
-from lidarops.aggregate._sums import Array, Sums
+from lidarops.aggregate._sums import Array, Sample, Sums
 from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates
 from lidarops.aggregate.means_file import (
     Frame,
@@ -60,7 +60,7 @@ def write_means(
     products: Sequence[Facts],
     period: Period,
     *,
-    weights: Weights = Weights.PLAIN,
+    weights: Weights = Weights.SHOTS,
 ) -> MeansResult:
     """Write the means of one group of products, one file per calendar year.
 
@@ -125,9 +125,8 @@ class _PeriodSums:
         for name, sample in profiles.samples.items():
             part = sample.take(chosen)
             if name not in self.quantities:
-                inverse = self.weights is Weights.INVERSE_VARIANCE
-                self.quantities[name] = Sums.like(part, inverse_variance=inverse)
-            self.quantities[name].add(part)
+                self.quantities[name] = Sums.like(part)
+            self.quantities[name].add(part, _weights(self.weights, part, profiles.shots[chosen]))
         flags = profiles.flags[chosen]
         usable = (flags & np.int32(flags_of(self.kind).rejecting)) == 0
         self.profiles += chosen.size
@@ -157,6 +156,16 @@ class _PeriodSums:
                 unflagged = ~np.isfinite(mean.mean) & (flags == 0)
                 flags = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags)
         return {**variables, "quality_flag": flags}
+
+
+def _weights(weights: Weights, sample: Sample, shots: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights of the values of a sample."""
+    if weights is Weights.INVERSE_VARIANCE:
+        with np.errstate(divide="ignore"):
+            return np.asarray(sample.errors**-2.0)
+    of_profiles = shots if weights is Weights.SHOTS else np.ones(shots.size)
+    along = of_profiles.reshape(-1, *(1,) * (sample.values.ndim - 1))
+    return np.broadcast_to(along, sample.values.shape)
 
 
 @dataclass(slots=True)

@@ -59,6 +59,8 @@ class Period(StrEnum):
 class Weights(StrEnum):
     """Weights of profiles in a mean."""
 
+    SHOTS = "shots"
+    """Number of laser shots: a profile of a few shots counts less than a whole one."""
     PLAIN = "plain"
     """Equal weights."""
     INVERSE_VARIANCE = "inverse-variance"
@@ -68,6 +70,7 @@ class Weights(StrEnum):
     def description(self) -> str:
         """Description for the attributes of a file."""
         return {
+            "shots": "usable profiles are weighted by their number of laser shots",
             "plain": "usable profiles have equal weights",
             "inverse-variance": "usable profiles have the weights 1 / standard_error^2",
         }[self.value]

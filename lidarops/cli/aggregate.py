@@ -46,8 +46,9 @@ def aggregate(
         str | None, typer.Option(help="Also write means over each day or month.", metavar="PERIOD")
     ] = None,
     weights: Annotated[
-        str, typer.Option(help="Weights of the profiles in a mean: plain or inverse-variance.")
-    ] = "plain",
+        str,
+        typer.Option(help="Weights of the profiles in a mean: shots, plain or inverse-variance."),
+    ] = "shots",
     stac: Annotated[bool, typer.Option("--stac", help="Also write a STAC catalog.")] = False,
     as_json: JsonOption = False,
 ) -> None:

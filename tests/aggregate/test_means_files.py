@@ -95,6 +95,29 @@ def test_daily_means_of_the_usable_values(tmp_path: Path):
     assert (means.quality_flag == 0).all()
 
 
+def test_a_profile_of_few_shots_has_little_weight(tmp_path: Path):
+    """As the last mean of a night, over a few files: its error is ten times that of the others."""
+    shots = np.array([600, 600, 600, 600, 6], np.int32)
+
+    def uneven(data: xr.Dataset) -> xr.Dataset:
+        data["shots"] = ("time", shots)
+        data["extinction_standard_error"][-1] *= 10.0
+        return data
+
+    add_day(tmp_path, 0, change=uneven)
+    data = open_products(tmp_path, usable=1).astype(np.float64).load()
+    weights = xr.DataArray(shots, dims="time").where(np.isfinite(data.extinction))
+    weights = weights / weights.sum("time")
+    expected = (weights * data.extinction).sum("time")
+    errors = ((weights * data.extinction_standard_error) ** 2).sum("time") ** 0.5
+    means = only(tmp_path, means_of(tmp_path))
+    np.testing.assert_allclose(means.extinction[0], expected, rtol=1e-6)
+    np.testing.assert_allclose(means.extinction_standard_error[0], errors, rtol=1e-6)
+    assert means.attrs["lidarops_weights"] == "shots"
+    equal = only(tmp_path, means_of(tmp_path, weights=Weights.PLAIN))
+    assert (equal.extinction_standard_error > 1.5 * means.extinction_standard_error).all()
+
+
 def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
     def uneven(data: xr.Dataset) -> xr.Dataset:
         data["extinction_standard_error"] *= xr.DataArray(np.arange(1.0, 6.0), dims="time")
@@ -301,7 +324,7 @@ def test_the_provenance_lists_every_product(tmp_path: Path):
     }
     assert inputs == {(product.sha256, product.id, product.path) for product in facts}
     assert document["entity"]["lidarops:means"]["lidarops:id"] == means.attrs["id"]
-    assert document["activity"]["lidarops:averaging"]["lidarops:weights"] == "plain"
+    assert document["activity"]["lidarops:averaging"]["lidarops:weights"] == "shots"
     assert means.attrs["lidarops_input_count"] == 3
 
 

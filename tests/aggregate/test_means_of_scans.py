@@ -34,8 +34,8 @@ def test_means_stay_within_their_errors(name: str):
         random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = np.isfinite(smooth.optical_depth)
         day = Sample(getattr(smooth, name), errors, random, shared, None, usable)
-        sums = sums or Sums.like(day, inverse_variance=False)
-        sums.add(day)
+        sums = sums or Sums.like(day)
+        sums.add(day, np.ones(day.values.shape))
         if days in (1, 5):
             mean = sums.mean()
             frequent = mean.observations > 0.9 * CYCLES * days

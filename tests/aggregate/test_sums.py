@@ -24,9 +24,11 @@ def sample(values, errors, *, random=None, shared=(), systematic=None, usable=No
 
 
 def mean(*samples: Sample, inverse_variance: bool = False):
-    sums = Sums.like(samples[0], inverse_variance=inverse_variance)
+    sums = Sums.like(samples[0])
     for part in samples:
-        sums.add(part)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = part.errors**-2.0
+        sums.add(part, inverse if inverse_variance else np.ones(part.values.shape))
     return sums.mean()
 
 
