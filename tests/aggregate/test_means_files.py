@@ -115,7 +115,8 @@ def test_a_profile_of_few_shots_has_little_weight(tmp_path: Path):
     np.testing.assert_allclose(means.extinction_standard_error[0], errors, rtol=1e-6)
     assert means.attrs["lidarops_weights"] == "shots"
     equal = only(tmp_path, means_of(tmp_path, weights=Weights.PLAIN))
-    assert (equal.extinction_standard_error > 1.5 * means.extinction_standard_error).all()
+    # In the first section, all values are usable.
+    assert equal.extinction_standard_error[0, 0] > 4.0 * means.extinction_standard_error[0, 0]
 
 
 def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
