@@ -138,7 +138,9 @@ def find_layers(
 def _excess_noise(power: Array, variance: Array, lengths: Array) -> Array:
     """Return the noise of means over each length relative to the stated one, (profile, length)."""
     noise = estimate_noise_correlation(power, variance)
-    return np.asarray(np.sqrt(noise.excess[:, np.newaxis] * noise.variance_of_means(lengths)))
+    of_means = noise.excess[:, np.newaxis] * noise.variance_of_means(lengths)
+    # A second standard error: noise that is estimated too small by chance makes layers.
+    return np.asarray(np.sqrt(of_means * (1.0 + noise.relative_error[:, np.newaxis])))
 
 
 @_compiled

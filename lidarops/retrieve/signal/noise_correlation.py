@@ -166,9 +166,13 @@ def _load_sections(
 
 
 @_compiled
-def _correlate(residuals: Array, squares: Array, limit: float, correlations: Array) -> int:
+def _correlate(
+    residuals: Array, squares: Array, fitted: int, limit: float, correlations: Array
+) -> int:
     """Write correlations up to the first insignificant one; return their number."""
     sections, size = residuals.shape
+    # The fit makes correlations of independent noise negative.
+    limit -= fitted / size
     of_sections = np.empty(sections)
     for distance in range(1, correlations.size + 1):
         for section in range(sections):
@@ -218,7 +222,11 @@ def _estimate(
             continue
         bins = sections * size
         found = _correlate(
-            residuals[:sections], moments[1], significant / math.sqrt(bins), correlations[k]
+            residuals[:sections],
+            moments[1],
+            fitted,
+            significant / math.sqrt(bins),
+            correlations[k],
         )
         # The parabola takes up noise of the length of a section.
         taken = fitted / size * (1.0 + 2.0 * correlations[k].sum())

@@ -81,8 +81,9 @@ def test_clouds_and_gaps_in_the_far_half_are_not_taken_for_noise():
     cloudy = deviations + 50.0 * np.exp(-0.5 * ((RANGE - 19e3) / 300.0) ** 2)
     cloudy[:, 3600:3605] = np.nan
     found = estimate_noise_correlation(cloudy, np.ones((1, RANGE.size)))
-    assert found.length.mean() == pytest.approx(clear.length.mean(), rel=0.05)
-    assert found.excess.mean() == pytest.approx(clear.excess.mean(), rel=0.05)
+    # Of variances: a tenth is 5 % of the noise.
+    assert found.length.mean() == pytest.approx(clear.length.mean(), rel=0.1)
+    assert found.excess.mean() == pytest.approx(clear.excess.mean(), rel=0.1)
 
 
 def test_nothing_is_assumed_of_short_or_empty_profiles():

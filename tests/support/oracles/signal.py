@@ -89,7 +89,7 @@ def _correlated(power, variance):
     r = []
     for k in range(1, 11):
         each = [e[k:] @ e[:-k] / (size - k) / (np.mean(e**2) or np.inf) for e, _ in sections]
-        if np.median(each) < 3.0 / np.sqrt(number):
+        if np.median(each) < 3.0 / np.sqrt(number) - 3.0 / size:
             break
         r.append(np.median(each))
     taken = 3.0 / size * (1.0 + 2.0 * sum(r))
