@@ -260,7 +260,7 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
 
 def _path(group: Group, period: Period, weights: Weights, year: int) -> str:
     folder = f"{group.station}/{group.instrument}/{group.kind}/{period.value}"
-    weighted = "" if weights is Weights.PLAIN else f"_{weights.value}"
+    weighted = "" if weights is Weights.SHOTS else f"_{weights.value}"
     return f"{FOLDER}/means/{folder}/{group.name}_{period.value}{weighted}_{year}.nc"
 
 
