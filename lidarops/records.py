@@ -32,6 +32,7 @@ class Role(StrEnum):
     DARK = "dark"
     MOLECULAR = "molecular"
     OVERLAP = "overlap"
+    LIDAR_RATIO = "lidar_ratio"
 
 
 class Status(StrEnum):
@@ -372,11 +373,11 @@ class Unmade:
 
 @dataclass(frozen=True, slots=True)
 class UnusableFile:
-    """A sounding or overlap function that the campaign names and that cannot be used."""
+    """A profile that the campaign names and that cannot be used."""
 
     instrument: str
     key: str
-    """Fact that names it: ``molecular_profile`` or ``overlap_profile``."""
+    """Fact that names it, such as ``molecular_profile``."""
     path: str
     problem: str
 

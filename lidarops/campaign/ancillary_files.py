@@ -1,6 +1,6 @@
-"""Read ancillary files: soundings and overlap functions, as CSV or NetCDF.
+"""Read ancillary files: soundings, overlap functions and lidar ratios, as CSV or NetCDF.
 
-Both hold named columns. The unit is given in brackets after the name of a CSV column
+All hold named columns. The unit is given in brackets after the name of a CSV column
 (``pressure [hPa]``) or in the attribute ``units`` of a NetCDF variable; SI where none is given.
 """
 
@@ -30,11 +30,15 @@ _SCALE: Final[Mapping[str, Mapping[str, float]]] = {
     "pressure": {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0},
     "temperature": {"K": 1.0, "degC": 1.0},
     "overlap": {"1": 1.0},
+    "lidar_ratio": {"sr": 1.0},
+    "lidar_ratio_standard_error": {"sr": 1.0},
 }
 _FULL: Final = 0.95
 """Smallest final overlap of a profile that counts as full."""
 _SHORTEST: Final = 30.0
 """m; a shorter overlap profile is probably in km."""
+_LIDAR_RATIOS: Final = (1.0, 200.0)
+"""sr; as for the fact ``lidar_ratio``."""
 _WIDEST: Final = 5000.0
 """m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
@@ -58,11 +62,29 @@ class Overlap:
 
 
 @dataclass(frozen=True, slots=True)
+class LidarRatio:
+    """Lidar ratio of particles over altitude."""
+
+    altitude: Array
+    """m above mean sea level, rising."""
+    ratio: Array
+    """sr."""
+    standard_error: Array
+    """sr; one error of this shape, common to all altitudes."""
+
+    def at(self, altitude: Array) -> tuple[Array, Array]:
+        """Return ratio and standard error at altitudes in m: linear, constant beyond the ends."""
+        ratio = np.interp(altitude, self.altitude, self.ratio)
+        return ratio, np.interp(altitude, self.altitude, self.standard_error)
+
+
+@dataclass(frozen=True, slots=True)
 class Ancillaries:
     """The ancillary files of one scene, read once."""
 
     profiles: Mapping[str, MolecularProfile]
     overlaps: Mapping[str, Overlap]
+    lidar_ratios: Mapping[str, LidarRatio]
     inputs: tuple[InputRecord, ...]
     """In order of file names."""
 
@@ -82,14 +104,16 @@ class Ancillaries:
         AncillaryError
             If a file cannot be used.
         """
-        profiles, overlaps, inputs = {}, {}, []
+        profiles, overlaps, lidar_ratios, inputs = {}, {}, {}, []
         for name, role in sorted(files.items()):
             if role is Role.MOLECULAR:
                 profiles[name], digest = molecular_profile(folder, name)
+            elif role is Role.LIDAR_RATIO:
+                lidar_ratios[name], digest = lidar_ratio_profile(folder, name)
             else:
                 overlaps[name], digest = overlap_profile(folder, name)
             inputs.append(InputRecord(name, role, digest))
-        return cls(profiles, overlaps, tuple(inputs))
+        return cls(profiles, overlaps, lidar_ratios, tuple(inputs))
 
 
 def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
@@ -186,6 +210,65 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
             remedy="continue the profile to full overlap",
         )
     return Overlap(ranges, overlap), hashlib.sha256(content).hexdigest()
+
+
+def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
+    """Return the lidar ratio of a file over altitude, and the sha256 of the file.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the campaign file.
+    name : str
+        Path of the file below `folder`. Columns: ``altitude`` (m above mean sea level, rising),
+        ``lidar_ratio`` and ``lidar_ratio_standard_error`` (sr). A name that ends in ``.nc`` means
+        NetCDF.
+
+    Raises
+    ------
+    AncillaryError
+        If the file holds no lidar ratios; the message names the file.
+    """
+    content = _read(folder, name)
+    names = ("altitude", "lidar_ratio", "lidar_ratio_standard_error")
+    columns, _ = _columns(content, folder, name, names)
+    altitude, ratio, error = (columns[column] for column in names)
+    if len({values.size for values in (altitude, ratio, error)}) > 1:
+        raise AncillaryError(
+            "has columns of different length",
+            file=name,
+            remedy="give all three over the same altitudes",
+        )
+    if not np.all(np.diff(altitude) > 0):
+        raise AncillaryError(
+            "does not rise strictly",
+            file=name,
+            field="altitude",
+            remedy="sort the rows by altitude",
+        )
+    if 0.0 < altitude[-1] < _SHORTEST:
+        raise AncillaryError(
+            f"ends at {altitude[-1]:g} m",
+            file=name,
+            field="altitude",
+            remedy="give altitudes in m, not in km, or name the unit: altitude [km]",
+        )
+    least, largest = _LIDAR_RATIOS
+    if not np.all((ratio >= least) & (ratio <= largest)):
+        raise AncillaryError(
+            f"has values from {ratio.min():g} to {ratio.max():g} sr",
+            file=name,
+            field="lidar_ratio",
+            remedy=f"give values from {least:g} to {largest:g} sr",
+        )
+    if not np.all((error >= 0.0) & (error <= largest)):
+        raise AncillaryError(
+            f"has values from {error.min():g} to {error.max():g} sr",
+            file=name,
+            field="lidar_ratio_standard_error",
+            remedy=f"give values from 0 to {largest:g} sr",
+        )
+    return LidarRatio(altitude, ratio, error), hashlib.sha256(content).hexdigest()
 
 
 def _read(folder: Path, name: str) -> bytes:

@@ -109,6 +109,21 @@ class ChannelFacts(SettingsModel):
         " photon-counting channel",
     )
     lidar_ratio_standard_error: float | None = quantity(None, unit="sr", ge=0, le=100)
+    lidar_ratio_profile: Inside | None = Field(
+        default=None,
+        description="in place of both: CSV or NetCDF file of altitude (m), lidar_ratio and"
+        " lidar_ratio_standard_error (sr)",
+    )
+
+    @model_validator(mode="after")
+    def _one_lidar_ratio(self) -> Self:
+        both = (self.lidar_ratio, self.lidar_ratio_standard_error)
+        if self.lidar_ratio_profile is not None and both != (None, None):
+            raise ValueError(
+                "lidar_ratio_profile is given together with lidar_ratio or its standard error; give"
+                " one of the two"
+            )
+        return self
 
 
 class InstrumentFacts(SettingsModel):

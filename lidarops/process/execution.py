@@ -175,7 +175,7 @@ def _rows(count: int, ends: np.ndarray[Any, Any] | None, profiles: int | None) -
 
 def joint_data(plan: Plan) -> dict[str, Data]:
     """Return what the steps of a whole network give, by kind of product."""
-    nothing = Source(xr.Dataset(), None, Ancillaries({}, {}, ()), math.nan)
+    nothing = Source(xr.Dataset(), None, Ancillaries({}, {}, {}, ()), math.nan)
     products: dict[str, Data] = {}
     for step in plan.steps:
         if not step.instrument:

@@ -88,6 +88,10 @@ def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[Unusab
             for key, path, role in (
                 ("molecular_profile", fact.molecular_profile, Role.MOLECULAR),
                 ("overlap_profile", fact.overlap_profile, Role.OVERLAP),
+                *(
+                    ("lidar_ratio_profile", channel.lidar_ratio_profile, Role.LIDAR_RATIO)
+                    for channel in fact.channels.values()
+                ),
             )
             if path is not None
         }

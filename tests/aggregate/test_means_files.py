@@ -160,7 +160,7 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
     errors = means.backscatter_standard_error.to_numpy()
     np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
     for name, factor in (
-        ("extinction", data.lidar_ratio.item()),
+        ("extinction", data.lidar_ratio.isel(product=0)),
         ("scattering_ratio", 1.0 / data.molecular_backscatter.isel(product=0)),
     ):
         total = data[f"{name}_standard_error"] ** 2

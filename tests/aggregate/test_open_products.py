@@ -66,12 +66,13 @@ def test_variables_of_a_whole_product_have_the_dimension_product(tmp_path: Path)
             tmp_path,
             day,
             "elastic",
-            change=lambda data, day=day: data.assign(lidar_ratio=((), 40.0 + day)),
+            change=lambda data, day=day: data.assign(lidar_ratio=data.lidar_ratio - 10.0 + day),
         )
     data = open_products(tmp_path)
-    assert data.lidar_ratio.dims == ("product",)
-    np.testing.assert_array_equal(data.lidar_ratio, [40.0, 41.0])
-    ratio = data.lidar_ratio.isel(product=data.product_index)
+    assert data.lidar_ratio.dims == ("product", "range")
+    ratio = data.lidar_ratio.isel(range=0)
+    np.testing.assert_array_equal(ratio, [40.0, 41.0])
+    ratio = ratio.isel(product=data.product_index)
     np.testing.assert_array_equal(ratio, np.repeat([40.0, 41.0], 5))
     assert data["product"].to_numpy().tolist() == [product.id for product in facts_of(tmp_path)]
 

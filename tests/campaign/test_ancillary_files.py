@@ -14,6 +14,7 @@ from support import factories
 
 from lidarops.campaign.ancillary_files import (
     Ancillaries,
+    lidar_ratio_profile,
     molecular_profile,
     overlap_profile,
 )
@@ -93,6 +94,39 @@ def test_overlap_between_its_ranges(tmp_path: Path) -> None:
     profile, _ = overlap_profile(tmp_path, "o.csv")
     at = profile.at(np.array([-10.0, 199.9, 200.0, 300.0, 600.0, 601.0, 9000.0]))
     np.testing.assert_array_equal(at, [np.nan, np.nan, 0.25, 0.5, 1.0, 1.0, 1.0])
+
+
+RATIOS = "altitude [km],lidar_ratio [sr],lidar_ratio_standard_error\n1,40,4\n3,60,12\n"
+
+
+def test_lidar_ratios_are_linear_between_their_altitudes(tmp_path: Path) -> None:
+    (tmp_path / "s.csv").write_text(RATIOS)
+    profile, digest = lidar_ratio_profile(tmp_path, "s.csv")
+    ratio, error = profile.at(np.array([0.0, 1000.0, 2000.0, 3000.0, 9000.0]))
+    np.testing.assert_array_equal(ratio, [40.0, 40.0, 50.0, 60.0, 60.0])
+    np.testing.assert_array_equal(error, [4.0, 4.0, 8.0, 12.0, 12.0])
+    assert digest == hashlib.sha256((tmp_path / "s.csv").read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("rows", "field", "words"),
+    [
+        ("1000,50,5\n1000,50,5\n", "altitude", "does not rise"),
+        ("1,50,5\n3,50,5\n", "altitude", "in km"),
+        ("1000,0.02,5\n", "lidar_ratio", "from 1 to 200 sr"),
+        ("1000,500,5\n", "lidar_ratio", "from 1 to 200 sr"),
+        ("1000,50,-5\n", "lidar_ratio_standard_error", "from 0 to 200 sr"),
+        ("1000,x,5\n", "lidar_ratio", "finite numbers"),
+    ],
+)
+def test_impossible_lidar_ratios_are_refused_by_name(
+    tmp_path: Path, rows: str, field: str, words: str
+) -> None:
+    (tmp_path / "s.csv").write_text(f"altitude,lidar_ratio,lidar_ratio_standard_error\n{rows}")
+    with pytest.raises(AncillaryError) as caught:
+        lidar_ratio_profile(tmp_path, "s.csv")
+    assert (caught.value.file, caught.value.field) == ("s.csv", field)
+    assert words in str(caught.value)
 
 
 def _text(content: str | bytes, name: str = "o.csv") -> Callable[[Path], str]:
@@ -223,8 +257,16 @@ def test_a_file_too_large_for_a_profile_is_not_read(tmp_path: Path) -> None:
 def test_files_of_a_plan_are_read_once_and_recorded(tmp_path: Path) -> None:
     _sounding(tmp_path, "altitude,pressure,temperature", ALTITUDE, PRESSURE, TEMPERATURE)
     (tmp_path / "o.csv").write_text(OVERLAP)
+    (tmp_path / "s.csv").write_text(RATIOS)
     campaign = factories.campaign(
-        facts=[{"molecular_profile": "air.csv", "overlap_profile": "o.csv", "zenith_angle": 0}],
+        facts=[
+            {
+                "molecular_profile": "air.csv",
+                "overlap_profile": "o.csv",
+                "zenith_angle": 0,
+                "channels": {"photon_532o": {"lidar_ratio_profile": "s.csv"}},
+            }
+        ],
         products={"elastic": {"channels": ["analog_532o", "photon_532o"]}},
     )
     scene = cut_scenes(campaign, (factories.granule(0),)).scenes[0]
@@ -234,9 +276,11 @@ def test_files_of_a_plan_are_read_once_and_recorded(tmp_path: Path) -> None:
     assert [(file.path, file.role) for file in files.inputs] == [
         ("air.csv", Role.MOLECULAR),
         ("o.csv", Role.OVERLAP),
+        ("s.csv", Role.LIDAR_RATIO),
     ]
+    assert list(files.lidar_ratios) == ["s.csv"]
     for file in files.inputs:
         assert file.sha256 == hashlib.sha256((tmp_path / file.path).read_bytes()).hexdigest()
     bare = factories.campaign()
     none = ancillary_files(plan_scene(scene, bare).steps)
-    assert Ancillaries.read(tmp_path, none) == Ancillaries({}, {}, ())
+    assert Ancillaries.read(tmp_path, none) == Ancillaries({}, {}, {}, ())

@@ -30,6 +30,7 @@ SOUNDING = "altitude [m],pressure [hPa],temperature [K]\n" + "".join(
     f"{km * 1000},{1013.25 * (1 - 0.0065 * km * 1000 / 288.15) ** 5.256:.4f},{288.15 - 6.5 * km}\n"
     for km in range(12)
 )
+RATIO = "altitude,lidar_ratio,lidar_ratio_standard_error\n0,40,5\n2000,60,10\n"
 OVERLAP = "range [m],overlap\n100,0.2\n300,0.7\n600,1\n"
 COAST = Selection(instruments=("coast-horizontal",))
 KINDS = ["signal", "homogeneous", "elastic", "multiangle"]
@@ -41,6 +42,8 @@ def tree(repository: Path) -> dict[str, Any]:
     found |= {"archive": "raw", "output": "out", "name": "again"}
     vertical = found["instruments"]["hill-vertical"]
     vertical["facts"][0] |= {"molecular_profile": "air.csv", "overlap_profile": "overlap.csv"}
+    channels = vertical["facts"][0].setdefault("channels", {})
+    channels["photon_532o"] = channels.get("photon_532o", {}) | {"lidar_ratio_profile": "ratio.csv"}
     found["stations"] |= scans.TREE["stations"]
     found["instruments"] |= scans.TREE["instruments"]
     simulation = found["simulation"]
@@ -60,6 +63,7 @@ def campaign(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Camp
     folder = tmp_path_factory.mktemp("again")
     (folder / "air.csv").write_text(SOUNDING, encoding="utf-8")
     (folder / "overlap.csv").write_text(OVERLAP, encoding="utf-8")
+    (folder / "ratio.csv").write_text(RATIO, encoding="utf-8")
     path = folder / "again.yaml"
     path.write_text(yaml.safe_dump(tree(repository)), encoding="utf-8")
     loaded = load_campaign(path)
@@ -81,7 +85,7 @@ def names(result: Reproduction, what: str) -> list[str]:
 def moved(campaign: Campaign, tmp_path: Path) -> Campaign:
     """A copy of the archive that tests may change, without the campaign file."""
     shutil.copytree(campaign.archive, tmp_path / "raw")
-    for name in ("air.csv", "overlap.csv"):
+    for name in ("air.csv", "overlap.csv", "ratio.csv"):
         shutil.copy(campaign.folder / name, tmp_path)
     return campaign.model_copy(update={"archive": str(tmp_path / "raw")})
 
@@ -149,11 +153,15 @@ def test_a_changed_byte_and_a_missing_file_are_named(kind: str, moved: Campaign,
     assert f"input {missing}: missing" in text
 
 
-def test_a_changed_sounding_is_reported(moved: Campaign, tmp_path: Path):
-    (tmp_path / "air.csv").write_text(SOUNDING.replace("288.15", "289.15"), encoding="utf-8")
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("air.csv", SOUNDING.replace("288.15", "289.15")), ("ratio.csv", RATIO.replace("60", "65"))],
+)
+def test_a_changed_profile_is_reported(moved: Campaign, tmp_path: Path, name: str, content: str):
+    (tmp_path / name).write_text(content, encoding="utf-8")
     product = of_kind(moved, "elastic")
     result = reproduce_product(product, archive=moved.archive, ancillary=tmp_path)
-    assert names(result, "input") == ["air.csv"]
+    assert names(result, "input") == [name]
 
 
 def test_one_changed_byte_of_an_input_changes_the_id(moved: Campaign, tmp_path: Path):

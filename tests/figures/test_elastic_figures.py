@@ -83,7 +83,7 @@ class TestClearestProfile:
         assert profile is not None
         assert profile.time == product["time"].to_numpy()[4]
         assert profile.reference == (200.0, 250.0)
-        assert profile.lidar_ratio == 50.0
+        assert profile.lidar_ratio == (50.0, 50.0)
         assert profile.range[-1] <= 1.15 * 250.0 < profile.range[-1] + 7.5
         shown = slice(0, profile.range.size)
         flag = product["quality_flag"].to_numpy()[4, shown]

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from support import factories
 
 from lidarops.kinds import Scope, kinds_of
@@ -223,6 +224,18 @@ def test_each_channel_may_have_a_lidar_ratio_of_its_own() -> None:
         "analog_532o": (28.0, 10.0),
         "glued_532o": (70.0, 5.0),
     }
+
+
+def test_a_channel_may_have_a_profile_of_the_lidar_ratio() -> None:
+    of_photon = {"lidar_ratio_profile": "ratio.csv"}
+    facts = {"zenith_angle": 0.0, "channels": {"photon_532o": of_photon}}
+    steps = _steps(_elastic(facts=facts), "photon_532o")["elastic"]
+    assert steps["lidar_ratio_profile"] == "ratio.csv"
+    assert "lidar_ratio" not in steps
+    for other in ({"lidar_ratio": 50}, {"lidar_ratio_standard_error": 5}):
+        facts["channels"] = {"photon_532o": of_photon | other}
+        with pytest.raises(ValidationError, match="lidar_ratio_profile is given together with"):
+            _elastic(facts=facts)
 
 
 def test_heights_of_the_reference_become_ranges_along_a_slanted_beam() -> None:

@@ -40,7 +40,7 @@ SKY = 0.1
 """MHz."""
 MINUTE = np.timedelta64(60_000_000_000, "ns")
 START = np.datetime64("2026-03-01T00:00", "ns")
-NONE = Ancillaries({}, {}, ())
+NONE = Ancillaries({}, {}, {}, ())
 distance = 7.5 * (np.arange(1200) + 0.5)
 
 

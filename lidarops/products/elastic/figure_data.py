@@ -56,8 +56,8 @@ class Profile:
     with_care: NDArray[np.bool_]
     reference: tuple[float, float]
     """m."""
-    lidar_ratio: float
-    """sr."""
+    lidar_ratio: tuple[float, float]
+    """sr, least and largest."""
 
 
 def clearest_profile(product: xr.Dataset) -> Profile | None:
@@ -81,7 +81,7 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
     require(
         product,
         dict.fromkeys(_ALONG_TIME, ("time",))
-        | {"range": ("range",), "molecular_backscatter": ("range",), "lidar_ratio": ()}
+        | dict.fromkeys(("range", "molecular_backscatter", "lidar_ratio"), ("range",))
         | dict.fromkeys(_ALONG_BOTH, ("time", "range")),
     )
     r = product["range"].values.astype(np.float64)
@@ -109,5 +109,5 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
         molecular=profile["molecular_backscatter"].values.astype(np.float64),
         with_care=(bits & _WITH_CARE) != 0,
         reference=(float(profile["reference_bottom"]), float(top[index])),
-        lidar_ratio=float(profile["lidar_ratio"]),
+        lidar_ratio=(float(profile["lidar_ratio"].min()), float(profile["lidar_ratio"].max())),
     )

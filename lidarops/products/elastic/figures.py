@@ -51,8 +51,9 @@ def _draw(profiles: Sequence[Profile]) -> list[Figure]:
     y = Axis("range (km)", float(r.min()), float(r.max()))
     bottom, top = (f"{edge / 1e3:.3g}" for edge in profile.reference)
     reach = span_in_words(_MEGA * profile.backscatter, _UNIT)
+    ratio = " to ".join(dict.fromkeys(f"{value:g}" for value in profile.lidar_ratio))
     words = (
-        f"Particle backscatter {reach}, lidar ratio {profile.lidar_ratio:g} sr, reference window"
+        f"Particle backscatter {reach}, lidar ratio {ratio} sr, reference window"
         f" {bottom} to {top} km; the band is the standard error"
     )
     caption = f"Profile at {utc(profile.time)} (most unflagged bins) and its error budget"

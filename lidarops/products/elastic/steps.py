@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.records import Role
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
 from lidarops.steps.conditioning import OVERLAP, PROFILES
-from lidarops.steps.data import Chunk, Data, RowProduct
+from lidarops.steps.data import Chunk, Data, RowProduct, Source
 from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
 from lidarops.steps.profiles import gluing
@@ -124,24 +126,28 @@ class ReferenceWindow(Step[Case, ReferenceWindowSettings]):
         data[REFERENCE] = labeled.Reference(**dict(settings))
 
 
-def _lidar_ratio(case: Case) -> tuple[float, float]:
-    """Return the lidar ratio and its standard error in sr: facts of the channel, or settings."""
+def _lidar_ratio(case: Case) -> dict[str, Any]:
+    """Return the settings of the lidar ratio: facts of the channel, or the settings of the kind."""
     facts = channel_facts(case.facts, range_channel(case.channel.name))
-    values = (
-        (facts.lidar_ratio, case.request.lidar_ratio),
-        (facts.lidar_ratio_standard_error, case.request.lidar_ratio_standard_error),
-    )
-    ratio, error = (general if given is None else given for given, general in values)
-    return ratio, error
+    if facts.lidar_ratio_profile is not None:
+        return {"lidar_ratio_profile": facts.lidar_ratio_profile}
+    names = ("lidar_ratio", "lidar_ratio_standard_error")
+    given = {name: getattr(facts, name) for name in names}
+    return {
+        name: getattr(case.request, name) if value is None else value
+        for name, value in given.items()
+    }
 
 
 class InversionSettings(SettingsModel):
     """Settings of the step ``elastic``."""
 
-    lidar_ratio: float
-    """sr."""
-    lidar_ratio_standard_error: float
-    """sr."""
+    lidar_ratio: float | None = None
+    """sr; None where a profile is given."""
+    lidar_ratio_standard_error: float | None = None
+    """sr; None where a profile is given."""
+    lidar_ratio_profile: str | None = None
+    """Ancillary file of both over altitude."""
     molecular_relative_error: float
 
 
@@ -162,13 +168,15 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
         if limits.reason:
             yield Leave(limits.reason)
             return
-        ratio, error = _lidar_ratio(case)
         settings = InversionSettings(
-            lidar_ratio=ratio,
-            lidar_ratio_standard_error=error,
-            molecular_relative_error=case.request.molecular_relative_error,
+            **_lidar_ratio(case), molecular_relative_error=case.request.molecular_relative_error
         )
         yield Run(REQUESTED, settings)
+
+    def files(self, settings: InversionSettings) -> Mapping[str, Role]:
+        """Return the file of the lidar ratio."""
+        name = settings.lidar_ratio_profile
+        return {name: Role.LIDAR_RATIO} if name else {}
 
     def stream(self, settings: InversionSettings, data: Data) -> RowProduct:
         """Return the product, whose averages are inverted as they become complete."""
@@ -203,6 +211,7 @@ class _Inversion(RowProduct):
             source.geometry, profiles.shots(source.archive), data[AVERAGE]
         )
         self._begun = False
+        self._lidar_ratio = _ratio_at(settings, source)
 
     def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Add the next profiles to their averages, and yield those that are complete, inverted."""
@@ -227,14 +236,22 @@ class _Inversion(RowProduct):
             molecules=data[MOLECULES],
             wavelength=data[WAVELENGTH],
             station_altitude=data.source.station_altitude,
-            lidar_ratio=settings.lidar_ratio,
-            lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
+            lidar_ratio=self._lidar_ratio,
             molecular_relative_error=settings.molecular_relative_error,
             reference=data[REFERENCE],
             known_shape=data.get(KNOWN_SHAPE) is True,
             overlap=None if overlap is None else overlap(averages["range"].to_numpy()),
         )
         return inverted.assign(gluing(averages))
+
+
+def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:
+    """Return the function of altitude that gives the lidar ratio and its standard error."""
+    if settings.lidar_ratio_profile is not None:
+        return source.ancillaries.lidar_ratios[settings.lidar_ratio_profile].at
+    return labeled.constant_ratio(
+        settings.lidar_ratio or np.nan, settings.lidar_ratio_standard_error or 0.0
+    )
 
 
 STEP: Final = Elastic()

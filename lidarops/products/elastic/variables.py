@@ -212,7 +212,7 @@ LAYOUT: Final = Layout(
         ),
         Row(
             name="lidar_ratio",
-            dims=(),
+            dims=("range",),
             dtype="f4",
             units="sr",
             standard_name="ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering"
@@ -221,7 +221,7 @@ LAYOUT: Final = Layout(
             coverage=Coverage.REFERENCE,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Set by the campaign, not measured.",
+            comment="Set by the campaign, not measured. Its errors at all ranges are one error.",
         ),
         Row(
             name="reference_bottom",

@@ -5,6 +5,7 @@ In this order: outlying bins, background, clouds, reference window, inversion, q
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -26,6 +27,8 @@ from lidarops.retrieve.signal.labeled import actual_noise, counts_per_power, dea
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
+RatioAt = Callable[[Array], tuple[Array, Array]]
+"""Altitudes in m -> lidar ratio and its standard error, sr."""
 
 _CONTRAST_WAVELENGTH: Final = 532e-9
 """m; wavelength of `Thresholds.cloud_contrast`."""
@@ -80,14 +83,22 @@ class _Signal:
     uncertain: npt.NDArray[np.bool_]
 
 
+def constant_ratio(ratio: float, standard_error: float) -> RatioAt:
+    """Return the function of a lidar ratio and standard error, sr, that are equal everywhere."""
+
+    def at(altitude: Array) -> tuple[Array, Array]:
+        return np.full(altitude.shape, ratio), np.full(altitude.shape, standard_error)
+
+    return at
+
+
 def invert_elastic(
     averages: xr.Dataset,
     *,
     molecules: MolecularProfile,
     wavelength: float,
     station_altitude: float,
-    lidar_ratio: float,
-    lidar_ratio_standard_error: float,
+    lidar_ratio: RatioAt,
     molecular_relative_error: float,
     reference: Reference,
     known_shape: bool = True,
@@ -107,8 +118,9 @@ def invert_elastic(
         m.
     station_altitude : float
         m above mean sea level.
-    lidar_ratio, lidar_ratio_standard_error : float
-        sr, of the aerosol.
+    lidar_ratio : callable
+        Returns the lidar ratio of the aerosol and its standard error in sr at altitudes in m above
+        mean sea level; see `constant_ratio`.
     molecular_relative_error : float
         Relative standard error of the air density.
     reference : Reference
@@ -137,6 +149,7 @@ def invert_elastic(
     averages, distance = averages.isel(range=inside), distance[inside]
     overlap = None if overlap is None else overlap[inside]
     air = _air(molecules, station_altitude + climb * distance, distance, wavelength)
+    ratio, ratio_error = lidar_ratio(station_altitude + climb * distance)
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
     means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
     signal, clouds = _signal_and_clouds(means, known_shape=known_shape)
@@ -146,12 +159,12 @@ def invert_elastic(
         distance,
         molecular_backscatter=air.backscatter,
         molecular_extinction=air.extinction,
-        lidar_ratio=lidar_ratio,
+        lidar_ratio=ratio,
         reference=window.edges,
         reference_scattering_ratio=reference.scattering_ratio,
         variance=means.variance,
         background_standard_error=signal.background_standard_error,
-        lidar_ratio_standard_error=lidar_ratio_standard_error,
+        lidar_ratio_standard_error=ratio_error,
         reference_relative_error=_reference_error(window, reference),
         molecular_relative_error=molecular_relative_error,
         dead_time_error=_dead_time_error(averages, means, signal),
@@ -169,8 +182,8 @@ def invert_elastic(
             **{name: (("time", "range"), values) for name, values in profiles.items()},
             "molecular_backscatter": ("range", air.backscatter),
             "molecular_extinction": ("range", air.extinction),
-            "lidar_ratio": ((), np.float64(lidar_ratio)),
-            "lidar_ratio_standard_error": ((), np.float64(lidar_ratio_standard_error)),
+            "lidar_ratio": ("range", ratio),
+            "lidar_ratio_standard_error": ("range", ratio_error),
             "reference_bottom": ("time", window.bottom),
             "reference_top": ("time", window.top),
             "reference_rejections": (

@@ -205,8 +205,9 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
         molecules=sounding(folder, "zTp"),
         wavelength=CHANNELS[channel],
         station_altitude=0.0,
-        lidar_ratio=float(np.average(ratio[compared], weights=true[compared])),
-        lidar_ratio_standard_error=10.0,
+        lidar_ratio=labeled.constant_ratio(
+            float(np.average(ratio[compared], weights=true[compared])), 10.0
+        ),
         molecular_relative_error=0.01,
         reference=labeled.Reference(**dict(reference)),
     )

@@ -14,7 +14,7 @@ from lidarops.products.elastic.flags import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
-from lidarops.retrieve.elastic.labeled import Reference, invert_elastic
+from lidarops.retrieve.elastic.labeled import Reference, constant_ratio, invert_elastic
 from lidarops.retrieve.elastic.reference_window import Rejection
 from lidarops.retrieve.signal.counts_to_signal import difference_variance, photon_signal
 
@@ -46,7 +46,8 @@ def light(r, *, zenith=0.0, backscatter=particles, ratio=LIDAR_RATIO, constant=B
     edges = np.concatenate([np.linspace(0.0, r[0], 20), r[1:]])
     half = np.diff(edges)[:, np.newaxis] / 2.0
     z = STATION + climb * (edges[:-1, np.newaxis] + half * (1.0 + nodes))
-    extinction = ratio * backscatter(z) + air.extinction(z, GREEN)
+    of_particles = ratio(z)[0] if callable(ratio) else ratio
+    extinction = of_particles * backscatter(z) + air.extinction(z, GREEN)
     depth = np.cumsum(np.sum(extinction * weights * half, axis=-1))[18:]
     z = STATION + climb * r
     total = backscatter(z) + air.backscatter(z, GREEN)
@@ -84,8 +85,7 @@ def solved(data, **changes):
         "molecules": AIR,
         "wavelength": GREEN,
         "station_altitude": STATION,
-        "lidar_ratio": LIDAR_RATIO,
-        "lidar_ratio_standard_error": 0.0,
+        "lidar_ratio": constant_ratio(LIDAR_RATIO, 0.0),
         "molecular_relative_error": 0.0,
         "reference": Reference(5000.0, 11_000.0, 1000.0, 1.0, 0.0),
     }
@@ -223,13 +223,13 @@ def test_each_error_of_the_budget_is_the_effect_of_its_cause():
     longer = signal.assign(power=signal["power"] + 1e-4 * signal["power"] ** 2)
     stated = solved(
         signal,
-        lidar_ratio_standard_error=1.0,
+        lidar_ratio=constant_ratio(LIDAR_RATIO, 1.0),
         molecular_relative_error=0.005,
         reference=Reference(5000.0, 11_000.0, 1000.0, 1.0, 0.01),
     )
     denser = MolecularProfile(AIR.altitude, 1.005 * AIR.pressure, AIR.temperature)
     changed = {
-        "lidar_ratio": solved(signal, lidar_ratio=LIDAR_RATIO + 1.0),
+        "lidar_ratio": solved(signal, lidar_ratio=constant_ratio(LIDAR_RATIO + 1.0, 0.0)),
         "molecular": solved(signal, molecules=denser),
         "reference": solved(signal, reference=Reference(5000.0, 11_000.0, 1000.0, 1.01, 0.0)),
         "dead_time": solved(longer),
@@ -388,6 +388,31 @@ def test_the_background_of_few_photons_is_within_its_error():
     score = np.concatenate(scores)
     assert np.mean(np.abs(score) > 4.0) <= 1e-3
     assert abs(score.mean()) < 0.2
+
+
+def test_a_lidar_ratio_that_changes_with_altitude():
+    """Of a mixed layer, and of a layer aloft."""
+
+    def ratio(z):
+        above = 1.0 / (1.0 + np.exp(np.clip((2200.0 - z) / 60.0, -50.0, 50.0)))
+        return 30.0 + 40.0 * above, np.full(np.shape(z), 1.0)
+
+    signal = noiseless(light(distance, ratio=ratio))
+    inside = between(300.0, 4000.0)
+    true = particles(STATION + distance)[inside]
+
+    def worst(given):
+        found = solved(signal, lidar_ratio=given)
+        return np.abs(found["backscatter"].to_numpy()[0, inside] - true).max() / true.max(), found
+
+    deviation, found = worst(ratio)
+    assert deviation < 2e-3
+    np.testing.assert_allclose(
+        found["extinction"].to_numpy()[0, inside],
+        (ratio(STATION + distance)[0][inside] * true),
+        atol=3e-3 * 70.0 * true.max(),
+    )
+    assert worst(constant_ratio(50.0, 1.0))[0] > 0.02
 
 
 def test_the_reasons_of_rejected_windows_are_given():
