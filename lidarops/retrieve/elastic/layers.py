@@ -64,7 +64,8 @@ def find_layers(
     flagged with a probability below `Thresholds.cloud_false_alarm`, because :math:`t` is the
     quantile of the normal distribution for that rate over the number of bins and lengths
     (Bonferroni bound), times the factor by which the noise of means over :math:`L` bins exceeds
-    the stated one in the far half of the profile (`lidarops.retrieve.signal.noise_correlation`).
+    the stated one in the far half of the profile, with two standard errors
+    (`lidarops.retrieve.signal.noise_correlation`).
     The base is where the statistic peaks. The top is where the mean of the next window is again
     within 2 standard errors of the level below the base.
 
