@@ -6,10 +6,10 @@ which the beams agree best at the crossings that they share. The equations are l
 because noise of the values is then additive. In rows that are linear in 1 / extinction, noise
 multiplies the unknowns and biases long chains of rows.
 
-Each pass linearises y in the constant, with j = exp(k) / w and the inverse S of the covariance of
-y. M = S - S j j' S / (j' S j) is the information of a beam with its constant eliminated. The
+Each pass linearises y in the constant, with g = exp(k) / w and the inverse W of the covariance of
+y. M = W - W g g' W / (g' W g) is the information of a beam with its constant eliminated. The
 crossings x follow from (sum A' M A + P) x = sum A' M y, where A selects the crossings of a beam
-and P is the precision of the prior; then k changes by j' S (y - A x) / (j' S j).
+and P is the precision of the prior; then k changes by g' W (y - A x) / (g' W g).
 """
 
 from __future__ import annotations

@@ -41,8 +41,8 @@ class Thresholds:
 
     # Outlying bins: ablation
     outlier: float = 6.0
-    """Standard errors by which a bin deviates from its neighbours: beyond 6 lies 2e-9 of the
-    normal distribution."""
+    """Standard errors by which a bin deviates from its neighbours: 2e-9 of the normal
+    distribution lie beyond 6 on either side, where the variance is known."""
     suspect: float = 4.5
     """Standard errors of a deviation near a bridged bin, beyond which the bin may be an edge of a
     layer; assumed."""
