@@ -348,7 +348,9 @@ def _causes(causes: tuple[npt.ArrayLike, ...], leading: tuple[int, ...]) -> Arra
     columns = []
     for values, name in zip(causes, names, strict=True):
         column = _profile_values(values, name, leading)
-        _require((column >= 0.0) | np.isnan(column), column, name, "give 0 or more")
+        least = 1.0 if name == names[-1] else 0.0
+        remedy = "give 1 bin or more" if least else "give a standard error"
+        _require((column >= least) | np.isnan(column), column, name, remedy)
         columns.append(column)
     return np.ascontiguousarray(np.stack(np.broadcast_arrays(*columns), axis=-1))
 

@@ -309,5 +309,6 @@ def solve_direct(
             sums = (total_of(s.w), product(s.w, s.z), 1.0)
             tau, p = find_extinction(g, s, sums)
             describe(g, s, p, tau, sums, row)
-            judge_residuals(g, s, p, tau, sums, is_variance, row)
+            spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
+            judge_residuals(g, s, p, tau, sums, spacing, row)
             unscale(g, reference, scale, unit, row)

@@ -102,7 +102,8 @@ def solve_above(
             sums = (total_of(s.w), product(s.w, s.z), 0.0)
             tau, p = find_extinction(g, s, sums)
             describe(g, s, p, tau, sums, row)
-            judge_residuals(g, s, p, tau, sums, is_variance, row)
+            spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
+            judge_residuals(g, s, p, tau, sums, spacing, row)
             unscale(g, reference, scale, unit, row)
 
 
@@ -137,7 +138,8 @@ def solve_from(
                 tau = row[EXTINCTION]
                 row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
                 p = _moved(evaluate(tau, g, s, sums), row)
-            judge_residuals(g, s, p, tau, sums, is_variance, row)
+            spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
+            judge_residuals(g, s, p, tau, sums, spacing, row)
             if not is_prior:
                 _describe_given(p, sums[0], row)
                 describe_bend_given(p, row)

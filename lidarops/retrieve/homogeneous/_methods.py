@@ -175,11 +175,20 @@ def _estimate(
 ) -> PathEstimate:
     """Run a kernel with what is given beside the profiles."""
     table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
-    spacing = 1 if problem.correlation_length is None else SIGNAL.most_correlated_bins
-    grid = make_grid(problem.range, problem.bounds, spacing)
+    grid = make_grid(problem.range, problem.bounds, _noise_spacing(problem))
     noise = (frozen(problem.noise), problem.known_variance, problem.rounding)
     solve(frozen(problem.power), *noise, *map(frozen, given), grid, table, **choice)
     return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
+
+
+def _noise_spacing(problem: PathProblem) -> npt.NDArray[np.int64]:
+    """Return the bins from one to the next of a second difference, (profile or 1,).
+
+    Differences over more than a twentieth of a section would hold its misfit.
+    """
+    widest = min(SIGNAL.most_correlated_bins, problem.range.size // 20)
+    length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
+    return np.where(length > 1.0, max(widest, 1), 1).astype(np.int64)
 
 
 def _solution(

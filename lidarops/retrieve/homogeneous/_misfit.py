@@ -1,6 +1,5 @@
 """Compiled tests of the residuals of a homogeneous path."""
 
-# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
@@ -177,10 +176,13 @@ def judge_residuals(
     p: Point,
     tau: float,
     sums: tuple[float, float, float],
-    known_variance: bool,
+    noise_spacing: int,
     row: Array,
 ) -> None:
-    """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal."""
+    """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal.
+
+    A spacing of 0 stands for a known variance.
+    """
     w0, wz, free = sums
     shapes = _sum_test_shapes(g.x, s.w, s.phi, p)
     _describe_bend(shapes, p, w0, free, row)
@@ -194,5 +196,5 @@ def judge_residuals(
     row[LARGEST] = largest_of(s.residual)
     row[TREND], row[TREND_COUNT] = _trend(shapes, residuals, full, w0)
     row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
-    if not known_variance:
-        row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s, g.noise_spacing)
+    if noise_spacing > 0:
+        row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s, noise_spacing)

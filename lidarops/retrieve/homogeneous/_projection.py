@@ -17,6 +17,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.frozen_arrays import frozen
+
 Array = npt.NDArray[np.float64]
 
 NODES: Final = 24
@@ -60,8 +62,8 @@ class Grid(NamedTuple):
     """R_0, m."""
     length: float
     """L, m."""
-    noise_spacing: int
-    """Bins from one to the next of a second difference, which gives the noise."""
+    noise_spacing: npt.NDArray[np.int64]
+    """(profile or 1,): bins from one to the next of a second difference, which gives the noise."""
 
 
 class ProjectionScratch(NamedTuple):
@@ -91,7 +93,14 @@ class Point(NamedTuple):
     curvature: float
 
 
-def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: int = 1) -> Grid:
+_NEIGHBOURS: Final = np.ones(1, np.int64)
+
+
+def make_grid(
+    range_: Array,
+    bounds: tuple[float, float],
+    noise_spacing: npt.NDArray[np.int64] = _NEIGHBOURS,
+) -> Grid:
     """Return the tables common to the profiles of a call.
 
     Parameters
@@ -100,7 +109,7 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: int = 1
         m, ascending.
     bounds : (float, float)
         Lowest and highest extinction, m-1.
-    noise_spacing : int
+    noise_spacing : (profile or 1,) int
         Bins; beyond it, noise is independent.
     """
     length = float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
@@ -133,7 +142,7 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: int = 1
         group_shapes=groups,
         start=float(range_[0]),
         length=length,
-        noise_spacing=noise_spacing,
+        noise_spacing=frozen(noise_spacing),
     )
 
 

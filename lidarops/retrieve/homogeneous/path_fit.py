@@ -148,8 +148,8 @@ def fit_homogeneous_path(
         of 7.6 at 8.
 
         With a correlation length s, standard errors are sqrt(s) times those of independent bins,
-        and noise is estimated from second differences of bins
-        `lidarops.retrieve.signal.thresholds.Thresholds.most_correlated_bins` apart.
+        and where s exceeds 1, noise is estimated from second differences of bins a twentieth of
+        the section apart, at most 10 (`Thresholds.most_correlated_bins` of the signal chain).
 
         Bits of `quality` and their limits: ``docs/algorithms/homogeneous.md``. A constant profile
         raises NO_SIGNAL: its value is the background, the amplitude is 0 and the extinction NaN.

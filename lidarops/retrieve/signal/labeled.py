@@ -226,7 +226,8 @@ def correct_for_range(
         _corrected,
         *(conditioned[name] for name in ("power", "variance", "quality")),
         _glued_until(conditioned),
-        input_core_dims=[["range"]] * 3 + [[]],
+        _stated_length(conditioned),
+        input_core_dims=[["range"]] * 3 + [[]] * 2,
         output_core_dims=[["range"]] * 3 + [[]] * 3,
         kwargs={
             "range": conditioned["range"].to_numpy().astype(np.float64),
@@ -257,7 +258,7 @@ class ActualNoise(NamedTuple):
     excess: _Block
     """(...), the factor."""
     correlation_length: _Block
-    """(...), bins."""
+    """(...), bins; of glued channels at least that of the analog part."""
 
 
 def actual_noise(profiles: xr.Dataset) -> ActualNoise:
@@ -270,20 +271,21 @@ def actual_noise(profiles: xr.Dataset) -> ActualNoise:
     """
     power, variance = profiles["power"].to_numpy(), profiles["variance"].to_numpy()
     distance = profiles["range"].to_numpy().astype(np.float64)
-    return _actual_noise(power, variance, _glued_until(profiles).to_numpy(), distance)
+    glued_until, stated = (part(profiles).to_numpy() for part in (_glued_until, _stated_length))
+    return _actual_noise(power, variance, glued_until, stated, distance)
 
 
 def counts_per_power(profiles: xr.Dataset, shots: npt.ArrayLike) -> _Block | None:
-    """Return the counts of a bin per MHz of power, (time,); None for analog signals.
+    """Return the counts of a bin per MHz of power, (time,); None but for photon counting.
 
     Parameters
     ----------
     profiles : xr.Dataset
-        From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
+        From `condition`, or means of these.
     shots : (time,) int
         Number of shots of each profile; without a shot, one is taken.
     """
-    if DEAD_TIME_ERROR not in profiles["power"].attrs:
+    if DEAD_TIME_ERROR not in profiles["power"].attrs or "glue_top" in profiles:
         return None
     width = float(np.median(np.diff(profiles["range"].to_numpy().astype(np.float64))))
     return np.asarray(np.maximum(shots, 1) * (width / LICEL_RANGE_PER_MICROSECOND))
@@ -297,8 +299,19 @@ def _glued_until(profiles: xr.Dataset) -> xr.DataArray:
     return xr.full_like(profiles["power"].isel(range=0, drop=True), -np.inf)
 
 
+def _stated_length(profiles: xr.Dataset) -> xr.DataArray:
+    """Return the correlation length of the analog part of glued profiles, else 1."""
+    if "glue_top" in profiles:
+        return profiles[CORRELATION_LENGTH]
+    return xr.ones_like(profiles["power"].isel(range=0, drop=True))
+
+
 def _actual_noise(
-    power: _Block, variance: _Block, glued_until: _Block, distance: _Block
+    power: _Block,
+    variance: _Block,
+    glued_until: _Block,
+    stated_length: _Block,
+    distance: _Block,
 ) -> ActualNoise:
     rows = (-1, distance.size)
     noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
@@ -306,7 +319,8 @@ def _actual_noise(
     excess = noise.excess.reshape(leading)
     beyond = distance > glued_until[..., np.newaxis]
     raised = variance * np.where(beyond, excess[..., np.newaxis], 1.0)
-    return ActualNoise(raised, excess, noise.length.reshape(leading))
+    length = np.maximum(noise.length.reshape(leading), stated_length)
+    return ActualNoise(raised, excess, length)
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
@@ -382,12 +396,13 @@ def _corrected(
     variance: _Block,
     quality: _Block,
     glued_until: _Block,
+    stated_length: _Block,
     *,
     range: _Block,  # noqa: A002
     background_range: tuple[float, float],
     estimate: Callable[..., Background],
 ) -> tuple[_Block, ...]:
-    noise = _actual_noise(power, variance, glued_until, range)
+    noise = _actual_noise(power, variance, glued_until, stated_length, range)
     length = noise.correlation_length
     sky = estimate(power, range, noise.variance * length[..., np.newaxis], background_range)
     signal, error = counts_to_signal.range_corrected(

@@ -8,6 +8,7 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.signal import labeled_gluing
+from lidarops.retrieve.signal.labeled import actual_noise, correct_for_range
 from lidarops.retrieve.signal.labeled_gluing import ChannelLag
 
 DIMS = ("time", "range")
@@ -96,6 +97,16 @@ def test_the_truth_is_returned_within_its_errors(lag):
         "glue_lag_standard_error": "1",
         "noise_correlation_length": "1",
     }
+
+
+def test_means_of_glued_bins_allow_for_the_correlation_of_analog_noise():
+    analog, photon = recorded(truth(), profiles=5)
+    analog["noise_correlation_length"][:] = 2.5
+    glued = labeled_gluing.glue(analog, photon)
+    assert (glued["noise_correlation_length"] == 2.5).all()
+    assert (actual_noise(glued).correlation_length >= 2.5).all()
+    product = correct_for_range(glued, (0.9 * distance[-1], distance[-1]))
+    assert (product["noise_correlation_length"] >= 2.5).all()
 
 
 def test_the_background_of_photon_counting_remains():

@@ -117,6 +117,24 @@ def test_fits_of_correlated_noise_hold_their_errors(kind):
     assert np.mean(fit.quality != 0) < 0.02
 
 
+@pytest.mark.parametrize("length", [1.0, 1.5])
+@pytest.mark.parametrize("bins", [16, 24, 40, 80])
+def test_two_layers_are_not_homogeneous_whatever_the_correlation_of_noise(bins, length):
+    rng = np.random.default_rng(6)
+    r = np.linspace(1000.0, 2500.0, bins)
+    depth = np.where(r < 1750.0, 5e-4 * (r - 1000.0), 0.375 + 3e-3 * (r - 1750.0))
+    true = np.where(r < 1750.0, 5e-4, 3e-3) / 5e-4 * 2e9 * np.exp(-2.0 * depth) / r**2
+    power = true + 2.0 * noise("white" if length == 1.0 else "two bins", (200, bins), rng)
+    fit = fit_homogeneous_path(
+        power,
+        r,
+        weights=np.ones(bins),
+        noise_correlation_length=np.full(200, length),
+        method="direct",
+    )
+    assert (fit.quality != 0).all()
+
+
 ARCHIVES = {
     "pilar/20241002/h*": {"analog_1064o", "photon_53200o"},
     "saopaulo/20170928/signals/*": {"analog_1064o"},
