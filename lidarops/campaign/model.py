@@ -111,8 +111,9 @@ class ChannelFacts(SettingsModel):
     lidar_ratio_standard_error: float | None = quantity(None, unit="sr", ge=0, le=100)
     lidar_ratio_profile: Inside | None = Field(
         default=None,
-        description="in place of both: CSV or NetCDF file of altitude (m), lidar_ratio and"
-        " lidar_ratio_standard_error (sr)",
+        description="in place of both: CSV or NetCDF file of altitude (m above mean sea level),"
+        " lidar_ratio and lidar_ratio_standard_error (sr); beyond its altitudes, the end values"
+        " hold",
     )
 
     @model_validator(mode="after")

@@ -167,6 +167,30 @@ def test_a_bad_sounding_costs_only_the_products_that_need_it(archive: Archive) -
     assert {path.name.split("_")[2] for path in after if mended[path] != after[path]} == {"elastic"}
 
 
+def test_a_file_of_lidar_ratios_is_checked_and_makes_elastic_stale(archive: Archive) -> None:
+    for facts in archive.tree["instruments"]["rich"]["facts"]:
+        facts.setdefault("channels", {})["analog_532o"] = {"lidar_ratio_profile": "ratio.csv"}
+    ratio, head = archive.folder / "ratio.csv", "altitude,lidar_ratio,lidar_ratio_standard_error"
+    for content, words in (
+        (None, "No such file"),
+        (f"{head} [%]\n0,40,5\n", "unknown unit '%'"),
+    ):
+        if content:
+            ratio.write_text(content)
+        shown = invoke(archive, "plan")
+        assert shown.exit_code == 1
+        assert "lidar_ratio_profile: ratio.csv" in shown.output
+        assert words in shown.output
+    made = {}
+    for value in (40, 60):
+        ratio.write_text(f"{head}\n0,{value},5\n")
+        assert invoke(archive, "reprocess").exit_code == 0
+        products = (archive.folder / "out/products/rich").rglob("*.nc")
+        made[value] = {path: path.read_bytes() for path in products}
+    changed = {path.name.split("_")[2] for path in made[40] if made[40][path] != made[60][path]}
+    assert changed == {"elastic"}
+
+
 def test_a_plan_tells_of_scenes_that_failed_before(archive: Archive) -> None:
     def fails(job: Job) -> tuple[SceneOutcome, bool]:
         return Failure("the far range is empty").outcome(job.scene, job.plan), True

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Self, cast
 
-import numpy as np
 import xarray as xr
+from pydantic import model_validator
 
 from lidarops.campaign.model import channel_facts
 from lidarops.products.elastic.settings import ElasticSettings
@@ -150,6 +150,13 @@ class InversionSettings(SettingsModel):
     """Ancillary file of both over altitude."""
     molecular_relative_error: float
 
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        numbers = (self.lidar_ratio, self.lidar_ratio_standard_error)
+        if self.lidar_ratio_profile is None and None in numbers:
+            raise ValueError("has neither lidar_ratio with its standard error nor a profile")
+        return self
+
 
 _AVERAGE: Final = Average("the noise of a single profile is too large for the inversion")
 
@@ -249,9 +256,9 @@ def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:
     """Return the function of altitude that gives the lidar ratio and its standard error."""
     if settings.lidar_ratio_profile is not None:
         return source.ancillaries.lidar_ratios[settings.lidar_ratio_profile].at
-    return labeled.constant_ratio(
-        settings.lidar_ratio or np.nan, settings.lidar_ratio_standard_error or 0.0
-    )
+    # `InversionSettings` requires both.
+    ratio = cast("float", settings.lidar_ratio)
+    return labeled.constant_ratio(ratio, cast("float", settings.lidar_ratio_standard_error))
 
 
 STEP: Final = Elastic()

@@ -164,10 +164,10 @@ def invert_elastic(
     backscatter times the scattering ratio there. Integrals are trapezoidal, so signals of either
     sign have the same weight. The relative error of the trapezoids is below 1e-4 where scattering
     changes over 100 m or more and bins are 7.5 m apart. Errors are of first order; noise errors
-    are widened where the reference is noisy (`Thresholds.skewed`). The
-    noise of a bin enters its value, and that of all others its reference and integrals, as the
-    variance of a bin times the correlation length.
-    Replace outlying bins before (`outlying_bins.bridge_outliers`).
+    are widened where the reference is noisy (`Thresholds.skewed`). The noise of a bin enters its
+    own value with its variance; that of other bins enters the reference and the integrals with
+    the variance times the correlation length. Replace outlying bins before
+    (`outlying_bins.bridge_outliers`).
 
     Parameters
     ----------
