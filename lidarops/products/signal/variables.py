@@ -67,9 +67,10 @@ LAYOUT: Final = Layout(
             long_name="integral correlation length of noise along range in range bins",
             coverage=Coverage.AUXILIARY,
             comment="Of the far half of the profile; of glued channels at least that of the analog"
-            " record. 1 where bins are independent, or too few to know. The standard error by noise"
-            " of a mean over many bins is that of a bin times the root of this number over the"
-            f" number of bins. {NO_STANDARD_NAME}",
+            " record. 1 where bins are independent; missing where too few are complete, and"
+            " standard errors then assume independent bins. The standard error by noise of a mean"
+            " over many bins is that of a bin times the root of this number over their number."
+            f" {NO_STANDARD_NAME}",
         ),
         *GLUING,
         quality(("time", "range"), FLAGS),

@@ -225,10 +225,11 @@ class _Means:
         partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
         self.quality = quality | partial.astype(np.int32)
         self.raw = averages["power"].to_numpy()
-        self.noise, excess, length = actual_noise(averages)
-        self.correlation_length = length
+        noise = actual_noise(averages)
+        length = noise.correlation_length
+        self.noise, self.correlation_length = noise.variance, length
         counts = counts_per_power(averages, averages["shots"].to_numpy())
-        self.exposure = None if counts is None else counts / (excess * length)
+        self.exposure = None if counts is None else counts / (noise.excess * length)
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
 

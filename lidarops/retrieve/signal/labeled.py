@@ -203,8 +203,8 @@ def correct_for_range(
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
         over (time, range), ``background``, ``background_standard_error`` and
-        ``noise_correlation_length`` over time; the attribute ``steps`` states the method of the
-        background. For photon counting,
+        ``noise_correlation_length`` over time, NaN where it is not known; the attribute ``steps``
+        states the method of the background. For photon counting,
         ``signal_dead_time_error`` over (time, range), the change of the signal with one standard
         error of the dead time (`dead_time_error`), which is not part of
         ``signal_standard_error``.
@@ -258,7 +258,9 @@ class ActualNoise(NamedTuple):
     excess: _Block
     """(...), the factor."""
     correlation_length: _Block
-    """(...), bins; of glued channels at least that of the analog part."""
+    """(...), bins; of glued channels at least that of the analog part. 1 where not `known`."""
+    known: _Block
+    """(...), False where too few bins are complete to tell excess and correlation."""
 
 
 def actual_noise(profiles: xr.Dataset) -> ActualNoise:
@@ -320,7 +322,7 @@ def _actual_noise(
     beyond = distance > glued_until[..., np.newaxis]
     raised = variance * np.where(beyond, excess[..., np.newaxis], 1.0)
     length = np.maximum(noise.length.reshape(leading), stated_length)
-    return ActualNoise(raised, excess, length)
+    return ActualNoise(raised, excess, length, noise.known.reshape(leading))
 
 
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
@@ -413,4 +415,5 @@ def _corrected(
         background_standard_error=sky.standard_error,
     )
     bits = quality | sky.quality[..., np.newaxis]
-    return signal, error, bits, sky.background, sky.standard_error, length
+    published = np.where(noise.known | (length > 1.0), length, np.nan)
+    return signal, error, bits, sky.background, sky.standard_error, published

@@ -39,6 +39,8 @@ class NoiseCorrelation:
     within its error."""
     relative_error: Array
     """(profile,): standard error of `length` over its value; 0 where bins are independent."""
+    known: npt.NDArray[np.bool_]
+    """(profile,); elsewhere independent noise of the stated variance is assumed."""
 
     @property
     def length(self) -> Array:
@@ -81,8 +83,7 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
     ----------
     power : (profile, range) float
         NaN where missing; sections with gaps are left out. Without half of the sections, and
-        where they would have fewer than `Thresholds.fewest_noise_bins`, nothing is known and
-        independent noise is assumed.
+        where they would have fewer than `Thresholds.fewest_noise_bins`, nothing is known.
     variance : (profile or 1, range) float
         Stated noise variance, in the square of the unit of the power.
 
@@ -93,6 +94,7 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
     count, bins = power.shape
     reach = THRESHOLDS.most_correlated_bins
     excess, error = np.ones(count), np.zeros(count)
+    known = np.zeros(count, dtype=np.bool_)
     correlations = np.zeros((count, reach))
     size = bins // (2 * _SECTIONS)
     if size >= THRESHOLDS.fewest_noise_bins:
@@ -105,8 +107,9 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
             excess,
             correlations,
             error,
+            known,
         )
-    return NoiseCorrelation(excess, correlations, error)
+    return NoiseCorrelation(excess, correlations, error, known)
 
 
 def _polynomials(size: int) -> Array:
@@ -194,6 +197,7 @@ def _estimate(
     excess: Array,
     correlations: Array,
     error: Array,
+    known: Any,
 ) -> None:
     """Estimate the noise of each profile.
 
@@ -210,6 +214,8 @@ def _estimate(
         Output; 1 and 0 before.
     correlations : (profile, distance) float64
         Output; 0 before.
+    known : (profile,) bool
+        Output; False before.
     """
     fitted, size = basis.shape
     residuals = np.empty((power.shape[1] // size, size))
@@ -218,7 +224,8 @@ def _estimate(
         sections = _load_sections(
             power[k], variance[k % variance.shape[0]], basis, residuals, moments
         )
-        if 2 * sections < residuals.shape[0]:
+        known[k] = 2 * sections >= residuals.shape[0]
+        if not known[k]:
             continue
         bins = sections * size
         found = _correlate(

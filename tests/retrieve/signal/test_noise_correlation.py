@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import signal
 
 import lidarops
@@ -87,10 +88,29 @@ def test_clouds_and_gaps_in_the_far_half_are_not_taken_for_noise():
 
 
 def test_nothing_is_assumed_of_short_or_empty_profiles():
-    for power in (np.ones((2, 100)), np.full((2, 4000), np.nan), np.zeros((2, 4000))):
+    cases = [(np.ones((2, 100)), False), (np.full((2, 4000), np.nan), False)]
+    for power, known in [*cases, (np.zeros((2, 4000)), True)]:
         found = estimate_noise_correlation(power, np.ones((1, power.shape[1])))
         assert (found.excess == 1.0).all()
         assert (found.length == 1.0).all()
+        assert (found.known == known).all()
+
+
+@pytest.mark.parametrize(("bins", "known"), [(480, False), (1200, True)])
+def test_a_correlation_length_that_is_not_known_is_missing(bins, known):
+    rng = np.random.default_rng(6)
+    dims = ("time", "range")
+    profiles = xr.Dataset(
+        {
+            "power": (dims, LIGHT[:bins] + rng.standard_normal((5, bins))),
+            "variance": (dims, np.ones((5, bins))),
+            "quality": (dims, np.zeros((5, bins), np.int32)),
+        },
+        coords={"range": RANGE[:bins]},
+    )
+    product = labeled.correct_for_range(profiles, (RANGE[bins - 100], RANGE[bins - 1]))
+    assert np.isfinite(product["noise_correlation_length"]).all() == known
+    assert np.isfinite(product["signal_standard_error"]).all()
 
 
 @pytest.mark.parametrize("kind", ["white", "two bins", "preamplifier"])
@@ -155,7 +175,7 @@ def test_stated_noise_of_real_archives_is_the_actual_one(files, data_root):
     for channel in sorted(str(name) for name in archive if "detection_mode" in archive[name].attrs):
         photon = archive[channel].attrs["detection_mode"] == "photon"
         profiles = labeled.condition(archive, channel, dead_time=3.7e-9 if photon else None)
-        variance, _, length = labeled.actual_noise(profiles)
+        variance, _, length, _ = labeled.actual_noise(profiles)
         far = slice(profiles.sizes["range"] // 2, None)
         power, variance = profiles["power"].to_numpy()[:, far], variance[:, far].mean(axis=-1)
         known = np.isfinite(power).all(axis=-1)
