@@ -134,6 +134,13 @@ class InstrumentFacts(SettingsModel):
     valid_to: Instant = datetime.max.replace(tzinfo=UTC)
     zenith_angle: float | None = quantity(None, unit="degree", ge=0, le=180)
     azimuth: float | None = quantity(None, unit="degree", ge=0, lt=360)
+    clock_offset: float = quantity(
+        0.0,
+        unit="s",
+        ge=-86400,
+        le=86400,
+        description="clock of the raw files minus UTC; -18000 for files in the time of UTC-5",
+    )
     full_overlap_range: Metres = quantity(0.0, unit="m")
     overlap_profile: Inside | None = Field(
         default=None, description="CSV or NetCDF file of range (m) and overlap (0 to 1)"

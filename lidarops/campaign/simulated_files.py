@@ -16,7 +16,7 @@ from lidarops.campaign.simulation_base import (
 )
 from lidarops.settings import SettingsModel, quantity
 
-DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud"]
+DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud", "raymetrics_scan"]
 
 
 class Handling(StrEnum):
@@ -57,6 +57,8 @@ class DamageKind(StrEnum):
     ZERO_VOLTAGE = "zero_voltage"
     LARGEST_INTEGER = "largest_integer"
     DUPLICATE = "duplicate"
+    STOP_BEFORE_START = "stop_before_start"
+    STALE_POINTING = "stale_pointing"
 
     @property
     def handling(self) -> Handling:
@@ -80,6 +82,7 @@ _HANDLING = {
             DamageKind.IMPOSSIBLE_POSITION,
             DamageKind.FOREIGN,
             DamageKind.SURPLUS,
+            DamageKind.STALE_POINTING,
         ),
         Handling.REFUSE,
     ),
@@ -120,6 +123,9 @@ class Pointing(SettingsModel):
         unit="degree", min_length=1, description="0 = up"
     )
     azimuth: Azimuth = quantity(0.0, unit="degree", description="clockwise from north")
+    further_azimuths: list[Azimuth] = quantity(
+        [], unit="degree", description="at which the zenith angles are repeated in one cycle"
+    )
     two_sided: bool = Field(
         default=False,
         description="whether the scan starts on the other side of the zenith (azimuth + 180) and"
@@ -128,8 +134,13 @@ class Pointing(SettingsModel):
 
     @model_validator(mode="after")
     def _fits_headers(self) -> Self:
-        if any(round(value, 1) != value for value in (*self.zenith_angles, self.azimuth)):
-            raise ValueError("zenith_angles and azimuth must have one decimal, as in the headers")
+        azimuths = [self.azimuth, *self.further_azimuths]
+        if any(round(value, 1) != value for value in (*self.zenith_angles, *azimuths)):
+            raise ValueError("zenith_angles and azimuths must have one decimal, as in the headers")
+        if len(set(azimuths)) < len(azimuths):
+            raise ValueError("an azimuth occurs twice in one cycle")
+        if self.two_sided and self.further_azimuths:
+            raise ValueError("two_sided and further_azimuths are given together; give one of them")
         if len(set(self.zenith_angles)) < len(self.zenith_angles):
             raise ValueError("a zenith angle occurs twice in one cycle")
         return self
@@ -138,7 +149,8 @@ class Pointing(SettingsModel):
         """Return zenith angle and azimuth of every file of one cycle, degree."""
         this_side = [(zenith, self.azimuth) for zenith in self.zenith_angles]
         if not self.two_sided:
-            return tuple(this_side)
+            azimuths = (self.azimuth, *self.further_azimuths)
+            return tuple((zenith, at) for at in azimuths for zenith in self.zenith_angles)
         opposite = round((self.azimuth + 180.0) % 360.0, 1)
         tilted = sorted((zenith for zenith in self.zenith_angles if zenith % 180.0), reverse=True)
         return (*((zenith, opposite) for zenith in tilted), *sorted(this_side))
@@ -186,14 +198,20 @@ class Acquisition(SettingsModel):
     )
 
     @property
+    def states_no_duration(self) -> bool:
+        """Whether headers state the start as the stop."""
+        return self.dialect == "raymetrics_scan"
+
+    @property
     def duration(self) -> float:
         """Duration of a file, s; 101 shots at 10 Hz count as 10 s, from first to last shot."""
         rate = self.repetition_rate
-        return (self.shots - 1) / rate if self.shots % rate == 1 else self.shots / rate
+        is_counted_whole = self.shots % rate == 1 and not self.states_no_duration
+        return (self.shots - 1) / rate if is_counted_whole else self.shots / rate
 
     @model_validator(mode="after")
     def _fits_headers(self) -> Self:
-        if self.interval % 1 or self.duration % 1:
+        if self.interval % 1 or (self.duration % 1 and not self.states_no_duration):
             raise ValueError(
                 "interval and shots / repetition_rate must be whole seconds: the headers of raw"
                 f" files hold no fractions, and a file lasts {self.duration:g} s"
@@ -223,7 +241,8 @@ class Acquisition(SettingsModel):
     def _changes_are_possible(self) -> Self:
         for change in self.changes:
             changed = self.at(change.at)
-            if changed.duration % 1 or changed.duration > self.interval:
+            whole = changed.duration % 1 == 0 or self.states_no_duration
+            if not whole or changed.duration > self.interval:
                 raise ValueError(
                     f"with the change at {change.at:%Y-%m-%d %H:%M} a file lasts"
                     f" {changed.duration:g} s: it must be a whole number, at most the interval"

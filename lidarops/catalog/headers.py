@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
@@ -51,6 +51,8 @@ class _Facts(NamedTuple):
     valid_to: datetime = datetime.max.replace(tzinfo=UTC)
     zenith_angle: float | None = None
     azimuth: float | None = None
+    clock_offset: float = 0.0
+    """s; clock of the instrument minus UTC."""
     wavelengths: tuple[tuple[str, float], ...] = ()
     """Channel and m."""
 
@@ -69,9 +71,10 @@ class _Place:
     """m."""
     facts: tuple[_Facts, ...]
 
-    def facts_at(self, moment: datetime) -> _Facts:
+    def facts_of(self, start: datetime) -> _Facts:
+        """Return the facts of a file that starts at a time by the clock of the instrument."""
         for fact in self.facts:
-            if fact.valid_from <= moment < fact.valid_to:
+            if fact.valid_from <= start - timedelta(seconds=fact.clock_offset) < fact.valid_to:
                 return fact
         return _Facts()
 
@@ -147,7 +150,15 @@ def _refused(due: UnreadFile, reason: str) -> Granule:
 
 
 def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
-    facts = place.facts_at(header.start)
+    facts = place.facts_of(header.start)
+    if header.doubt and facts.zenith_angle is None:
+        raise RawFormatError(
+            header.doubt,
+            file=header.path,
+            field="pointing",
+            remedy="give zenith_angle in the facts if it is known",
+        )
+    shift = timedelta(seconds=facts.clock_offset)
     order = place.header_position
     position = None if order == "ignore" else header.position(order)
     latitude, longitude = position or (place.latitude, place.longitude)
@@ -160,8 +171,8 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
         status=Status.GOOD,
         notes=(*header.notes, *_overridden(header, facts)),
         contradictions=() if order == "ignore" else tuple(_contradictions(header, position, place)),
-        start=header.start,
-        stop=header.stop,
+        start=header.start - shift,
+        stop=header.stop - shift,
         zenith_angle=header.zenith_angle if facts.zenith_angle is None else facts.zenith_angle,
         azimuth=header.azimuth if facts.azimuth is None else facts.azimuth,
         latitude=latitude,
@@ -227,6 +238,7 @@ def _place(station: Station, instrument: Instrument) -> _Place:
                 fact.valid_to,
                 fact.zenith_angle,
                 fact.azimuth,
+                fact.clock_offset,
                 tuple(
                     (name, channel.wavelength)
                     for name, channel in fact.channels.items()

@@ -382,6 +382,7 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                         str(fact.valid_from),
                         fact.zenith_angle,
                         fact.azimuth,
+                        fact.clock_offset,
                         [
                             (name, channel.wavelength)
                             for name, channel in fact.channels.items()

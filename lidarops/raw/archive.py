@@ -74,7 +74,7 @@ def open_archive(
     source : str, path, or iterable of paths or Granule
         A folder (with its subfolders, without hidden files), a file, a glob pattern, or files.
         Profiles are sorted by start, then path. Where `header_position` is "ignore", granules
-        with a `header_digest` supply start, stop, altitude and pointing in place of the header.
+        supply start, stop, altitude and pointing in place of the header.
     channels : iterable of str, optional
         Channels to open, with equal range grids in all files; by default all signal channels,
         which must then be the same in all files.
@@ -110,7 +110,7 @@ def open_archive(
     token = tokenize(repr(stamps), columns.kept)
 
     def signal(index: int, channel: RawChannel) -> da.Array:
-        places = columns.channel_values(index, "place").astype(np.int64)
+        places = columns.channel_places(index)
         scales = columns.channel_values(index, "scale") if mask_and_scale else None
         lengths = tuple(len(files.paths) for _, files in chunks)
         kept = columns.kept.get(channel.name)
@@ -146,7 +146,8 @@ def _read_headers(
                 continue
         with RawFile(path) as file:
             header = read_raw_header(file, "" if granule is None else granule.format)
-            columns.append(header)
+            known = columns.position_order == "ignore" and granule is not None and granule.start
+            columns.append(header, granule if known else None)
             stamps.append((path, file.size, file.mtime_ns))
         if digest_and_size == (header.digest, header.size):
             variants[digest_and_size] = columns.variant[-1]
@@ -168,7 +169,8 @@ class _Chunk:
     """Task that reads one channel of the files of one chunk; small, and can be pickled."""
 
     files: _Files
-    places: NDArray[np.int64]
+    places: tuple[tuple[int, ...], ...]
+    """Of the channel, for each file."""
     bins: int
     kept: Stretches | None
     """Stretches of bins to read; None for all bins."""
@@ -179,18 +181,18 @@ class _Chunk:
         shape = len(self.places), self.bins
         counts = np.empty(shape if self.scales is None else shape[1:], np.dtype("<i4"))
         values = counts if self.scales is None else np.empty(shape, np.float32)
-        read_counts = raw_format(self.files.format).read_counts
-        files = zip(self.files.paths, self.files.sizes, self.places.tolist(), strict=True)
-        for index, (path, size, place) in enumerate(files):
+        read_channel = raw_format(self.files.format).read_channel
+        files = zip(self.files.paths, self.files.sizes, self.places, strict=True)
+        for index, (path, size, places) in enumerate(files):
             row = counts if self.scales is not None else counts[index]
             with RawFile(path) as file:
                 file.expect(size)
-                read_counts(file, place, self.kept, row)
+                read_channel(file, places, self.kept, row)
             if self.scales is not None:
                 to_physical(row, self.scales[index], values[index])
         count = _COUNT.get()
         if count is not None:
-            count.bytes += len(self.places) * self.bins * counts.itemsize
+            count.bytes += sum(map(len, self.places)) * self.bins * counts.itemsize
         return values.astype(np.int32 if self.scales is None else np.float32, copy=False)
 
 

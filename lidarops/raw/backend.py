@@ -92,7 +92,7 @@ class _LazyChannel(BackendArray):
 
     def __init__(self, header: RawHeader, channel: RawChannel, *, scaled: bool) -> None:
         self._path, self._size = header.path, header.size
-        self._place = channel.place
+        self._places = channel.places
         self._scale = channel.scale if scaled else None
         self.shape = (1, channel.bins)
         self.dtype = np.dtype(np.float32 if scaled else np.int32)
@@ -112,7 +112,7 @@ class _LazyChannel(BackendArray):
             whole = counts.size == self.shape[1]
             with RawFile(self._path) as file:
                 file.expect(self._size)
-                FORMAT.read_counts(file, self._place, None if whole else ((low, past),), counts)
+                FORMAT.read_channel(file, self._places, None if whole else ((low, past),), counts)
             if self._scale is None:
                 values[...] = counts[selected - low]
             else:

@@ -9,7 +9,7 @@ A raw format is one `RawFormat`. A package outside lidarops adds one by an entry
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
@@ -25,6 +25,9 @@ from lidarops.registry import RAW_FORMATS, by_name, registered
 
 UNKNOWN_FORMAT: Final = "is of no known raw format"
 """What is wrong with a file that no format recognises."""
+
+
+_INT32: Final = np.iinfo(np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +47,23 @@ class RawFormat:
 
     `header.IncompleteHeaderError` requests more bytes. Given a whole file, it may check more."""
     read_counts: Callable[[RawFile, int, Stretches | None, NDArray[np.int32]], None]
-    """Fill a row with the counts of one channel: open file, `place` of the channel, stretches of
-    bins (None for all), row."""
+    """Fill a row with the counts at one of the `places` of a channel: open file, place, stretches
+    of bins (None for all), row."""
+
+    def read_channel(
+        self,
+        file: RawFile,
+        places: Sequence[int],
+        stretches: Stretches | None,
+        row: NDArray[np.int32],
+    ) -> None:
+        """Fill a row with the counts of a channel, the sum of those at its places."""
+        self.read_counts(file, places[0], stretches, row)
+        for place in places[1:]:
+            further = np.empty_like(row)
+            self.read_counts(file, place, stretches, further)
+            # A sum beyond 32 bits stays above full scale.
+            row[:] = np.clip(row.astype(np.int64) + further, _INT32.min, _INT32.max)
 
 
 @cache

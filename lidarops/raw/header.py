@@ -46,8 +46,9 @@ class RawChannel:
     shots: int
     scale: float
     """Physical value of one count, mV (analog) or MHz (photon counting); NaN without shots."""
-    place: int
-    """Where the file holds the counts, for the format's own use: byte, column or number."""
+    places: tuple[int, ...]
+    """Where the file holds the counts, for the format's own use: bytes, columns or numbers. The
+    counts of several places add up, as those of the two memories of a recorder."""
     adc_bits: int = 0
     """0 for photon counting."""
     polarisation: str = "o"
@@ -64,7 +65,7 @@ class RawChannel:
     """Bins."""
 
     def __hash__(self) -> int:
-        return hash((self.name, self.place, self.shots))
+        return hash((self.name, self.places, self.shots))
 
     @property
     def units(self) -> str:
@@ -101,7 +102,7 @@ class RawHeader(NamedTuple):
     digest: str
     """At most 16 characters; equal for files with equal site and channels."""
     zenith_angle: float | None = None
-    """degree, 0 = up."""
+    """degree, 0 = up; None where the file does not state it."""
     azimuth: float | None = None
     """degree in [0, 360)."""
     altitude: float | None = None
@@ -111,6 +112,9 @@ class RawHeader(NamedTuple):
     site: str = ""
     notes: tuple[str, ...] = ()
     """Oddities of the header, in words."""
+    doubt: str = ""
+    """Why the pointing is unknown although the header holds one, in words; the file is refused
+    unless the campaign gives zenith_angle."""
     record: Any = None
     """The header as its format holds it, a dataclass; ``lidarops inspect`` shows its fields too."""
 

@@ -38,6 +38,7 @@ from lidarops.raw.licel_header import (
     DatasetKind,
     Header,
     Laser,
+    ScanGrid,
     parse_header,
 )
 from lidarops.raw.licel_write import (
@@ -55,6 +56,7 @@ __all__ = [
     "Header",
     "HeaderOrder",
     "Laser",
+    "ScanGrid",
     "encode",
     "format_header",
     "new_dataset",

@@ -3,8 +3,9 @@
 Line 1 holds the file name; line 2 site, start, stop, altitude, longitude, latitude and zenith
 angle, then azimuth and a quoted text (newer Licel) or a dummy, temperature and pressure
 (Raymetrics); line 3 the lasers and the number of datasets; then one line per dataset and an
-empty line (`licel2023`). Instruments deviate in widths, padding, decimals and site names, so
-line 2 is parsed relative to its dates, not by columns.
+empty line (`licel2023`). Scanning lidars of Raymetrics write a line of seven decimals before the
+lasers, the grid of the scan (`ScanGrid`). Instruments deviate in widths, padding, decimals and
+site names, so line 2 is parsed relative to its dates, not by columns.
 
 There is no checksum. The only guard against a wrong header is that the offsets must add up to
 the size of the file: truncated files, and files with surplus bytes, are refused.
@@ -17,7 +18,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from enum import IntEnum
 from functools import lru_cache
 from sys import intern
@@ -50,6 +51,13 @@ _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
 _DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
 _DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
+_DECIMAL = r"[+-]?\d{1,4}[.,]\d{1,6}"
+_SCAN = re.compile(rf" *{_DECIMAL}(?: +{_DECIMAL}){{6}} *", re.ASCII)
+
+_CLOCK_STEP = timedelta(seconds=1)
+"""Resolution of start and stop, by which the stop may lie before the start."""
+_ANGLE_STEP = 0.1
+"""degree; resolution of pointings and of the grid of a scan."""
 
 
 class DatasetKind(IntEnum):
@@ -69,6 +77,25 @@ _MODES = {
 }
 _ANALOG = frozenset({DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED})
 _PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
+
+
+class ScanGrid(NamedTuple):
+    """Pointings of a scan in the extra line of Raymetrics, degree as written."""
+
+    azimuth_start: float
+    azimuth_stop: float
+    azimuth_step: float
+    elevation_start: float
+    """Elevations are negative upwards."""
+    elevation_stop: float
+    elevation_step: float
+    azimuth_offset: float
+
+    def holds(self, elevation: float, azimuth: float) -> bool:
+        """Return whether a pointing as written is one of the grid."""
+        elevations = self.elevation_start, self.elevation_stop, self.elevation_step
+        azimuths = self.azimuth_start, self.azimuth_stop, self.azimuth_step
+        return _is_on_grid(elevation, *elevations) and _is_on_grid(azimuth, *azimuths)
 
 
 class Laser(NamedTuple):
@@ -118,6 +145,19 @@ class Dataset:
         return hash((self.name, self.offset, self.shots))
 
     @property
+    def is_signal(self) -> bool:
+        """Whether the file stores it and it is a signal."""
+        return self.offset is not None and self.kind in _MODES
+
+    @property
+    def recorded_as(self) -> tuple[object, ...]:
+        """What datasets of one channel have in common."""
+        return (
+            self.active, self.kind, self.device, self.laser, self.wavelength_label, self.bins,
+            self.bin_width, self.adc_bits, self.input_range, self.bin_shift,
+        )  # fmt: skip
+
+    @property
     def mode(self) -> DetectionMode | None:
         """Detection mode; None if the dataset is not a signal."""
         return _MODES.get(self.kind)
@@ -157,9 +197,9 @@ class Header:
     """File name in line 1."""
     site: str
     start: datetime
-    """UTC."""
+    """By the clock of the instrument, taken as UTC."""
     stop: datetime
-    """UTC."""
+    """The same; where it is not later than the start as written, from shots and repetition rate."""
     altitude: float
     """m above the geoid."""
     longitude: float
@@ -168,7 +208,7 @@ class Header:
     """degree; the second of the two coordinates, see `position`."""
     zenith_as_written: float
     """degree; see `zenith_angle`."""
-    azimuth: float | None
+    azimuth_as_written: float | None
     """degree in [0, 360)."""
     temperature: float | None
     """K at the ground."""
@@ -176,6 +216,8 @@ class Header:
     """Pa at the ground."""
     custom: str | None
     """The quoted text of line 2."""
+    scan: ScanGrid | None
+    """None where no scan is stated."""
     lasers: tuple[Laser, ...]
     """Two or three."""
     timestamp: str | None
@@ -194,14 +236,50 @@ class Header:
     """The header as written: `data_start` bytes."""
 
     @property
-    def zenith_angle(self) -> float:
-        """degree, 0 = up. -90 means vertical (Raymetrics); other signs are dropped."""
-        return 0.0 if self.zenith_as_written == -90.0 else abs(self.zenith_as_written)
+    def pointing_doubt(self) -> str:
+        """Why the zenith angle is unknown, in words; empty where it is known."""
+        written = self.zenith_as_written
+        if self.scan is not None:
+            azimuth = self.azimuth_as_written
+            if self.scan.holds(written, math.nan if azimuth is None else azimuth):
+                return ""
+            at = "unknown azimuth" if azimuth is None else f"azimuth {azimuth:g}"
+            return (
+                f"the pointing {written:g} degree at {at} is not on the grid of its scan: it is"
+                " that of an earlier file"
+            )
+        if written >= 0.0 or written == -90.0:
+            return ""
+        return (
+            f"the pointing {written:g} degree may be an elevation or a zenith angle: the header"
+            " holds no grid of a scan"
+        )
+
+    @property
+    def zenith_angle(self) -> float | None:
+        """degree, 0 = up; None where `pointing_doubt` says why it is unknown.
+
+        -90 as written means vertical. Scans state elevations, negative upwards (Raymetrics).
+        """
+        if self.pointing_doubt:
+            return None
+        if self.scan is not None:
+            return 90.0 + self.zenith_as_written
+        return max(self.zenith_as_written, 0.0)
+
+    @property
+    def azimuth(self) -> float | None:
+        """Azimuth in degree in [0, 360); None where it is unknown."""
+        if self.azimuth_as_written is None or self.scan is None:
+            return self.azimuth_as_written
+        if self.pointing_doubt:
+            return None
+        return (self.azimuth_as_written + self.scan.azimuth_offset) % 360.0
 
     @property
     def channels(self) -> tuple[Dataset, ...]:
         """Stored analog and photon-counting datasets, in file order."""
-        return tuple(d for d in self.datasets if d.offset is not None and d.kind in _MODES)
+        return tuple(d for d in self.datasets if d.is_signal)
 
     def position(self, order: HeaderOrder = "longitude_first") -> tuple[float, float]:
         """Return latitude and longitude in degree.
@@ -269,15 +347,19 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         buffer[start:end].decode("latin-1")
         for start, end in zip((0, ends[0] + 2, ends[1] + 2), ends, strict=True)
     )
+    scan = _parse_scan(third)
+    if scan is not None:
+        ends += _line_ends(buffer, ends[2] + 2, 1)
+        third = buffer[ends[2] + 2 : ends[3]].decode("latin-1")
     dates = _DATES.search(second)
     if dates is None:
         raise RawFormatError(
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
-    start, stop = _moments(dates)
+    start, written_stop = _moments(dates)
     place = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, notes = _parse_lasers(third)
-    block_start = ends[2] + 2
+    block_start = ends[-1] + 2
     block_end = _line_ends(buffer, block_start, number)[-1] + 2
     if buffer[block_end : block_end + 2] != b"\r\n":
         if len(buffer) < block_end + 2:
@@ -295,19 +377,24 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     except RawFormatError:
         _refuse_export(buffer[data_start:])
         raise
+    if written_stop < start:
+        notes += ("stop lies 1 s before start: the interval follows from the shots",)
+    if len(memories(datasets)) < sum(dataset.is_signal for dataset in datasets):
+        notes += ("channels have two memories: counts and shots of both are added",)
     return Header(
         name=first.strip(),
         site=second[: dates.start()].strip(),
         start=start,
-        stop=stop,
+        stop=_true_stop(start, written_stop, lasers, datasets),
         altitude=place.altitude,
         longitude=place.longitude,
         latitude=place.latitude,
         zenith_as_written=place.zenith,
-        azimuth=place.azimuth,
+        azimuth_as_written=place.azimuth,
         temperature=place.temperature,
         pressure=place.pressure,
         custom=place.custom,
+        scan=scan,
         lasers=lasers,
         timestamp=timestamp,
         datasets=datasets,
@@ -368,7 +455,7 @@ def _bounded(value: float, low: float, high: float, name: str) -> None:
 def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
     numbers = list(map(int, dates.groups()))
     start, stop = _moment(numbers[:6], "start"), _moment(numbers[6:], "stop")
-    if stop < start:
+    if stop < start - _CLOCK_STEP:
         raise RawFormatError(f"{stop:%Y-%m-%d %H:%M:%S} lies before the start", field="stop")
     return start, stop
 
@@ -380,6 +467,48 @@ def _moment(numbers: list[int], name: str) -> datetime:
         return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError as error:
         raise RawFormatError(f"is not a date and time: {error}", field=name) from None
+
+
+def _true_stop(
+    start: datetime, stop: datetime, lasers: tuple[Laser, ...], datasets: tuple[Dataset, ...]
+) -> datetime:
+    """Return the stop; where the header states no duration, from shots and repetition rate."""
+    if stop > start:
+        return stop
+    rate = max(laser.repetition_rate for laser in lasers)
+    shots = max((sum(d.shots for d in group) for group in memories(datasets)), default=0)
+    return start + timedelta(seconds=shots / rate) if rate > 0.0 else start
+
+
+@lru_cache(maxsize=128)
+def memories(datasets: tuple[Dataset, ...]) -> tuple[tuple[Dataset, ...], ...]:
+    """Return the stored signal datasets in file order, those of one channel together.
+
+    A recorder with two memories writes the same channel twice. In files of Raymetrics the first
+    one holds the shots of both, and the second one zeros: only the sums of counts and of shots
+    are those of one signal.
+    """
+    groups: dict[tuple[object, ...], list[Dataset]] = {}
+    for dataset in datasets:
+        if dataset.is_signal:
+            groups.setdefault(dataset.recorded_as, []).append(dataset)
+    return tuple(tuple(group) for group in groups.values())
+
+
+@lru_cache(maxsize=1024)
+def _parse_scan(text: str) -> ScanGrid | None:
+    if _SCAN.fullmatch(text) is None:
+        return None
+    return ScanGrid(*(_number(token, "grid of the scan") for token in text.split()))
+
+
+def _is_on_grid(value: float, start: float, stop: float, step: float) -> bool:
+    low, high = min(start, stop) - _ANGLE_STEP, max(start, stop) + _ANGLE_STEP
+    if not low <= value <= high:
+        return False
+    from_node = 0.0 if step == 0.0 else abs(math.remainder(value - start, step))
+    # The last pointing need not be a whole number of steps from the first one.
+    return min(from_node, abs(value - stop)) <= _ANGLE_STEP
 
 
 # Position, pointing and lasers are the same in many files.
@@ -394,7 +523,7 @@ def _parse_place(text: str) -> _Place:
     names = ("altitude", "longitude", "latitude", "zenith angle")
     altitude, longitude, latitude, zenith = map(_number, tokens, names)
     _bounded(zenith, -180, 180, "zenith angle")
-    notes = _zenith_notes(zenith)
+    notes: tuple[str, ...] = ("zenith angle -90 taken as vertical",) if zenith == -90.0 else ()
     azimuth = temperature = pressure = None
     if len(tokens) in {5, 7} and _holds_azimuth(tokens):
         azimuth = _number(tokens[4], "azimuth")
@@ -423,14 +552,6 @@ def _split_custom(text: str) -> tuple[list[str], str | None]:
 def _holds_azimuth(tokens: list[str]) -> bool:
     # Raymetrics: zenith, a dummy integer, temperature, pressure. Licel: zenith, azimuth.
     return len(tokens) == 5 or "." in tokens[4] or "," in tokens[4]
-
-
-def _zenith_notes(zenith: float) -> tuple[str, ...]:
-    if zenith == -90.0:
-        return ("zenith angle -90 taken as vertical",)
-    if zenith < 0:
-        return (f"zenith angle {zenith:g} taken as {-zenith:g}",)
-    return ()
 
 
 def _parse_weather(

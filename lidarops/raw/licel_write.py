@@ -23,6 +23,7 @@ from lidarops.raw.licel_header import (
     DatasetKind,
     Header,
     Laser,
+    ScanGrid,
     parse_dataset,
     parse_header,
 )
@@ -137,6 +138,7 @@ def new_header(
     pressure: float | None = None,
     custom: str | None = None,
     timestamp: int | None = None,
+    scan: ScanGrid | None = None,
     dialect: Dialect | None = None,
 ) -> Header:
     """Build a header from numbers.
@@ -151,21 +153,24 @@ def new_header(
     altitude : float
         m; written in whole metres.
     longitude, latitude : float
-        degree; one decimal, or six in the extended dialect.
+        degree; one decimal, four in a scan of Raymetrics, or six in the extended dialect.
     datasets : sequence of Dataset
         From `new_dataset` or a parsed header.
     lasers : sequence of Laser
         Two or three: shots and repetition rate in Hz.
     zenith_angle : float
-        degree; whole degrees except in the extended dialect. Raymetrics writes -90 for vertical.
+        degree; whole degrees except in the extended dialect. Raymetrics writes -90 for vertical,
+        and in a scan the elevation, negative upwards, with one decimal.
     azimuth : float, optional
-        degree; makes the dialect extended, which needs it.
+        degree; makes the dialect extended, unless a scan is given; both need it.
     temperature, pressure : float, optional
         K and Pa; make the dialect raymetrics, which needs both.
     custom : str, optional
         Quoted text; makes the dialect extended.
     timestamp : int, optional
         Timestamp of the controller; needs three lasers.
+    scan : ScanGrid, optional
+        Grid of a scan of Raymetrics; needs temperature and pressure.
     dialect : {"classic", "extended", "raymetrics"}, optional
         By default the one that the given values need.
 
@@ -180,10 +185,13 @@ def new_header(
         If a number does not fit the dialect.
     """
     dialect = dialect or _dialect(azimuth, temperature, pressure, custom)
+    if scan is not None and dialect != "raymetrics":
+        raise RawFormatError("needs the raymetrics dialect", field="grid of the scan")
+    angles = (zenith_angle, azimuth)
     place = [
         f"{altitude:04.0f}",
-        *_coordinates(dialect, longitude, latitude),
-        *_angles(dialect, zenith_angle, azimuth),
+        *_coordinates(dialect, longitude, latitude, scan=scan is not None),
+        *(_angles(dialect, *angles) if scan is None else _scan_angles(*angles)),
         *_weather(dialect, temperature, pressure),
         *([] if custom is None else [f'"{custom}"']),
     ]
@@ -196,6 +204,7 @@ def new_header(
                 _utc(stop, "stop"),
                 *place,
             ),
+            *([] if scan is None else [_scan_line(scan)]),
             _line(*_laser_tokens(lasers, len(datasets), timestamp)),
             *(dataset.line for dataset in datasets),
             b"\r\n",
@@ -205,6 +214,7 @@ def new_header(
     header = parse_header(text, file=name, size=size)
     _compare("site", site.strip(), header.site)
     _compare("custom text", custom, header.custom)
+    _compare("grid of the scan", scan, header.scan)
     _compare("zenith angle", round(zenith_angle, 6), header.zenith_as_written)
     _compare("datasets", len(datasets), len(header.datasets))
     return header
@@ -313,7 +323,9 @@ def _dialect(
     return "classic" if azimuth is None and custom is None else "extended"
 
 
-def _coordinates(dialect: Dialect, *degrees: float) -> list[str]:
+def _coordinates(dialect: Dialect, *degrees: float, scan: bool) -> list[str]:
+    if scan:
+        return [f"{value:.4f}" for value in degrees]
     if dialect == "extended":
         return [f"{value:011.6f}" for value in degrees]
     return [f"{value:06.1f}" for value in degrees]
@@ -323,10 +335,24 @@ def _angles(dialect: Dialect, zenith: float, azimuth: float | None) -> list[str]
     if dialect != "extended":
         if azimuth is not None:
             raise RawFormatError("needs the extended dialect", field="azimuth")
-        return [f"{zenith:02.0f}"]
+        # Raymetrics writes a number without meaning behind the zenith angle.
+        return [f"{zenith:02.0f}", *(["00"] if dialect == "raymetrics" else [])]
     if azimuth is None:
         raise RawFormatError("the extended dialect needs one", field="azimuth")
     return [f"{zenith:04.1f}", f"{azimuth:04.1f}"]
+
+
+def _scan_angles(elevation: float, azimuth: float | None) -> list[str]:
+    if azimuth is None:
+        raise RawFormatError("a scan needs one", field="azimuth")
+    return [f"{elevation:.1f}", f"{azimuth:.1f}"]
+
+
+def _scan_line(scan: ScanGrid) -> bytes:
+    azimuth = f"{scan.azimuth_start:04.1f} {scan.azimuth_stop:05.1f} {scan.azimuth_step:04.1f}"
+    first, last = f"{scan.elevation_start:04.1f}", f"{scan.elevation_stop:05.1f}"
+    elevation = f"{first} {last} {scan.elevation_step:04.1f}"
+    return _line(azimuth, f" {elevation}", f" {scan.azimuth_offset:04.1f}")
 
 
 def _weather(dialect: Dialect, temperature: float | None, pressure: float | None) -> list[str]:
@@ -336,7 +362,7 @@ def _weather(dialect: Dialect, temperature: float | None, pressure: float | None
         return []
     if temperature is None or pressure is None:
         raise RawFormatError("the raymetrics dialect needs both", field="temperature and pressure")
-    return ["00", f"{temperature - _ICE_POINT:.1f}", f"{pressure / 100:.1f}"]
+    return [f"{temperature - _ICE_POINT:.1f}", f"{pressure / 100:.1f}"]
 
 
 def _laser_tokens(lasers: Sequence[Laser], datasets: int, timestamp: int | None) -> list[str]:

@@ -36,7 +36,7 @@ Position = Literal["longitude_first", "latitude_first", "ignore"]
 POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
 
 _EPOCH = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
-_SECOND = timedelta(seconds=1)
+_MICROSECOND = timedelta(microseconds=1)
 _POLARISATIONS = {
     "o": "no",
     "p": "parallel",
@@ -78,7 +78,7 @@ class Columns:
     paths: list[str] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     times: list[tuple[int, int]] = field(default_factory=list)
-    """Start and stop in s since 1970."""
+    """Start and stop in ns since 1970."""
     places: list[tuple[float, float, float, float, float]] = field(default_factory=list)
     """Latitude, longitude, altitude, zenith angle, azimuth; NaN if unknown."""
     sites: set[str] = field(default_factory=set)
@@ -99,8 +99,14 @@ class Columns:
                 remedy=f"choose one of {', '.join(POSITIONS)}",
             )
 
-    def append(self, header: RawHeader) -> None:
+    def append(self, header: RawHeader, granule: Granule | None = None) -> None:
         """Add a file.
+
+        Parameters
+        ----------
+        header : RawHeader
+        granule : Granule, optional
+            Supplies times, altitude and pointing in place of the header.
 
         Raises
         ------
@@ -118,9 +124,12 @@ class Columns:
         position = (
             None if self.position_order == "ignore" else header.position(self.position_order)
         ) or (math.nan, math.nan)
-        pointing = (_nan_if_none(header.zenith_angle), _nan_if_none(header.azimuth))
         self.sites.add(header.site)
-        self.notes.update(header.notes)
+        if granule is not None:
+            self.append_alike(granule, header.path, self.variants[header.channels][0])
+            return
+        pointing = (_nan_if_none(header.zenith_angle), _nan_if_none(header.azimuth))
+        self.notes.update((*header.notes, *([header.doubt] if header.doubt else [])))
         self._add_row(
             header.path,
             header.size,
@@ -173,7 +182,8 @@ class Columns:
         self.paths.append(path)
         self.sizes.append(size)
         start, stop = interval
-        self.times.append(((start - _EPOCH) // _SECOND, (stop - _EPOCH) // _SECOND))
+        nanoseconds = [1000 * ((moment - _EPOCH) // _MICROSECOND) for moment in (start, stop)]
+        self.times.append((nanoseconds[0], nanoseconds[1]))
         self.places.append(place)
         self.variant.append(variant)
 
@@ -186,6 +196,11 @@ class Columns:
         """Return a property of selected channel number `channel`, one value per file."""
         by_variant = [getattr(selected[channel], name) for _, selected in self.variants.values()]
         return np.array(by_variant)[self.variant]
+
+    def channel_places(self, channel: int) -> tuple[tuple[int, ...], ...]:
+        """Return where each file holds the counts of selected channel number `channel`."""
+        by_variant = [selected[channel].places for _, selected in self.variants.values()]
+        return tuple(by_variant[variant] for variant in self.variant)
 
     def sort(self) -> None:
         """Order the files by start, then path."""
@@ -354,7 +369,7 @@ def _attributes(channel: RawChannel, *, scaled: bool) -> dict[str, Any]:
 
 
 def _time(columns: Columns) -> dict[str, xr.Variable]:
-    bounds = np.array(columns.times, dtype=np.int64) * 1_000_000_000
+    bounds = np.array(columns.times, dtype=np.int64)
     middle = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     return {
         "time": xr.Variable(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
@@ -115,15 +115,15 @@ class Recipe:
         settings = self.settings
         try:
             if "network" not in settings:
-                return self._scene_of(archive, settings["keys"], self.inputs)
+                return self._scene_of(archive, settings, self.inputs)
             members = tuple(
-                self._scene_of(archive, member["keys"], self._files_of(member["files"]))
+                self._scene_of(archive, member, self._files_of(member["files"]))
                 # The members of a product are sorted by name; the network defines their order.
                 for name in settings["network"]["instruments"]
                 for member in [settings["members"].get(name)]
                 if member is not None
             )
-            whole = self._scene_of(archive, settings["keys"], ())
+            whole = self._scene_of(archive, settings, ())
         except (KeyError, TypeError, ValueError) as error:
             raise _insufficient(self.file, repr(error)) from error
         granules = (granule for member in members for granule in member.granules)
@@ -140,12 +140,13 @@ class Recipe:
         return tuple(record for record in self.inputs if record.path in set(names))
 
     def _scene_of(
-        self, archive: Path, keys: Mapping[str, str], inputs: Iterable[InputRecord]
+        self, archive: Path, part: Mapping[str, Any], inputs: Iterable[InputRecord]
     ) -> Scene:
-        """Return the scene of one instrument with its part of the inputs."""
+        """Return the scene of one instrument, with its part of the settings and inputs."""
+        keys = part["keys"]
         start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
         raw = (record for record in inputs if record.role in RAW)
-        granules = [_granule(archive, record, keys["instrument"]) for record in raw]
+        granules = [_granule(archive, record, keys["instrument"], part["facts"]) for record in raw]
         granules.sort(key=_order)
         return Scene(
             id=self.plan.scene,
@@ -228,9 +229,10 @@ def _order(granule: Granule) -> tuple[bool, datetime | None, str]:
     return granule.start is not None, granule.start, granule.path
 
 
-def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:
+def _granule(root: Path, record: InputRecord, instrument: str, facts: Mapping[str, Any]) -> Granule:
     with RawFile(root / record.path) as file:
         header = read_raw_header(file)
+    shift = timedelta(seconds=facts["clock_offset"])
     return Granule(
         path=record.path,
         size=header.size,
@@ -238,8 +240,11 @@ def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:
         instrument=instrument,
         role=record.role,
         status=Status.GOOD,
-        start=header.start,
-        stop=header.stop,
+        start=header.start - shift,
+        stop=header.stop - shift,
+        zenith_angle=header.zenith_angle,
+        azimuth=header.azimuth,
+        altitude=header.altitude,
         layout=header.layout,
         format=header.format,
     )

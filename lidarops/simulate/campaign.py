@@ -348,7 +348,7 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
                 f"headers of the {site.simulated.acquisition.dialect} dialect do not hold the"
                 " azimuth of a scan",
                 field=f"simulation.instruments.{site.key}.acquisition.dialect",
-                remedy="use the dialect licel for scans",
+                remedy="use the dialect licel or raymetrics_scan for scans",
             )
         if any(fact.zenith_angle is not None for fact in site.instrument.facts):
             raise CampaignError(
@@ -356,6 +356,12 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
                 field=f"{field}.zenith_angle",
                 remedy="leave zenith_angle and azimuth out of the facts",
             )
+    elif site.dialect.scans:
+        raise CampaignError(
+            f"the {site.simulated.acquisition.dialect} dialect states a scan, but there is none",
+            field=f"simulation.instruments.{site.key}.scan",
+            remedy="give the zenith angles of a scan, or use another dialect",
+        )
     counted = [
         channel_name(DetectionMode.PHOTON, detector)
         for detector in site.simulated.detectors
@@ -365,8 +371,15 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
         start = site.start_of(planned.role, planned.index)
         for name in counted:
             photon_dead_time(site, start, name)
-        if site.damage_of(planned.index) is DamageKind.ZENITH_MINUS_90:
+        damage = site.damage_of(planned.index)
+        if damage is DamageKind.ZENITH_MINUS_90:
             _check_vertical(site, planned)
+        if damage is DamageKind.STALE_POINTING and not site.dialect.scans:
+            raise CampaignError(
+                "stale_pointing needs the grid of a scan in the headers",
+                field=f"simulation.instruments.{site.key}.damage",
+                remedy="use the dialect raymetrics_scan, or another damage",
+            )
 
 
 def _check_vertical(site: SimulatedInstrument, planned: PlannedFile) -> None:

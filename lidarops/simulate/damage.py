@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime, timedelta
 from typing import Final
 
 import numpy as np
@@ -26,7 +27,9 @@ _SITE: Final = re.compile(rb"(?<=\r\n ).*?(?= \d\d/\d\d/\d{4} )")
 _PLACE: Final = re.compile(rb"(:\d\d \d\d/\d\d/\d{4} \d\d:\d\d:\d\d \S+) (\S+ \S+) (\S+)([^\r]*)")
 _BINS: Final = re.compile(rb"(\r\n [01] \d \d )(\d{5}) ")
 _DATASET: Final = re.compile(rb"(?<=\r\n )[01] \d \d \d{5} [^\r]*")
+_STOP: Final = re.compile(rb"(\d\d/\d\d/\d{4} \d\d:\d\d:\d\d) \d\d/\d\d/\d{4} \d\d:\d\d:\d\d")
 _SURPLUS: Final = 1000
+_TIME: Final = "%d/%m/%Y %H:%M:%S"
 _LONG_SITE: Final = b"Demonstration site"
 
 
@@ -140,6 +143,11 @@ def _zero_shots(content: bytes, random: np.random.Generator) -> bytes:
     return _in_header(lambda header: _replace_token(header, 13, b"000000"))(without, random)
 
 
+def _earlier(match: re.Match[bytes]) -> bytes:
+    start = datetime.strptime(match[1].decode(), _TIME)  # noqa: DTZ007 - as written
+    return b"%s %s" % (match[1], f"{start - timedelta(seconds=1):{_TIME}}".encode())
+
+
 _DAMAGE: Final[Mapping[DamageKind, _Edit]] = {
     DamageKind.TRUNCATED: lambda content, _: content[: len(content) * 3 // 5],
     DamageKind.EMPTY: lambda _, __: b"",
@@ -164,4 +172,7 @@ _DAMAGE: Final[Mapping[DamageKind, _Edit]] = {
     DamageKind.ZERO_VOLTAGE: _in_header(lambda header: _replace_token(header, 5, b"0000")),
     DamageKind.LARGEST_INTEGER: _in_counts(_largest),
     DamageKind.DUPLICATE: _unchanged,
+    DamageKind.STOP_BEFORE_START: _replaced(_STOP, _earlier),
+    # 89 degrees below the horizon.
+    DamageKind.STALE_POINTING: _replaced(_PLACE, rb"\g<1> \g<2> 89.0\g<4>"),
 }

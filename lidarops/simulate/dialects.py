@@ -7,13 +7,14 @@ agrees with its text.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Final, Literal
 
 from lidarops.campaign.simulated_files import DialectName
-from lidarops.raw.licel import Dataset, Header, Laser, new_header
+from lidarops.raw.licel import Dataset, Header, Laser, ScanGrid, new_header
 from lidarops.raw.licel_header import parse_dataset
 
 _LINE = 78
@@ -37,11 +38,21 @@ class Dialect:
     """Whether the datasets belong to laser 2, whose shots line 3 gives."""
     tens: bool = False
     """Whether the file name ends in minutes and tens of seconds, ``mmX``."""
+    scans: bool = False
+    """Whether headers state elevations, negative upwards, and the grid of the scan, and the stop
+    is the start."""
+    two_memories: bool = False
+    """Whether every channel is written twice, of which the first holds all counts, and each states
+    half of the shots."""
 
     @property
     def holds_azimuth(self) -> bool:
         """Whether headers hold the azimuth of a scan."""
-        return self.layout in {None, "extended"}
+        return self.scans or self.layout in {None, "extended"}
+
+    def shots_of_memories(self, shots: int) -> tuple[int, ...]:
+        """Return the shots that headers state for each memory of a channel."""
+        return (shots - shots // 2, shots // 2) if self.two_memories else (shots,)
 
     @property
     def laser(self) -> int:
@@ -57,6 +68,7 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     "saopaulo": Dialect(layout="classic", site="cut", second_laser=True),
     "pilar": Dialect(layout="classic", site="cut"),
     "golmud": Dialect(layout="classic", site="whole", whole_bin_widths=True),
+    "raymetrics_scan": Dialect(layout="raymetrics", scans=True, two_memories=True),
 }
 
 
@@ -89,6 +101,8 @@ class Measurement:
     shots: int
     repetition_rate: float
     """Hz."""
+    scan: ScanGrid | None = None
+    """For dialects that write it; None where the pointing is fixed."""
     temperature: float = 303.15
     """K at the ground, for dialects that write it."""
     pressure: float = 1.013e5
@@ -121,23 +135,47 @@ def make_header(
         If a number or text does not fit the dialect.
     """
     weather = dialect.layout == "raymetrics"
-    vertical = measurement.zenith_angle == 0.0
+    scan = measurement.scan if dialect.scans else None
     return new_header(
         name=name,
         site=_site(dialect, place),
         start=measurement.start,
-        stop=measurement.stop,
+        stop=measurement.stop if scan is None else measurement.start,
         altitude=place.altitude,
         longitude=place.first,
         latitude=place.second,
-        zenith_angle=-90.0 if dialect.minus_90 and vertical else measurement.zenith_angle,
+        zenith_angle=_zenith_angle(dialect, measurement),
         azimuth=measurement.azimuth if dialect.holds_azimuth else None,
+        scan=scan,
         temperature=measurement.temperature if weather else None,
         pressure=measurement.pressure if weather else None,
         datasets=datasets,
         lasers=_lasers(dialect, measurement),
         dialect=dialect.layout,
     )
+
+
+def _zenith_angle(dialect: Dialect, measurement: Measurement) -> float:
+    """Return the zenith angle as the station writes it."""
+    zenith = measurement.zenith_angle
+    if dialect.scans and measurement.scan is not None:
+        return round(zenith - 90.0, 1)
+    return -90.0 if (dialect.minus_90 or dialect.scans) and zenith == 0.0 else zenith
+
+
+def scan_grid(pointings: Sequence[tuple[float, float]]) -> ScanGrid:
+    """Return the grid of a scan, of the zenith angle and azimuth of its beams in degree."""
+    zeniths, azimuths = (sorted(set(angles)) for angles in zip(*pointings, strict=True))
+    return ScanGrid(
+        azimuths[0], azimuths[-1], _common_step(azimuths),
+        round(zeniths[-1] - 90.0, 1), round(zeniths[0] - 90.0, 1), _common_step(zeniths),
+        azimuth_offset=0.0,
+    )  # fmt: skip
+
+
+def _common_step(angles: Sequence[float]) -> float:
+    """Return the largest step of tenths of a degree on which all angles lie."""
+    return math.gcd(*(round(10.0 * (angle - angles[0])) for angle in angles)) / 10.0
 
 
 def dataset_in_dialect(dialect: Dialect, dataset: Dataset) -> Dataset:
@@ -157,9 +195,12 @@ def _site(dialect: Dialect, place: Place) -> str:
 
 
 def _lasers(dialect: Dialect, measurement: Measurement) -> tuple[Laser, Laser]:
-    firing = Laser(measurement.shots, measurement.repetition_rate)
+    shots = dialect.shots_of_memories(measurement.shots)[0]
+    firing = Laser(shots, measurement.repetition_rate)
     if dialect.both_lasers:
         return firing, firing
+    if dialect.two_memories:
+        return firing, Laser(shots, 0.0)
     if dialect.second_laser:
         return Laser(0, measurement.repetition_rate), firing
     return firing, Laser(0, 0.0)

@@ -26,7 +26,7 @@ from lidarops.simulate.analog import digitise, digitise_fast
 from lidarops.simulate.atmosphere import Air, Beam, BeamPath
 from lidarops.simulate.counting import count_fast, count_photons
 from lidarops.simulate.damage import damage_file
-from lidarops.simulate.dialects import Measurement, dataset_in_dialect, make_header
+from lidarops.simulate.dialects import Measurement, dataset_in_dialect, make_header, scan_grid
 from lidarops.simulate.echo import pulse_echo
 from lidarops.simulate.laser import laser_energy
 from lidarops.simulate.photoelectrons import (
@@ -170,7 +170,11 @@ class Simulator:
         for detector in site.simulated.detectors:
             channels |= self._read_out(conditions, detector, random)
         header = self._header(conditions)
-        content = encode(header, {name: counts for name, (counts, _) in channels.items()})
+        counts = {name: values for name, (values, _) in channels.items()}
+        if site.dialect.two_memories:
+            # The second memory is empty, although the header shares the shots between both.
+            counts |= {f"{name}_2": np.zeros_like(values) for name, values in counts.items()}
+        content = encode(header, counts)
         damage = site.damage_of(planned.index) if planned.role is Role.SIGNAL else None
         if damage is not None:
             content = damage_file(damage, content, random)
@@ -216,6 +220,7 @@ class Simulator:
         site, acquisition = self.site, conditions.acquisition
         _, error = site.simulated.acquisition.clock_error(conditions.start)
         start = conditions.start + error
+        scan = site.simulated.pointing
         measurement = Measurement(
             start=start,
             stop=start + site.duration_of(conditions.planned),
@@ -223,6 +228,7 @@ class Simulator:
             azimuth=conditions.azimuth,
             shots=acquisition.shots,
             repetition_rate=acquisition.repetition_rate,
+            scan=None if scan is None else scan_grid(scan.cycle()),
         )
         name = site.name_of(conditions.planned)
         return make_header(
@@ -233,8 +239,15 @@ class Simulator:
         key = acquisition.bins, acquisition.bin_width, acquisition.shots
         if key not in self._datasets:
             self._datasets[key] = tuple(
-                _dataset(self.site, acquisition, detector, mode, number)
+                _dataset(
+                    self.site,
+                    acquisition.model_copy(update={"shots": shots}),
+                    detector,
+                    mode,
+                    number,
+                )
                 for number, detector in enumerate(self.site.simulated.detectors)
+                for shots in self.site.dialect.shots_of_memories(acquisition.shots)
                 for mode in modes(detector)
             )
         return self._datasets[key]

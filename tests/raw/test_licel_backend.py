@@ -290,9 +290,9 @@ def test_header_position(tmp_path):
 def test_direction_and_notes(tmp_path):
     path = write(tmp_path, line_2=LINE_2[:-2] + "-72.5 123.4")
     opened = xr.open_dataset(path, engine="licel")
-    assert opened.zenith_angle.values.tolist() == [72.5]
+    assert np.isnan(opened.zenith_angle.values).all()
     assert opened.azimuth.values.tolist() == [123.4]
-    assert opened.attrs["notes"] == "zenith angle -72.5 taken as 72.5"
+    assert "the pointing -72.5 degree may be an elevation" in opened.attrs["notes"]
 
 
 def test_channels_on_other_grids(tmp_path):

@@ -104,13 +104,14 @@ def test_decimal_comma():
 
 @pytest.mark.parametrize(
     ("written", "angle", "notes"),
-    [("00", 0, 0), ("-90.0", 0, 1), ("90", 90, 0), ("-30", 30, 1), ("-45.5", 45.5, 1)],
+    [("00", 0, 0), ("-90.0", 0, 1), ("90", 90, 0), ("-30", None, 0), ("-45.5", None, 0)],
 )
 def test_zenith_angle(written, angle, notes):
     header = place(f"0411 -064.1 -031.2 {written}")
     assert header.zenith_angle == angle
     assert header.zenith_as_written == float(written)
     assert len(header.notes) == notes
+    assert bool(header.pointing_doubt) == (angle is None)
 
 
 def test_position_order_and_refusal():

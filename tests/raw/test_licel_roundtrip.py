@@ -15,6 +15,7 @@ from support.licel_strategies import datasets, files, headers, naive_read, raw_f
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
+from lidarops.raw.licel_header import memories
 
 MIXED = st.lists(
     datasets(kinds=st.sampled_from(list(licel.DatasetKind)), active=st.booleans()),
@@ -65,12 +66,16 @@ def test_files_are_read_back_in_every_way(tmp_path, file):
         xr.open_dataset(path, engine="licel") as scaled,
     ):
         for dataset in header.channels:
-            name = dataset.name
-            np.testing.assert_array_equal(read[name], counts[name])
-            np.testing.assert_array_equal(raw[name].values[0], counts[name])
-            np.testing.assert_array_equal(scaled[name].values, physical[name])
-            expected = (counts[name] * dataset.scale).astype(np.float32)
-            np.testing.assert_array_equal(scaled[name].values[0], expected)
+            np.testing.assert_array_equal(read[dataset.name], counts[dataset.name])
+            expected = (counts[dataset.name] * dataset.scale).astype(np.float32)
+            np.testing.assert_array_equal(physical[dataset.name][0], expected)
+        for group in memories(header.datasets):
+            name = group[0].name
+            added = sum(counts[memory.name].astype(np.int64) for memory in group)
+            limits = np.iinfo(np.int32)
+            np.testing.assert_array_equal(raw[name].values[0], added.clip(limits.min, limits.max))
+            if len(group) == 1:
+                np.testing.assert_array_equal(scaled[name].values, physical[name])
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from lidarops.records import Role, Status
 from lidarops.run.archive import reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
-KINDS = list(DamageKind)
+# A stale pointing needs a scan, see `test_scans_of_raymetrics.py`.
+KINDS = [kind for kind in DamageKind if kind is not DamageKind.STALE_POINTING]
 ALL_DAMAGE = [{"kind": kind.value, "index": 2 * i} for i, kind in enumerate(KINDS)]
 
 
@@ -289,6 +291,14 @@ def _is(expected):
     return check
 
 
+def _stop_before_start(good, bad, _):
+    start = licel.parse_header(good).start
+    written = [f"{start - timedelta(seconds=early):%d/%m/%Y %H:%M:%S}".encode() for early in (0, 1)]
+    assert b" ".join(written) in bad
+    assert licel.parse_header(bad).start == start
+    assert licel.parse_header(bad).stop > start
+
+
 _CHECKS = {
     DamageKind.TRUNCATED: _truncated,
     DamageKind.EMPTY: _is(lambda _: b""),
@@ -312,6 +322,7 @@ _CHECKS = {
     DamageKind.ZERO_VOLTAGE: _zero_voltage,
     DamageKind.LARGEST_INTEGER: _largest_integer,
     DamageKind.DUPLICATE: _is(lambda good: good),
+    DamageKind.STOP_BEFORE_START: _stop_before_start,
 }
 
 

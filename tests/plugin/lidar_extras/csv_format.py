@@ -123,7 +123,7 @@ def _channel(
         bin_width=bin_width,
         shots=shots,
         scale=scale,
-        place=column,
+        places=(column,),
         adc_bits=bits,
         polarisation=match[3],
         input_range=volts,

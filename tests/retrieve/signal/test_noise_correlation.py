@@ -160,6 +160,7 @@ ARCHIVES = {
     "saopaulo/20170928/signals/*": {"analog_1064o"},
     "manaus/RM*": set(),
     "manaus_raman/RM*": {"photon_355o"},
+    "savant/2018-10-18-0703tRANSITION/R18*": set(),
 }
 """Files, and channels of other noise: periodic interference, a counter near paralysis, and bursts
 of 1e-3 counts a bin."""
