@@ -258,7 +258,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         )
 
     def stream(self, settings: ScanSettings, data: Data) -> WholeProduct:
-        """Return the product, which holds cycles on common altitudes."""
+        """Return the product, which holds the cycles of all profiles."""
         return _Scans(settings, data)
 
     def cpu_time(self, settings: ScanSettings, work: Workload) -> float:
@@ -287,7 +287,7 @@ throughput --case memory`` measures."""
 
 
 class _Scans(WholeProduct):
-    """Scan cycles on common altitudes, and their optical depth."""
+    """Scan cycles in altitude cells, and their optical depth."""
 
     def __init__(self, settings: ScanSettings, data: Data) -> None:
         self._settings, self._station = settings, data.source.station_altitude
@@ -312,7 +312,7 @@ class _Scans(WholeProduct):
         return self._cycles.ends()
 
     def add(self, chunk: Chunk) -> None:
-        """Interpolate the cycles of the next profiles to common altitudes."""
+        """Average the cycles of the next profiles over altitude cells."""
         self._cycles.add(chunk.profiles(self._profiles), chunk.rows.start)
 
     def results(self) -> Iterator[xr.Dataset]:

@@ -1,7 +1,9 @@
-"""Estimate the background of profiles by one of three methods, and judge the signal left in it.
+"""Estimate the background of profiles by one of several methods, and judge the signal left in it.
 
-`from_tail` averages the far bins, `from_known_shape` fits background and amplitude of clear air,
-`from_cubic` solves the cubic of a homogeneous section. All return a `Background`: value, standard
+`from_tail` averages the far bins, `from_bounded_tail` subtracts half of the signal that they may
+hold, `from_known_shape` fits background and amplitude of clear air, `from_far_range` takes the
+better known of these two, and `from_cubic` solves the cubic of a homogeneous section. All return a
+`Background`: value, standard
 error, the most signal that may have been subtracted with it (`left_signal`), and quality bits.
 The result of a profile does not depend on the other profiles, to the last bit.
 """
@@ -36,7 +38,8 @@ class Background:
     """In the unit of the power; NaN where there is none."""
     standard_error: Array
     left: LeftSignal
-    """The most signal that may have been subtracted with the background."""
+    """The most signal that may have been subtracted with the background; of `from_bounded_tail`
+    the standard deviation of what it holds too much or too little."""
     unjudged: Booleans
     """The far range does not fit the method, or `left` cannot be estimated."""
     uncertain: Booleans
@@ -146,6 +149,81 @@ def from_known_shape(
     uncertain = np.where(usable, doubtful, tail.uncertain)
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
     return Background(value, error, left, unjudged, uncertain, _bits(uncertain, missing))
+
+
+def from_bounded_tail(
+    power: Array,
+    range: Array,  # noqa: A002 - the field's word
+    variance: Array,
+    shape: Array | None = None,
+    span: tuple[float, float] | None = None,
+) -> Background:
+    r"""Return the middle of the backgrounds that the tail permits.
+
+    The mean of the tail :math:`P_t` holds between no signal and the largest one :math:`L` that may
+    be left in it: the signal before the tail, falling as that of clean air, or as :math:`R^{-2}`
+    where no `shape` is given. The background is
+    :math:`P_t - L / 2`, and `left` the standard deviation :math:`L / \sqrt{12}` of an even
+    distribution, with one standard error of :math:`L`. BACKGROUND_UNCERTAIN is raised where `left`
+    cannot be estimated, or bins that are left out may shift the mean.
+
+    Parameters and errors are those of `from_known_shape`.
+    """
+    tail = from_tail(power, range, variance, span)
+    in_tail = left_in_tail(
+        power,
+        range,
+        variance,
+        _bins(range, span),
+        tail.background,
+        tail.standard_error,
+        shape,
+    )
+    most, spread = np.maximum(np.nan_to_num(in_tail.most), 0.0), in_tail.standard_error
+    left = LeftSignal((most + spread) / np.sqrt(12.0), np.zeros_like(most))
+    return Background(
+        background=tail.background - 0.5 * most,
+        standard_error=np.hypot(tail.standard_error, 0.5 * np.nan_to_num(spread)),
+        left=left,
+        unjudged=tail.unjudged,
+        uncertain=tail.unjudged,
+        quality=_bits(tail.unjudged, tail.quality & np.int32(Quality.INPUT_MISSING)),
+    )
+
+
+def from_far_range(
+    power: Array,
+    range: Array,  # noqa: A002 - the field's word
+    variance: Array,
+    shape: Array,
+    span: tuple[float, float] | None = None,
+    *,
+    mask: Booleans,
+) -> Background:
+    """Return the better known one of `from_known_shape` and `from_bounded_tail` for each profile.
+
+    The fit counts where it passes its tests, and its standard error with `left` is smaller.
+    Parameters and errors are those of `from_known_shape`.
+    """
+    tail = from_bounded_tail(power, range, variance, shape, span)
+    fit = from_known_shape(power, range, variance, shape, span, mask=mask)
+    of_tail, of_fit = (np.hypot(sky.standard_error, sky.left.most) for sky in (tail, fit))
+    fitted = np.isfinite(fit.background) & ~fit.unjudged & ~(of_tail <= of_fit)
+
+    def better(of_fit: Array, of_tail: Array) -> Array:
+        return np.asarray(np.where(fitted, of_fit, of_tail))
+
+    return Background(
+        background=better(fit.background, tail.background),
+        standard_error=better(fit.standard_error, tail.standard_error),
+        left=LeftSignal(
+            better(fit.left.most, tail.left.most),
+            better(fit.left.standard_error, tail.left.standard_error),
+        ),
+        unjudged=~fitted & tail.unjudged,
+        uncertain=np.where(fitted, fit.uncertain, tail.uncertain),
+        quality=np.where(fitted, fit.quality, tail.quality),
+    )
 
 
 def from_cubic(

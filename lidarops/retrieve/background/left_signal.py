@@ -64,6 +64,7 @@ def left_in_tail(
     tail: slice,
     background: Array,
     background_standard_error: Array,
+    shape: Array | None = None,
 ) -> LeftSignal:
     """Return the most signal that the mean of a tail may contain.
 
@@ -77,6 +78,9 @@ def left_in_tail(
         Bins whose mean is the background.
     background, background_standard_error : (...) float
         From these bins.
+    shape : (..., range) float, optional
+        Signal that falls no faster than the actual one from the window before to the tail. By
+        default that of air of constant scattering, without attenuation.
 
     Returns
     -------
@@ -87,7 +91,8 @@ def left_in_tail(
     if before.start == before.stop:
         unknown = np.full(power.shape[:-1], np.nan)
         return LeftSignal(unknown, unknown)
-    fall = np.mean(range[tail] ** -2.0) / np.mean(range[before] ** -2.0)
+    slowest = range**-2.0 if shape is None else shape
+    fall = slowest[..., tail].mean(axis=-1) / slowest[..., before].mean(axis=-1)
     net, noise = power[..., before] - background[..., np.newaxis], variance[..., before]
     known = np.isfinite(net) & np.isfinite(noise)
     count = known.sum(axis=-1)

@@ -3,8 +3,8 @@
 A scan passes through these modules in order:
 
 1. `labeled_altitudes.AltitudeCycles` takes the conditioned profiles of a scene. `scan_cycles`
-   groups them into directions and cycles. The background is subtracted, and `_common_altitude`
-   interpolates each beam to the common altitudes.
+   groups them into directions and cycles. The background is subtracted, and `_cell_means`
+   averages each beam over altitude cells.
 2. `optical_depth.retrieve_optical_depth` solves the cycles in blocks. `_methods` carries out one
    block. `_sample_mask` takes the logarithms, and `_block` with `_kano_hamilton` fits them against
    the slant path (`slant_paths`) at each altitude. `robust_weights` gives outliers less weight.
@@ -13,7 +13,8 @@ A scan passes through these modules in order:
    the slant path with regularisation (the historical method), each altitude on its own.
 4. `_methods` adds extinction, errors and flags. `_path_variation` tests whether the air is
    horizontally stratified.
-5. `labeled.retrieve_optical_depth` turns the result into the ``multiangle`` product.
+5. `labeled.retrieve_optical_depth` repeats this with the backgrounds with which the beams agree
+   best (`beam_backgrounds`), and turns the result into the ``multiangle`` product.
 """
 
 from lidarops.retrieve.multiangle.optical_depth import (

@@ -11,8 +11,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.retrieve.background.left_signal import shifts
 from lidarops.retrieve.multiangle import optical_depth, slant_paths
+from lidarops.retrieve.multiangle.beam_backgrounds import BeamSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
 from lidarops.retrieve.multiangle.optical_depth import (
@@ -63,6 +63,11 @@ _PER_LAYER: Final = (
 )
 
 
+_LINEARISATIONS: Final = 3
+"""Fits that the agreement of beams starts from: about a biased first one, large backgrounds are off
+(`test_unflagged_optical_depths_lie_within_three_standard_errors`, bright beams)."""
+
+
 def retrieve_optical_depth(
     beams: xr.Dataset,
     *,
@@ -101,25 +106,35 @@ def retrieve_optical_depth(
     RetrievalInputError
         For invalid arguments.
     """
-    signal = beams["signal"].to_numpy()
-    retrieval = _solve(
-        signal,
-        beams["beam_zenith_angle"].to_numpy(),
-        beams["altitude"].to_numpy(),
-        variance=beams["variance"].to_numpy(),
-        azimuth=beams["beam_azimuth"].to_numpy() if "beam_azimuth" in beams.coords else None,
-        method=method,
-        station_altitude=station_altitude,
-        largest_gradient=largest_gradient,
-        layers=layers,
+    altitude, zenith_angle = (beams[n].to_numpy() for n in ("altitude", "beam_zenith_angle"))
+    bounds = optical_depth.layer_bounds(layers, altitude, station_altitude=station_altitude)
+    settings: dict[str, Any] = {
+        "azimuth": beams["beam_azimuth"].to_numpy() if "beam_azimuth" in beams.coords else None,
+        "method": method,
+        "station_altitude": station_altitude,
+        "largest_gradient": largest_gradient,
+    }
+    left = beams["left"].to_numpy()
+    signals = BeamSignals.of(
+        beams["signal"].to_numpy(),
+        beams["variance"].to_numpy(),
+        left,
+        slant_paths.slant_path(zenith_angle, altitude - station_altitude),
+        beams["response"].to_numpy(),
     )
+    prior = signals
+    for _ in range(_LINEARISATIONS if (left > 0.0).any() else 0):
+        signals = prior.agreed(_solve(signals, zenith_angle, altitude, **settings))
+    retrieval = _solve(signals, zenith_angle, altitude, layers=layers, **settings)
+    levels = np.searchsorted(altitude, bounds, side="right")
+    depth = np.diff(altitude, prepend=station_altitude)
+    retrieval = _with_background_errors(retrieval, signals, depth, levels)
+    signal = signals.signal
     sampled = np.isfinite(signal).any(axis=-1)
     values = {name: (("time", "altitude"), getattr(retrieval, name)) for name in _PER_ALTITUDE}
     values["reduced_chi2"] = values.pop("reduced_chi_square")
     values["monotone_optical_depth"] = (("time", "altitude"), monotone(retrieval.optical_depth))
     quality = _quality(retrieval, beams["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
-    shifted = _shifted_by_background(retrieval, beams, station_altitude)
-    quality |= shifted * np.int32(Quality.BACKGROUND_UNCERTAIN)
     product = xr.Dataset(
         {
             **values,
@@ -134,22 +149,16 @@ def retrieve_optical_depth(
     )
     if not layers:
         return product
-    bounds = optical_depth.layer_bounds(
-        layers, beams["altitude"], station_altitude=station_altitude
-    )
-    return product.assign(
-        _layer_variables(retrieval, quality, beams["altitude"].to_numpy(), bounds)
-    )
+    return product.assign(_layer_variables(retrieval, quality, levels, bounds))
 
 
 def _layer_variables(
-    retrieval: MultiAngleResult, quality: Flags, altitude: Array, bounds: Array
+    retrieval: MultiAngleResult, quality: Flags, levels: npt.NDArray[np.intp], bounds: Array
 ) -> dict[str, xr.Variable]:
     """Return the variables of layers; NaN where a flag rejects the value at a bound."""
     rejected = (quality & np.int32(REJECTING)) != 0
     # At the station the optical depth is zero, and nothing is rejected.
     rejected = np.hstack([np.zeros((len(quality), 1), dtype=np.bool_), rejected])
-    levels = np.searchsorted(altitude, bounds, side="right")
     hidden = rejected[:, levels].any(axis=2)
     variables = {
         name: xr.Variable(("time", "layer"), np.where(hidden, np.nan, getattr(retrieval, name)))
@@ -160,13 +169,17 @@ def _layer_variables(
     return {**variables, "layer_altitude": middle, "layer_bnds": limits}
 
 
-def _solve(*data: Array, method: str, **settings: Any) -> MultiAngleResult:
+def _solve(
+    beams: BeamSignals, zenith_angle: Array, altitude: Array, *, method: str, **settings: Any
+) -> MultiAngleResult:
     """Return the result of the method; of "kano_hamilton" if "auto" joined and flagged all values.
 
     Errors that are common to neighbouring altitudes, such as those of the shot energy, look like
     structure of the profile. The joint solution then flags its standard errors as too small, while
     those of single altitudes remain valid.
     """
+    data = (beams.signal, zenith_angle, altitude)
+    settings |= {"variance": beams.variance}
     retrieval = optical_depth.retrieve_optical_depth(*data, method=method, **settings)
     flags = retrieval.flags
     valued = np.isfinite(retrieval.optical_depth)
@@ -227,24 +240,26 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     )
 
 
-def _shifted_by_background(
-    retrieval: MultiAngleResult, beams: xr.Dataset, station_altitude: float
-) -> Flags:
-    """Return 1 where signal left in the background may shift an optical depth, else 0.
+def _with_background_errors(
+    retrieval: MultiAngleResult,
+    beams: BeamSignals,
+    depth: Array,
+    levels: npt.NDArray[np.intp],
+) -> MultiAngleResult:
+    """Return the result with standard errors that include signal in the background of all beams.
 
-    The shift is the weighted regression of the relative change of each signal on the slant path.
+    `depth` is that of the layers between altitudes in m; `levels` are the bottom and top of
+    requested layers, 0 for the station and k + 1 for altitude k.
     """
-    height = beams["altitude"].to_numpy() - station_altitude
-    path = slant_paths.slant_path(beams["beam_zenith_angle"].to_numpy(), height)
-    signal, variance = beams["signal"].to_numpy(), beams["variance"].to_numpy()
-    scatter = np.nan_to_num(retrieval.inhomogeneity)[:, np.newaxis, :] ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        change = beams["left"].to_numpy()[:, :, np.newaxis] * (path * height) ** 2 / signal
-        weight = 1.0 / (variance / signal**2 + scatter)
-        used = np.isfinite(retrieval.residual) & np.isfinite(change) & np.isfinite(weight)
-        weight = np.where(used, weight, 0.0)
-        mean = (weight * path).sum(axis=1) / weight.sum(axis=1)
-        arm = weight * (path - mean[:, np.newaxis, :])
-        change = np.where(used, change, 0.0)
-        shift = 0.5 * (arm * change).sum(axis=1) / (arm * path).sum(axis=1)
-    return shifts(shift, retrieval.optical_depth_standard_error).astype(np.int32)
+    shift = np.pad(beams.shift(retrieval), ((0, 0), (1, 0)))
+    of_layers = np.diff(shift[:, levels], axis=2)[..., 0]
+    return replace(
+        retrieval,
+        optical_depth_standard_error=np.hypot(retrieval.optical_depth_standard_error, shift[:, 1:]),
+        extinction_standard_error=np.hypot(
+            retrieval.extinction_standard_error, np.diff(shift, axis=1) / depth
+        ),
+        layer_optical_depth_standard_error=np.hypot(
+            retrieval.layer_optical_depth_standard_error, of_layers
+        ),
+    )

@@ -1,10 +1,10 @@
-"""Profiles of a scan over xarray: sorted by cycle and beam, on common altitudes."""
+"""Profiles of a scan over xarray: sorted by cycle and beam, in altitude cells."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
-from lidarops.retrieve.multiangle._common_altitude import along_beam
+from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
 from lidarops.retrieve.signal.averaging import RunningMean
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
@@ -31,13 +31,13 @@ WITHHELD: Final = (
 CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
 BATCH: Final = 64
-"""Profiles interpolated together, unless one cycle has more."""
+"""Profiles averaged together, unless one cycle has more."""
 _BESIDE: Final = 4
-"""Bins beside an altitude that an interpolation may need."""
+"""Bins beyond the highest cell, of which its mean needs one."""
 
 
 class AltitudeCycles:
-    """Profiles of a scan on common altitudes, sorted by cycle and beam, from chunks of profiles.
+    """Profiles of a scan in altitude cells, sorted by cycle and beam, from chunks of profiles.
 
     The variance of the background is added to that of the noise. Profiles of one cycle and
     direction are averaged, weighted by their shots. Beams that do not rise, are longer than 10
@@ -55,14 +55,15 @@ class AltitudeCycles:
     shots : (time,) int
         Number of laser shots of each profile.
     altitude_grid : (altitude,) float
-        m above mean sea level, ascending, above the station; uniform for the method "joint".
+        m above mean sea level, ascending, above the station, at least two; uniform for the method
+        "joint". The edges of cells are midway between altitudes.
     station_altitude : float
         m above mean sea level.
     background_range : (float, float)
         m along the beam: the tail, whose mean is the background.
     molecules : MolecularProfile, optional
-        If given, the background is fitted in the far range together with the signal shape of clean
-        air (`lidarops.retrieve.background.known_shape`); the tail is used where that fit fails.
+        If given, the background is that of `estimate.from_far_range`, else that of
+        `estimate.from_bounded_tail` (`lidarops.retrieve.background`).
     wavelength : float
         m, for the scattering of the molecules.
     overlap : (range,) float, optional
@@ -93,6 +94,10 @@ class AltitudeCycles:
         numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
         levels = np.asarray(altitude_grid, dtype=np.float64)
         height = slant_paths.altitude_grid(levels, station_altitude)
+        if height.size < 2:
+            raise RetrievalInputError(
+                "holds one altitude", field="altitude_grid", remedy="give at least two, in m"
+            )
         self._order = order = _order(directions, numbers, height)
         self._settings = _Settings(
             distance=distance,
@@ -102,7 +107,7 @@ class AltitudeCycles:
             if molecules is None
             else _shapes(molecules, wavelength, order.zenith_angle, distance, station_altitude),
             altitude=levels,
-            slant_ranges=slant_paths.slant_path(order.zenith_angle, height) * height,
+            slant_edges=_slant_edges(order.zenith_angle, height),
         )
         self._weights = np.asarray(shots, dtype=np.float64)
         self._bounds = np.asarray(time_bnds)
@@ -159,8 +164,9 @@ class AltitudeCycles:
         xr.Dataset
             ``signal`` (range-corrected) and ``variance`` over (time, beam, altitude), NaN where
             missing; ``quality`` (the bits of all bins at an altitude) over (time, altitude);
-            ``left`` (the signal that may have been subtracted with the background, 0 where none is
-            detected) over (time, beam); and ``shots`` over time. ``time`` is the middle of
+            ``left`` (the standard error of the background by signal in the far range) over (time,
+            beam); ``response`` (the mean of the square of range over overlap, m2) over (beam,
+            altitude); and ``shots`` over time. ``time`` is the middle of
             ``time_bnds``, which span the profiles of a cycle.
         """
         order = self._order
@@ -182,6 +188,7 @@ class AltitudeCycles:
         return xr.Dataset(
             {
                 **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=True)},
+                "response": (("beam", "altitude"), self._settings.response()),
                 "shots": ("time", np.rint(total).astype(np.int32)),
             },
             coords=coordinates,
@@ -214,8 +221,8 @@ class _Settings:
     shapes: Array | None
     """(beam, range): signal of clean air."""
     altitude: Array
-    slant_ranges: Array
-    """(beam, altitude) m: the range at which a beam crosses an altitude."""
+    slant_edges: Array
+    """(beam, altitude + 1) m: the range at which a beam crosses the edges of the cells."""
 
     @property
     def in_front(self) -> slice:
@@ -223,12 +230,43 @@ class _Settings:
         return slice(int(np.searchsorted(self.distance, 0.0, side="right")), None)
 
     @property
-    def interpolated(self) -> slice:
-        """Bins needed to interpolate all beams up to the highest altitude."""
-        farthest = float(np.max(self.slant_ranges[:, -1]))
+    def covered(self) -> slice:
+        """Bins needed for all cells of all beams."""
+        farthest = float(np.max(self.slant_edges[:, -1]))
         first = self.in_front.start
         bins = int(np.searchsorted(self.distance, farthest)) + _BESIDE
-        return slice(first, max(bins, first + _BESIDE))
+        return slice(first, max(bins, first) + _BESIDE)
+
+    @property
+    def gain(self) -> Array:
+        """Square of range over overlap of the bins that are covered, m2."""
+        distance = self.distance[self.covered]
+        if self.overlap is None:
+            return distance**2
+        overlap = self.overlap[self.covered]
+        return distance**2 / np.where(overlap > 0.0, overlap, np.nan)
+
+    def response(self) -> Array:
+        """Return the change of signals per change of the background, (beam, altitude) m2."""
+        distance = self.distance[self.covered]
+        dark = np.zeros((1, distance.size))
+        nothing = dark, dark, dark.astype(np.int32)
+        return np.stack(
+            [
+                average_over_cells(*nothing, self.gain, distance, edges).response
+                for edges in self.slant_edges
+            ]
+        )
+
+
+def _slant_edges(zenith_angle: Array, height: Array) -> Array:
+    """Return the ranges at which beams cross the edges of cells around heights, (beam, edge) m."""
+    middles = 0.5 * (height[:-1] + height[1:])
+    lowest = max(height[0] - 0.5 * (height[1] - height[0]), 0.0)
+    highest = height[-1] + 0.5 * (height[-1] - height[-2])
+    edges = np.concatenate([[lowest], middles, [highest]])
+    above = np.where(edges > 0.0, edges, 1.0)
+    return np.where(edges > 0.0, slant_paths.slant_path(zenith_angle, above) * edges, 0.0)
 
 
 def _order(directions: scan_cycles.Directions, numbers: Integers, height: Array) -> _Order:
@@ -281,30 +319,49 @@ def _batch_on_altitudes(
     background.
     """
     power, variance, quality, length = profiles
-    values, noise, bits, left = _net_bins(power, variance, quality, length, beam, settings)
-    distance = settings.distance[settings.interpolated]
-    unexplained = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)
-    bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
-    beams = len(settings.slant_ranges)
+    bins = _net_bins(power, variance, quality, length, beam, settings)
+    beams = len(settings.slant_edges)
     visit = cycle * beams + beam
     first = np.flatnonzero(np.diff(visit, prepend=-1))
     if first.size < visit.size:
-        values, noise, bits, left = _visit_means(values, noise, bits, left, shots, first)
-    values, noise = values * distance**2, noise * distance**4
+        bins = _visit_means(bins, shots, first)
     shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
     signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     flags = np.zeros((shape[0], shape[2]), dtype=np.int32)
     left_by_beam = np.full(shape[:2], np.nan)
-    left_by_beam[cycle[first], beam[first]] = left
+    left_by_beam[cycle[first], beam[first]] = bins.left
     beam, cycle = beam[first], cycle[first]
+    near, gain = settings.covered, settings.gain
     for number in np.unique(beam):
         rows = beam == number
-        target = settings.slant_ranges[number]
-        signal[cycle[rows], number], spread[cycle[rows], number] = along_beam(
-            values[rows], noise[rows], distance, target
+        means = average_over_cells(
+            bins.power[rows],
+            bins.variance[rows],
+            bins.quality[rows],
+            gain,
+            settings.distance[near],
+            settings.slant_edges[number],
         )
-        flags[cycle[rows]] |= _bits_beside(bits[rows], distance, target)
+        # The background is common to all bins of a beam.
+        noise = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
+        signal[cycle[rows], number], spread[cycle[rows], number] = at_centres(means.signal, noise)
+        flags[cycle[rows]] |= means.quality
     return signal, spread, flags, left_by_beam
+
+
+class _Bins(NamedTuple):
+    """Bins of profiles without background."""
+
+    power: Array
+    """(profile, range); NaN where missing."""
+    variance: Array
+    """(profile, range): as of independent bins, for means over many."""
+    quality: Flags
+    """(profile, range)."""
+    level_variance: Array
+    """(profile,): variance of the background."""
+    left: Array
+    """(profile,): signal that may have been subtracted with the background."""
 
 
 def _net_bins(
@@ -314,36 +371,33 @@ def _net_bins(
     length: _Block,
     beam: Integers,
     settings: _Settings,
-) -> tuple[Array, Array, Flags, Array]:
-    """Return signal without background, variance and bits of the bins to interpolate.
-
-    The fourth array is, as (profile,), the signal that may have been subtracted.
-    """
+) -> _Bins:
+    """Return the bins to average, without their background."""
     bits = quality & np.int32(WITHHELD | CARE)
-    front, near, overlap = settings.in_front, settings.interpolated, settings.overlap
+    front, near, overlap = settings.in_front, settings.covered, settings.overlap
     if overlap is not None:
         unknown = ~(np.isfinite(overlap) & (overlap > 0))
         bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
-    data = (
-        values[:, front],
-        settings.distance[front],
-        variance[:, front] * length[:, np.newaxis],
-    )
+    of_means = variance * length[:, np.newaxis]
+    data = (values[:, front], settings.distance[front], of_means[:, front])
     tail = settings.background_range
-    sky = (
-        estimate.from_tail(*data, tail)
-        if settings.shapes is None
-        else estimate.from_known_shape(*data, settings.shapes[beam][:, front], tail)
-    )
+    if settings.shapes is None:
+        sky = estimate.from_bounded_tail(*data, None, tail)
+    else:
+        # Within the altitudes of the retrieval, the air is not taken as clean.
+        highest = settings.slant_edges[beam, -1:]
+        sky = estimate.from_far_range(
+            *data, settings.shapes[beam][:, front], tail, mask=data[1] > highest
+        )
     uncertain = np.where(sky.unjudged, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     # Farther bins serve the background only.
-    values = values[:, near] - sky.background[:, np.newaxis]
-    noise = variance[:, near] + sky.standard_error[:, np.newaxis] ** 2
-    if overlap is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values, noise = values / overlap[near], noise / overlap[near] ** 2
-    return values, noise, bits[:, near] | uncertain[:, np.newaxis], sky.left.detected
+    net = values[:, near] - sky.background[:, np.newaxis]
+    bits = bits[:, near] | uncertain[:, np.newaxis]
+    unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
+    bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
+    left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
+    return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left)
 
 
 def _shapes(
@@ -370,32 +424,22 @@ def _shapes(
     return shapes
 
 
-def _visit_means(
-    values: Array,
-    noise: Array,
-    bits: Flags,
-    left: Array,
-    shots: Array,
-    first: npt.NDArray[np.intp],
-) -> tuple[Array, Array, Flags, Array]:
+def _visit_means(bins: _Bins, shots: Array, first: npt.NDArray[np.intp]) -> _Bins:
     """Average the profiles of each visit of a direction, weighted by shots."""
     group = np.zeros(shots.size, dtype=np.int64)
     group[first[1:]] = 1
     group = np.cumsum(group)
-    sums = RunningMean((first.size, values.shape[1]))
-    sums.add(values, noise, groups=group, weights=shots)
+    sums = RunningMean((first.size, bins.power.shape[1]))
+    sums.add(bins.power, bins.variance, groups=group, weights=shots)
     means = sums.averages()
-    known = np.isfinite(left)
-    total = np.add.reduceat(np.where(known, left, 0.0), first)
-    bits = np.bitwise_or.reduceat(bits, first, axis=0)
+    known = np.isfinite(bins.left)
+    left = np.add.reduceat(np.where(known, bins.left, 0.0), first)
     count = np.maximum(np.add.reduceat(known.astype(np.int64), first), 1)
-    return means.values, means.variance, bits, total / count
-
-
-def _bits_beside(bits: Flags, distance: Array, target: Array) -> Flags:
-    """Return the bits of the two bins beside each target range."""
-    below = np.searchsorted(distance, target, side="right") - 1
-    below = np.clip(below, 0, distance.size - 2)
-    combined = bits[:, below] | bits[:, below + 1]
-    outside = (target < distance[0]) | (target > distance[-1])
-    return np.where(outside, np.int32(Quality.INPUT_MISSING), combined)
+    level = np.add.reduceat(shots**2 * bins.level_variance, first)
+    return _Bins(
+        means.values,
+        means.variance,
+        np.bitwise_or.reduceat(bins.quality, first, axis=0),
+        level / np.add.reduceat(shots, first) ** 2,
+        left / count,
+    )

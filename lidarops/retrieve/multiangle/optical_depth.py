@@ -72,9 +72,8 @@ def retrieve_optical_depth(
     Parameters
     ----------
     signal : (..., angle, altitude) float
-        Range-corrected, without background, in any unit, on common altitudes (see
-        `lidarops.retrieve.multiangle._common_altitude`), from full overlap upwards; NaN where
-        missing.
+        Range-corrected, without background, in any unit, of altitude cells (see
+        `lidarops.retrieve.multiangle._cell_means`), from full overlap upwards; NaN where missing.
     zenith_angle : (angle,) float
         degree, -90 to 90; a beam with a negative angle points opposite to its azimuth.
     altitude : (altitude,) float

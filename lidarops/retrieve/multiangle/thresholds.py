@@ -36,10 +36,12 @@ class Thresholds:
     """Slant over vertical path beyond which a beam is left out, because refraction is not
     modelled; assumed."""
 
-    # Samples (`_common_altitude`, `_sample_mask`).
-    clear_bin: float = 30.0
-    """Signal over noise from which the logarithm is interpolated; below, the error of
-    interpolating the signal is far less than its noise; assumed."""
+    # Background (`beam_backgrounds`).
+    common_background: float = 0.5
+    """Share of the variance of backgrounds, by signal in the far range, that all beams have in
+    common; assumed."""
+
+    # Samples (`_sample_mask`).
     lowest_snr: float = 3.0
     """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
     light (`test_kano_hamilton`)."""

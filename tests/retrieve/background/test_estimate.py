@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import molecular_shape
-from lidarops.retrieve.background.estimate import from_cubic, from_known_shape, from_tail
+from lidarops.retrieve.background.estimate import (
+    from_bounded_tail,
+    from_cubic,
+    from_far_range,
+    from_known_shape,
+    from_tail,
+)
 from lidarops.retrieve.background.left_signal import shifts, window_before
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 
@@ -261,3 +267,68 @@ def test_an_empty_span_is_refused(method):
 def _with_range(data):
     power, variance = data
     return power, RANGE, variance
+
+
+# Bounds by the tail ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [0.01, 1.0])
+@pytest.mark.parametrize("amount", [0.0, 1.0, 20.0])
+@pytest.mark.parametrize("attenuation", [0.0, 5e-5, 3e-4])
+def test_the_bounded_tail_holds_the_background(amount, attenuation, noise):
+    """Of air of constant scattering and any attenuation, from none to what leaves no signal."""
+    signal = square_law(amount) * np.exp(-2.0 * attenuation * (RANGE - TAIL[0]))
+    signal = np.minimum(signal, 1e6)
+    power, variance = noisy(signal, noise=noise)
+    found = from_bounded_tail(power, RANGE, variance, None, TAIL)
+    largest = np.sqrt(3.0) * found.left.most + 4.0 * found.standard_error
+    assert np.all(np.abs(found.background - SKY) < largest)
+    assert not flagged(found).any()
+    # The middle of the interval, and no more than its width.
+    tail = from_tail(power, RANGE, variance, TAIL)
+    assert np.all(found.background <= tail.background)
+    np.testing.assert_allclose(
+        tail.background - found.background, 0.5 * np.maximum(tail.left.most, 0.0), atol=1e-9
+    )
+
+
+def test_bounds_by_clean_air_are_narrower():
+    power, variance = noisy(50.0 * air() / air()[IN_TAIL].mean(), noise=0.1)
+    plain, clean = (from_bounded_tail(power, RANGE, variance, s, TAIL) for s in (None, air()))
+    assert np.all(clean.left.most < 0.8 * plain.left.most)
+    # Clean air itself is the upper end.
+    ends = np.sqrt(3.0) * clean.left.most
+    np.testing.assert_allclose(clean.background - ends, SKY, atol=1.0)
+
+
+def test_the_better_known_background_of_the_far_range_is_taken():
+    everywhere = np.ones((1, RANGE.size), dtype=bool)
+    clean = 50.0 * air() / air()[IN_TAIL].mean()
+    for noise in (0.1, 30.0):
+        power, variance = noisy(clean, noise=noise)
+        found = from_far_range(power, RANGE, variance, air(), TAIL, mask=everywhere)
+        fit = from_known_shape(power, RANGE, variance, air(), TAIL)
+        tail = from_bounded_tail(power, RANGE, variance, air(), TAIL)
+        errors = [np.hypot(sky.standard_error, sky.left.most) for sky in (found, fit, tail)]
+        judged = ~fit.unjudged
+        assert judged.mean() > 0.95
+        np.testing.assert_array_equal(errors[0][judged], np.minimum(*errors[1:])[judged])
+        assert np.mean(np.abs(found.background - SKY) < 4.0 * errors[0]) > 0.99
+    # Where no bin may be taken as clean.
+    power, variance = noisy(clean, noise=0.1)
+    hazy = from_far_range(power, RANGE, variance, air(), TAIL, mask=~everywhere)
+    bounded = from_bounded_tail(power, RANGE, variance, air(), TAIL)
+    np.testing.assert_array_equal(hazy.background, bounded.background)
+
+
+def test_haze_in_the_far_range_does_not_bias_the_background():
+    """Haze that the fit of clean air takes for background: its value is far below."""
+    haze = 1.0 + 30.0 * np.exp(-(((RANGE - 9000.0) / 2500.0) ** 2))
+    power, variance = noisy(50.0 * haze * air() / air()[IN_TAIL].mean(), noise=1.0)
+    fit = from_known_shape(power, RANGE, variance, air(), TAIL)
+    found = from_far_range(
+        power, RANGE, variance, air(), TAIL, mask=np.broadcast_to(RANGE > 14e3, power.shape)
+    )
+    total = np.hypot(found.standard_error, found.left.most)
+    assert np.all(np.abs(found.background - SKY) < 2.0 * total)
+    assert np.median(np.abs(found.background - SKY)) < np.median(np.abs(fit.background - SKY))

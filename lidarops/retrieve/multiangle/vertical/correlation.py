@@ -24,7 +24,7 @@ _FARTHEST: Final = 2
 _LEAST_SHARE: Final = THRESHOLDS.least_correlated
 _CANDIDATES: Final = np.arange(98) / 100.0
 """Correlations to choose from; beyond `highest_correlation` they are flagged, and 1 is excluded
-because its noise has no finite power at low frequencies (formula 8 of the page)."""
+because its noise has no finite power at low frequencies (formula 9 of the page)."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 

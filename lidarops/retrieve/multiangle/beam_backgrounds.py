@@ -1,0 +1,177 @@
+"""Backgrounds of the beams of a scan, as far as the beams agree on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.multiangle._result import MultiAngleResult
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
+Array = npt.NDArray[np.float64]
+
+_COMMON: Final = THRESHOLDS.common_background
+_MOST_CORRELATED: Final = 0.98
+"""Largest correlation of residuals at neighbouring altitudes, as in `vertical.correlation`."""
+
+
+@dataclass(frozen=True, slots=True)
+class BeamSignals:
+    r"""Signals of the beams of a scan, and the covariance of their backgrounds.
+
+    A background of beam :math:`l` that is too low by :math:`\delta_l` raises the logarithm of its
+    signal by :math:`g_l \delta_l` at every altitude, :math:`g = r^2 / S`.
+    """
+
+    signal: Array
+    """(time, beam, altitude), range-corrected."""
+    noise: Array
+    """(time, beam, altitude): variance by noise alone."""
+    variance: Array
+    """(time, beam, altitude): with which the beams are weighted. With that of noise alone, those of
+    an uncertain background would pull the first fit."""
+    covariance: Array
+    """(time, beam, beam): of the backgrounds, by signal that they may hold."""
+    path: Array
+    """(beam, altitude): slant over vertical path."""
+    response: Array
+    """(beam, altitude) m2: mean of the square of range over overlap, the change of the signal per
+    change of the background."""
+
+    @classmethod
+    def of(cls, signal: Array, noise: Array, left: Array, path: Array, response: Array) -> Self:
+        """Return the signals of beams.
+
+        Parameters
+        ----------
+        signal, noise : (time, beam, altitude) float
+        left : (time, beam) float
+            Standard error of each background by signal in the far range, of which a part
+            (`Thresholds.common_background`, of the variance) is common to all beams; NaN for
+            missing beams.
+        path, response : (beam, altitude) float
+        """
+        left = np.nan_to_num(left)
+        covariance = _COMMON * left[:, :, np.newaxis] * left[:, np.newaxis]
+        covariance += (1.0 - _COMMON) * left[:, np.newaxis] ** 2 * np.eye(left.shape[1])
+        variance = noise + (left[..., np.newaxis] * response) ** 2
+        return cls(signal, noise, variance, covariance, path, response)
+
+    def agreed(self, retrieval: MultiAngleResult) -> Self:
+        r"""Return the signals with the backgrounds with which the beams agree best.
+
+        With the weights :math:`W` of a fit of :math:`c - 2 x \tau` at each altitude, the matrix
+        :math:`Q = W - W X (X'WX)^{-1} X'W` that leaves what no :math:`c` and :math:`\tau` explain,
+        the residuals :math:`y`, and the number :math:`q` of altitudes per independent residual,
+
+        .. math:: C' = \Big(C^{-1} + \frac1q \sum_z G Q G\Big)^{-1}, \qquad
+                  \delta = \frac1q\,C' \sum_z G Q y, \qquad G = \mathrm{diag}\,g .
+
+        With these backgrounds subtracted, weights of noise alone give the optical depths of
+        generalised least squares (`shift` has the rest of their error).
+
+        Parameters
+        ----------
+        retrieval : MultiAngleResult
+            Of these signals.
+        """
+        weight, change, residual = self._samples(retrieval)
+        fit = _Regression(weight, self.path)
+        pull = weight * change
+        level = pull / np.sqrt(fit.total)[:, np.newaxis]
+        slope = pull * fit.arm / np.sqrt(fit.squares)[:, np.newaxis]
+        information = _beside(pull * change) - _outer(level) - _outer(slope)
+        misfit = (pull * fit.residual(residual)).sum(axis=-1)
+        # Without the backgrounds, which are common to all altitudes.
+        background, _ = self._posterior(information, misfit)
+        rest = fit.residual(residual - change * background[..., np.newaxis])
+        together = _altitudes_together(rest * np.sqrt(weight))
+        background, covariance = self._posterior(information / together, misfit / together)
+        return replace(
+            self,
+            signal=self.signal - background[..., np.newaxis] * self.response,
+            variance=self.noise,
+            covariance=0.5 * (covariance + np.swapaxes(covariance, 1, 2)),
+        )
+
+    def _posterior(self, information: Array, misfit: Array) -> tuple[Array, Array]:
+        """Return mean and covariance of the backgrounds, from the normal equations of a fit."""
+        known = np.eye(len(self.path)) + information @ self.covariance
+        covariance = self.covariance @ np.linalg.inv(known)
+        return (covariance @ misfit[..., np.newaxis])[..., 0], covariance
+
+    def shift(self, retrieval: MultiAngleResult) -> Array:
+        r"""Return the standard error of optical depths by the backgrounds, (time, altitude).
+
+        It is carried by half the weighted regression of :math:`g_l \delta_l` on the slant path.
+        """
+        weight, change, _ = self._samples(retrieval)
+        fit = _Regression(weight, self.path)
+        pull = 0.5 * weight * fit.arm * change / fit.squares[:, np.newaxis]
+        square = np.einsum("tbz,tbc,tcz->tz", pull, self.covariance, pull)
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+
+    def _samples(self, retrieval: MultiAngleResult) -> tuple[Array, Array, Array]:
+        """Return weight, relative change per background, and residual; 0 where there is none."""
+        scatter = np.nan_to_num(retrieval.inhomogeneity)[:, np.newaxis] ** 2
+        depth, level = (
+            values[:, np.newaxis] for values in (retrieval.optical_depth, retrieval.log_intercept)
+        )
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            # That of the fit: the noise of the signal would be common to change and residual.
+            expected = np.exp(level - 2.0 * self.path * depth)
+            weight = 1.0 / (self.noise / expected**2 + scatter)
+            change, residual = self.response / expected, self.signal / expected - 1.0
+            used = np.isfinite(retrieval.residual) & np.isfinite(residual * change * weight)
+        weight, change, residual = (
+            np.where(used, values, 0.0) for values in (weight, change, residual)
+        )
+        return weight, change, residual
+
+
+class _Regression:
+    """Weighted straight lines over the slant path at each altitude of each cycle."""
+
+    def __init__(self, weight: Array, path: Array) -> None:
+        """Regress with weights (time, beam, altitude) on paths (beam, altitude)."""
+        self._weight = weight
+        self.total = _infinite_where_zero(weight.sum(axis=1))
+        """(time, altitude): sum of the weights; infinite where there is none."""
+        self.arm = path - ((weight * path).sum(axis=1) / self.total)[:, np.newaxis]
+        """(time, beam, altitude): path about its mean."""
+        self.squares = _infinite_where_zero((weight * self.arm**2).sum(axis=1))
+        """(time, altitude): weighted squares of the arms; infinite where there is none."""
+
+    def residual(self, values: Array) -> Array:
+        """Return values minus their line."""
+        weighted = self._weight * values
+        level = weighted.sum(axis=1) / self.total
+        slope = (weighted * self.arm).sum(axis=1) / self.squares
+        line = level[:, np.newaxis] + slope[:, np.newaxis] * self.arm
+        return np.asarray(np.where(self._weight > 0.0, values - line, 0.0))
+
+
+def _infinite_where_zero(values: Array) -> Array:
+    return np.asarray(np.where(values > 0.0, values, np.inf))
+
+
+def _altitudes_together(scaled: Array) -> float:
+    """Return the number of altitudes per independent residual, of residuals of unit variance."""
+    both = (scaled[..., 1:] != 0.0) & (scaled[..., :-1] != 0.0)
+    squares = np.where(both, scaled[..., 1:] ** 2 + scaled[..., :-1] ** 2, 0.0).sum()
+    products = (scaled[..., 1:] * scaled[..., :-1]).sum()
+    correlation = np.clip(2.0 * products / squares if squares else 0.0, 0.0, _MOST_CORRELATED)
+    return float((1.0 + correlation) / (1.0 - correlation))
+
+
+def _beside(values: Array) -> Array:
+    """Return the sums over altitudes as diagonal matrices, (time, beam, beam)."""
+    return np.asarray(values.sum(axis=-1)[:, np.newaxis] * np.eye(values.shape[1]))
+
+
+def _outer(values: Array) -> Array:
+    """Return the sums over altitudes of outer products, (time, beam, beam)."""
+    return np.asarray(values @ np.swapaxes(values, 1, 2))
