@@ -6,6 +6,7 @@ of a difference is that of pairs: a jackknife over clusters, which share a geome
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -139,3 +140,10 @@ def _change(own: list[Counts], base: list[Counts], part: str, whole: str) -> tup
         value, without = value - base_value, without - base_without
     count = without.size
     return value, float(np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2)))
+
+
+def cluster_count(description: str | None, default: int) -> int:
+    """Return the number of clusters that the command line of a study requests."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("clusters", nargs="?", type=int, default=default)
+    return int(parser.parse_args().clusters)

@@ -18,6 +18,7 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from studies.ablation import cluster_count
 from support.archives.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import load_campaign
@@ -76,4 +77,4 @@ def main(days: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 40)
+    main(cluster_count(__doc__, 40))

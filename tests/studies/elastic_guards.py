@@ -13,7 +13,10 @@ from typing import Any, Final
 from unittest import mock
 
 import numpy as np
-from studies.ablation import Guard, measure, table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from studies.ablation import Guard, cluster_count, measure, table
 
 from lidarops.bench.stability import random_elastic
 from lidarops.flags import Quality
@@ -143,6 +146,6 @@ GUARDS: Final = (
 )
 
 if __name__ == "__main__":
-    clusters = int(sys.argv[1]) if len(sys.argv) > 1 else CLUSTERS
+    clusters = cluster_count(__doc__, CLUSTERS)
     counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), range(clusters), GUARDS)
     sys.stdout.write("\n".join([*table(counts), ""]))

@@ -297,12 +297,15 @@ def table(out: Path, marker: str) -> None:
     for name in names:
         changed = _read(out / f"{name}.json")
         classes = [None, OWN[name]] if name in OWN else [None]
-        for of_class in classes if name != ALL else [None, *dict.fromkeys(OWN.values())]:
+        for of_class in (
+            classes if name != ALL else [None, *dict.fromkeys(OWN.values()), CURVED, CAMPAIGNS]
+        ):
             kept, all_kept = (
                 {key: entry for key, entry in counts.items() if of_class in {None, key[0]}}
                 for counts in (changed, reference)
             )
-            if kept:
+            # A table of one class only needs no row of all.
+            if kept and (of_class or len({key[0] for key in kept}) > 1):
                 rows.append(_row(name, of_class or "all", kept, all_kept))
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(f"<!-- {marker} -->\n")
@@ -350,7 +353,8 @@ def _row(name: str, of_class: str, changed: Any, reference: Any) -> str:
         )
         sign = "" if name == ALL else "+"
         cells.append(f"{100 * figures[0]:{sign}.2f} ± {100 * figures[1]:.2f}")
-    networks = len({key[1] for key in changed if key[0] != CAMPAIGNS})
+    campaigns = {key[0] for key in changed} == {CAMPAIGNS}
+    networks = len({key[1] for key in changed if campaigns or key[0] != CAMPAIGNS})
     return f"| {name} | {of_class} | {networks} | {' | '.join(cells)} |"
 
 

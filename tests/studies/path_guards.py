@@ -6,11 +6,15 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
 import numpy as np
-from studies.ablation import Guard, measure, table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from studies.ablation import Guard, cluster_count, measure, table
 
 from lidarops.bench.stability import random_homogeneous
 from lidarops.flags import Quality
@@ -85,7 +89,7 @@ GUARDS: Final = (
 BINS: Final = {"sections of 8 to 800 bins": (8, 800), "8 to 24 bins": (8, 24), "4 to 7": (4, 7)}
 
 if __name__ == "__main__":
-    clusters = int(sys.argv[1]) if len(sys.argv) > 1 else CLUSTERS
+    clusters = cluster_count(__doc__, CLUSTERS)
     for title, bins in BINS.items():
         with mock.patch.object(random_homogeneous, "_BINS", bins):
             counts = measure(

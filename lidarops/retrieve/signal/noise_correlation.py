@@ -21,8 +21,6 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 
 _SECTIONS: Final = THRESHOLDS.noise_sections
-_FITTED: Final = 3
-"""Coefficients of the parabola that is fitted to each section."""
 _HUGE: Final = 1e300
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")

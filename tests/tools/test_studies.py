@@ -1,0 +1,29 @@
+"""The studies that the pages of the algorithms name start as these state."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+STUDIES = sorted(
+    path
+    for path in (Path(__file__).resolve().parents[1] / "studies").glob("*.py")
+    if "__main__" in path.read_text(encoding="utf-8")
+)
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=[path.stem for path in STUDIES])
+def test_a_study_states_its_arguments(path: Path, repository: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(path), "--help"],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "usage" in done.stdout
