@@ -93,3 +93,26 @@ def test_two_hundred_scans(tmp_path):
     deviating = np.abs(share - 1.0) > 0.104  # Stored to 8 bits.
     assert np.count_nonzero(deviating) > 500
     assert (flags[deviating] & int(MultiAngleQuality.PRIOR_DOMINATED)).all()
+
+
+def low_scan(folder: Path, zenith_angles: list[float]) -> Campaign:
+    """Return a simulated campaign that scans over these angles to one side."""
+    instrument = TREE["simulation"]["instruments"]["scanner"]
+    scan = {"zenith_angles": zenith_angles, "azimuth": 90}
+    return campaign(folder, duration=800, instruments={"scanner": instrument | {"scan": scan}})[0]
+
+
+def test_beams_near_the_horizon_are_left_out_with_a_reason(tmp_path):
+    (outcome,) = reprocess(low_scan(tmp_path, [86.0, 85.0, 83.0, 80.0, 70.0])).scenes
+    (step,) = (step for step in outcome.plan.steps if step.name == "multiangle")
+    assert "2 of 5 beam directions rise less than 5.7 degree" in step.reason
+    with xr.open_dataset(next(tmp_path.rglob("*multiangle*.nc"))) as product:
+        np.testing.assert_allclose(product["beam_zenith_angle"], [70.0, 80.0, 83.0])
+
+
+@pytest.mark.parametrize("angles", [[89.9, 88.0, 84.4], [89.0, 86.0, 80.0]])
+def test_a_scan_without_leverage_is_known_before_it_is_read(tmp_path, angles):
+    record = bring_up_to_date(low_scan(tmp_path, angles))
+    (reason,) = record.empty_scenes.values()
+    assert "beam directions rise less than 5.7 degree" in reason
+    assert "no leverage" in reason

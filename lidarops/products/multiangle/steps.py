@@ -21,6 +21,7 @@ from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
@@ -45,6 +46,10 @@ PartOfRetrieval = Choice[Case, NoSettings]
 """A step that the retrieval carries out within itself."""
 
 _HALF_TURN: Final = 180.0
+_FEWEST_DIRECTIONS: Final = 2
+"""Two paths define a slope."""
+LOWEST_ELEVATION: Final = math.degrees(math.asin(1.0 / THRESHOLDS.longest_path))
+"""degree; lower beams are longer than the longest path, but for the curvature of the Earth."""
 _SIMPLE: Final = frozenset({"kano_hamilton", "two_angle"})
 """Methods that treat each altitude independently."""
 _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
@@ -62,6 +67,9 @@ class Beams:
     """The beam directions of a scan that the retrieval uses."""
 
     count: int
+    low: int
+    """Number of directions that are left out, because their path is too long or they do not rise.
+    """
     sides_known: bool
     """Whether any azimuth is known."""
     free: float
@@ -94,15 +102,16 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
         directions = scan_cycles.directions(zenith_angle, azimuth)
     except RetrievalInputError:
         # The retrieval raises the same error with its message.
-        return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
+        return Beams(0, 0, sides_known, 2 * _HALF_TURN, surround=False)
     altitude = altitude_steps(step, highest)
     up = slant_paths.rising_beams(directions.zenith_angle, altitude)
+    low = directions.zenith_angle.size - up.size
     if up.size == 0:
-        return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
+        return Beams(0, low, sides_known, 2 * _HALF_TURN, surround=False)
     scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
     tilted = scan.tilted_azimuths
     free = math.degrees(slant_paths.widest_azimuth_gap(tilted))
-    return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(tilted))
+    return Beams(up.size, low, sides_known, free, slant_paths.surrounds_zenith(tilted))
 
 
 class Gradient(PartOfRetrieval):
@@ -245,9 +254,16 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         if reason:
             yield Leave(reason)
             return
+        directions = beams(case)
+        low = f"{directions.low} of {directions.low + directions.count} beam directions rise less"
+        low += f" than {LOWEST_ELEVATION:.1f} degree above the horizon"
+        if directions.count < _FEWEST_DIRECTIONS:
+            yield Leave(f"{low}: the rest has no leverage", number=float(directions.count))
+            return
         settings = case.request
+        words = f"{REQUESTED}, and the beam scans"
         yield Run(
-            f"{REQUESTED}, and the beam scans",
+            f"{words}; {low} and are left out" if directions.low else words,
             ScanSettings(
                 highest=settings.highest,
                 step=settings.step,

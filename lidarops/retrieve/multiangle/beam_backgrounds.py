@@ -19,7 +19,7 @@ _MOST_CORRELATED: Final = 0.98
 
 
 @dataclass(frozen=True, slots=True)
-class BeamSignals:
+class ScanSignals:
     r"""Signals of the beams of a scan, and the covariance of their backgrounds.
 
     A background of beam :math:`l` that is too low by :math:`\delta_l` raises the logarithm of its

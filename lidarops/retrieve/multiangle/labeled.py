@@ -12,7 +12,7 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import optical_depth, slant_paths
-from lidarops.retrieve.multiangle.beam_backgrounds import BeamSignals
+from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
 from lidarops.retrieve.multiangle.optical_depth import (
@@ -115,7 +115,7 @@ def retrieve_optical_depth(
         "largest_gradient": largest_gradient,
     }
     left = beams["left"].to_numpy()
-    signals = BeamSignals.of(
+    signals = ScanSignals.of(
         beams["signal"].to_numpy(),
         beams["variance"].to_numpy(),
         left,
@@ -170,7 +170,7 @@ def _layer_variables(
 
 
 def _solve(
-    beams: BeamSignals, zenith_angle: Array, altitude: Array, *, method: str, **settings: Any
+    beams: ScanSignals, zenith_angle: Array, altitude: Array, *, method: str, **settings: Any
 ) -> MultiAngleResult:
     """Return the result of the method; of "kano_hamilton" if "auto" joined and flagged all values.
 
@@ -242,7 +242,7 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
 
 def _with_background_errors(
     retrieval: MultiAngleResult,
-    beams: BeamSignals,
+    beams: ScanSignals,
     depth: Array,
     levels: npt.NDArray[np.intp],
 ) -> MultiAngleResult:

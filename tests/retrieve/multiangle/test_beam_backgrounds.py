@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.retrieve.multiangle import slant_paths
-from lidarops.retrieve.multiangle.beam_backgrounds import BeamSignals
+from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 HEIGHT = 60.0 * np.arange(5, 61)
@@ -28,7 +28,7 @@ def scans(cycles, rng, *, common, noise=0.01, beams=slice(None)):
     variance = np.broadcast_to((noise * CLEAN) ** 2, signal.shape)
     left = np.broadcast_to(LEFT, wrong.shape)
     parts = (signal[:, beams], variance[:, beams], left[:, beams], PATH[beams], RESPONSE[beams])
-    return BeamSignals.of(*parts), wrong[:, beams]
+    return ScanSignals.of(*parts), wrong[:, beams]
 
 
 def fit(signals, beams=slice(None)):
@@ -95,7 +95,7 @@ def test_known_backgrounds_and_missing_beams_stay():
     left[:, 0], left[1, 3] = 0.0, np.nan
     signal = prior.signal.copy()
     signal[1, 3] = np.nan
-    before = BeamSignals.of(signal, prior.noise, left, PATH, RESPONSE)
+    before = ScanSignals.of(signal, prior.noise, left, PATH, RESPONSE)
     after = agreed(before)
     np.testing.assert_array_equal(after.signal[:, 0], before.signal[:, 0])
     assert np.isnan(after.signal[1, 3]).all()
@@ -108,7 +108,7 @@ def test_a_cycle_does_not_depend_on_the_others():
     prior, _ = scans(6, np.random.default_rng(5), common=0.5)
     whole = prior.agreed(fit(prior)).covariance
     order = np.array([3, 0, 5, 1, 2, 4])
-    turned = BeamSignals(
+    turned = ScanSignals(
         *(values[order] for values in (prior.signal, prior.noise, prior.variance)),
         prior.covariance[order],
         PATH,
