@@ -157,6 +157,20 @@ class InstrumentFacts(SettingsModel):
             raise ValueError("valid_to must be later than valid_from")
         return self
 
+    @model_validator(mode="after")
+    def _one_role_of_each_file(self) -> Self:
+        ratios = {channel.lidar_ratio_profile for channel in self.channels.values()}
+        for name in ({self.overlap_profile, self.molecular_profile} | ratios) - {None}:
+            roles = {
+                "overlap_profile": name == self.overlap_profile,
+                "molecular_profile": name == self.molecular_profile,
+                "lidar_ratio_profile": name in ratios,
+            }
+            given = [role for role, named in roles.items() if named]
+            if len(given) > 1:
+                raise ValueError(f"{' and '.join(given)} name the same file, {name}")
+        return self
+
 
 def _fields(scope: Scope) -> dict[str, Any]:
     """Return the definition of one optional field for every kind of product of a scope."""

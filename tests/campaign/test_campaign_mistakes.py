@@ -123,6 +123,11 @@ def _message(folder: Path, text: str) -> str:
                 "0.1: must be a number from 0 to 150000 m, not -1"
             ),
         ),
+        (
+            "channels: {photon_532o: {dead_time: 4.0e-9, lag: 0}}",
+            "channels: {photon_532o: {lidar_ratio_profile: o.csv}}\n        overlap_profile: o.csv",
+            "overlap_profile and lidar_ratio_profile name the same file, o.csv",
+        ),
         ("[[750, 4500]]", "[[750, off]]", "sections: must be a list of at least 1 values, each"),
         (
             "lag: 0",

@@ -71,7 +71,8 @@ class Thresholds:
     least_share: float = 0.9
     """Data share below which the prior determines the extinction of "mld" and "mld_prior", by
     definition; and the farthest from 1 at which the optical depth of "joint" is not flagged: beyond
-    it, 0.4 percent deviate by more than 4 errors instead of 0.07 (`studies/days_of_scans.py`)."""
+    it, 0.4 percent deviated by more than 4 errors, not 0.07, where beams were not averaged over
+    cells (`docs/algorithms/multiangle.md`)."""
 
     # Outlying beams (`_block`, `robust_weights`).
     outlying_residual: float = 4.5
