@@ -6,6 +6,7 @@ scattering follows from the number density.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -49,6 +50,21 @@ _COLDEST: Final = 120.0
 _WARMEST: Final = 350.0
 """K; no air below 84 km is colder or warmer."""
 
+_ZERO_CELSIUS: Final = 273.15
+"""K."""
+_SLACK_AT_THE_SURFACE: Final = 1.25
+"""Largest ratio of a pressure to that of the standard atmosphere: weather changes the pressure at
+the ground by a tenth."""
+_SLACK_ALOFT: Final = 2.0
+"""The same in the stratosphere, where it changes by half."""
+_IMBALANCE: Final = 0.1
+"""Largest deviation of levels from hydrostatic balance, as a share of their altitude."""
+_ROUNDING_OF_PRESSURE: Final = 200.0
+"""m that are added to it: soundings round pressure to 0.1 hPa, a large share of low pressures."""
+_UNITS_OF_ALTITUDE: Final[Mapping[str, float]] = {"km": 1000.0, "feet": 0.3048}
+"""Metres of the units that altitudes may be in by mistake."""
+_ROUGHLY: Final = 0.2
+"""Relative deviation within which a ratio of altitudes tells their unit."""
 _SURFACE: Final = 9_000.0
 """m, highest ground at which a profile may begin."""
 
@@ -383,7 +399,7 @@ def _check_temperature(temperature: Array) -> None:
     low, high = float(temperature.min()), float(temperature.max())
     if low >= _COLDEST and high <= _WARMEST:
         return
-    celsius = low >= -100.0 and high <= 60.0
+    celsius = low >= _COLDEST - _ZERO_CELSIUS and high <= _WARMEST - _ZERO_CELSIUS
     raise RetrievalInputError(
         f"reaches from {low:g} to {high:g}, which is not air in K",
         field="temperature",
@@ -397,8 +413,7 @@ def _unit(altitude: float, pressure: float, named: str | None) -> str:
         raise RetrievalInputError(
             f"is {named!r}", field="pressure_unit", remedy=f"choose one of {', '.join(_UNITS)}"
         )
-    # Weather changes the pressure at the ground by a tenth, in the stratosphere by half.
-    slack = 1.25 if altitude <= _SURFACE else 2.0
+    slack = _SLACK_AT_THE_SURFACE if altitude <= _SURFACE else _SLACK_ALOFT
     standard = float(us_standard(altitude)[0])
     for unit, scale in _UNITS.items():
         if standard / slack <= pressure * scale <= standard * slack:
@@ -432,17 +447,15 @@ def _check_balance(altitude: Array, pressure: Array, temperature: Array) -> None
     scale = _GAS_CONSTANT / (_MOLAR_MASS * _GRAVITY)
     expected = np.cumsum(-scale * mean * np.diff(np.log(pressure)))
     rise = altitude[1:] - altitude[0]
-    # 200 m: soundings round pressure to 0.1 hPa, a large share of low pressures.
-    wrong = np.abs(expected - rise) > 0.1 * expected + 200.0
+    wrong = np.abs(expected - rise) > _IMBALANCE * expected + _ROUNDING_OF_PRESSURE
     if not np.any(wrong):
         return
     level = int(np.argmax(wrong))
     ratio = float(expected[-1] / rise[-1])
     remedy = "check the units of altitude, pressure and temperature"
-    if 800.0 < ratio < 1200.0:
-        remedy = "this looks like km: give m"
-    elif 0.25 < ratio < 0.36:
-        remedy = "this looks like feet: give m"
+    for unit, metres in _UNITS_OF_ALTITUDE.items():
+        if abs(ratio / metres - 1.0) < _ROUGHLY:
+            remedy = f"this looks like {unit}: give m"
     raise RetrievalInputError(
         f"is {rise[level]:.0f} m from the lowest level to level {level + 1}, but pressure and"
         f" temperature make it {expected[level]:.0f} m",

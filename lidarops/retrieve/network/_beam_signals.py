@@ -151,9 +151,10 @@ def _overlap(
 
 def _exponents(exponent: npt.ArrayLike, beams: int) -> Array:
     array = inputs.real_array(exponent, "exponent").astype(np.float64)
-    if array.shape not in {(), (beams,)} or not np.all((array >= 0.1) & (array <= 10.0)):
+    low, high = THRESHOLDS.exponents
+    if array.shape not in {(), (beams,)} or not np.all((array >= low) & (array <= high)):
         raise RetrievalInputError(
-            "is not from 0.1 to 10, or of a wrong shape",
+            f"is not from {low:g} to {high:g}, or of a wrong shape",
             field="exponent",
             remedy=f"give m of backscatter ~ extinction^(1/m): one, or one per beam ({beams})",
         )

@@ -341,7 +341,8 @@ class _Errors:
         tail_signal = _root_sum_square(list(solver.extinction_changes(result, tail)))
         exponent = solver.exponent * (1.0 + settings.exponent_relative_error)
         by_exponent = (
-            solver.solve(signals.power, np.minimum(exponent, 10.0)).extinction - result.extinction
+            solver.solve(signals.power, np.minimum(exponent, THRESHOLDS.exponents[1])).extinction
+            - result.extinction
         )
         by_lidar_ratio = _lidar_ratio_error(solver, result, settings.lidar_ratio_relative_error)
         contributions = [

@@ -26,6 +26,8 @@ class Thresholds:
     """Largest number of beams of a network; assumed."""
 
     # Signals
+    exponents: tuple[float, float] = (0.1, 10.0)
+    """Smallest and largest exponent m of backscatter ~ extinction^(1/m); assumed."""
     fit_bins: int = 7
     """Bins of the fit that gives the signal at a crossing; the study of the method."""
     lowest_overlap: float = 0.5
