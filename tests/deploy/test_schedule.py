@@ -153,7 +153,7 @@ def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
         scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         (site.folder / "campaign.yaml").unlink()
         # Prefect needs minutes to activate automations: the first failure may not be reported.
-        loopback.wait_until(lambda: notified("cannot be read"), 300, "nobody was told")
+        loopback.wait_until(lambda: notified("cannot be read"), 300, "no notification")
         sink.shutdown()
 
 

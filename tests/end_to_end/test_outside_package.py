@@ -160,7 +160,7 @@ def test_a_window_beyond_the_last_bin_is_left_out_with_its_number(campaign: Camp
     assert "integrated" in run("plan", file_of(campaign))
 
 
-def test_its_own_bit_is_told_and_shared_bits_keep_their_meaning(campaign: Campaign) -> None:
+def test_its_own_bit_is_stated_and_shared_bits_keep_their_meaning(campaign: Campaign) -> None:
     for path in products(campaign):
         with xr.open_dataset(path) as product:
             flags = product.quality_flag
@@ -226,7 +226,7 @@ def test_the_schema_describes_its_settings() -> None:
     assert properties["windows"]["unit"] == "m"
 
 
-def test_a_mistake_in_its_settings_is_told_with_its_line(tmp_path: Path) -> None:
+def test_a_mistake_in_its_settings_is_reported_with_its_line(tmp_path: Path) -> None:
     settings = tree()
     settings["instruments"]["coast-lidar"]["products"][KIND]["windows"] = [[3000, 600]]
     with pytest.raises(CampaignError, match=r"line \d+: .*\[3000, 600\] must end farther"):

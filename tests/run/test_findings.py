@@ -1,4 +1,4 @@
-"""An archive that is not what its campaign states: shown everywhere, and told by the exit code."""
+"""An archive that is not what its campaign states: shown everywhere, and by the exit code."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_a_product_that_no_scene_gives_is_named_in_the_last_line_and_the_report(
     assert document(archive, "plan")["never_made"][0]["kind"] == "elastic"
 
 
-def test_a_wavelength_that_contradicts_the_header_is_told(archive: Archive) -> None:
+def test_a_wavelength_that_contradicts_the_header_is_noted(archive: Archive) -> None:
     facts = archive.tree["instruments"]["rich"]["facts"]
     facts[1]["channels"]["photon_532o"]["wavelength"] = 355e-9
     shown = invoke(archive, "catalog")

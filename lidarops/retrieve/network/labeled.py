@@ -339,11 +339,8 @@ class _Errors:
             condition = overlap_change / THRESHOLDS.relative_change / result.extinction
         tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], signals.power.shape)
         tail_signal = _root_sum_square(list(solver.extinction_changes(result, tail)))
-        exponent = solver.exponent * (1.0 + settings.exponent_relative_error)
-        by_exponent = (
-            solver.solve(signals.power, np.minimum(exponent, THRESHOLDS.exponents[1])).extinction
-            - result.extinction
-        )
+        exponent = _changed_exponents(solver.exponent, settings.exponent_relative_error)
+        by_exponent = solver.solve(signals.power, exponent).extinction - result.extinction
         by_lidar_ratio = _lidar_ratio_error(solver, result, settings.lidar_ratio_relative_error)
         contributions = [
             by_exponent,
@@ -362,6 +359,13 @@ def _lidar_ratio_error(solver: _Solver, result: NetworkResult, relative_error: f
             power = solver.signals.power * (1.0 + THRESHOLDS.relative_change * weights)
             square_sum += (solver.solve(power).extinction - result.extinction) ** 2
     return np.asarray(np.sqrt(square_sum) * relative_error / THRESHOLDS.relative_change)
+
+
+def _changed_exponents(exponent: Array, relative_error: float) -> Array:
+    """Return exponents off by one error; those that would be too large are off downwards."""
+    larger = exponent * (1.0 + relative_error)
+    smaller = exponent / (1.0 + relative_error)
+    return np.where(larger <= THRESHOLDS.exponents[1], larger, smaller)
 
 
 def _root_sum_square(contributions: Sequence[Array]) -> Array:

@@ -66,6 +66,17 @@ def test_a_larger_declared_error_gives_a_larger_systematic_error(setting):
     )
 
 
+@pytest.mark.parametrize("exponent", [THRESHOLDS.exponents[0], THRESHOLDS.exponents[1]])
+def test_an_exponent_at_its_bound_has_an_error_too(exponent):
+    beams = [beam(number, noise=0.001, exponent=exponent) for number in range(3)]
+    declared = {"overlap_relative_error": 0.0, "lidar_ratio_relative_error": 0.0}
+    less, more = (solved(beams, exponent_relative_error=error, **declared) for error in (0.0, 0.1))
+    known = np.isfinite(more["extinction"]).to_numpy()
+    assert known.any()
+    changes = (more["extinction_systematic_error"] - less["extinction_systematic_error"]).to_numpy()
+    assert (changes[known] > 0.0).all()
+
+
 def test_the_declared_error_covers_an_error_of_the_overlap():
     declared = 0.03
     beams = [beam(number) for number in range(3)]
