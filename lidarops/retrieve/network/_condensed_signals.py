@@ -192,10 +192,7 @@ def _take_logarithms(
 
 
 def _bridge(row: _Beam, grid: Array, status: Codes, low: int) -> None:
-    """Replace single outlying bins by what their neighbours predict, in place.
-
-    The mean of a logarithm is low by half its variance, for one bin and for an interpolation.
-    """
+    """Replace single outlying bins by what their neighbours predict, in place."""
     if not grid[low + 1] - grid[low] <= THRESHOLDS.widest_bin:
         return
     grid = np.ascontiguousarray(grid[row.start : row.start + row.logs.shape[1]])
@@ -207,10 +204,9 @@ def _bridge(row: _Beam, grid: Array, status: Codes, low: int) -> None:
     row.stops[:] = ends + row.start
     profiles, bins, nodes, weights = _bridged_bins(row, grid)
     noise = row.noise[profiles[:, np.newaxis], nodes]
-    logs = row.logs[profiles[:, np.newaxis], nodes] + 0.5 * noise / row.exponent
-    spread = (weights * weights * noise).sum(axis=1)
-    row.logs[profiles, bins] = (weights * logs).sum(axis=1) - 0.5 * spread / row.exponent
-    row.noise[profiles, bins] = spread
+    logs = row.logs[profiles[:, np.newaxis], nodes]
+    row.logs[profiles, bins] = (weights * logs).sum(axis=1)
+    row.noise[profiles, bins] = (weights * weights * noise).sum(axis=1)
 
 
 def _bridged_bins(row: _Beam, grid: Array) -> tuple[Indices, Indices, Indices, Array]:

@@ -350,8 +350,7 @@ def _contradicted(solution: Solution, free: Solution) -> bool:
 
     The variance of the difference is the difference of the variances, because one solution uses
     all the information of the other (`hausman1978`). Only crossings that the beams determine well
-    can contradict, and only by more than their variance, which is the bias of the solution
-    without prior. A difference below half the standard error is harmless.
+    can contradict. A difference below half the standard error is harmless.
     """
     gap = free.logarithm - solution.logarithm
     known = np.isfinite(gap) & free.settled[:, np.newaxis]
@@ -365,7 +364,7 @@ def _contradicted(solution: Solution, free: Solution) -> bool:
     # Profiles that are left are no fair sample of the block.
     determined = known.sum(axis=0) > THRESHOLDS.determined_share * len(known)
     determined &= free_variance < THRESHOLDS.well_determined**2
-    return bool(np.any(determined & (np.abs(average) > allowed + free_variance)))
+    return bool(np.any(determined & (np.abs(average) > allowed)))
 
 
 def median(values: Array) -> Array:
