@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,36 @@ def test_named_files_exist(readme: str, repository: Path) -> None:
     for name in re.findall(r"`([\w./-]+\.(?:py|toml|bib|md|yaml))`|\]\(([\w./-]+)\)", readme):
         path = next(text for text in name if text)
         assert (repository / path).exists(), path
+
+
+def test_the_accuracy_table_is_that_of_a_result_of_the_benchmark(repository: Path) -> None:
+    script = spec_from_file_location("accuracy_table", repository / "docs/accuracy_table.py")
+    assert script is not None
+    assert script.loader is not None
+    generator = module_from_spec(script)
+    script.loader.exec_module(generator)
+    row = {"case": "path", "method": "ours", "error": 0.0}
+    result = {
+        "date": "2026-01-01",
+        "machine": {"processor": "one"},
+        "tables": {
+            generator.BEST: [
+                {
+                    **row,
+                    "case": "scan",
+                    "method": "peer",
+                    "quantity": "RMSE",
+                    "value": 2.0,
+                    "unit": "",
+                },
+                {**row, "quantity": "RMSE", "value": 1.25, "error": 0.01, "unit": ""},
+                {**row, "quantity": "95 %", "value": 0.951, "unit": "1"},
+                {**row, "quantity": "CPU time", "value": 2500.0, "unit": "ns"},
+            ]
+        },
+    }
+    lines = generator.page(result).splitlines()
+    assert lines[-4] == "| RMSE of | method | RMSE | 95 % | CPU time |"
+    assert lines[-1] == "| path | ours | 1.25(1) | 95.1 % | 2.5 µs |"
+    assert "(one, shared), of one run (2026-01-01)" in " ".join(lines)
+    assert lines[-4] in generator.PAGE.read_text(encoding="utf-8")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Final
 
-from lidarops.bench.harness.rows import CPU_TIME, Chapter, Results, Row, Unit, cpu_time, rows_of
+from lidarops.bench.harness.rows import CPU_TIME, Chapter, Results, Row, cpu_time, rows_of
 from lidarops.bench.harness.timing import READ, in_threads, least_times
 from lidarops.figures.charts import Ladder
 from lidarops.figures.wording import counted
@@ -72,7 +72,7 @@ def cost_chapter(name: str, text: str, rows: Sequence[Row]) -> Chapter:
                 name,
                 "CPU time per profile",
                 "A mark for each case.",
-                f"{CPU_TIME} ({Unit.TIME})",
+                f"{CPU_TIME} (µs)",
                 methods,
                 tuple((case, tuple(times.get((case, m)) for m in methods)) for case in cases),
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -38,13 +38,13 @@ class Unit(StrEnum):
     """Unit of a value, which selects how it is written."""
 
     NUMBER = ""
-    SHARE = "%"
+    SHARE = "1"
     """0 to 1, written in percent."""
-    TIME = "µs"
-    """Nanoseconds, written in a suitable unit and drawn in microseconds."""
+    TIME = "ns"
+    """Written in a suitable unit and drawn in microseconds."""
 
 
-_DRAWN: Final[Mapping[Unit, float]] = {Unit.NUMBER: 1.0, Unit.SHARE: 100.0, Unit.TIME: 1e-3}
+_DRAWN: Final = {Unit.NUMBER: (1.0, ""), Unit.SHARE: (100.0, "%"), Unit.TIME: (1e-3, "µs")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,20 +291,20 @@ def panel(
 
 
 def _axis(name: str, unit: Unit) -> str:
-    return f"{name} ({unit})" if unit else name
+    return f"{name} ({_DRAWN[unit][1]})" if unit else name
 
 
 def _height(row: Row) -> float | None:
     if row.value is None or isinstance(row.value, str):
         return None
-    return _DRAWN[row.unit] * row.value
+    return _DRAWN[row.unit][0] * row.value
 
 
 def _series(
     label: str, points: Sequence[tuple[float, Row]], *, joined: bool, hollow: bool
 ) -> Series:
     heights = [_height(row) or 0.0 for _, row in points]
-    bars = [2.0 * _DRAWN[row.unit] * row.error for _, row in points]
+    bars = [2.0 * _DRAWN[row.unit][0] * row.error for _, row in points]
     ends = [
         # A bar that reaches 0 cannot be drawn on a logarithmic axis.
         (max(y - bar, 0.1 * y) if y > 0.0 else y - bar, y + bar)
