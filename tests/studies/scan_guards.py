@@ -100,6 +100,7 @@ GUARDS: Final = (
             MultiAngleQuality.HIGH_CORRELATION,
             MultiAngleQuality.HORIZONTAL_GRADIENT,
             MultiAngleQuality.INTERPOLATED,
+            MultiAngleQuality.ONE_SIDED,
         )
     ),
     Guard("path variation", off=_off((_path_variation, "path_variation_from", _nothing))),
