@@ -25,7 +25,7 @@ Indices = npt.NDArray[np.intp]
 def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
     """Return the lowest altitude affected by extinction that varies along paths; None if none is.
 
-    Formula 14 of ``docs/algorithms/multiangle.md``. If the deviations from the mean over profiles
+    Formula 9 of ``docs/algorithms/multiangle.md``. If the deviations from the mean over profiles
     grow, all altitudes are affected. Growth common to all profiles of a block may also be an
     instrumental error that increases with range, such as of the background; it affects altitudes
     above the lower third.

@@ -1,6 +1,6 @@
 """Calibration of the standard errors of a block, by the spread of a rougher solution.
 
-Formula numbers are those of ``docs/algorithms/multiangle.md``.
+Formula numbers are those of ``docs/algorithms/vertical.md``.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Calibration:
 def sandwich(calibration: Calibration, upper: Integers, lower: Integers) -> Array:
     """Return posterior variances of differences of optical depths, and their components.
 
-    Formula 11 of ``docs/algorithms/multiangle.md``.
+    Formula 4 of ``docs/algorithms/vertical.md``.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _common(count: Integers) -> Booleans:
 
 
 def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
-    """Return the squared optical depth of each profile over the usual one, formula 14 of the page.
+    """Return the squared optical depth of each profile over the usual one, formula 6 of the page.
 
     The smoothing error of a profile is proportional to its extinction. Profiles are compared at
     the highest altitude within the reach of each that half of the block also reaches.
@@ -157,7 +157,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
 
 
 def _smoothing_square(bias: Array, known: Array) -> Array:
-    """Return the square of the smoothing error, formula 13 of the page, (difference,).
+    """Return the square of the smoothing error, formula 5 of the page, (difference,).
 
     Parameters
     ----------

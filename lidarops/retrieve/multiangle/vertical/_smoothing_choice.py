@@ -51,7 +51,7 @@ class Scores:
 
 
 def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
-    """Score every weight on the grid for the profiles of one block, formula 11 of the page.
+    """Score every weight on the grid for the profiles of one block, formula 3 of the page.
 
     A long block is scored on every n-th profile.
 

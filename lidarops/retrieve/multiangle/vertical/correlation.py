@@ -24,7 +24,7 @@ _FARTHEST: Final = 2
 _LEAST_SHARE: Final = THRESHOLDS.least_correlated
 _CANDIDATES: Final = np.arange(98) / 100.0
 """Correlations to choose from; beyond `highest_correlation` they are flagged, and 1 is excluded
-because its noise has no finite power at low frequencies (formula 9 of the page)."""
+because its noise has no finite power at low frequencies (formula 1 of the page)."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -156,7 +156,7 @@ def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
 def correlated_precision(information: Array, share: Array, correlation: float) -> Array:
     """Return the precision of the estimates as an autoregressive process along altitude.
 
-    Formula 8 of ``docs/algorithms/multiangle.md``. An altitude whose correlated share is less than
+    Formula 1 of ``docs/algorithms/vertical.md``. An altitude whose correlated share is less than
     half of that of one of the two on either side is not linked: most of its noise is its own and
     does not predict that of its neighbours. It is bridged like a single missing altitude; a longer
     gap breaks the chain.
@@ -223,7 +223,7 @@ def _own_noise(share: Array, linked: Booleans, k: int) -> float:
 def gap_precision(information: Array, share: Array, correlation: float) -> Array:
     """Return the precision of estimates whose neighbours come from different beams.
 
-    Formula 9 of ``docs/algorithms/multiangle.md``; parameters and shape as of
+    Formula 2 of ``docs/algorithms/vertical.md``; parameters and shape as of
     `correlated_precision`.
     """
     profiles, altitudes = information.shape

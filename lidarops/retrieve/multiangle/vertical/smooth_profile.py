@@ -2,7 +2,7 @@
 
 A scan gives the optical depth of each altitude independently. Altitudes are connected because
 extinction changes gradually and the optical depth is zero at the lidar. The formulas are in
-``docs/algorithms/multiangle.md``.
+``docs/algorithms/vertical.md``.
 """
 
 from __future__ import annotations
