@@ -257,7 +257,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         directions = beams(case)
         low = f"{directions.low} of {directions.low + directions.count} beam directions rise less"
         low += f" than {LOWEST_ELEVATION:.1f} degree above the horizon"
-        if directions.count < _FEWEST_DIRECTIONS:
+        if directions.low and directions.count < _FEWEST_DIRECTIONS:
             yield Leave(f"{low}: the rest has no leverage", number=float(directions.count))
             return
         settings = case.request
