@@ -54,6 +54,8 @@ def from_tail(
     range: Array,  # noqa: A002 - the field's word
     variance: Array,
     span: tuple[float, float] | None = None,
+    *,
+    shape: Array | None = None,
 ) -> Background:
     """Return the mean of far bins, and the most signal that it may contain.
 
@@ -70,6 +72,8 @@ def from_tail(
     span : (float, float), optional
         m; ranges of the bins that are averaged, both ends included. The last tenth of the bins
         where not given.
+    shape : (..., range) float, optional
+        Signal that falls no faster than the actual one; by default :math:`R^{-2}`.
 
     Raises
     ------
@@ -81,7 +85,7 @@ def from_tail(
         power[..., tail], range[tail], start=float(range[tail][0]), variance=variance[..., tail]
     )
     value, error = mean.background, mean.background_standard_error
-    left = left_in_tail(power, range, variance, tail, value, error)
+    left = left_in_tail(power, range, variance, tail, value, error, shape)
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
     known = np.isfinite(power[..., tail]) & np.isfinite(variance[..., tail])
     selected = _selected(known.sum(axis=-1), np.asarray(known.shape[-1]))
@@ -169,17 +173,8 @@ def from_bounded_tail(
 
     Parameters and errors are those of `from_known_shape`.
     """
-    tail = from_tail(power, range, variance, span)
-    in_tail = left_in_tail(
-        power,
-        range,
-        variance,
-        _bins(range, span),
-        tail.background,
-        tail.standard_error,
-        shape,
-    )
-    most, spread = np.maximum(np.nan_to_num(in_tail.most), 0.0), in_tail.standard_error
+    tail = from_tail(power, range, variance, span, shape=shape)
+    most, spread = np.maximum(np.nan_to_num(tail.left.most), 0.0), tail.left.standard_error
     left = LeftSignal((most + spread) / np.sqrt(12.0), np.zeros_like(most))
     return Background(
         background=tail.background - 0.5 * most,
