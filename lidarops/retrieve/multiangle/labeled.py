@@ -114,17 +114,7 @@ def retrieve_optical_depth(
         "station_altitude": station_altitude,
         "largest_gradient": largest_gradient,
     }
-    left = beams["left"].to_numpy()
-    signals = ScanSignals.of(
-        beams["signal"].to_numpy(),
-        beams["variance"].to_numpy(),
-        left,
-        slant_paths.slant_path(zenith_angle, altitude - station_altitude),
-        beams["response"].to_numpy(),
-    )
-    prior = signals
-    for _ in range(_LINEARISATIONS if (left > 0.0).any() else 0):
-        signals = prior.agreed(_solve(signals, zenith_angle, altitude, **settings))
+    signals = _agreed_signals(beams, zenith_angle, altitude, settings)
     retrieval = _solve(signals, zenith_angle, altitude, layers=layers, **settings)
     levels = np.searchsorted(altitude, bounds, side="right")
     depth = np.diff(altitude, prepend=station_altitude)
@@ -150,6 +140,24 @@ def retrieve_optical_depth(
     if not layers:
         return product
     return product.assign(_layer_variables(retrieval, quality, levels, bounds))
+
+
+def _agreed_signals(
+    beams: xr.Dataset, zenith_angle: Array, altitude: Array, settings: dict[str, Any]
+) -> ScanSignals:
+    """Return the signals with the backgrounds with which the beams agree best."""
+    left = beams["left"].to_numpy()
+    height = altitude - settings["station_altitude"]
+    prior = signals = ScanSignals.of(
+        beams["signal"].to_numpy(),
+        beams["variance"].to_numpy(),
+        left,
+        slant_paths.slant_path(zenith_angle, height),
+        beams["response"].to_numpy(),
+    )
+    for _ in range(_LINEARISATIONS if (left > 0.0).any() else 0):
+        signals = prior.agreed(_solve(signals, zenith_angle, altitude, **settings))
+    return signals
 
 
 def _layer_variables(
