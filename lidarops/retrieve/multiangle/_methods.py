@@ -290,11 +290,11 @@ def _raise_gradient(
 
 
 def _lag_one(beams: BeamBlock, fit: Regression) -> float:
-    """Return the correlation of residuals at neighbouring altitudes, 0 to 0.98."""
+    """Return the correlation of residuals at neighbouring altitudes, from 0 on."""
     u = np.nan_to_num(fit.residual) * np.sqrt(_block.weights_of(beams, fit))
     both = np.einsum("tak,tak->", u[:, :, :-1], u[:, :, 1:])
     whole = np.einsum("tak,tak->", u, u)
-    return float(np.clip(both / whole, 0.0, 0.98)) if whole > 0 else 0.0
+    return float(np.clip(both / whole, 0.0, THRESHOLDS.most_correlated)) if whole > 0 else 0.0
 
 
 def _gradient_slopes(fit: Regression, settings: BlockSettings) -> Array:

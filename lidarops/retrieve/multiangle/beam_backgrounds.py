@@ -14,8 +14,6 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 
 _COMMON: Final = THRESHOLDS.common_background
-_MOST_CORRELATED: Final = 0.98
-"""Largest correlation of residuals at neighbouring altitudes, as in `vertical.correlation`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +161,9 @@ def _altitudes_together(scaled: Array) -> float:
     both = (scaled[..., 1:] != 0.0) & (scaled[..., :-1] != 0.0)
     squares = np.where(both, scaled[..., 1:] ** 2 + scaled[..., :-1] ** 2, 0.0).sum()
     products = (scaled[..., 1:] * scaled[..., :-1]).sum()
-    correlation = np.clip(2.0 * products / squares if squares else 0.0, 0.0, _MOST_CORRELATED)
+    correlation = np.clip(
+        2.0 * products / squares if squares else 0.0, 0.0, THRESHOLDS.most_correlated
+    )
     return float((1.0 + correlation) / (1.0 - correlation))
 
 

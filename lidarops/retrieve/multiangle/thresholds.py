@@ -41,6 +41,10 @@ class Thresholds:
     """Share of the variance of backgrounds, by signal in the far range, that all beams have in
     common; assumed."""
 
+    most_correlated: float = 0.98
+    """Largest correlation of residuals at neighbouring altitudes: one altitude then counts as a
+    hundredth; assumed."""
+
     # Samples (`_sample_mask`).
     lowest_snr: float = 3.0
     """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
