@@ -48,7 +48,7 @@ def multiangle(cycles=12, *, seed=0, tilt=0.02):
     beyond = np.broadcast_to(ALTITUDE > REACH, shape)
     flag = np.where(beyond, int(MultiAngleQuality.EXTRAPOLATED), 0).astype(np.int32)
     flag[:, (ALTITUDE > 1450) & (ALTITUDE < 1600)] |= int(MultiAngleQuality.PRIOR_DOMINATED)
-    flag[:, ALTITUDE < 600] |= int(MultiAngleQuality.HORIZONTAL_GRADIENT)
+    flag[:, ALTITUDE < 600] |= int(MultiAngleQuality.POOR_STRATIFICATION)
     depth_error = np.broadcast_to(0.002 + 1e-6 * ALTITUDE, shape)
     error = np.broadcast_to(4e-6 + 2e-9 * ALTITUDE, shape)
     depth = true_depth(ALTITUDE) + depth_error * random.standard_normal(shape)
@@ -147,7 +147,7 @@ class TestClearestCycle:
 
     def test_where_all_carry_a_bit_of_care_rejections_decide_then_the_first(self):
         product = multiangle(cycles=4)
-        flag = np.full((4, ALTITUDE.size), int(MultiAngleQuality.ONE_SIDED))
+        flag = np.full((4, ALTITUDE.size), int(MultiAngleQuality.LOW_LEVERAGE))
         flag[0, :5] |= int(MultiAngleQuality.POOR_STRATIFICATION)
         flag[:, ALTITUDE > REACH] |= int(MultiAngleQuality.EXTRAPOLATED)
         product["quality_flag"] = (BOTH, flag)
@@ -345,7 +345,7 @@ class TestProfileFigure:
             "2024-03-01 00:08:30 UTC",
             "reach 3.5 km",
             f"{flagged} of {profile.flag.size} altitudes flagged",
-            "horizontal_gradient",
+            "poor_stratification",
             "prior_dominated",
             "extrapolated",
         ):
@@ -495,7 +495,7 @@ class TestImage:
         assert panel.bar.label == "extinction (km⁻¹)"
         value = 1e3 * true_extinction(ALTITUDE)
         assert value.min() / 10 < panel.bar.low < panel.bar.high < 1.5 * value.max()
-        assert "horizontal_gradient" in figure.words
+        assert "poor_stratification" in figure.words
         assert "prior_dominated" in figure.words
 
     def test_many_cycles_become_columns_of_means(self):

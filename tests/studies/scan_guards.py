@@ -33,7 +33,6 @@ from lidarops.bench.stability import random_scans
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import (
     _block,
-    _methods,
     _path_variation,
     _sample_mask,
     robust_weights,
@@ -98,14 +97,11 @@ GUARDS: Final = (
             MultiAngleQuality.PRIOR_DOMINATED,
             MultiAngleQuality.UNDERSMOOTHED,
             MultiAngleQuality.HIGH_CORRELATION,
-            MultiAngleQuality.HORIZONTAL_GRADIENT,
             MultiAngleQuality.INTERPOLATED,
-            MultiAngleQuality.ONE_SIDED,
         )
     ),
     Guard("path variation", off=_off((_path_variation, "path_variation_from", _nothing))),
-    Guard("harmless gradients", off=_at(_methods, harmless_gradient=0.0)),
-    Guard("noisy samples in the test of gradients", off=_at(_block, gradient_noise=np.inf)),
+    Guard("gradients that residuals show", off=_at(_block, gradient_limit=1e9)),
     Guard("outlying beams", off=_off((_block, "_has_outliers", _never))),
     Guard(
         "outlying beams: moments", off=_off((robust_weights, "clean_moments", lambda _: (1.0, 1.0)))

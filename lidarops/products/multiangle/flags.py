@@ -7,5 +7,5 @@ from typing import Final
 from lidarops.flags import SIGNAL_BITS, Flags
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
-FLAGS: Final = Flags(kind="multiangle", version=2, bits=(*SIGNAL_BITS, *MultiAngleQuality))
+FLAGS: Final = Flags(kind="multiangle", version=3, bits=(*SIGNAL_BITS, *MultiAngleQuality))
 """Published places are in `tests/products/test_flags.py`."""

@@ -126,7 +126,10 @@ class Gradient(PartOfRetrieval):
             reason = "backscatter may vary horizontally: retrieved, or part of the error"
             yield Run(reason, number=largest)
         else:
-            yield Leave("largest_gradient of the campaign is 0", number=0.0)
+            yield Leave(
+                "largest_gradient of the campaign is 0: only what the residuals show is included",
+                number=0.0,
+            )
 
 
 class GradientRegressor(PartOfRetrieval):

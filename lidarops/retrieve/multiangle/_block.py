@@ -119,10 +119,10 @@ def regress(beams: BeamBlock, *, inhomogeneity: float | None, robust: bool) -> R
     return _fit_robustly(beams, inhomogeneity)
 
 
-def shows_gradient(
-    beams: BeamBlock, fit: Regression, altitude: Array, correlation: float, slack: float
-) -> npt.NDArray[np.bool_]:
-    """Return at which altitudes the residuals of a block show a horizontal gradient.
+def visible_gradient(
+    beams: BeamBlock, fit: Regression, altitude: Array, correlation: float
+) -> float:
+    """Return the largest horizontal gradient of ln backscatter that residuals of a block show.
 
     Parameters
     ----------
@@ -132,30 +132,28 @@ def shows_gradient(
         m.
     correlation : float
         Of neighbouring altitudes.
-    slack : float
-        m-1, standard deviation of gradients that are small enough to ignore.
 
     Returns
     -------
-    (altitude,) bool
+    float
+        m-1, of all profiles within 1000 m of altitude; 0 if all are within 4 standard errors.
     """
     weights = np.where(np.isnan(fit.residual), 0.0, weights_of(beams, fit))
-    noisiest = np.where(beams.noise < np.inf, beams.noise, 0.0).max(axis=1)
-    testable = (fit.column(kh.SIDES) == 0.0) & (noisiest < THRESHOLDS.gradient_noise)
-    testable &= fit.column(kh.FREEDOM) > 0
+    testable = (fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0)
     inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
-    gradient = np.zeros(altitude.size, dtype=np.bool_)
+    square = np.zeros(altitude.size)
     ratio = weights * np.nan_to_num(fit.residual)
     plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
     for distance in beams.design[:2]:
-        left, square = orthogonal_columns(weights, (distance,), plain)[-1]
-        known = np.where(testable & np.isfinite(square[:, 0]), square[:, 0], 0.0)
+        left, length = orthogonal_columns(weights, (distance,), plain)[-1]
+        known = np.where(testable & np.isfinite(length[:, 0]), length[:, 0], 0.0)
         product = sum_over_beams(ratio, left)[:, 0]
-        total = np.where(known > 0.0, product * altitude, 0.0).sum(axis=0)
+        total = inside @ np.where(known > 0.0, product * altitude, 0.0).sum(axis=0)
         weight = inside @ (known * altitude**2).sum(axis=0)
-        spread = weight * (1.0 + correlation) / (1.0 - correlation) + (slack * weight) ** 2
-        gradient |= np.abs(inside @ total) > THRESHOLDS.gradient_limit * np.sqrt(spread)
-    return gradient
+        limit = THRESHOLDS.gradient_limit**2 * (1.0 + correlation)
+        seen = total**2 * (1.0 - correlation) > limit * weight
+        square += np.where(seen, (total / np.where(seen, weight, 1.0)) ** 2, 0.0)
+    return float(np.sqrt(square.max(initial=0.0)))
 
 
 def orthogonal_columns(

@@ -58,9 +58,6 @@ def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> Mul
         profiles.flags.poor_stratification[:, lowest:] = True
         _withhold_extinction(profiles, profiles.flags.poor_stratification)
     _raise_common_flags(profiles, beams, fit)
-    if method in _BLIND:
-        # These methods fit no gradient, even if beams point to all sides.
-        profiles.flags.one_sided[:] |= np.isfinite(profiles.optical_depth)
     steps = (*_steps(beams, fit, settings), StepRecord(method, ran=True, reason=reason))
     return replace(profiles, steps=steps)
 
@@ -101,10 +98,9 @@ def _kano_hamilton(beams: BeamBlock, fit: Regression, settings: BlockSettings) -
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
     single = _Single(
         profiles.optical_depth, error, np.ones_like(error), np.ones_like(error),
-        _gradient_slopes(fit, settings),
+        _gradient_slopes(beams, fit, settings, _lag_one(beams, fit)),
     )  # fmt: skip
     _fill_single(profiles, single, settings)
-    _raise_gradient(profiles, beams, fit, settings, _lag_one(beams, fit))
     return profiles
 
 
@@ -114,9 +110,7 @@ def _two_angle(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Mu
     The inhomogeneity comes from all beams of the scan.
     """
     ends = _block.end_beams(beams)
-    profiles = _kano_hamilton(ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), settings)
-    profiles.flags.gradient[:] = False
-    return profiles
+    return _kano_hamilton(ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), settings)
 
 
 def _mld(
@@ -202,7 +196,8 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     profiles.effective_degrees_of_freedom[rows] = smooth.effective_degrees_of_freedom
     profiles.data_share[rows] = smooth.data_share
     slopes = np.full((2, *within.shape), np.nan)
-    for slope, single in zip(slopes, _gradient_slopes(fit, settings), strict=True):
+    of_single = _gradient_slopes(beams, fit, settings, smooth.correlation)
+    for slope, single in zip(slopes, of_single, strict=True):
         slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
     _fill_gradient_errors(profiles, slopes, settings)
     for number, (bottom, top) in enumerate(settings.layers):
@@ -218,7 +213,6 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     flags.prior_dominated[:] |= deviating
     flags.undersmoothed[rows] |= smooth.undersmoothed[:, np.newaxis]
     flags.high_correlation[rows] |= smooth.high_correlation
-    _raise_gradient(profiles, beams, fit, settings, smooth.correlation)
     return profiles
 
 
@@ -265,28 +259,9 @@ def _raise_common_flags(profiles: MultiAngleResult, beams: BeamBlock, fit: Regre
         valued & estimated & (fit.column(kh.SPAN) < THRESHOLDS.least_span)
     )
     profiles.flags.no_residual[:] |= valued & (_block.pooled_freedom(fit) == 0)
-    one_sided = np.hypot(fit.column(kh.SLOPE_EAST), fit.column(kh.SLOPE_NORTH)) > 1e-6
-    profiles.flags.one_sided[:] |= (valued & one_sided) if beams.sides else valued
     if fit.robust:
         low = (fit.keep < 0.5) & (beams.noise < np.inf)
         profiles.flags.outlier[:] |= low.any(axis=1)
-
-
-def _raise_gradient(
-    profiles: MultiAngleResult,
-    beams: BeamBlock,
-    fit: Regression,
-    settings: BlockSettings,
-    correlation: float,
-) -> None:
-    gradient = _block.shows_gradient(
-        beams,
-        fit,
-        settings.height,
-        correlation,
-        THRESHOLDS.harmless_gradient * settings.largest_gradient,
-    )
-    profiles.flags.gradient[:] |= gradient & np.isfinite(profiles.optical_depth)
 
 
 def _lag_one(beams: BeamBlock, fit: Regression) -> float:
@@ -297,9 +272,15 @@ def _lag_one(beams: BeamBlock, fit: Regression) -> float:
     return float(np.clip(both / whole, 0.0, THRESHOLDS.most_correlated)) if whole > 0 else 0.0
 
 
-def _gradient_slopes(fit: Regression, settings: BlockSettings) -> Array:
-    """Return the error of optical depth by the largest gradient to the east and to the north."""
-    scale = settings.largest_gradient * settings.height
+def _gradient_slopes(
+    beams: BeamBlock, fit: Regression, settings: BlockSettings, correlation: float
+) -> Array:
+    """Return the error of optical depth by a gradient to the east and to the north.
+
+    The gradient is the declared one, or that which the residuals show where it is larger.
+    """
+    shown = _block.visible_gradient(beams, fit, settings.height, correlation)
+    scale = max(settings.largest_gradient, shown) * settings.height
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
 
@@ -327,8 +308,6 @@ def _below(values: Array) -> Array:
     return np.concatenate([np.zeros((values.shape[0], 1)), values[:, :-1]], axis=1)
 
 
-_BLIND: Final = ("two_angle", "mld", "mld_prior")
-"""Methods that cannot detect a horizontal gradient."""
 _METHODS: Final[dict[str, Callable[[BeamBlock, Regression, BlockSettings], MultiAngleResult]]] = {
     "two_angle": _two_angle,
     "kano_hamilton": _kano_hamilton,

@@ -28,10 +28,6 @@ class MultiAngleFlags:
     cannot be checked, and the inhomogeneity cannot be estimated."""
     low_leverage: Mask
     """The slant paths differ by less than a tenth of the vertical path."""
-    one_sided: Mask
-    """A half turn around the zenith has no beam: a horizontal gradient cannot be detected."""
-    gradient: Mask
-    """The residuals show a horizontal gradient that the fit does not account for."""
     poor_stratification: Mask
     """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
     explain, as when extinction varies along the horizontal. Extinction is withheld."""
@@ -50,11 +46,7 @@ class MultiAngleFlags:
     def doubtful(self) -> Mask:
         """Return where the stated uncertainty may be too small."""
         return np.asarray(
-            self.no_residual
-            | self.gradient
-            | self.undersmoothed
-            | self.high_correlation
-            | self.poor_stratification
+            self.no_residual | self.undersmoothed | self.high_correlation | self.poor_stratification
         )
 
 

@@ -32,14 +32,6 @@ class MultiAngleQuality(FlagBit):
         Severity.CARE,
         "in a gap of the data, interpolated from the altitudes above and below",
     )
-    ONE_SIDED = (
-        FIRST_OWN + 8,
-        Severity.CARE,
-        (
-            "the scan covers one side of the zenith only, so a horizontal gradient cannot be"
-            " detected and its systematic error is stated separately"
-        ),
-    )
     LOW_LEVERAGE = FIRST_OWN + 9, *flags.LOW_LEVERAGE
     NO_RESIDUAL = (
         FIRST_OWN + 10,
@@ -58,11 +50,6 @@ class MultiAngleQuality(FlagBit):
             "errors of neighbouring altitudes are correlated by more than 0.85: confidence"
             " intervals are too narrow"
         ),
-    )
-    HORIZONTAL_GRADIENT = (
-        FIRST_OWN + 13,
-        Severity.REJECT,
-        "the residuals over zenith angle show a horizontal gradient",
     )
 
 

@@ -33,8 +33,6 @@ QUALITY_OF_FLAG: Final = {
     "interpolated": MultiAngleQuality.INTERPOLATED,
     "no_residual": MultiAngleQuality.NO_RESIDUAL,
     "low_leverage": MultiAngleQuality.LOW_LEVERAGE,
-    "one_sided": MultiAngleQuality.ONE_SIDED,
-    "gradient": MultiAngleQuality.HORIZONTAL_GRADIENT,
     "poor_stratification": MultiAngleQuality.POOR_STRATIFICATION,
     "prior_dominated": MultiAngleQuality.PRIOR_DOMINATED,
     "undersmoothed": MultiAngleQuality.UNDERSMOOTHED,

@@ -90,7 +90,7 @@ def retrieve_optical_depth(
         Standard deviation of the logarithms on top of the noise; estimated if not given.
     largest_gradient : float
         m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
-        `extinction_gradient_error`.
+        `extinction_gradient_error`, unless the residuals show a larger one.
     robust : bool
         Whether to test for outliers.
     layers : sequence of (float, float)

@@ -106,12 +106,7 @@ class Thresholds:
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_limit: float = 4.0
-    """Standard errors beyond which a gradient is flagged; assumed."""
-    gradient_noise: float = 0.02
-    """Variance of a logarithm (signal 7 times its noise) above which its skew, averaged over many
-    profiles, looks like a gradient; assumed."""
-    harmless_gradient: float = 0.02
-    """Share of the declared gradient that raises no flag, however certain it is; assumed."""
+    """Standard errors beyond which a gradient is part of the error; assumed."""
 
     # Stratification (`_path_variation`).
     growth: float = 1.5**2

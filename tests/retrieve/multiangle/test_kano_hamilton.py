@@ -257,12 +257,10 @@ def test_gradient_does_not_affect_scans_to_both_sides():
     alone = retrieve_optical_depth(signal, np.abs(angles), atmosphere[0], **options)
     ratio = both.optical_depth_standard_error / alone.optical_depth_standard_error
     assert np.nanmedian(ratio) < 1.05
-    assert not both.flags.one_sided.any()
-    assert not both.flags.gradient.any()
     assert np.nanmax(both.optical_depth_gradient_error) < 1e-12
 
 
-def test_scans_to_one_side_bound_and_flag_a_gradient():
+def test_scans_to_one_side_bound_a_gradient():
     rng = np.random.default_rng(11)
     atmosphere = clear(100)
     results = []
@@ -273,9 +271,6 @@ def test_scans_to_one_side_bound_and_flag_a_gradient():
         options = {"variance": variance, "method": "kano_hamilton"}
         results.append(retrieve_optical_depth(signal, ANGLES, atmosphere[0], **options))
     clean, tilted = results
-    assert clean.flags.one_sided.all()
-    assert not clean.flags.gradient.any()
-    assert tilted.flags.gradient.mean() > 0.9
     bias = np.mean(tilted.optical_depth - tau, axis=0)
     bound = tilted.optical_depth_gradient_error.mean(axis=0)
     # The bound for 5 percent per km is the bias by that gradient.

@@ -239,9 +239,9 @@ def multiangle(
     angles = np.atleast_1d(np.float64(zenith))
     dims = ("time", "altitude")
     shape = (profiles, levels)
-    flags = np.full(shape, np.int32(MultiAngleQuality.ONE_SIDED))
+    flags = np.full(shape, np.int32(MultiAngleQuality.LOW_LEVERAGE))
     flags[0, 2 * levels // 3 :] = MultiAngleQuality.EXTRAPOLATED
-    flags[-1, 0] |= np.int32(MultiAngleQuality.INTERPOLATED | MultiAngleQuality.HORIZONTAL_GRADIENT)
+    flags[-1, 0] |= np.int32(MultiAngleQuality.INTERPOLATED | MultiAngleQuality.POOR_STRATIFICATION)
     scales = {
         "optical_depth": 0.3,
         "optical_depth_standard_error": 0.01,
