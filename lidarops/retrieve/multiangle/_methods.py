@@ -56,7 +56,7 @@ def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> Mul
     lowest = _path_variation.path_variation_from(beams, fit)
     if lowest is not None:
         profiles.flags.poor_stratification[:, lowest:] = True
-        _withhold_extinction(profiles, profiles.flags.poor_stratification)
+    _withhold_extinction(profiles, profiles.flags.poor_stratification)
     _raise_common_flags(profiles, beams, fit)
     steps = (*_steps(beams, fit, settings), StepRecord(method, ran=True, reason=reason))
     return replace(profiles, steps=steps)
@@ -98,7 +98,7 @@ def _kano_hamilton(beams: BeamBlock, fit: Regression, settings: BlockSettings) -
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
     single = _Single(
         profiles.optical_depth, error, np.ones_like(error), np.ones_like(error),
-        _gradient_slopes(beams, fit, settings, _lag_one(beams, fit)),
+        _gradient_slopes(profiles, beams, fit, settings, _lag_one(beams, fit)),
     )  # fmt: skip
     _fill_single(profiles, single, settings)
     return profiles
@@ -196,7 +196,7 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     profiles.effective_degrees_of_freedom[rows] = smooth.effective_degrees_of_freedom
     profiles.data_share[rows] = smooth.data_share
     slopes = np.full((2, *within.shape), np.nan)
-    of_single = _gradient_slopes(beams, fit, settings, smooth.correlation)
+    of_single = _gradient_slopes(profiles, beams, fit, settings, smooth.correlation)
     for slope, single in zip(slopes, of_single, strict=True):
         slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
     _fill_gradient_errors(profiles, slopes, settings)
@@ -273,13 +273,20 @@ def _lag_one(beams: BeamBlock, fit: Regression) -> float:
 
 
 def _gradient_slopes(
-    beams: BeamBlock, fit: Regression, settings: BlockSettings, correlation: float
+    profiles: MultiAngleResult,
+    beams: BeamBlock,
+    fit: Regression,
+    settings: BlockSettings,
+    correlation: float,
 ) -> Array:
     """Return the error of optical depth by a gradient to the east and to the north.
 
-    The gradient is the declared one, or that which the residuals show where it is larger.
+    The gradient is the declared one, or that which the residuals show where it is larger. One that
+    is too large for air raises `poor_stratification`.
     """
     shown = _block.visible_gradient(beams, fit, settings.height, correlation)
+    if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
+        profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth)
     scale = max(settings.largest_gradient, shown) * settings.height
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 

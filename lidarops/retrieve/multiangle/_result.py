@@ -30,7 +30,8 @@ class MultiAngleFlags:
     """The slant paths differ by less than a tenth of the vertical path."""
     poor_stratification: Mask
     """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
-    explain, as when extinction varies along the horizontal. Extinction is withheld."""
+    explain, as when extinction varies along the horizontal; or the residuals show a gradient that
+    is too large for air. Extinction is withheld."""
     prior_dominated: Mask
     """The best fit has the largest smoothness that is allowed; the data share of "joint" is below
     0.9 or above 1.1; or that of "mld" and "mld_prior" is below 0.9, and extinction is withheld."""

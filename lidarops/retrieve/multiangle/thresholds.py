@@ -107,6 +107,10 @@ class Thresholds:
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_limit: float = 4.0
     """Standard errors beyond which a gradient is part of the error; assumed."""
+    largest_gradient: float = 3e-4
+    """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
+    no optical depth deviates by more than 4 stated errors, with 5e-4 every seventh does. Distorted
+    analog signals of scans up to 25 degrees of elevation show 2e-3 and more."""
 
     # Stratification (`_path_variation`).
     growth: float = 1.5**2

@@ -198,6 +198,20 @@ def test_a_gradient_that_residuals_show_is_part_of_the_error(gradient):
         assert np.all((result.extinction_gradient_error > 0.0).any() == (gradient > 0.0))
 
 
+@pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
+@pytest.mark.parametrize(("gradient", "rejected"), [(0.2 / 1000, False), (0.6 / 1000, True)])
+def test_a_gradient_too_large_for_air_rejects_all_values(method, gradient, rejected):
+    """Like a distorted analog signal, it hides what else curves the residuals."""
+    atmosphere = clear(100)
+    signal, variance, _ = signals(
+        np.random.default_rng(8), 32, ANGLES, atmosphere, inhomogeneity=0.01, gradient=gradient
+    )
+    result = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance, method=method)
+    known = np.isfinite(result.optical_depth)
+    assert (result.flags.poor_stratification[known] == rejected).all()
+    assert np.isfinite(result.extinction).any() != rejected
+
+
 def test_layers_are_far_more_certain_than_differences():
     atmosphere = clear(120)
     signal, variance, tau = signals(
