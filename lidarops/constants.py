@@ -7,6 +7,15 @@ from typing import Final
 SPEED_OF_LIGHT: Final = 299_792_458.0
 """m s-1, exact (SI)."""
 
+EARTH_RADIUS: Final = 6_371_008.8
+"""m, mean radius of the ellipsoid WGS 84."""
+BEAM_CURVATURE: Final = 0.17
+"""Curvature of a near-horizontal beam by refraction over that of the Earth: minus the radius times
+the vertical gradient of the refractive index, -2.67e-8 m-1 at 532 nm and sea level in the standard
+atmosphere (`us1976`, `bodhaine1999`)."""
+EFFECTIVE_RADIUS: Final = EARTH_RADIUS / (1.0 - BEAM_CURVATURE)
+"""m, radius of an Earth over which bent beams are straight."""
+
 LICEL_RANGE_PER_MICROSECOND: Final = 150.0
 """m. Licel converts counts to MHz with this nominal value, not with c / 2 (`licel2023`)."""
 

@@ -167,9 +167,9 @@ def _air_positions(
 def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes of a scan."""
     names = ["beam", "beam_zenith_angle"]
-    names += [name for name in ("beam_azimuth",) if name in source]
-    # Layers are optional, and so is their coordinate.
-    names += [name for name in ("layer_altitude",) if name in source]
+    # Layers and planes are optional, and so are their coordinates.
+    optional = ("beam_azimuth", "layer_altitude", "plane", "plane_azimuth")
+    names += [name for name in optional if name in source]
     by_name = {name: _along(source, layout.row(name)) for name in names}
     row = layout.row("altitude")
     values = _along(source, replace(row, bounds=None)).values

@@ -14,6 +14,7 @@ from scipy.special import expit
 
 from lidarops.campaign.simulated_atmosphere import Gradient, Plume, Sounding, Turbulence
 from lidarops.campaign.simulation import Aerosol, AtmosphereSettings, DiurnalCourse
+from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.retrieve.air.molecular import (
     HIGHEST,
     LOWEST,
@@ -94,10 +95,11 @@ class Air:
 
     Notes
     -----
-    The Earth is flat, and refraction is neglected. Extinction and backscatter are the sums over
-    molecules (US Standard Atmosphere; or a sounding, continued by the standard scaled to meet
-    its ends) and all particles in the settings. Turbulence multiplies all particles except
-    clouds.
+    The air is stratified over the curved Earth, and refraction bends beams (`EFFECTIVE_RADIUS`),
+    but for horizontal ones. Horizontal distances are those of a flat Earth. Extinction and
+    backscatter are the sums over molecules (US Standard Atmosphere; or a sounding, continued by the
+    standard scaled to meet its ends) and all particles in the settings. Turbulence multiplies all
+    particles except clouds.
     """
 
     def __init__(
@@ -229,13 +231,15 @@ class _Eddies:
 
 def _points(beam: Beam, distance: Array) -> _Points:
     zenith, azimuth = math.radians(beam.zenith_angle), math.radians(beam.azimuth)
-    # Exactly 0, so a horizontal beam stays in its layer at any range.
-    rise = 0.0 if beam.zenith_angle == 90.0 else math.cos(zenith)
     level = math.sin(zenith) * distance
+    # A horizontal beam stays in its layer at any range: homogeneous paths are exactly that.
+    climb = np.zeros_like(distance)
+    if beam.zenith_angle != 90.0:
+        climb = math.cos(zenith) * distance + level**2 / (2.0 * EFFECTIVE_RADIUS)
     return _Points(
         beam.east + level * math.sin(azimuth),
         beam.north + level * math.cos(azimuth),
-        beam.height + rise * distance,
+        beam.height + climb,
     )
 
 

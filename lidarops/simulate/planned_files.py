@@ -20,13 +20,11 @@ from lidarops.campaign.simulation import (
     InstrumentSimulation,
     SimulationSettings,
 )
+from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.damage import FOREIGN_NAME
 from lidarops.simulate.dialects import DIALECTS, Dialect, Place, name_suffix
-
-EARTH_RADIUS: Final = 6_371_008.8
-"""m, mean radius."""
 
 _MASK: Final = (1 << 64) - 1
 

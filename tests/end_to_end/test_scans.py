@@ -104,16 +104,17 @@ def low_scan(folder: Path, zenith_angles: list[float]) -> Campaign:
 
 
 def test_beams_near_the_horizon_are_left_out_with_a_reason(tmp_path):
-    (outcome,) = reprocess(low_scan(tmp_path, [86.0, 85.0, 83.0, 80.0, 70.0])).scenes
+    (outcome,) = reprocess(low_scan(tmp_path, [88.0, 87.5, 83.0, 80.0, 70.0])).scenes
     (step,) = (step for step in outcome.plan.steps if step.name == "multiangle")
-    assert "2 of 5 beam directions rise less than 5.7 degree" in step.reason
+    assert "2 of 5 beam directions rise less than 3.0 degree" in step.reason
+    assert "a range-height scan (RHI) at azimuth 90 degree, 3 directions" in step.reason
     with xr.open_dataset(next(tmp_path.rglob("*multiangle*.nc"))) as product:
         np.testing.assert_allclose(product["beam_zenith_angle"], [70.0, 80.0, 83.0])
 
 
-@pytest.mark.parametrize("angles", [[89.9, 88.0, 84.4], [89.0, 86.0, 80.0]])
+@pytest.mark.parametrize("angles", [[89.9, 88.0, 84.0], [89.0, 87.2, 80.0], [88.0, 80.0, 80.1]])
 def test_a_scan_without_leverage_is_known_before_it_is_read(tmp_path, angles):
     record = bring_up_to_date(low_scan(tmp_path, angles))
     (reason,) = record.empty_scenes.values()
-    assert "beam directions rise less than 5.7 degree" in reason
+    assert "beam directions rise less than 3.0 degree" in reason
     assert "no leverage" in reason

@@ -112,7 +112,13 @@ def test_variables_without_standard_name():
         "multiangle": {
             *(
                 f"{quantity}{error}"
-                for quantity in ("optical_depth", "extinction", "layer_optical_depth")
+                for quantity in (
+                    "optical_depth",
+                    "extinction",
+                    "layer_optical_depth",
+                    "plane_optical_depth",
+                    "plane_extinction",
+                )
                 for error in ("", "_standard_error", "_gradient_error")
             ),
             "monotone_optical_depth",

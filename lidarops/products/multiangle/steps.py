@@ -76,6 +76,10 @@ class Beams:
     """degree, the largest azimuth sector without beams."""
     surround: bool
     """Whether no half turn is free of beams, so that a horizontal gradient can be estimated."""
+    span: float = 0.0
+    """Largest minus smallest slant path over the vertical one."""
+    pattern: str = ""
+    """Such as a volume of 6 vertical planes."""
 
 
 def beams(case: Case) -> Beams:
@@ -111,7 +115,25 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
     scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
     tilted = scan.tilted_azimuths
     free = math.degrees(slant_paths.widest_azimuth_gap(tilted))
-    return Beams(up.size, low, sides_known, free, slant_paths.surrounds_zenith(tilted))
+    angles = directions.zenith_angle[up]
+    return Beams(
+        up.size,
+        low,
+        sides_known,
+        free,
+        slant_paths.surrounds_zenith(tilted),
+        float(np.ptp(scan.path[:, 0])),
+        _pattern(angles, directions.azimuth[up]) if sides_known else f"{up.size} zenith angles",
+    )
+
+
+def _pattern(zenith_angle: Array, azimuth: Array) -> str:
+    """Return the name of the pattern of a scan of known azimuths."""
+    planes = scan_cycles.vertical_planes(zenith_angle, azimuth)
+    if len(planes) != 1:
+        return f"a volume of {len(planes)} vertical planes, {azimuth.size} directions"
+    lowest = azimuth[np.argmax(zenith_angle)]
+    return f"a range-height scan (RHI) at azimuth {lowest:.0f} degree, {azimuth.size} directions"
 
 
 class Gradient(PartOfRetrieval):
@@ -260,11 +282,14 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         directions = beams(case)
         low = f"{directions.low} of {directions.low + directions.count} beam directions rise less"
         low += f" than {LOWEST_ELEVATION:.1f} degree above the horizon"
-        if directions.low and directions.count < _FEWEST_DIRECTIONS:
+        lever = directions.count >= _FEWEST_DIRECTIONS and directions.span >= THRESHOLDS.least_span
+        if directions.low and not lever:
             yield Leave(f"{low}: the rest has no leverage", number=float(directions.count))
             return
         settings = case.request
         words = f"{REQUESTED}, and the beam scans"
+        if directions.pattern:
+            words += f": {directions.pattern}"
         yield Run(
             f"{words}; {low} and are left out" if directions.low else words,
             ScanSettings(

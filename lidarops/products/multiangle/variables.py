@@ -61,11 +61,52 @@ _LAYER: Final = Row(
     " the station.",
 )
 
+_PLANE: Final = Row(
+    name="plane",
+    dims=("plane",),
+    dtype="i4",
+    units="1",
+    long_name="number of the vertical plane",
+    coverage=Coverage.COORDINATE,
+    optional=True,
+    comment="The beams of a plane are a range-height scan (RHI), of a volume of several planes.",
+)
+
 
 def _direction(name: str) -> Row:
     """Return the row of a pointing angle of the beams."""
     angle = next(row for row in PLACE if row.name == name)
     return replace(angle, name=f"beam_{name}", dims=("beam",), follows_beam=False)
+
+
+def _plane_azimuth() -> Row:
+    """Return the row of the azimuth of planes."""
+    azimuth = _direction("azimuth")
+    words = "azimuth of the lowest beam of the vertical plane"
+    return replace(azimuth, name="plane_azimuth", dims=("plane",), long_name=words, optional=True)
+
+
+def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
+    """Return the rows of a quantity that is retrieved from the beams of each vertical plane."""
+    dims = ("time", "plane", "altitude")
+    value = Row(
+        name=f"plane_{quantity}",
+        dims=dims,
+        dtype="f4",
+        units=units,
+        long_name=f"{words}, from the beams of a vertical plane",
+        coverage=Coverage.PHYSICAL,
+        cell_methods=f"time: mean altitude: {'mean' if quantity == 'extinction' else 'point'}",
+        ancillaries=(f"plane_{quantity}_gradient_error",),
+        significant_bits=_BITS,
+        uncertain=True,
+        error_kind=ErrorKind.BOTH,
+        optional=True,
+        comment=f"As {quantity}, with an inhomogeneity of the plane. Missing where a test rejects"
+        f" the value. {NO_STANDARD_NAME}",
+    )
+    error = _gradient_error(f"plane_{quantity}", f"{words} of a plane", units)
+    return value, replace(error, dims=dims, optional=True)
 
 
 _STATION: Final = tuple(row for row in PLACE if row.name not in ("zenith_angle", "azimuth"))
@@ -119,6 +160,8 @@ LAYOUT: Final = Layout(
         _direction("zenith_angle"),
         _direction("azimuth"),
         _LAYER,
+        _PLANE,
+        _plane_azimuth(),
         *_STATION,
     ),
     data=(
@@ -254,6 +297,8 @@ LAYOUT: Final = Layout(
             dims=("time", "layer"),
             optional=True,
         ),
+        *_of_planes("optical_depth", "optical depth of molecules and particles", "1"),
+        *_of_planes("extinction", "extinction coefficient of molecules and particles", "m-1"),
         Row(
             name="residual",
             dims=("time", "beam", "altitude"),

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri, stdtrit
 
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle import _sample_mask, robust_weights
@@ -18,6 +18,8 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
+_UNKNOWNS: Final = 3
+"""Constant, optical depth and a gradient."""
 _DEPENDENT: Final = 1e-8
 """Squared length of a column outside those before it, over its own, up to which it depends on
 them."""
@@ -119,10 +121,11 @@ def regress(beams: BeamBlock, *, inhomogeneity: float | None, robust: bool) -> R
     return _fit_robustly(beams, inhomogeneity)
 
 
-def visible_gradient(
-    beams: BeamBlock, fit: Regression, altitude: Array, correlation: float
-) -> float:
+def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
     """Return the largest horizontal gradient of ln backscatter that residuals of a block show.
+
+    The error of a gradient follows from the scatter of the beams of all profiles about it. The
+    altitudes of a beam may be correlated.
 
     Parameters
     ----------
@@ -130,30 +133,54 @@ def visible_gradient(
     fit : Regression
     altitude : (altitude,) float
         m.
-    correlation : float
-        Of neighbouring altitudes.
 
     Returns
     -------
     float
-        m-1, of all profiles within 1000 m of altitude; 0 if all are within 4 standard errors.
+        m-1, of all profiles within 1000 m of altitude; 0 if all are within chance.
     """
     weights = np.where(np.isnan(fit.residual), 0.0, weights_of(beams, fit))
-    testable = (fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0)
+    weights *= ((fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0))[:, np.newaxis]
     inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
-    square = np.zeros(altitude.size)
-    ratio = weights * np.nan_to_num(fit.residual)
+    residual = np.nan_to_num(fit.residual)
     plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
-    for distance in beams.design[:2]:
+    square = np.zeros(altitude.size)
+    for distance in _along_axes(beams.design[:2]):
         left, length = orthogonal_columns(weights, (distance,), plain)[-1]
-        known = np.where(testable & np.isfinite(length[:, 0]), length[:, 0], 0.0)
-        product = sum_over_beams(ratio, left)[:, 0]
-        total = inside @ np.where(known > 0.0, product * altitude, 0.0).sum(axis=0)
-        weight = inside @ (known * altitude**2).sum(axis=0)
-        limit = THRESHOLDS.gradient_limit**2 * (1.0 + correlation)
-        seen = total**2 * (1.0 - correlation) > limit * weight
-        square += np.where(seen, (total / np.where(seen, weight, 1.0)) ** 2, 0.0)
+        lever = np.where(np.isfinite(length), weights * left * altitude, 0.0)
+        product, weight = (
+            inside @ values.reshape(-1, altitude.size).T
+            for values in (lever * residual, lever * left * altitude)
+        )
+        total, whole = product.sum(axis=1), weight.sum(axis=1)
+        gradient = total / np.where(whole > 0.0, whole, np.inf)
+        squares = (weight**2).sum(axis=1)
+        # Beams with little weight do not tell the scatter of those that decide.
+        freedom = whole**2 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
+        scatter = ((product - gradient[:, np.newaxis] * weight) ** 2).sum(axis=1)
+        variance = scatter * (1.0 + _UNKNOWNS / np.maximum(freedom, 1.0))
+        limit = stdtrit(np.maximum(freedom, 1.0), ndtr(THRESHOLDS.gradient_limit))
+        seen = (freedom >= 1.0) & (total**2 > limit**2 * variance) & (variance > 0.0)
+        square += np.where(seen, gradient**2, 0.0)
     return float(np.sqrt(square.max(initial=0.0)))
+
+
+def _along_axes(distances: Array) -> list[Array]:
+    """Return horizontal distances along the axes of a scan, each (angle, altitude).
+
+    Beams of one vertical plane have one axis.
+
+    Parameters
+    ----------
+    distances : (2, angle, altitude) float
+        To the east and north.
+    """
+    lengths, axes = np.linalg.eigh(np.einsum("iak,jak->ij", distances, distances))
+    return [
+        np.tensordot(axis, distances, axes=1)
+        for length, axis in zip(lengths, axes.T, strict=True)
+        if length > _DEPENDENT * lengths[-1]
+    ]
 
 
 def orthogonal_columns(

@@ -69,7 +69,9 @@ def _steps(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Iterat
     are = "are" if number else "is"
     beam = "beams" if number else "beam"
     yield StepRecord(
-        "drop_longest_paths", number > 0, f"{count} {beam} {are} longer than 10 vertical paths"
+        "drop_longest_paths",
+        number > 0,
+        f"{count} {beam} {are} less than 3 degrees above the horizon",
     )
     if not settings.robust:
         why = "not requested"
@@ -98,7 +100,7 @@ def _kano_hamilton(beams: BeamBlock, fit: Regression, settings: BlockSettings) -
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
     single = _Single(
         profiles.optical_depth, error, np.ones_like(error), np.ones_like(error),
-        _gradient_slopes(profiles, beams, fit, settings, _lag_one(beams, fit)),
+        _gradient_slopes(profiles, beams, fit, settings),
     )  # fmt: skip
     _fill_single(profiles, single, settings)
     return profiles
@@ -196,7 +198,7 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     profiles.effective_degrees_of_freedom[rows] = smooth.effective_degrees_of_freedom
     profiles.data_share[rows] = smooth.data_share
     slopes = np.full((2, *within.shape), np.nan)
-    of_single = _gradient_slopes(profiles, beams, fit, settings, smooth.correlation)
+    of_single = _gradient_slopes(profiles, beams, fit, settings)
     for slope, single in zip(slopes, of_single, strict=True):
         slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
     _fill_gradient_errors(profiles, slopes, settings)
@@ -264,27 +266,15 @@ def _raise_common_flags(profiles: MultiAngleResult, beams: BeamBlock, fit: Regre
         profiles.flags.outlier[:] |= low.any(axis=1)
 
 
-def _lag_one(beams: BeamBlock, fit: Regression) -> float:
-    """Return the correlation of residuals at neighbouring altitudes, from 0 on."""
-    u = np.nan_to_num(fit.residual) * np.sqrt(_block.weights_of(beams, fit))
-    both = np.einsum("tak,tak->", u[:, :, :-1], u[:, :, 1:])
-    whole = np.einsum("tak,tak->", u, u)
-    return float(np.clip(both / whole, 0.0, THRESHOLDS.most_correlated)) if whole > 0 else 0.0
-
-
 def _gradient_slopes(
-    profiles: MultiAngleResult,
-    beams: BeamBlock,
-    fit: Regression,
-    settings: BlockSettings,
-    correlation: float,
+    profiles: MultiAngleResult, beams: BeamBlock, fit: Regression, settings: BlockSettings
 ) -> Array:
     """Return the error of optical depth by a gradient to the east and to the north.
 
     The gradient is the declared one, or that which the residuals show where it is larger. One that
     is too large for air raises `poor_stratification`.
     """
-    shown = _block.visible_gradient(beams, fit, settings.height, correlation)
+    shown = _block.visible_gradient(beams, fit, settings.height)
     if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
         profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth)
     scale = max(settings.largest_gradient, shown) * settings.height

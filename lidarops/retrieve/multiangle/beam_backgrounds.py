@@ -58,6 +58,18 @@ class ScanSignals:
         variance = noise + (left[..., np.newaxis] * response) ** 2
         return cls(signal, noise, variance, covariance, path, response)
 
+    def of_beams(self, beams: npt.NDArray[np.int64]) -> Self:
+        """Return the signals of some beams."""
+        return replace(
+            self,
+            signal=self.signal[:, beams],
+            noise=self.noise[:, beams],
+            variance=self.variance[:, beams],
+            covariance=self.covariance[:, beams[:, np.newaxis], beams],
+            path=self.path[beams],
+            response=self.response[beams],
+        )
+
     def agreed(self, retrieval: MultiAngleResult) -> Self:
         r"""Return the signals with the backgrounds with which the beams agree best.
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.retrieve.multiangle import optical_depth, slant_paths
+from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
@@ -20,6 +20,7 @@ from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
     StepRecord,
 )
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical.monotone import project as monotone
 
 __all__ = ["retrieve_optical_depth"]
@@ -59,8 +60,18 @@ _PER_LAYER: Final = (
     "layer_optical_depth_standard_error",
     "layer_optical_depth_gradient_error",
 )
-
-
+_PER_PLANE: Final = (
+    "optical_depth",
+    "optical_depth_standard_error",
+    "optical_depth_gradient_error",
+    "extinction",
+    "extinction_standard_error",
+    "extinction_gradient_error",
+)
+_SEVERAL: Final = 2
+"""Planes of a volume."""
+_FEWEST_OF_PLANE: Final = 3
+"""Beams of a plane that leave a residual."""
 _LINEARISATIONS: Final = 3
 """Fits that the agreement of beams starts from: about a biased first one, large backgrounds are off
 (`test_unflagged_optical_depths_lie_within_three_standard_errors`, bright beams)."""
@@ -113,10 +124,8 @@ def retrieve_optical_depth(
         "largest_gradient": largest_gradient,
     }
     signals = _agreed_signals(beams, zenith_angle, altitude, settings)
-    retrieval = _solve(signals, zenith_angle, altitude, layers=layers, **settings)
     levels = np.searchsorted(altitude, bounds, side="right")
-    depth = np.diff(altitude, prepend=station_altitude)
-    retrieval = _with_background_errors(retrieval, signals, depth, levels)
+    retrieval = _solve_all(signals, zenith_angle, altitude, levels, layers=layers, **settings)
     signal = signals.signal
     sampled = np.isfinite(signal).any(axis=-1)
     values = {name: (("time", "altitude"), getattr(retrieval, name)) for name in _PER_ALTITUDE}
@@ -135,6 +144,7 @@ def retrieve_optical_depth(
         coords={name: beams[name] for name in beams.coords},
         attrs={"steps": _step_texts(retrieval)},
     )
+    product = product.assign(_plane_variables(signals, beams, settings))
     if not layers:
         return product
     return product.assign(_layer_variables(retrieval, quality, levels, bounds))
@@ -158,6 +168,59 @@ def _agreed_signals(
     return signals
 
 
+def _plane_variables(
+    signals: ScanSignals, beams: xr.Dataset, settings: dict[str, Any]
+) -> dict[str, xr.Variable]:
+    """Return the variables of the vertical planes of a volume; none where it has one plane only.
+
+    The inhomogeneity of a plane is its own. Values that a flag rejects are NaN.
+    """
+    if settings["azimuth"] is None:
+        return {}
+    altitude, zenith_angle = (beams[n].to_numpy() for n in ("altitude", "beam_zenith_angle"))
+    planes = _planes_with_leverage(signals, zenith_angle, settings["azimuth"])
+    if len(planes) < _SEVERAL:
+        return {}
+    pieces: dict[str, list[Array]] = {name: [] for name in _PER_PLANE}
+    for members in planes:
+        part = signals.of_beams(members)
+        own = settings | {"azimuth": settings["azimuth"][members]}
+        nothing = np.empty((0, 2), dtype=np.intp)
+        retrieval = _solve_all(part, zenith_angle[members], altitude, nothing, layers=(), **own)
+        samples = np.isfinite(part.signal).sum(axis=1)
+        quality = _quality(retrieval, beams["quality"].to_numpy(), samples)
+        rejected = (quality & np.int32(REJECTING)) != 0
+        for name, values in pieces.items():
+            values.append(np.where(rejected, np.nan, getattr(retrieval, name)))
+    cube = ("time", "plane", "altitude")
+    azimuths = [_azimuth_of_plane(settings["azimuth"], zenith_angle, own) for own in planes]
+    return {
+        "plane": xr.Variable("plane", np.arange(len(planes), dtype=np.int32)),
+        "plane_azimuth": xr.Variable("plane", np.array(azimuths)),
+        **{
+            f"plane_{name}": xr.Variable(cube, np.stack(values, axis=1))
+            for name, values in pieces.items()
+        },
+    }
+
+
+def _planes_with_leverage(
+    signals: ScanSignals, zenith_angle: Array, azimuth: Array
+) -> list[npt.NDArray[np.int64]]:
+    """Return the beams of the vertical planes of which three or more see different paths."""
+    lowest = signals.path[:, 0]
+    return [
+        members
+        for members in scan_cycles.vertical_planes(zenith_angle, azimuth)
+        if members.size >= _FEWEST_OF_PLANE and np.ptp(lowest[members]) >= THRESHOLDS.least_span
+    ]
+
+
+def _azimuth_of_plane(azimuth: Array, zenith_angle: Array, members: npt.NDArray[np.int64]) -> float:
+    """Return the azimuth of the lowest beam of a plane, degree."""
+    return float(azimuth[members][np.argmax(zenith_angle[members])])
+
+
 def _layer_variables(
     retrieval: MultiAngleResult, quality: Flags, levels: npt.NDArray[np.intp], bounds: Array
 ) -> dict[str, xr.Variable]:
@@ -173,6 +236,19 @@ def _layer_variables(
     middle = xr.Variable("layer", bounds.mean(axis=1))
     limits = xr.Variable(("layer", "nv"), bounds)
     return {**variables, "layer_altitude": middle, "layer_bnds": limits}
+
+
+def _solve_all(
+    beams: ScanSignals,
+    zenith_angle: Array,
+    altitude: Array,
+    levels: npt.NDArray[np.intp],
+    **settings: Any,
+) -> MultiAngleResult:
+    """Return the result of the method, with errors by what the backgrounds may hold."""
+    retrieval = _solve(beams, zenith_angle, altitude, **settings)
+    depth = np.diff(altitude, prepend=settings["station_altitude"])
+    return _with_background_errors(retrieval, beams, depth, levels)
 
 
 def _solve(

@@ -40,8 +40,8 @@ class AltitudeCycles:
     """Profiles of a scan in altitude cells, sorted by cycle and beam, from chunks of profiles.
 
     The variance of the background is added to that of the noise. Profiles of one cycle and
-    direction are averaged, weighted by their shots. Beams that do not rise, are longer than 10
-    vertical paths or have no known direction are left out, as are cycles without other beams.
+    direction are averaged, weighted by their shots. Beams that do not rise by 3 degrees or have no
+    known direction are left out, as are cycles without other beams.
     Only the cycles are held; chunks do not change a bit of the result.
 
     Parameters
@@ -273,7 +273,7 @@ def _order(directions: scan_cycles.Directions, numbers: Integers, height: Array)
     usable = slant_paths.rising_beams(directions.zenith_angle, height)
     if usable.size == 0:
         raise RetrievalInputError(
-            "has no direction more than about 6 degree above the horizon",
+            "has no direction more than 3 degrees above the horizon",
             field="zenith_angle",
             remedy="leave the multi-angle retrieval out of this scene",
         )

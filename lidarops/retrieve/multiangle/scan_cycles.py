@@ -66,7 +66,7 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     """
     zenith, heading = _angles(zenith_angle, azimuth)
     tilt = np.abs(zenith)
-    upright = np.minimum(tilt, 180.0 - tilt) < 0.5 * THRESHOLDS.same_direction
+    upright = ~_tilted(tilt)
     bearing = np.where(zenith < 0, heading + 180.0, heading) % 360.0
     known = np.flatnonzero(np.isfinite(zenith) & (np.isfinite(heading) | upright))
     index = np.full(zenith.size, _UNKNOWN, dtype=np.int64)
@@ -75,7 +75,7 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     tilt, bearing = tilt[known], np.where(upright, 0.0, bearing)[known]
     label = _clusters(_unit_vectors(tilt, bearing))
     angle = np.bincount(label, weights=tilt) / np.bincount(label)
-    vertical = np.minimum(angle, 180.0 - angle) < 0.5 * THRESHOLDS.same_direction
+    vertical = ~_tilted(angle)
     towards = _mean_bearings(bearing, label)
     plane, side = _planes(towards, ~vertical)
     order = np.lexsort((towards, side * angle, plane))
@@ -86,14 +86,35 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     return Directions(index, angle[order], np.where(vertical, first, towards)[order])
 
 
+def vertical_planes(zenith_angle: Array, azimuth: Array) -> list[Integers]:
+    """Return the directions of each vertical plane of a scan, by rising azimuth.
+
+    A direction along the vertical belongs to all planes.
+
+    Parameters
+    ----------
+    zenith_angle, azimuth : (direction,) float
+        degree, 0 to 180 and 0 to 360.
+
+    Returns
+    -------
+    list of (direction,) int
+        Rising indices of directions; empty where no direction is tilted.
+    """
+    tilted = _tilted(zenith_angle)
+    plane = _planes(azimuth, tilted)[0]
+    return [np.flatnonzero(~tilted | (plane == number)) for number in np.unique(plane[tilted])]
+
+
 def cycles(
     zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None, time_bnds: npt.ArrayLike
 ) -> Integers:
     """Return the number of the cycle of each profile.
 
     A cycle ends before the first direction that it already contains. It also ends at a pause (from
-    the end of a profile to the start of the next) of more than 3 median intervals between starts
-    and more than 1.5 times the longest dwell in a direction.
+    the end of a profile to the start of the next) of more than 3 median intervals between starts,
+    more than 1.5 times the longest dwell in a direction, and longer than the cycle up to it: a scan
+    slews for less time than it measured before.
 
     Successive profiles in one direction are one visit and stay together, except at a turning
     point: a visit of at least twice the median length between two visits of the same direction is
@@ -123,11 +144,17 @@ def cycles(
         For angles out of range, or times that do not rise.
     """
     index = directions(zenith_angle, azimuth).index
-    stretch = _stretches(_bounds(time_bnds, index.size), index)
+    bounds = _bounds(time_bnds, index.size)
+    stretch = _stretches(bounds, index)
     known = np.flatnonzero(index != _UNKNOWN)
-    numbers = _cycle_numbers(index[known], stretch[known])
+    numbers = _cycle_numbers(index[known], stretch[known], bounds[known])
     previous = np.searchsorted(known, np.arange(index.size), side="right") - 1
     return np.append(numbers, 0)[np.maximum(previous, 0)] if known.size else np.zeros_like(index)
+
+
+def _tilted(angle: Array) -> npt.NDArray[np.bool_]:
+    """Return whether zenith angles (degree, 0 to 180) are not along the vertical."""
+    return np.asarray(np.minimum(angle, 180.0 - angle) >= 0.5 * THRESHOLDS.same_direction)
 
 
 def _unit_vectors(tilt: Array, bearing: Array) -> Array:
@@ -208,20 +235,25 @@ def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, In
     return plane, side
 
 
-def _cycle_numbers(index: Integers, stretch: Integers) -> Integers:
-    """Return the cycles of profiles of known direction; no cycle crosses a long pause."""
+def _cycle_numbers(index: Integers, stretch: Integers, bounds: Array) -> Integers:
+    """Return the cycles of profiles of known direction."""
     if index.size == 0:
         return np.empty(0, dtype=np.int64)
     begins = np.zeros(index.size, dtype=np.int64)
     seen: set[int] = set()
-    last = stretch[0]
+    first = 0
     for profile in _visits(index, stretch):
         direction = int(index[profile])
-        if direction in seen or stretch[profile] != last:
+        before = max(profile - 1, 0)
+        stopped = bounds[before, 1]
+        paused = stretch[profile] != stretch[before] and (
+            bounds[profile, 0] - stopped > stopped - bounds[first, 0]
+        )
+        if direction in seen or paused:
             begins[profile] = 1
             seen.clear()
+            first = profile
         seen.add(direction)
-        last = stretch[profile]
     return np.cumsum(begins)
 
 

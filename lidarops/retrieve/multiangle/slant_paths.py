@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
@@ -16,8 +17,6 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
-EARTH_RADIUS: Final = 6_371_000.0
-"""m, mean."""
 _UPRIGHT: Final = 1e-9
 """Horizontal distance over altitude up to which a beam is vertical and has no azimuth."""
 _OPPOSITE: Final = 1e-6
@@ -37,7 +36,7 @@ class Scan:
     azimuth: Array
     """(angle,) radian; a beam with a negative zenith angle points opposite to its azimuth."""
     usable: Mask
-    """(angle,): false for beams whose path is longer than ten times the vertical one."""
+    """(angle,): false for beams less than 3 degrees above the horizon."""
 
     @property
     def tilted_azimuths(self) -> Array:
@@ -51,8 +50,8 @@ def make_scan(
 ) -> Scan:
     r"""Return the slant paths of a scan.
 
-    Up to 75 degrees :math:`x = \sec\theta`; beyond, the mean path through a spherical atmosphere
-    with constant extinction,
+    Up to 75 degrees :math:`x = \sec\theta`; beyond, the mean path of a refracted beam through a
+    spherical atmosphere with constant extinction,
 
     .. math:: x(z) = \left[\sqrt{R^2\cos^2\theta + 2Rz + z^2} - R\cos\theta\right] / z .
 
@@ -68,7 +67,7 @@ def make_scan(
     Returns
     -------
     Scan
-        Beams with x > 10 at any altitude, or with a missing angle, are not usable.
+        Beams with x > 19.2 at any altitude, or with a missing angle, are not usable.
 
     Raises
     ------
@@ -112,8 +111,10 @@ def slant_path(angle: Array, altitude: Array) -> Array:
         secant = np.where(cosine > 1e-12, 1.0 / cosine, np.inf)
     # The textbook form subtracts two numbers of the size of the Earth's radius; this form keeps
     # the digits.
-    root = np.sqrt((EARTH_RADIUS * cosine) ** 2 + (2.0 * EARTH_RADIUS + altitude) * altitude)
-    spherical = (2.0 * EARTH_RADIUS + altitude) / (root + EARTH_RADIUS * cosine)
+    root = np.sqrt(
+        (EFFECTIVE_RADIUS * cosine) ** 2 + (2.0 * EFFECTIVE_RADIUS + altitude) * altitude
+    )
+    spherical = (2.0 * EFFECTIVE_RADIUS + altitude) / (root + EFFECTIVE_RADIUS * cosine)
     steep = angle[:, np.newaxis] <= THRESHOLDS.spherical_beyond
     return np.asarray(np.where(steep, secant, spherical), dtype=np.float64)
 

@@ -32,9 +32,8 @@ class Thresholds:
     spherical_beyond: float = 75.0
     """degree beyond which the path follows the curvature of the Earth; below, the secant errs by
     less than 0.3 percent of the path up to 2.7 km, and 1.1 percent up to 10 km, by the formula."""
-    longest_path: float = 10.0
-    """Slant over vertical path beyond which a beam is left out, because refraction is not
-    modelled; assumed."""
+    longest_path: float = 19.2
+    """Slant over vertical path beyond which a beam is left out: 3 degrees of elevation."""
 
     # Background (`beam_backgrounds`).
     common_background: float = 0.5
@@ -106,10 +105,11 @@ class Thresholds:
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_limit: float = 4.0
-    """Standard errors beyond which a gradient is part of the error; assumed."""
+    """Standard errors beyond which a gradient is part of the error, of a normal distribution: that
+    of Student's is the same probability; assumed."""
     largest_gradient: float = 3e-4
     """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
-    no optical depth deviates by more than 4 stated errors, with 5e-4 every seventh does. Distorted
+    no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted
     analog signals of scans up to 25 degrees of elevation show 2e-3 and more."""
 
     # Stratification (`_path_variation`).

@@ -19,7 +19,7 @@ ANGLES = (0.0, 20.0, 50.0, 75.0, 80.0)
 def height_of(range_, angle):
     """Return the height at a range, from the triangle with the centre of the Earth."""
     slanted = range_ * np.cos(np.radians(angle))
-    earth = slant_paths.EARTH_RADIUS
+    earth = slant_paths.EFFECTIVE_RADIUS
     sphere = np.sqrt(earth**2 + range_**2 + 2 * earth * slanted) - earth
     return slanted if angle <= THRESHOLDS.spherical_beyond else sphere
 

@@ -341,8 +341,35 @@ def test_an_angle_to_one_side_has_a_systematic_error():
     )
 
 
+def test_a_plume_in_one_plane_of_a_volume_does_not_widen_the_errors_of_another():
+    conditioned, pointing = scan(8, np.concatenate([ONE_SIDE[1:], -ONE_SIDE[1:]]))
+    pointing["azimuth"] = np.tile(np.repeat([20.0, 80.0], 9), 8)
+    plume = np.exp(np.random.default_rng(9).normal(0.0, 0.2, conditioned["power"].shape))
+    plume[pointing["azimuth"] == 20.0] = 1.0
+    calm = solve(conditioned, pointing)
+    rough = solve(conditioned.assign(power=conditioned["power"] * plume), pointing)
+    np.testing.assert_allclose(calm["plane_azimuth"], [20.0, 80.0])
+    ratio = (
+        (rough["plane_optical_depth_standard_error"] / calm["plane_optical_depth_standard_error"])
+        .isel(altitude=slice(5, 30))
+        .median(("time", "altitude"))
+    )
+    assert ratio[0] == pytest.approx(1.0, abs=0.1)
+    assert ratio[1] > 3.0
+    truth = optical_depth(ALTITUDE - STATION)
+    off = (calm["plane_optical_depth"] - truth) / calm["plane_optical_depth_standard_error"]
+    assert np.sqrt((off**2).mean()) < 1.3
+
+
+def test_a_scan_in_one_plane_has_no_planes():
+    for azimuth in (None, 20.0):
+        conditioned, pointing = scan(2, ONE_SIDE)
+        pointing["azimuth"] = None if azimuth is None else pointing["azimuth"]
+        assert "plane" not in solve(conditioned, pointing).dims
+
+
 def test_beams_along_the_horizon_and_unknown_ones_are_left_out():
-    zenith = np.concatenate([ONE_SIDE, [85.5, 90.0, 95.0]])
+    zenith = np.concatenate([ONE_SIDE, [87.5, 90.0, 95.0]])
     conditioned, pointing = scan(3, zenith)
     pointing["zenith_angle"][12] = 180.0
     pointing["zenith_angle"][5] = np.nan

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.multiangle.scan_cycles import cycles, directions
+from lidarops.retrieve.multiangle.scan_cycles import cycles, directions, vertical_planes
 
 SWEEP = [0.0, 15.0, 30.0, 45.0, 60.0]
 
@@ -191,3 +191,28 @@ def test_invalid_arguments_are_refused(zenith, azimuth, bounds, field):
     with pytest.raises(RetrievalInputError) as caught:
         cycles(zenith, azimuth, bounds)
     assert caught.value.field == field
+
+
+def test_slews_between_the_planes_of_a_volume_begin_no_cycle():
+    """Two volumes of 6 azimuths: beams last 1.4 s, slews 15 s, the way back 40 s."""
+    elevations = np.arange(5.0, 25.5, 0.5)
+    zenith = np.tile(90.0 - elevations, 12)
+    azimuth = np.tile(np.repeat(62.0 + 15.0 * np.arange(6), elevations.size), 2)
+    steps = np.full(zenith.size, 1.5)
+    steps[:: elevations.size] = 15.0
+    steps[zenith.size // 2] = 40.0
+    seconds = np.cumsum(steps)
+    numbers = numbered(zenith, azimuth, seconds=seconds, lengths=1.4)
+    assert numbers == [0] * (zenith.size // 2) + [1] * (zenith.size // 2)
+    # A pause longer than the planes before it ends the volume.
+    seconds[2 * elevations.size :] += 200.0
+    numbers = numbered(zenith, azimuth, seconds=seconds, lengths=1.4)
+    assert numbers[2 * elevations.size - 1 : 2 * elevations.size + 1] == [0, 1]
+
+
+def test_a_direction_along_the_vertical_belongs_to_all_planes():
+    zenith = np.array([0.0, 30.0, 60.0, 30.0, 60.0, 45.0])
+    azimuth = np.array([0.0, 10.0, 10.0, 100.0, 100.0, 190.0])
+    planes = [plane.tolist() for plane in vertical_planes(zenith, azimuth)]
+    assert planes == [[0, 1, 2, 5], [0, 3, 4]]
+    assert vertical_planes(zenith[:1], azimuth[:1]) == []

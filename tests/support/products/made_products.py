@@ -286,7 +286,22 @@ def multiangle(
         },
         attrs={"steps": "joint: extinction is requested"},
     )
-    return with_layers(found) if layers else found
+    return with_planes(with_layers(found)) if layers else found
+
+
+def with_planes(data: xr.Dataset) -> xr.Dataset:
+    """Return data with profiles of two vertical planes."""
+    names = ("optical_depth", "extinction")
+    return data.assign(
+        {
+            f"plane_{name}{ending}": data[name + ending].expand_dims(plane=2, axis=1).copy()
+            for name in names
+            for ending in ("", "_standard_error", "_gradient_error")
+        }
+    ).assign_coords(
+        plane=("plane", np.arange(2, dtype=np.int32)),
+        plane_azimuth=("plane", np.array([20.0, 110.0])),
+    )
 
 
 def with_layers(data: xr.Dataset) -> xr.Dataset:

@@ -1,0 +1,68 @@
+"""Two range-height scans of a real lidar, against an independent estimate of the optical depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidarops.campaign.model import load_campaign
+from lidarops.run.archive import reprocess
+
+CAMPAIGN = Path(__file__).parent / "campaigns" / "rhis.yaml"
+HEIGHTS = (300.0, 600.0, 900.0, 1200.0, 1800.0)
+REFERENCE = {
+    "photon_355p": ((0.054, 0.069, 0.087, 0.109, 0.149), (0.002, 0.004, 0.007, 0.014, 0.038)),
+    "photon_355s": ((0.060, 0.072, 0.090, 0.105, 0.146), (0.003, 0.003, 0.005, 0.009, 0.025)),
+}
+"""Optical depth and standard error at the heights, by quasi-likelihood, over six azimuths."""
+
+
+@pytest.fixture(scope="module")
+def products(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, xr.Dataset]:
+    """The product of each channel, and the reason of its step."""
+    out = tmp_path_factory.mktemp("rhis")
+    record = reprocess(load_campaign(CAMPAIGN, archive=data_root / "savant", output=out))
+    assert record is not None
+    (scene,) = record.scenes
+    opened = {}
+    for product in scene.products:
+        opened[product.channel] = xr.load_dataset(Path(record.products) / product.path)
+    (reason,) = {step.reason for step in scene.plan.steps if step.name == "multiangle"}
+    assert "a volume of 2 vertical planes, 82 directions" in reason
+    return opened
+
+
+@pytest.mark.parametrize("channel", REFERENCE)
+def test_optical_depths_agree_with_an_independent_estimate(channel, products):
+    product = products[channel]
+    # The four azimuths between them are missing.
+    assert product.sizes["time"] == 2
+    rows = [int(np.abs(product["altitude"].values - 220.0 - z).argmin()) for z in HEIGHTS]
+    expected, scatter = (np.array(values) for values in REFERENCE[channel])
+    part = product.isel(altitude=rows)
+    random = part["optical_depth_standard_error"]
+    total = np.sqrt(random**2 + part["optical_depth_gradient_error"] ** 2 + scatter**2)
+    deviation = (np.abs(part["optical_depth"] - expected) / total).values
+    # One of 20 values lies 2.2 standard errors off, at 300 m.
+    assert np.all(deviation[:, 1:] < 1.0)
+    assert np.all(deviation[:, 0] < 2.4)
+    assert np.all(random < 1.5 * scatter)
+    assert (product["usable"] < 2).mean() >= 0.95
+    assert (product["usable"] == 0).any()
+
+
+def test_parallel_and_perpendicular_see_the_same_optical_depth(products):
+    one, other = (products[channel].isel(altitude=slice(4, None)) for channel in REFERENCE)
+    difference = one["optical_depth"] - other["optical_depth"]
+    spread = np.hypot(one["optical_depth_standard_error"], other["optical_depth_standard_error"])
+    assert np.sqrt(((difference / spread) ** 2).mean()) < 1.3
+
+
+@pytest.mark.parametrize("channel", ["analog_355p", "analog_355s"])
+def test_distorted_analog_signals_are_rejected(channel, products):
+    product = products[channel]
+    assert (product["usable"] == 2).all()
+    assert product["extinction"].isnull().all()
