@@ -20,7 +20,12 @@ LONG: dict[str, dict[str, Any]] = {
     "signal": {"profiles": 1440, "bins": 800},
     "homogeneous": {"profiles": 10_000, "sections": 6},
     "elastic": {"profiles": 720, "bins": 800},
-    "multiangle": {"profiles": 300, "levels": 150, "zenith": np.linspace(0.0, 80.0, 16)},
+    "multiangle": {
+        "profiles": 300,
+        "levels": 150,
+        "zenith": np.linspace(0.0, 80.0, 16),
+        "azimuth": 90.0,
+    },
     "visibility": {"profiles": 2000, "crossings": 20, "zenith": np.full(8, 85.0)},
 }
 VIEWS = [(kind, name) for kind in MAKERS for name in views(kind)]

@@ -128,6 +128,7 @@ def test_variables_without_standard_name():
             "data_share",
             "inhomogeneity",
             "residual",
+            "beam_signal",
             "effective_degrees_of_freedom",
             "reach",
         },

@@ -32,6 +32,7 @@ _STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
 _LEAST_SNR: Final = 3.0
 _FEWEST_BEAMS: Final = 3
 
+AUTO: Final = "auto"
 TWO_ANGLE: Final = "two_angle"
 KANO_HAMILTON: Final = "kano_hamilton"
 JOINT: Final = "joint"

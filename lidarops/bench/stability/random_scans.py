@@ -20,9 +20,6 @@ from lidarops.retrieve.multiangle.labeled import QUALITY_OF_FLAG
 
 Random = np.random.Generator
 
-_LARGEST_GRADIENT: Final = 5e-5
-"""m-1, default of the retrieval."""
-
 
 def _level(scene: Scene, _: Random) -> Scene:
     return replace(scene, outliers=0.0, gradient=0.0, variation=0.0)
@@ -33,8 +30,8 @@ def _outliers(scene: Scene, rng: Random) -> Scene:
 
 
 def _gradient(scene: Scene, rng: Random, *, times: float = 1.0) -> Scene:
-    slope = times * rng.uniform(0.2, 1.0) * _LARGEST_GRADIENT * rng.choice([-1.0, 1.0])
-    return replace(_level(scene, rng), gradient=float(slope))
+    slope = rng.uniform(0.2, 1.0) * optical_depth.LARGEST_GRADIENT * rng.choice([-1.0, 1.0])
+    return replace(_level(scene, rng), gradient=times * float(slope))
 
 
 def _two_sided(scene: Scene, rng: Random) -> Scene:
@@ -43,7 +40,8 @@ def _two_sided(scene: Scene, rng: Random) -> Scene:
     return replace(_gradient(scene, rng, times=2.0), zenith_angle=angles)
 
 
-def _variation(scene: Scene, rng: Random) -> Scene:
+def _variation(scene: Scene, rng: Random, *, two_sided: bool = False) -> Scene:
+    scene = _two_sided(scene, rng) if two_sided else scene
     return replace(_level(scene, rng), variation=rng.uniform(0.3, 1.0))
 
 
@@ -94,6 +92,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
     ),
     (Failure("gradient up to twice the declared one, two sides"), _two_sided, _plain),
     (Failure("extinction that varies along the paths"), _variation, _plain),
+    (Failure("the same, two sides"), partial(_variation, two_sided=True), _plain),
     (
         Failure("overlap error", unseen="it is the same at equal ranges, which are not compared"),
         _level,
@@ -110,7 +109,7 @@ def score_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int
         rng = np.random.default_rng((72, cluster, number))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
-        result = multiangle_cases.retrieve(scan, multiangle_cases.JOINT)
+        result = multiangle_cases.retrieve(scan, multiangle_cases.AUTO)
         yield from _score_quantities(failure, scene, result, profiles)
 
 

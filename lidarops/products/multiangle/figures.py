@@ -1,4 +1,4 @@
-"""The figures of the ``multiangle`` product: extinction, one scan cycle, residuals of the fit."""
+"""The figures of the ``multiangle`` product: extinction, one scan cycle, residuals, images."""
 
 from __future__ import annotations
 
@@ -39,6 +39,11 @@ from lidarops.products.multiangle.figure_data import (
     clearest_cycle,
     read_extinction,
     read_residuals,
+)
+from lidarops.products.multiangle.scan_images import (
+    VARIABLES,
+    draw_scan_images,
+    read_scan_image,
 )
 
 Floats = NDArray[np.float64]
@@ -230,6 +235,7 @@ FIGURES: Final = KindFigures(
     (
         image_view("multiangle", EXTINCTION_VARIABLES, read_extinction, "extinction", "altitude"),
         View("scan-profile", CYCLE_VARIABLES, _read_cycle, _draw_cycle, first=True),
+        View("scan-image", VARIABLES, read_scan_image, draw_scan_images, first=True),
         View("scan-residuals", RESIDUAL_VARIABLES, _read_residuals, _draw_residuals, first=True),
     ),
     preferred="optical_depth",

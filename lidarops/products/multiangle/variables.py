@@ -300,6 +300,19 @@ LAYOUT: Final = Layout(
         *_of_planes("optical_depth", "optical depth of molecules and particles", "1"),
         *_of_planes("extinction", "extinction coefficient of molecules and particles", "m-1"),
         Row(
+            name="beam_signal",
+            dims=("time", "beam", "altitude"),
+            dtype="f4",
+            units="{signal} m2",
+            long_name="range-corrected signal of a beam in the altitude cell",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean altitude: mean",
+            significant_bits=8,
+            optional=True,
+            comment="Without background, divided by the overlap where one is given. Its noise is"
+            f" not stated; residual is missing where it is too large. {NO_STANDARD_NAME}",
+        ),
+        Row(
             name="residual",
             dims=("time", "beam", "altitude"),
             dtype="f4",

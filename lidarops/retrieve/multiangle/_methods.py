@@ -52,14 +52,42 @@ def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> Mul
     beams = _block.make_beam_block(signal, variance, settings.scan)
     fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
     method, reason = _choose_method(beams, settings)
+    profiles = _solve(method, beams, fit, settings)
+    steps = [*_steps(beams, fit, settings), StepRecord(method, ran=True, reason=reason)]
+    doubt = _doubt(profiles) if settings.method == "auto" and method == "joint" else ""
+    if doubt:
+        profiles = _solve("kano_hamilton", beams, fit, settings)
+        steps[-1:] = [
+            StepRecord("kano_hamilton", ran=True, reason="single altitudes instead of a profile"),
+            StepRecord("joint", ran=False, reason=doubt),
+        ]
+    return replace(profiles, steps=tuple(steps))
+
+
+def _solve(
+    method: str, beams: BeamBlock, fit: Regression, settings: BlockSettings
+) -> MultiAngleResult:
+    """Return the solution by a method, with the flags common to all methods."""
     profiles = _METHODS[method](beams, fit, settings)
     lowest = _path_variation.path_variation_from(beams, fit)
     if lowest is not None:
         profiles.flags.poor_stratification[:, lowest:] = True
     _withhold_extinction(profiles, profiles.flags.poor_stratification)
     _raise_common_flags(profiles, beams, fit)
-    steps = (*_steps(beams, fit, settings), StepRecord(method, ran=True, reason=reason))
-    return replace(profiles, steps=steps)
+    return profiles
+
+
+def _doubt(profiles: MultiAngleResult) -> str:
+    """Return why the standard errors of all values of "joint" would be too small; empty if not.
+
+    Errors that are common to neighbouring altitudes, such as those of the shot energy, look like
+    structure of the profile. The standard errors of single altitudes remain valid.
+    """
+    flags, valued = profiles.flags, np.isfinite(profiles.optical_depth)
+    if not valued.any() or not (flags.undersmoothed | flags.high_correlation)[valued].all():
+        return ""
+    causes = [name for name in ("undersmoothed", "high_correlation") if getattr(flags, name).any()]
+    return f"its standard errors would be too small ({' and '.join(causes)})"
 
 
 def _steps(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Iterator[StepRecord]:

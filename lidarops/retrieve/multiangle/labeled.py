@@ -16,9 +16,7 @@ from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
 from lidarops.retrieve.multiangle.optical_depth import (
-    MultiAngleMethod,
     MultiAngleResult,
-    StepRecord,
 )
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical.monotone import project as monotone
@@ -94,8 +92,7 @@ def retrieve_optical_depth(
     station_altitude : float
         m above mean sea level.
     method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
-        See `MultiAngleMethod`. If "auto" selects "joint" and all standard errors of "joint" would
-        be too small, "kano_hamilton" is used.
+        See `MultiAngleMethod`.
     largest_gradient : float
         m-1, horizontal gradient of ln backscatter covered by the gradient errors.
     layers : sequence of (float, float)
@@ -136,6 +133,7 @@ def retrieve_optical_depth(
         {
             **values,
             **{name: ("time", getattr(retrieval, name)) for name in _PER_PROFILE},
+            "beam_signal": (("time", "beam", "altitude"), signal),
             "residual": (("time", "beam", "altitude"), retrieval.residual),
             "quality_flag": (("time", "altitude"), quality),
             "beams": ("time", sampled.sum(axis=1).astype(np.int32)),
@@ -252,29 +250,12 @@ def _solve_all(
 
 
 def _solve(
-    beams: ScanSignals, zenith_angle: Array, altitude: Array, *, method: str, **settings: Any
+    beams: ScanSignals, zenith_angle: Array, altitude: Array, **settings: Any
 ) -> MultiAngleResult:
-    """Return the result of the method; of "kano_hamilton" if "auto" joined and flagged all values.
-
-    Errors that are common to neighbouring altitudes, such as those of the shot energy, look like
-    structure of the profile. The joint solution then flags its standard errors as too small, while
-    those of single altitudes remain valid.
-    """
-    data = (beams.signal, zenith_angle, altitude)
-    settings |= {"variance": beams.variance}
-    retrieval = optical_depth.retrieve_optical_depth(*data, method=method, **settings)
-    flags = retrieval.flags
-    valued = np.isfinite(retrieval.optical_depth)
-    doubted = flags.undersmoothed | flags.high_correlation
-    if method != MultiAngleMethod.AUTO or not valued.any() or not doubted[valued].all():
-        return retrieval
-    single = optical_depth.retrieve_optical_depth(
-        *data, method=MultiAngleMethod.KANO_HAMILTON.value, **settings
+    """Return the result of the method."""
+    return optical_depth.retrieve_optical_depth(
+        beams.signal, zenith_angle, altitude, variance=beams.variance, **settings
     )
-    causes = [name for name in ("undersmoothed", "high_correlation") if getattr(flags, name).any()]
-    reason = f"its standard errors would be too small ({' and '.join(causes)})"
-    joint = StepRecord(MultiAngleMethod.JOINT.value, ran=False, reason=reason)
-    return replace(single, steps=(*single.steps, joint))
 
 
 def _step_texts(retrieval: MultiAngleResult) -> str:

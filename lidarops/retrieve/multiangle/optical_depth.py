@@ -37,7 +37,8 @@ class MultiAngleMethod(StrEnum):
     """Method of retrieving optical depths."""
 
     AUTO = "auto"
-    """`TWO_ANGLE` for two beams, else `JOINT`."""
+    """`TWO_ANGLE` for two beams, else `JOINT`; `KANO_HAMILTON` where all standard errors of `JOINT`
+    would be too small."""
     TWO_ANGLE = "two_angle"
     """Only the shortest and the longest path."""
     KANO_HAMILTON = "kano_hamilton"

@@ -271,6 +271,7 @@ def multiangle(
                 name: (dims, np.where(missing, np.nan, scale * rng.uniform(0.5, 1.5, shape)))
                 for name, scale in scales.items()
             },
+            "beam_signal": (("time", "beam", "altitude"), np.exp(14.0 + residual)),
             "residual": (("time", "beam", "altitude"), residual),
             "effective_degrees_of_freedom": ("time", np.full(profiles, 12.5)),
             "reach": ("time", np.full(profiles, 800.0)),
