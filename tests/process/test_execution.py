@@ -203,6 +203,14 @@ def deviation(product, inside):
         ("signal", {"channels": ["glued_532o"]}),
         ("elastic", {**ELASTIC, "average": "20min"}),
         ("homogeneous", {"channels": ["photon_532o"], "sections": [[750, 4500]], "visibility": {}}),
+        (
+            "homogeneous",
+            {
+                "channels": ["photon_532o"],
+                "sections": [[750, 4500]],
+                "method": "known_background",
+            },
+        ),
     ],
 )
 def test_steps_take_no_data_but_their_inputs(kind, request_, monkeypatch) -> None:

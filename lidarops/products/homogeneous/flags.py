@@ -22,6 +22,7 @@ FLAGS: Final = Flags(
         Quality.NOT_HOMOGENEOUS,
         Quality.OUTLIER,
         Quality.NO_REAL_SOLUTION,
+        Quality.BACKGROUND_UNCERTAIN,
         *HomogeneousQuality,
     ),
 )

@@ -6,7 +6,13 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, VisibilitySettings, quantity
+from lidarops.settings import (
+    ChannelProduct,
+    Metres,
+    VisibilitySettings,
+    located_error,
+    quantity,
+)
 
 
 class HomogeneousSettings(ChannelProduct):
@@ -14,7 +20,16 @@ class HomogeneousSettings(ChannelProduct):
 
     channels: list[str] = Field(min_length=1)
     sections: list[tuple[Metres, Metres]] = quantity(unit="m", min_length=1)
-    method: Literal["auto", "direct", "cubic"] = "auto"
+    method: Literal["auto", "direct", "cubic", "known_background"] = Field(
+        default="auto",
+        description="known_background takes the background from the far range, for paths that end"
+        " there; the other methods retrieve it from the section",
+    )
+    background_range: tuple[Metres, Metres] | None = quantity(
+        None,
+        unit="m",
+        description="far range of known_background; the last tenth of the bins by default",
+    )
     visibility: VisibilitySettings | None = Field(
         default=None, description="if given, adds visibility along the sections"
     )
@@ -26,4 +41,9 @@ class HomogeneousSettings(ChannelProduct):
         for near, far in self.sections:
             if far <= near:
                 raise ValueError(f"section [{near}, {far}] must end farther than it starts")
+        limits = self.background_range
+        if limits is not None and self.method != "known_background":
+            raise located_error("is used by the method known_background only", "background_range")
+        if limits is not None and limits[1] <= limits[0]:
+            raise located_error("must end farther than it starts", "background_range")
         return self

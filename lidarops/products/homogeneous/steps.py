@@ -31,7 +31,7 @@ from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
-from lidarops.steps.preparation import FEWEST_BINS
+from lidarops.steps.preparation import FEWEST_BINS, tail
 from lidarops.steps.reading import ANALOG_NOISE, WAVELENGTH, Window, WindowSettings, bins_with_noise
 from lidarops.steps.step import (
     ALL_STEPS,
@@ -97,6 +97,9 @@ class SectionWindow(Window, Choice[Case, WindowSettings]):
         if case.all_steps:
             yield Leave(ALL_STEPS)
             return
+        if case.request.method == "known_background":
+            yield Leave("the background is that of the far range")
+            return
         farthest = max(far for _, far in _level(case))
         bins = bins_with_noise(0.0, farthest, case)[1]
         if not 0 < bins < case.channel.bins:
@@ -150,9 +153,11 @@ class AlongPath(Choice[Case, NoSettings]):
 class PathSettings(SettingsModel):
     """Settings of the step ``homogeneous``."""
 
-    method: Literal["auto", "direct", "cubic"]
+    method: Literal["auto", "direct", "cubic", "known_background"]
     sections: tuple[Section, ...]
     """m."""
+    background_range: tuple[float, float] | None = None
+    """m, far range of `known_background`."""
     visibility: VisibilitySettings | None = None
     left_out: tuple[tuple[float, float, OmittedBit], ...] = ()
     """Sections that are not retrieved, with the quality bit that says why."""
@@ -190,11 +195,16 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
         if level:
             settings = case.request
             definition = settings.visibility
+            known = settings.method == "known_background"
+            whence = (
+                "comes from the far range" if known else "is retrieved together with extinction"
+            )
             yield Run(
-                f"{REQUESTED}; background is retrieved together with extinction",
+                f"{REQUESTED}; background {whence}",
                 PathSettings(
                     method=settings.method,
                     sections=tuple(level),
+                    background_range=tail(case, settings.background_range) if known else None,
                     visibility=definition and definition.resolved,
                 ),
                 number=float(len(level)),
@@ -298,9 +308,11 @@ class _Sections(WholeProduct):
             # The signal still holds its background, so it cannot be divided by the overlap: bins
             # with partial overlap are excluded.
             quality = quality | _partial(overlap(conditioned["range"].to_numpy()))
+        far = self._settings.background_range
         return labeled.fit_homogeneous_path(
             conditioned["power"],
             sections=self._kept,
+            background_range=far,
             variance=conditioned["variance"],
             quality=quality,
             method=self._settings.method,

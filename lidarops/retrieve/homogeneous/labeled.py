@@ -11,6 +11,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.retrieve.background.estimate import from_bounded_tail
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -46,6 +47,7 @@ def fit_homogeneous_path(
     method: str = "auto",
     relative_variance: bool = False,
     noise_correlation_length: xr.DataArray | None = None,
+    background_range: tuple[float, float] | None = None,
 ) -> xr.Dataset:
     """Return background, amplitude and extinction of sections of range.
 
@@ -64,13 +66,17 @@ def fit_homogeneous_path(
         INCOMPLETE_OVERLAP from its bins.
     method : str
         A method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path` that needs no
-        argument other than the power.
+        argument other than the power, or "known_background" with `background_range`.
     relative_variance : bool
         Whether `variance` is known up to a factor only, which each section estimates: for a
         variance estimated from the same data.
     noise_correlation_length : xr.DataArray, optional
         Bins, over the dimensions of `power` but range; see
         `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`.
+    background_range : (float, float), optional
+        m; far range whose mean is the background of "known_background", which needs `variance`. Its
+        error holds the signal that may be left there. Where that cannot be estimated,
+        BACKGROUND_UNCERTAIN is raised.
 
     Returns
     -------
@@ -88,12 +94,12 @@ def fit_homogeneous_path(
     distance, edges = _distance(power), _edges(sections)
     bins = [_bins(distance, near, far) for near, far in edges]
     used = slice(min(section.start for section in bins), max(section.stop for section in bins))
+    checked = _checked_inputs(power, variance, quality, noise_correlation_length)
     inputs = {
-        name: array.isel(range=used, missing_dims="ignore")
-        for name, array in _checked_inputs(
-            power, variance, quality, noise_correlation_length
-        ).items()
+        name: array.isel(range=used, missing_dims="ignore") for name, array in checked.items()
     }
+    if background_range is not None:
+        inputs |= _far_background(checked, distance, background_range)
     outputs = xr.apply_ufunc(
         _solve,
         *inputs.values(),
@@ -213,6 +219,43 @@ def _checked_inputs(
     }
 
 
+def _far_background(
+    inputs: Mapping[str, xr.DataArray],
+    distance: npt.NDArray[np.float64],
+    background_range: tuple[float, float],
+) -> dict[str, xr.DataArray]:
+    """Return the mean of the far range, its standard error, and whether that is uncertain."""
+    if "variance" not in inputs:
+        raise RetrievalInputError("is needed for a background of the far range", field="variance")
+    front = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
+
+    def mean(
+        power: _Block, variance: _Block, quality: _Block, length: _Block
+    ) -> tuple[_Block, _Block, _Block]:
+        values = np.where((quality & EXCLUDED) != 0, np.nan, power)[..., front]
+        noise = np.broadcast_to(variance * length, power.shape)[..., front]
+        sky = from_bounded_tail(values, distance[front], noise, None, background_range)
+        bits = sky.quality & np.int32(Quality.BACKGROUND_UNCERTAIN)
+        return sky.background, np.hypot(sky.standard_error, sky.left.most), bits
+
+    power = inputs["power"]
+    arrays = [
+        power,
+        inputs["variance"].broadcast_like(power),
+        inputs.get("quality", xr.zeros_like(power, dtype=np.int32)),
+        inputs.get("correlation_length", xr.DataArray(1.0)).broadcast_like(power),
+    ]
+    outputs = xr.apply_ufunc(
+        mean,
+        *(array.transpose(..., "range") for array in arrays),
+        input_core_dims=[["range"]] * len(arrays),
+        output_core_dims=[[], [], []],
+        dask="parallelized",
+        output_dtypes=[np.float64, np.float64, np.int32],
+    )
+    return dict(zip(("background", "background_error", "background_bits"), outputs, strict=True))
+
+
 def _bins(distance: npt.NDArray[np.float64], near: float, far: float) -> slice:
     inside = np.flatnonzero((distance >= near) & (distance < far))
     fewest = THRESHOLDS.fewest_solved_bins
@@ -257,6 +300,9 @@ def _solve_section(
     variance: _Block | None = None,
     quality: _Block | None = None,
     correlation_length: _Block | None = None,
+    background: _Block | None = None,
+    background_error: _Block | None = None,
+    background_bits: _Block | None = None,
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
@@ -271,7 +317,10 @@ def _solve_section(
         with np.errstate(divide="ignore"):
             weights = 1.0 / variance
         variance = None
-    length = None if correlation_length is None else correlation_length[..., 0]
+    length, level, error, doubt = (
+        None if values is None else values[..., 0]
+        for values in (correlation_length, background, background_error, background_bits)
+    )
     fit = _homogeneous.fit_homogeneous_path(
         power,
         range,
@@ -279,9 +328,12 @@ def _solve_section(
         weights=weights,
         method=method,
         noise_correlation_length=length,
+        background=level,
+        background_standard_error=error,
     )
     values = tuple(getattr(fit, name) for name in _VALUES)
-    return (*values, fit.valid_bins, fit.quality | carried)
+    bits = fit.quality | carried
+    return (*values, fit.valid_bins, bits if doubt is None else bits | doubt)
 
 
 def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:

@@ -250,3 +250,77 @@ def test_chunks_do_not_change_a_bit_of_signals(data_root):
             for name in results[0].data_vars:
                 np.testing.assert_array_equal(other[name].values, results[0][name].values)
         assert np.isfinite(results[0]["background"].values).any()
+
+
+FAR = np.arange(1, 2001) * 15.0
+"""m, bins to 30 km."""
+
+
+def far_path(extinction, profiles=300, amplitude=2e8, background=20.0, sigma=0.5, seed=3):
+    rng = np.random.default_rng(seed)
+    clean = signal(FAR, amplitude, extinction)
+    noise = rng.normal(0.0, sigma, (profiles, FAR.size))
+    values = background + clean + noise
+    return xr.DataArray(
+        values,
+        dims=("time", "range"),
+        coords={"range": ("range", FAR, {"units": "m"})},
+        attrs={"units": "mV"},
+    )
+
+
+@pytest.mark.parametrize(("extinction", "amplitude"), [(2e-4, 2e8), (5e-5, 2e7)])
+def test_the_background_of_the_far_range_makes_extinction_more_certain(extinction, amplitude):
+    """Its error holds what signal may be left there, of which half is subtracted."""
+    power = far_path(extinction, amplitude=amplitude)
+    options = {"sections": [(1500.0, 4000.0)], "variance": 0.25}
+    own = labeled.fit_homogeneous_path(power, **options)
+    far = labeled.fit_homogeneous_path(
+        power, **options, method="known_background", background_range=(27_000.0, 30_000.0)
+    )
+    off = (far["extinction"] - extinction) / far["extinction_standard_error"]
+    assert np.sqrt((off**2).mean()) == pytest.approx(1.0, abs=0.12)
+    assert (np.abs(off) < 4.0).all()
+    ratio = far["extinction_standard_error"] / own["extinction_standard_error"]
+    # At 5e-5 m-1, signal reaches 27 km.
+    assert ratio.median() < (0.5 if extinction == 2e-4 else 1.2)
+    assert not (far["quality_flag"] & int(Quality.BACKGROUND_UNCERTAIN)).any()
+
+
+def test_signal_left_in_a_near_tail_is_part_of_the_error():
+    """The last tenth of 4.5 km holds 30 standard errors of its mean."""
+    power = far_path(2e-5, sigma=0.2).sel(range=slice(None, 4500.0))
+    far = labeled.fit_homogeneous_path(
+        power,
+        sections=[(1500.0, 4000.0)],
+        variance=0.04,
+        method="known_background",
+        background_range=(4050.0, 4500.0),
+    )
+    off = (far["extinction"] - 2e-5) / far["extinction_standard_error"]
+    assert np.isfinite(off).all()
+    assert (np.abs(off) < 4.0).all()
+    assert far["background_standard_error"].median() > 0.2
+
+
+def test_the_far_background_is_the_same_for_any_chunking():
+    power = far_path(2e-4, profiles=7)
+    options = {
+        "sections": [(1500.0, 4000.0)],
+        "variance": 0.25,
+        "method": "known_background",
+        "background_range": (27_000.0, 30_000.0),
+    }
+    expected = labeled.fit_homogeneous_path(power, **options)
+    chunked = labeled.fit_homogeneous_path(power.chunk(time=3, range=500), **options)
+    xr.testing.assert_identical(expected, chunked.compute())
+
+
+def test_the_far_background_needs_variances():
+    with pytest.raises(RetrievalInputError, match="variance: is needed"):
+        labeled.fit_homogeneous_path(
+            far_path(2e-4, profiles=2),
+            sections=[(1500.0, 4000.0)],
+            method="known_background",
+            background_range=(27_000.0, 30_000.0),
+        )
