@@ -1,7 +1,8 @@
 """Group granules into scenes, which are processed together.
 
 A scene holds the granules of one instrument in one window of the campaign (a UTC day or a part of
-it). It is split where the facts about the instrument change, because a scene has one plan, and
+it); those of a scan cycle that crosses the end of a window belong to the window in which it began.
+A scene is split where the facts about the instrument change, because a scene has one plan, and
 where the channels or the range grid of the files change, because a product has one grid.
 
 A scene of a network holds one member scene for each instrument, in the same window. It is split
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +21,17 @@ from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
-from lidarops.errors import SceneError
+from lidarops.errors import RetrievalInputError, SceneError
 from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
+from lidarops.retrieve.multiangle import scan_cycles
+from lidarops.steps.pointing import LEAST_SPREAD
 
 DARK_REACH = timedelta(hours=24)
 """Longest time between a scene and the dark files that it uses."""
 MOST_NOTES = 20
 """Different notes on the files of a scene that are kept."""
+Window = tuple[datetime, datetime]
+"""Start and end of a window."""
 _STAMP = "%Y%m%dT%H%M%S"
 """Format of the start time in the name of a scene."""
 
@@ -61,11 +67,14 @@ def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     )
     signal, twins = _without_twins([g for g in good if g.role is Role.SIGNAL])
     dark = [granule for granule in good if granule.role is Role.DARK]
-    groups: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
+    groups: dict[tuple[str, datetime, datetime], list[Granule]] = {}
     for instrument, own in itertools.groupby(signal, key=lambda granule: granule.instrument):
         if instrument in campaign.instruments:
+            windows: dict[Window, list[Granule]] = defaultdict(list)
             for granule, window in _in_windows(campaign, (instrument,), own):
-                groups[instrument, *window].append(granule)
+                windows[window].append(granule)
+            _keep_cycles_whole(windows, campaign.instruments[instrument].facts)
+            groups |= {(instrument, *window): own for window, own in windows.items() if own}
     scenes = [
         scene
         for (instrument, start, stop), members in sorted(groups.items())
@@ -204,6 +213,42 @@ def _in_windows(
         if not opens <= _start(granule) < closes:
             opens, closes = _window(campaign, instruments, _start(granule))
         yield granule, (opens, closes)
+
+
+def _keep_cycles_whole(
+    windows: dict[Window, list[Granule]], facts: Sequence[InstrumentFacts]
+) -> None:
+    """Move granules to the window in which the cycle of their scan began.
+
+    No cycle crosses a moment at which facts change.
+    """
+    if any(fact.zenith_angle is not None for fact in facts):
+        return
+    edges = {edge for fact in facts for edge in (fact.valid_from, fact.valid_to)}
+    for before, after in itertools.pairwise(sorted(windows)):
+        earlier, later = windows[before], windows[after]
+        if before[1] != after[0] or after[0] in edges or not earlier:
+            continue
+        numbers = _cycles([*earlier, *later])
+        last = numbers[len(earlier) - 1]
+        crossing = sum(1 for number in numbers[len(earlier) :] if number == last)
+        earlier += later[:crossing]
+        del later[:crossing]
+
+
+def _cycles(granules: Sequence[Granule]) -> list[int]:
+    """Return the scan cycle of each granule; all differ where the beam does not scan."""
+    angles = [granule.zenith_angle for granule in granules]
+    known = [angle for angle in angles if angle is not None]
+    if len(known) < len(angles) or max(known) - min(known) < LEAST_SPREAD:
+        return list(range(len(granules)))
+    azimuth = [math.nan if g.azimuth is None else g.azimuth for g in granules]
+    bounds = [[moment.timestamp() for moment in (g.start, g.stop) if moment] for g in granules]
+    try:
+        return [int(number) for number in scan_cycles.cycles(known, azimuth, bounds)]
+    except RetrievalInputError:
+        # The retrieval raises the same error with its message.
+        return list(range(len(granules)))
 
 
 def _window(

@@ -11,7 +11,7 @@ from support import factories
 
 from lidarops.errors import SceneError
 from lidarops.plan.scenes import cut_scenes, scene_stop, select_scenes
-from lidarops.records import Role, Status
+from lidarops.records import Granule, Role, Status
 
 
 def test_one_scene_for_each_utc_day() -> None:
@@ -31,6 +31,32 @@ def test_a_window_divides_the_day() -> None:
     scenes = cut_scenes(campaign, granules).scenes
     assert [scene.start.hour for scene in scenes] == [0, 6, 12, 18]
     assert all(len(scene.granules) == 6 for scene in scenes)
+
+
+def scan_of(cycles: int, first: float) -> list[Granule]:
+    """Return a scan over 10 elevations to one azimuth, one a minute, from a minute of the day."""
+    return [
+        factories.granule(
+            first + minute, zenith_angle=85.0 - 5.0 * (minute % 10), azimuth=62.0 + minute // 5 % 2
+        )
+        for minute in range(10 * cycles)
+    ]
+
+
+def test_a_scan_cycle_belongs_to_the_window_in_which_it_begins() -> None:
+    campaign = factories.campaign()
+    hourly = campaign.scenes.model_copy(update={"window": timedelta(hours=1)})
+    campaign = campaign.model_copy(update={"scenes": hourly})
+    granules = scan_of(12, 5.0)
+    scenes = cut_scenes(campaign, granules).scenes
+    assert [(scene.start.hour, len(scene.granules)) for scene in scenes] == [(0, 60), (1, 60)]
+    random.Random(1).shuffle(granules)
+    assert cut_scenes(campaign, granules).scenes == scenes
+    one = (factories.DAY + timedelta(hours=1)).isoformat()
+    changed = factories.campaign(facts=[{"valid_to": one}, {"valid_from": one}])
+    changed = changed.model_copy(update={"scenes": hourly})
+    scenes = cut_scenes(changed, granules).scenes
+    assert [len(scene.granules) for scene in scenes] == [55, 60, 5]
 
 
 def test_a_scene_ends_where_the_facts_change() -> None:
