@@ -20,9 +20,10 @@ from studies.ablation import Guard, cluster_count, measure, table
 
 from lidarops.bench.stability import random_elastic
 from lidarops.flags import Quality
-from lidarops.retrieve.elastic import inversion, layers, outlying_bins, reference_window
+from lidarops.retrieve.air import reference_window
+from lidarops.retrieve.air.reference_window import Rejection
+from lidarops.retrieve.elastic import inversion, layers, outlying_bins
 from lidarops.retrieve.elastic.flags import ElasticQuality
-from lidarops.retrieve.elastic.reference_window import Rejection
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 CLUSTERS: Final = 60

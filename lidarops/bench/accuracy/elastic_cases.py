@@ -21,11 +21,11 @@ from lidarops.bench.harness.rows import Array, Mask
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
-from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
 from lidarops.retrieve.background.known_shape import KnownShapeResult
-from lidarops.retrieve.elastic import inversion, layers, reference_window
+from lidarops.retrieve.elastic import inversion, layers
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
 from lidarops.simulate.signal import backscatter_signal, bin_centres

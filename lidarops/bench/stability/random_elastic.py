@@ -13,9 +13,9 @@ from lidarops.bench.harness.rows import Array, Mask
 from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.products.elastic.settings import ReferenceSettings
-from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.background import known_shape
-from lidarops.retrieve.elastic import inversion, layers, outlying_bins, reference_window
+from lidarops.retrieve.elastic import inversion, layers, outlying_bins
 from lidarops.retrieve.elastic.flags import ElasticQuality
 
 Random = np.random.Generator

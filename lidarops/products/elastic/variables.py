@@ -23,7 +23,7 @@ from lidarops.netcdf.variables import (
     shots,
 )
 from lidarops.products.elastic.flags import FLAGS
-from lidarops.retrieve.elastic.reference_window import Rejection
+from lidarops.retrieve.air.reference_window import Rejection
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12

@@ -4,6 +4,8 @@
 Atmosphere or a sounding (`MolecularProfile`). `visibility` converts extinction to 550 nm
 (`at_reference_wavelength`) and then to visibility (`visibility_from_extinction`).
 
+`reference_window` selects the window in which a profile has the shape of clean air.
+
 `labeled.visibility_of_extinction` does the latter on `xarray` data; import it from its module, so
 that the numerics stay free of xarray.
 """

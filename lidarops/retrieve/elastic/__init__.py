@@ -11,6 +11,12 @@
 it from its module, so that the numerics stay free of xarray.
 """
 
+from lidarops.retrieve.air.reference_window import (
+    ReferenceWindow,
+    Rejection,
+    candidate_windows,
+    choose_reference,
+)
 from lidarops.retrieve.elastic.inversion import (
     ElasticResult,
     ErrorBudget,
@@ -18,12 +24,6 @@ from lidarops.retrieve.elastic.inversion import (
 )
 from lidarops.retrieve.elastic.layers import Layers, find_layers
 from lidarops.retrieve.elastic.outlying_bins import BridgedProfiles, bridge_outliers
-from lidarops.retrieve.elastic.reference_window import (
-    ReferenceWindow,
-    Rejection,
-    candidate_windows,
-    choose_reference,
-)
 
 __all__ = [
     "BridgedProfiles",

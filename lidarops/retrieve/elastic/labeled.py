@@ -14,13 +14,14 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
+from lidarops.retrieve.air import reference_window as _reference
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
+from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.background import cubic_and_tail, estimate
 from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic import layers as _layers
 from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
-from lidarops.retrieve.elastic import reference_window as _reference
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import actual_noise, counts_per_power, dead_time_error
@@ -315,7 +316,7 @@ def _window(
     highest = min(reference.highest, float(means.distance[-1]))
     width = min(reference.width, highest - reference.lowest)
     candidates = _reference.candidate_windows(
-        reference.lowest, highest, width, reference.width / THRESHOLDS.steps_per_window
+        reference.lowest, highest, width, reference.width / WINDOW_THRESHOLDS.steps_per_window
     )
     return _reference.choose_reference(
         signal.power,

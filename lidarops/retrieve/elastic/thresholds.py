@@ -8,7 +8,7 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Limits of the four steps: outlying bins, clouds, reference window, inversion."""
+    """Limits of outlying bins, clouds and inversion."""
 
     # Isolated outlying bins
     outlying: float = 6.0
@@ -44,24 +44,6 @@ class Thresholds:
     """m beyond the last bin of a cloud; its thin edge extends beyond its apparent top. Assumed."""
     least_share_beyond: float = 0.1
     """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
-
-    # Reference window
-    steps_per_window: int = 4
-    """Candidates that start within the width of one. Assumed."""
-    fewest_bins: int = 8
-    """Bins with data. Assumed."""
-    least_share: float = 0.5
-    """Share of the bins of a window that must hold data. Assumed."""
-    most_deviation: float = 3.0
-    """Standard errors by which a window may depart from the shape of air or exceed the lowest ratio
-    to it, and must exceed zero. Assumed: 1 % of clean windows fail."""
-    undetected_particles: float = 1.5
-    """Standard errors of the difference from the lowest ratio by which undetected particles may
-    raise a window. Simulations (`test_noisy_windows_state_what_they_cannot_see`, 1000 profiles):
-    of the values beside a background of 3e6 counts, 0.28 % deviate by more than 4 errors; without
-    the error of the lowest ratio, 4.0 %."""
-    most_windows: int = 10_000
-    """Candidates; more are taken for a mistake of units. Assumed."""
 
     # Inversion
     longest_gap: float = 150.0

@@ -12,10 +12,10 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.products.elastic.flags import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import Reference, constant_ratio, invert_elastic
-from lidarops.retrieve.elastic.reference_window import Rejection
 from lidarops.retrieve.signal.counts_to_signal import difference_variance, photon_signal
 
 GREEN = 532e-9

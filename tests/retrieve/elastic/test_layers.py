@@ -9,12 +9,12 @@ from scipy import signal, stats
 from lidarops.errors import RetrievalInputError
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.layers import find_layers
-from lidarops.retrieve.elastic.reference_window import (
+from lidarops.retrieve.air.reference_window import (
     Rejection,
     candidate_windows,
     choose_reference,
 )
+from lidarops.retrieve.elastic.layers import find_layers
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 AIR = MolecularProfile.us_standard()

@@ -8,13 +8,13 @@ from scipy import stats
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.inversion import invert_elastic
-from lidarops.retrieve.elastic.reference_window import (
+from lidarops.retrieve.air.reference_window import (
     Rejection,
     candidate_windows,
     choose_reference,
 )
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.air.thresholds import THRESHOLDS
+from lidarops.retrieve.elastic.inversion import invert_elastic
 
 AIR = MolecularProfile.us_standard()
 RANGE = 15.0 * (np.arange(900) + 0.5)[20:]

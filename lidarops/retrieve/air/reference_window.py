@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.air.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
