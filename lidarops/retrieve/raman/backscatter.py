@@ -1,0 +1,204 @@
+r"""Backscatter of particles from the ratio of an elastic to a Raman signal.
+
+With the elastic signal over the transmission of clean air :math:`y_0 \propto \beta e^{-2 \tau_p}`
+and the Raman signal over that of clean air :math:`y_R \propto e^{-\theta}`, both with the same
+overlap, total backscatter is
+
+.. math:: \beta = K \frac{y_0}{y_R} e^{-\theta + 2 \tau_p}, \qquad
+    \tau_p = \frac{\theta}{1 + \kappa},
+
+where :math:`K` makes it equal to the assumed one in the reference window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.raman.depth_fit import SignalNoise
+
+Array = npt.NDArray[np.float64]
+
+
+def inverse_mean(signal: Array, relative_variance: Array) -> Array:
+    r"""Return an estimate of the reciprocal of a mean signal, from a noisy signal.
+
+    Posterior mean where the signal is as certain as :math:`n = 1 / s^2` counts,
+    :math:`1 / (y (1 + s^2))`: for :math:`n` counts and a prior that grows with the mean, the mean
+    of :math:`1 / \mu` is :math:`1 / (n + 1)`. A quotient of means is too large by :math:`s^2`.
+
+    Parameters
+    ----------
+    signal : (...) float
+    relative_variance : (...) float
+        :math:`s^2`, by its noise.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(1.0 / (signal * (1.0 + relative_variance)))
+
+
+def ratio_of_counts(counts: Array, denominator: Array) -> tuple[Array, Array]:
+    r"""Return mean and standard deviation of the posterior of a ratio of means of Poisson counts.
+
+    With gamma posteriors :math:`\Gamma(N_1, 1)` and :math:`\Gamma(N_2 + 2, 1)`, the mean is
+    :math:`N_1 / (N_2 + 1)`, whose expectation is :math:`\mu_1/\mu_2 \, (1 - e^{-\mu_2})`. Sum the
+    counts of the denominator over bins until the exponential is negligible.
+
+    Parameters
+    ----------
+    counts, denominator : (...) float
+        Counts without background.
+    """
+    first, second = np.asarray(counts, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
+    mean = first / (second + 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.where(second > 0.0, first * (first + 1.0) / ((second + 1.0) * second), np.inf)
+    return mean, np.sqrt(square - mean**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Backscatter:
+    """Total backscatter at the laser wavelength, (cell,) unless stated."""
+
+    total: Array
+    """m-1 sr-1, of particles and molecules; NaN where there are no data."""
+    own: Array
+    """m-1 sr-1, standard error by noise of the elastic signal and of a Raman signal that is not
+    smoothed, of the cell itself."""
+    reference: float
+    """Relative standard error by noise of the elastic signal in the reference window."""
+    shares: Array
+    """Weight of each cell in the reference, 1 in total."""
+    sensitivity: Array
+    """Change of the logarithm of the ratio with the depth."""
+    scale: float
+    """K: total backscatter over the ratio."""
+
+    def respond(self, relative: Array, depth: Array) -> Array:
+        """Return the change of total backscatter, m-1 sr-1.
+
+        Parameters
+        ----------
+        relative : (cell, ...) float
+            Relative change of the ratio of the signals.
+        depth : (cell, ...) float
+            Change of the optical depth of the Raman signal.
+        """
+        extra = (1,) * (depth.ndim - 1)
+        change = relative + self.sensitivity.reshape(-1, *extra) * depth
+        known = self.shares > 0.0
+        calibration = np.tensordot(self.shares[known], change[known], axes=1)
+        return np.asarray(self.total.reshape(-1, *extra) * (change - calibration))
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """Elastic over Raman signal, corrected for attenuation, (cell,)."""
+
+    value: Array
+    """Proportional to total backscatter; NaN where there are no data."""
+    variance: Array
+    """By noise of the elastic signal, and of the Raman signal where that is not smoothed."""
+    sensitivity: Array
+    """Change of its logarithm with the depth."""
+    factor: Array
+    """By which the elastic signal was multiplied."""
+
+
+def smooth_ratio(
+    elastic: Array, variance: Array, depth: Array, depth_error: Array, ratio: float
+) -> Ratio:
+    """Return the ratio of an elastic signal to a smooth Raman signal.
+
+    Parameters
+    ----------
+    elastic, variance : (cell,) float
+        Elastic signal over the transmission of clean air, and its variance.
+    depth, depth_error : (cell,) float
+        Of the Raman signal, with its standard error by noise.
+    ratio : float
+        Particle extinction at the Raman wavelength over that at the laser's.
+    """
+    sensitivity = np.full(depth.size, 2.0 / (1.0 + ratio))
+    factor = inverse_mean(np.exp(-depth), depth_error**2) * np.exp((sensitivity - 1.0) * depth)
+    return Ratio(elastic * factor, variance * factor**2, sensitivity, factor)
+
+
+def cell_ratio(
+    elastic: Array,
+    variance: Array,
+    raman: Array,
+    raman_variance: Array,
+    depth: Array,
+    ratio: float,
+) -> Ratio:
+    """Return the ratio of an elastic to a Raman signal of the same cells.
+
+    Overlap that both have in common cancels, where the fit of the depth does not hold.
+
+    Parameters
+    ----------
+    elastic, variance, raman, raman_variance : (cell,) float
+        Signals over those of clean air, and their variances.
+    depth : (cell,) float
+        Of particles alone, continued into cells of partial overlap.
+    ratio : float
+        Particle extinction at the Raman wavelength over that at the laser's.
+    """
+    sensitivity = np.full(depth.size, 2.0 / (1.0 + ratio) - 1.0)
+    signal = np.where(raman > 0.0, raman, np.nan)
+    square = raman_variance / signal**2
+    factor = inverse_mean(signal, square) * np.exp(sensitivity * depth)
+    own = (variance + elastic**2 * square) * factor**2
+    return Ratio(elastic * factor, own, sensitivity, factor)
+
+
+def calibrated(
+    ratio: Ratio, noise: SignalNoise, reference: Array, window: npt.NDArray[np.bool_]
+) -> Backscatter | None:
+    """Return total backscatter from a ratio and the backscatter in the reference window.
+
+    Parameters
+    ----------
+    ratio : Ratio
+    noise : SignalNoise
+        Of the elastic signal: weights by the observed counts would prefer low ones.
+    reference : (cell,) float
+        m-1 sr-1, total backscatter that is assumed in the window.
+    window : (cell,) bool
+
+    Returns
+    -------
+    Backscatter or None
+        None where the window holds no signal.
+
+    References
+    ----------
+    `ansmann1992`.
+    """
+    used = window & np.isfinite(ratio.value) & np.isfinite(ratio.variance)
+    if not used.any():
+        return None
+    first = float(ratio.value[used].sum() / reference[used].sum())
+    if not first > 0.0:
+        return None
+    factor = np.where(used, ratio.factor, 1.0)
+    variance = noise.of(first * reference / factor) * factor**2
+    weight = np.where(used, reference, 0.0) / np.where(used, variance, 1.0)
+    level = float((weight[used] * ratio.value[used]).sum())
+    if not level > 0.0:
+        return None
+    expected = weight * reference
+    scale = float(expected.sum()) / level
+    # The noise of the window relative to its level, by the expected variances.
+    spread = float(np.sqrt((weight[used] ** 2 * variance[used]).sum())) / level
+    return Backscatter(
+        total=scale * ratio.value,
+        own=scale * np.sqrt(ratio.variance),
+        reference=spread,
+        shares=expected / expected.sum(),
+        sensitivity=ratio.sensitivity,
+        scale=scale,
+    )

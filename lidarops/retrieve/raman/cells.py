@@ -1,0 +1,71 @@
+"""Cells of several bins, which the Raman retrieval solves for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Equal numbers of neighbouring bins."""
+
+    first: int
+    """First bin of the first cell."""
+    bins: int
+    """Bins of a cell."""
+    range: Array
+    """m, middle of each cell."""
+    step: float
+    """m."""
+
+    def split(self, values: Array) -> Array:
+        """Return (..., bin) values as (..., cell, bin of the cell)."""
+        stop = self.first + self.bins * self.range.size
+        inside = values[..., self.first : stop]
+        return inside.reshape(*inside.shape[:-1], self.range.size, self.bins)
+
+    def mean(self, values: Array) -> Array:
+        """Return the mean of each cell over its bins that are finite, NaN where there is none."""
+        parts = self.split(values)
+        known = np.isfinite(parts)
+        count = known.sum(axis=-1)
+        total = np.where(known, parts, 0.0).sum(axis=-1)
+        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+    def known(self, values: Array) -> Array:
+        """Return the number of finite bins of each cell."""
+        return np.asarray(np.isfinite(self.split(values)).sum(axis=-1).astype(np.float64))
+
+
+def make_cells(range: Array, highest: float, length: float) -> Cells:  # noqa: A002
+    """Return the cells of about `length` m from the first bin with a positive range to `highest` m.
+
+    Parameters
+    ----------
+    range : (bin,) float
+        m, ascending and uniform.
+    highest, length : float
+        m.
+
+    Raises
+    ------
+    RetrievalInputError
+        If the range holds fewer than 2 cells.
+    """
+    width = float(np.median(np.diff(range)))
+    bins = max(1, round(length / width))
+    first = int(np.searchsorted(range, 0.0, side="right"))
+    count = (int(np.searchsorted(range, highest, side="right")) - first) // bins
+    if count < 2:
+        raise RetrievalInputError(
+            f"holds fewer than 2 cells of {bins * width:g} m below {highest:g} m", field="range"
+        )
+    inside = range[first : first + count * bins].reshape(count, bins)
+    return Cells(first, bins, inside.mean(axis=1), bins * width)

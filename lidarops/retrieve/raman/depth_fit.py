@@ -1,0 +1,214 @@
+r"""Fit the attenuation of a Raman signal: smooth, with the noise of counts.
+
+A Raman signal over that of clean air is :math:`y = e^{-\theta}`, where :math:`\theta` is the
+optical depth of particles at both wavelengths. With cells of length :math:`h` and variances
+:math:`v`, the fit is the minimum of
+
+.. math:: \sum_i \frac{(y_i - e^{-\theta_i})^2}{v_i(\theta)}
+    + \lambda \sum_i (\theta_{i-1} - 2 \theta_i + \theta_{i+1})^2 ,
+
+found by Fisher scoring: counts enter as they are, without a logarithm, so that few counts leave no
+bias. Where signal is strong the data decide, where it is weak the smoothness does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
+
+Array = npt.NDArray[np.float64]
+
+_LEAST_WEIGHT: Final = 1e-2
+"""Weight of smoothness over the mean information of a cell: a length of 0.3 cells."""
+_PER_DECADE: Final = 3
+_START: Final = 1e6
+"""The same for the first fit: a length of about 30 cells."""
+_ITERATIONS: Final = 50
+_CONVERGED: Final = 1e-9
+_LONGEST_STEP: Final = 2.0
+"""Largest change of the logarithm of the signal in one iteration."""
+_CHOICES: Final = 2
+"""Times that the weight is chosen, each with the information of the fit before."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignalNoise:
+    """Variance of a signal as a function of its mean: counts, or a given variance."""
+
+    per_signal: Array
+    """(cell,): variance per unit of the signal; 0 where it does not depend on the signal."""
+    fixed: Array
+    """(cell,): variance without signal; infinite where there are no data."""
+
+    def of(self, signal: Array) -> Array:
+        """Return the variance of a signal."""
+        return np.asarray(self.per_signal * signal + self.fixed)
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFit:
+    """Smooth optical depth of particles along a Raman signal, up to a constant."""
+
+    depth: Array
+    """(cell,): at both wavelengths together."""
+    information: Array
+    """(cell,): reciprocal variance of the logarithm of the signal of a cell."""
+    inverse: Array
+    """(cell, cell): covariance of the depth as the smoothness that is used permits."""
+    weight: float
+    """The weight of smoothness."""
+
+    @property
+    def noise(self) -> Array:
+        """Response of the depth to independent unit noise, (cell, noise of a cell)."""
+        return np.asarray(self.inverse * np.sqrt(self.information))
+
+    @property
+    def standard_error(self) -> Array:
+        """Standard error of the depth by noise, (cell,)."""
+        return np.asarray(np.sqrt((self.noise**2).sum(axis=1)))
+
+    def respond(self, relative: Array) -> Array:
+        """Return the change of the depth when the signal changes by a share of it, (cell,)."""
+        return np.asarray(-self.inverse @ (self.information * relative))
+
+
+def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
+    """Fit the optical depth of particles to a Raman signal over that of clean air.
+
+    Parameters
+    ----------
+    signal : (cell,) float
+        Any value where `noise` is infinite.
+    noise : SignalNoise
+
+    Returns
+    -------
+    DepthFit or None
+        None where fewer than 8 cells have data, or the data hold no signal.
+
+    References
+    ----------
+    `patterson1971` (restricted likelihood, by which the smoothness is chosen).
+    """
+    known = np.isfinite(signal) & np.isfinite(noise.fixed)
+    if known.sum() < THRESHOLDS.fewest_cells:
+        return None
+    values = np.where(known, signal, 0.0)
+    level = _level(values, noise, known)
+    if not level > 0.0:
+        return None
+    depth = np.full(signal.size, -np.log(level))
+    weight = _START
+    for _ in range(_CHOICES):
+        smooth = _scored(values, noise, depth, weight)
+        if smooth is None:
+            return None
+        depth, weight = smooth, _likely_weight(*_working(values, noise, smooth))
+    used = _scored(values, noise, depth, weight)
+    if used is None:
+        return None
+    information = _working(values, noise, used)[0]
+    absolute = weight * float(information.mean())
+    inverse = _solved(information, absolute, np.eye(signal.size))
+    return DepthFit(used, information, inverse, absolute)
+
+
+def _level(signal: Array, noise: SignalNoise, known: npt.NDArray[np.bool_]) -> float:
+    """Return the mean signal, weighted by the information of a signal of a first mean."""
+    variance = np.where(known, np.where(known, noise.fixed, 1.0) + noise.per_signal, 1.0)
+    weight = np.where(known, 1.0 / variance, 0.0)
+    first = float((weight * signal).sum() / weight.sum())
+    if not first > 0.0:
+        return first
+    weight = np.where(known, 1.0 / np.where(known, noise.of(np.full(signal.size, first)), 1.0), 0.0)
+    return float((weight * signal).sum() / weight.sum())
+
+
+def _working(signal: Array, noise: SignalNoise, depth: Array) -> tuple[Array, Array]:
+    """Return information and response of the linearised problem at a depth."""
+    mean = np.exp(-depth)
+    information = mean**2 / noise.of(mean)
+    return information, depth - (signal - mean) / mean
+
+
+def _scored(signal: Array, noise: SignalNoise, depth: Array, weight: float) -> Array | None:
+    """Return the depth of the least sum for a relative weight; None without convergence."""
+    for _ in range(_ITERATIONS):
+        information, response = _working(signal, noise, depth)
+        absolute = weight * float(information.mean())
+        step = _solved(information, absolute, information * response) - depth
+        longest = float(np.abs(step).max())
+        if not np.isfinite(longest):
+            return None
+        depth = depth + step * min(1.0, _LONGEST_STEP / max(longest, _CONVERGED))
+        if longest < _CONVERGED:
+            return depth
+    return None
+
+
+def _solved(information: Array, weight: float, right: Array) -> Array:
+    """Return the solution of the linear problem, refined once.
+
+    Information and smoothness differ by up to 14 orders of magnitude; the refinement restores the
+    digits that the factor loses.
+    """
+    factor = (_factor(information, weight), False)
+    solved = cho_solve_banded(factor, right, check_finite=False)
+    bend = np.diff(solved, 2, axis=0)
+    left = (information * solved.T).T
+    left[2:] += weight * bend
+    left[1:-1] -= 2.0 * weight * bend
+    left[:-2] += weight * bend
+    return np.asarray(solved + cho_solve_banded(factor, right - left, check_finite=False))
+
+
+def _factor(information: Array, weight: float) -> Array:
+    """Return the banded Cholesky factor of information and smoothness."""
+    bands = weight * _penalty(information.size)
+    bands[2] += information
+    return np.asarray(cholesky_banded(bands, overwrite_ab=True, check_finite=False))
+
+
+def _penalty(cells: int) -> Array:
+    """Return the sum of squared second differences as the upper bands of a quadratic form."""
+    bands = np.zeros((3, cells))
+    bands[2] = 6.0
+    bands[2, [0, -1]], bands[2, [1, -2]] = 1.0, 5.0
+    bands[1, 1:] = -4.0
+    bands[1, [1, -1]] = -2.0
+    bands[0, 2:] = 1.0
+    return bands
+
+
+def _likely_weight(information: Array, response: Array) -> float:
+    """Return the relative weight of smoothness by restricted likelihood, at the rough end.
+
+    With few counts, straight lines are as likely as structure; the most likely weight then often
+    leaves no structure, with errors that are too small.
+    """
+    mean = float(information.mean())
+    right = information * response
+    weights = _weights(information.size)
+    scores = np.empty(weights.size)
+    for number, weight in enumerate(weights):
+        factor = _factor(information, weight * mean)
+        solved = cho_solve_banded((factor, False), right, check_finite=False)
+        logarithm = 2.0 * np.log(factor[2]).sum()
+        misfit = float(right @ (response - solved))
+        scores[number] = misfit + logarithm - (information.size - 2) * np.log(weight)
+    share = np.exp(-0.5 * (scores - np.nanmin(scores)))
+    below = np.cumsum(np.nan_to_num(share)) / np.nansum(share)
+    return float(np.exp(np.interp(THRESHOLDS.rougher_share, below, np.log(weights))))
+
+
+def _weights(cells: int) -> Array:
+    """Return the weights of smoothness that are compared, up to one that leaves a straight line."""
+    decades = np.log10(10.0 * (cells / np.pi) ** 4 / _LEAST_WEIGHT)
+    return np.asarray(_LEAST_WEIGHT * 10.0 ** np.arange(0.0, decades, 1.0 / _PER_DECADE))

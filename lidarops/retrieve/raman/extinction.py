@@ -1,0 +1,154 @@
+"""Extinction of particles from the slope of the optical depth of a Raman signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.raman.depth_fit import DepthFit
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Extinction:
+    """Particle extinction at the laser wavelength, (cell,) unless stated."""
+
+    value: Array
+    """m-1."""
+    kernel: Array
+    """(cell, cell): weights of the true extinction of each cell in the value, 1 in total."""
+    vertical_resolution: Array
+    """m along the beam: length over which a mean has the sum of squared weights of the kernel."""
+    noise: Array
+    """(cell, noise of a cell): response in m-1 to independent unit noise."""
+    resolution_error: Array
+    """m-1: of the value as the mean over `vertical_resolution`."""
+    smoothing_error: Array
+    """m-1: of the value as the extinction of the cell itself."""
+
+    @property
+    def noise_error(self) -> Array:
+        """Standard error by noise, m-1."""
+        return np.asarray(np.sqrt((self.noise**2).sum(axis=1)))
+
+
+def slope(depth: Array, step: float) -> Array:
+    """Return the derivative along the first axis: central differences, one-sided at the ends."""
+    return np.asarray(np.gradient(depth, step, axis=0))
+
+
+def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
+    r"""Return the extinction of a fit, with resolution and errors.
+
+    .. math:: \alpha = \frac{1}{1 + \kappa} \frac{\mathrm{d}\theta}{\mathrm{d}R}
+
+    The smoothness is also a model of extinction: a random walk, from which the errors by
+    resolution follow.
+
+    Parameters
+    ----------
+    fit : DepthFit
+    step : float
+        m, length of a cell.
+    ratio : float
+        :math:`\kappa`, particle extinction at the Raman wavelength over that at the laser's.
+
+    References
+    ----------
+    `ansmann1990`; `iarlori2015` (resolution).
+    """
+    both = 1.0 + ratio
+    response = slope(fit.inverse, step)
+    weights = response * fit.information
+    beyond = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
+    kernel = step * (beyond - 0.5 * weights)
+    resolution = step / (kernel**2).sum(axis=1)
+    walk = np.sqrt(1.0 / fit.weight) / (step * both)
+    away = kernel - mean_weights(resolution, step)
+    return Extinction(
+        value=slope(fit.depth, step) / both,
+        kernel=kernel,
+        vertical_resolution=resolution,
+        noise=response * np.sqrt(fit.information) / both,
+        resolution_error=walk * _summed(away),
+        smoothing_error=walk * _summed(kernel - np.eye(kernel.shape[0])),
+    )
+
+
+def _summed(weights: Array) -> Array:
+    """Return the response of weighted sums to a random walk with unit steps."""
+    beyond = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
+    return np.asarray(np.sqrt((beyond[:, 1:] ** 2).sum(axis=1)))
+
+
+def mean_weights(length: Array, step: float) -> Array:
+    """Return the weights of cells in means over a length around each cell, within the profile.
+
+    Parameters
+    ----------
+    length : (cell,) float
+        m.
+    step : float
+        m, length of a cell.
+
+    Returns
+    -------
+    (cell, cell) float64
+        Rows have the sum 1.
+    """
+    edges = np.arange(length.size + 1) * step
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    low, high = middle - 0.5 * length, middle + 0.5 * length
+    inside = np.minimum(high[:, np.newaxis], edges[1:]) - np.maximum(low[:, np.newaxis], edges[:-1])
+    inside = np.maximum(inside, 0.0)
+    return np.asarray(inside / inside.sum(axis=1, keepdims=True))
+
+
+def sliding_line(
+    signal: Array, variance: Array, step: float, ratio: float, cells: int
+) -> tuple[Array, Array]:
+    r"""Return extinction and standard error by lines through the logarithm, for comparison.
+
+    The classical method (`ansmann1990`, `pappalardo2004`): a weighted line through
+    :math:`-\ln y` of `cells` neighbouring cells, whose slope is :math:`(1 + \kappa) \alpha`.
+
+    Parameters
+    ----------
+    signal, variance : (cell,) float
+        Raman signal over that of clean air.
+    step : float
+        m, length of a cell.
+    ratio : float
+        :math:`\kappa`.
+    cells : int
+        Odd number of cells, 3 or more.
+
+    Returns
+    -------
+    (cell,) float64, (cell,) float64
+        m-1, NaN within half a window of the ends and where a signal of the window is not positive.
+
+    Raises
+    ------
+    RetrievalInputError
+        For an even number of cells, or fewer than 3.
+    """
+    if cells < 3 or cells % 2 == 0:
+        raise RetrievalInputError(f"is {cells}", field="cells", remedy="give an odd number from 3")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(signal > 0.0, -np.log(signal), np.nan)
+        weight = signal**2 / variance
+    z = step * (np.arange(cells) - cells // 2)
+    value, error = np.full((2, signal.size), np.nan)
+    for middle in range(cells // 2, signal.size - cells // 2):
+        window = slice(middle - cells // 2, middle + cells // 2 + 1)
+        w, y = weight[window], depth[window]
+        away = z - (w * z).sum() / w.sum()
+        spread = (w * away**2).sum()
+        value[middle] = (w * away * y).sum() / spread
+        error[middle] = np.sqrt(1.0 / spread)
+    return value / (1.0 + ratio), error / (1.0 + ratio)

@@ -1,0 +1,23 @@
+"""Quality bits of Raman retrievals, beside those of `lidarops.flags.Quality`."""
+
+from __future__ import annotations
+
+from lidarops.flags import FIRST_OWN, FlagBit, Severity
+
+
+class RamanQuality(FlagBit):
+    """Own bits. A place is never given to another bit."""
+
+    NO_REFERENCE = (
+        FIRST_OWN,
+        Severity.CARE,
+        (
+            "no range window passes the tests for aerosol-free air, so that backscatter and lidar"
+            " ratio are missing; extinction needs none"
+        ),
+    )
+    WEAK_SIGNAL = (
+        FIRST_OWN + 1,
+        Severity.REJECT,
+        "the smoothed Raman signal is less than 5 times its standard error",
+    )

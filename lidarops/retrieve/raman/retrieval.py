@@ -1,0 +1,611 @@
+"""Extinction, backscatter and lidar ratio of profiles, with an error budget."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.flags import Quality
+from lidarops.retrieve.air import reference_window
+from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
+from lidarops.retrieve.raman import backscatter as _backscatter
+from lidarops.retrieve.raman.backscatter import Backscatter
+from lidarops.retrieve.raman.cells import Cells
+from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth
+from lidarops.retrieve.raman.extinction import Extinction, extinction_of, slope
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.scattering import particle_ratio
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+
+EXTINCTION_CAUSES: Final = (
+    "noise", "resolution", "background", "dead_time", "angstrom", "molecular", "overlap",
+)  # fmt: skip
+BACKSCATTER_CAUSES: Final = (
+    "noise", "background", "dead_time", "reference", "angstrom", "molecular", "overlap",
+)  # fmt: skip
+RANDOM: Final = frozenset({"noise", "resolution", "background"})
+"""Causes whose errors change from profile to profile; those of all others are systematic."""
+_MOST_UNKNOWN: Final = 0.05
+"""Weight of cells without backscatter in the lidar ratio of a cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSignal:
+    """Signals of a channel, without background, not corrected for overlap or range."""
+
+    power: Array
+    """(profile, bin), any unit; NaN where missing."""
+    variance: Array
+    """(profile, bin): of a bin, times the correlation length of noise."""
+    background: Array
+    """(profile,)"""
+    background_standard_error: Array
+    """(profile,)"""
+    dead_time_error: Array
+    """(profile or 1, bin): change with one standard error of the dead time."""
+    counts_per_power: Array | None = None
+    """(profile,): for photon counting, whose variance then follows from the fitted counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class AirColumn:
+    """Clean air along the beam, (bin,)."""
+
+    range: Array
+    """m."""
+    backscatter: Array
+    """m-1 sr-1, at the laser wavelength."""
+    depth: Array
+    """Molecular optical depth from the lidar, at the laser wavelength."""
+    raman_depth: Array
+    """The same at the Raman wavelength."""
+    density: Array
+    """Number density of the Raman scatterers times the share of their lines that is measured; any
+    unit."""
+    overlap: Array
+    """Common to both signals; NaN where it is not known."""
+
+    @property
+    def elastic_shape(self) -> Array:
+        """Elastic signal of air for a backscatter of 1."""
+        return np.asarray(self._seen * np.exp(-2.0 * self.depth) / self.range**2)
+
+    @property
+    def raman_shape(self) -> Array:
+        """Raman signal of clean air."""
+        density = self.density / self.density.max()
+        both = np.exp(-self.depth - self.raman_depth)
+        return np.asarray(self._seen * density * both / self.range**2)
+
+    @property
+    def _seen(self) -> Array:
+        """Overlap, 1 where it is not known."""
+        return np.where(np.isnan(self.overlap), 1.0, self.overlap)
+
+
+@dataclass(frozen=True, slots=True)
+class RamanSettings:
+    """What is assumed, with standard errors."""
+
+    wavelength: float
+    """m, of the laser."""
+    raman_wavelength: float
+    """m."""
+    angstrom_exponent: float
+    """Of particle extinction between both wavelengths."""
+    angstrom_standard_error: float
+    lowest: float
+    """m, least range of the reference window."""
+    highest: float
+    """m, largest range of the reference window."""
+    width: float
+    """m, of the reference window."""
+    scattering_ratio: float
+    """Total over molecular backscatter in the reference window."""
+    reference_relative_error: float
+    molecular_relative_error: float
+    """Of the density of air."""
+    overlap_relative_error: float = 0.0
+    """Of one minus the overlap."""
+
+    @property
+    def ratio(self) -> float:
+        """Particle extinction at the Raman wavelength over that at the laser's."""
+        return particle_ratio(self.angstrom_exponent, self.wavelength, self.raman_wavelength)
+
+    @property
+    def ratio_error(self) -> float:
+        """Standard error of `ratio`."""
+        colour = abs(float(np.log(self.wavelength / self.raman_wavelength)))
+        return self.ratio * colour * self.angstrom_standard_error
+
+
+@dataclass(frozen=True, slots=True)
+class RamanResult:
+    """Profiles of particles, (profile, cell) unless stated; NaN where there is no value."""
+
+    extinction: Array
+    """m-1, mean over `vertical_resolution`."""
+    extinction_budget: dict[str, Array]
+    """Absolute error from each of `EXTINCTION_CAUSES`, m-1."""
+    extinction_smoothing_error: Array
+    """m-1: of extinction as that of the cell itself; not part of the budget."""
+    vertical_resolution: Array
+    """m along the beam, of extinction and lidar ratio."""
+    backscatter: Array
+    """m-1 sr-1, of the cell."""
+    backscatter_budget: dict[str, Array]
+    """Absolute error from each of `BACKSCATTER_CAUSES`, m-1 sr-1."""
+    lidar_ratio: Array
+    """sr: extinction over backscatter, which is smoothed as extinction is."""
+    lidar_ratio_random: Array
+    """sr, standard error by random causes, with the covariance of both."""
+    lidar_ratio_systematic: Array
+    """sr, standard error by all others."""
+    raman_depth: Array
+    """Fitted optical depth of particles at both wavelengths, up to a constant."""
+    raman_depth_error: Array
+    """Its standard error by noise."""
+    reference_bottom: Array
+    """(profile,): m; NaN without reference."""
+    reference_top: Array
+    """(profile,): m."""
+    reference_rejections: Flags
+    """(profile,): bits of `Rejection` of all candidates together."""
+    quality: Flags
+
+    @property
+    def extinction_standard_error(self) -> Array:
+        """Root of the sum of squares of the budget, m-1."""
+        return total_error(self.extinction_budget)
+
+    @property
+    def backscatter_standard_error(self) -> Array:
+        """Root of the sum of squares of the budget, m-1 sr-1."""
+        return total_error(self.backscatter_budget)
+
+    @property
+    def lidar_ratio_standard_error(self) -> Array:
+        """Random and systematic errors together, sr."""
+        return np.hypot(self.lidar_ratio_random, self.lidar_ratio_systematic)
+
+
+def total_error(budget: dict[str, Array]) -> Array:
+    """Return the root of the sum of squares of the errors of all causes."""
+    return np.asarray(np.sqrt(sum(error**2 for error in budget.values())))
+
+
+@dataclass(frozen=True, slots=True)
+class CellSignal:
+    """A signal over that of clean air in cells, of one profile."""
+
+    value: Array
+    """(cell,): NaN where there are no data."""
+    variance: Array
+    noise: SignalNoise
+    background: Array
+    """(cell,): change of the value with one standard error of the background."""
+    dead_time: Array
+    """(cell,): change of the value with one standard error of the dead time."""
+
+    def relative(self, change: Array, level: Array) -> Array:
+        """Return a change relative to a level, 0 where there are no data."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.nan_to_num(change / level, posinf=0.0, neginf=0.0)
+
+
+def cell_signal(signal: ChannelSignal, profile: int, shape: Array, cells: Cells) -> CellSignal:
+    """Return a signal over that of clean air in cells, with its noise as a function of its mean."""
+    power, stated = signal.power[profile], signal.variance[profile]
+    known = np.isfinite(power) & np.isfinite(stated)
+    power = np.where(known, power, np.nan)
+    bins = np.maximum(cells.known(power), 1.0)
+    variance = cells.mean(np.where(known, stated / shape**2, np.nan)) / bins
+    inverse = np.where(known, 1.0 / shape, np.nan)
+    value = cells.mean(power / shape)
+    change = signal.dead_time_error[min(profile, len(signal.dead_time_error) - 1)]
+    if signal.counts_per_power is None:
+        noise = SignalNoise(np.zeros(value.size), np.where(np.isnan(variance), np.inf, variance))
+    else:
+        counts = signal.counts_per_power[profile]
+        per_signal = cells.mean(inverse) / (bins * counts)
+        sky = max(float(signal.background[profile]), 0.0)
+        fixed = sky * cells.mean(inverse**2) / (bins * counts)
+        missing = np.isnan(value)
+        many = np.nan_to_num(value / per_signal) > THRESHOLDS.many_counts
+        expected = np.where(many, per_signal * value + fixed, 1.0)
+        excess = np.where(many, np.maximum(variance / expected, 1.0), 1.0)
+        noise = SignalNoise(
+            np.where(missing, 0.0, per_signal * excess), np.where(missing, np.inf, fixed * excess)
+        )
+    error = float(np.nan_to_num(signal.background_standard_error[profile]))
+    return CellSignal(
+        value, variance, noise, cells.mean(inverse) * error, cells.mean(change * inverse)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Cause:
+    """Effect of one standard error of one cause on one profile, with signs, (cell,)."""
+
+    name: str
+    extinction: Array
+    """m-1."""
+    backscatter: Array
+    """m-1 sr-1."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Profile:
+    """One profile before its calibration."""
+
+    raman: CellSignal
+    elastic: CellSignal
+    fit: DepthFit
+    extinction: Extinction
+
+
+def retrieve_raman(
+    raman: ChannelSignal,
+    elastic: ChannelSignal,
+    air: AirColumn,
+    cells: Cells,
+    settings: RamanSettings,
+    *,
+    quality: Flags,
+) -> RamanResult:
+    r"""Return extinction, backscatter and lidar ratio of particles without an assumed lidar ratio.
+
+    Parameters
+    ----------
+    raman, elastic : ChannelSignal
+        Of nitrogen, and at the laser wavelength, of the same bins.
+    air : AirColumn
+    cells : Cells
+    settings : RamanSettings
+    quality : (profile, cell) int32
+        Bits of `Quality`. Cells with INCOMPLETE_OVERLAP take no part in the fit of the Raman
+        signal; there, backscatter follows from the ratio of the signals of the cell.
+
+    Returns
+    -------
+    RamanResult
+        Profiles without Raman signal are NaN, with WEAK_SIGNAL.
+
+    References
+    ----------
+    `ansmann1990`, `ansmann1992`, `pappalardo2004`, `russo2006`.
+    """
+    partial = (quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
+    rows = [
+        _profile(raman, elastic, air, cells, settings, number, partial[number])
+        for number in range(len(raman.power))
+    ]
+    window = _reference(elastic, air, cells, settings, rows)
+    edges = np.stack(window.edges, axis=-1)
+    solved = [
+        _Solution.of(row, air, cells, settings, partial[number], edges[number], number)
+        for number, row in enumerate(rows)
+        if row is not None
+    ]
+    rejections = np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32)
+    return _joined(solved, quality, window, rejections, cells.range)
+
+
+def _profile(
+    raman: ChannelSignal,
+    elastic: ChannelSignal,
+    air: AirColumn,
+    cells: Cells,
+    settings: RamanSettings,
+    number: int,
+    partial: Mask,
+) -> _Profile | None:
+    """Return the fitted profile; None where there is no Raman signal."""
+    of_raman = cell_signal(raman, number, air.raman_shape, cells)
+    noise = SignalNoise(of_raman.noise.per_signal, np.where(partial, np.inf, of_raman.noise.fixed))
+    fit = fit_depth(of_raman.value, noise)
+    if fit is None:
+        return None
+    return _Profile(
+        of_raman,
+        cell_signal(elastic, number, air.elastic_shape, cells),
+        fit,
+        extinction_of(fit, cells.step, settings.ratio),
+    )
+
+
+def _reference(
+    elastic: ChannelSignal,
+    air: AirColumn,
+    cells: Cells,
+    settings: RamanSettings,
+    rows: Sequence[_Profile | None],
+) -> reference_window.ReferenceWindow:
+    """Return the reference windows: clean air, corrected for the measured attenuation."""
+    # Of cells: the tests take noise as normal, which it is not in bins of few counts.
+    shape = np.tile(cells.mean(air.backscatter * air.elastic_shape), (len(rows), 1))
+    power, bins = cells.mean(elastic.power), np.maximum(cells.known(elastic.power), 1.0)
+    variance = cells.mean(elastic.variance) / bins
+    for number, row in enumerate(rows):
+        if row is None:
+            power[number] = np.nan
+            continue
+        depth = row.fit.depth - row.fit.depth.min()
+        shape[number] *= np.exp(-2.0 / (1.0 + settings.ratio) * depth)
+        power[number, row.fit.standard_error > THRESHOLDS.most_uncertain] = np.nan
+    highest = min(settings.highest, float(cells.range[-1]))
+    width = min(settings.width, highest - settings.lowest)
+    candidates = reference_window.candidate_windows(
+        settings.lowest, highest, width, settings.width / WINDOW_THRESHOLDS.steps_per_window
+    )
+    return reference_window.choose_reference(
+        power,
+        cells.range,
+        variance,
+        molecular_attenuated=shape,
+        candidates=candidates,
+        background_standard_error=np.nan_to_num(elastic.background_standard_error),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """Values and errors of one profile, (cell,)."""
+
+    number: int
+    profile: _Profile
+    extinction_budget: dict[str, Array]
+    backscatter: Array
+    backscatter_budget: dict[str, Array]
+    lidar_ratio: tuple[Array, Array, Array]
+    """Value, random and systematic standard error, sr."""
+
+    @classmethod
+    def of(
+        cls,
+        profile: _Profile,
+        air: AirColumn,
+        cells: Cells,
+        settings: RamanSettings,
+        partial: Mask,
+        window: Array,
+        number: int,
+    ) -> _Solution:
+        """Calibrate a profile and state its errors."""
+        molecular = cells.mean(air.backscatter)
+        bottom, top = window
+        inside = (cells.range >= bottom) & (cells.range <= top)
+        ratio = _ratio(profile, partial, settings.ratio)
+        assumed = settings.scattering_ratio * molecular
+        calibrated = _backscatter.calibrated(ratio, profile.elastic.noise, assumed, inside)
+        effects = _Effects(profile, calibrated, air, cells, settings, partial)
+        causes = list(effects.causes(molecular))
+        extinction = profile.extinction
+        budget = _summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
+        budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
+        empty = np.full(molecular.size, np.nan)
+        if calibrated is None:
+            absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)
+            return cls(number, profile, budget, empty, absent, (empty, empty, empty))
+        noise = calibrated.respond(np.zeros((molecular.size, 1)), profile.fit.noise)
+        of_backscatter = _summed(BACKSCATTER_CAUSES, [(c.name, c.backscatter) for c in causes])
+        of_backscatter["noise"] = np.sqrt(
+            calibrated.own**2
+            + (noise**2).sum(axis=1)
+            + (calibrated.total * calibrated.reference) ** 2
+        )
+        value = calibrated.total - molecular
+        ratios = _lidar_ratio(profile.extinction, calibrated, value, noise, causes)
+        return cls(number, profile, budget, value, of_backscatter, ratios)
+
+
+def _ratio(profile: _Profile, partial: Mask, ratio: float) -> _backscatter.Ratio:
+    """Return the ratio of the signals: to the smooth Raman signal, but in partial overlap."""
+    fit, elastic, raman = profile.fit, profile.elastic, profile.raman
+    smooth = _backscatter.smooth_ratio(
+        elastic.value, elastic.variance, fit.depth, fit.standard_error, ratio
+    )
+    near = _backscatter.cell_ratio(
+        elastic.value, elastic.variance, raman.value, raman.variance, fit.depth, ratio
+    )
+    return _backscatter.Ratio(
+        np.where(partial, near.value, smooth.value),
+        np.where(partial, near.variance, smooth.variance),
+        np.where(partial, near.sensitivity, smooth.sensitivity),
+        np.where(partial, near.factor, smooth.factor),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Effects:
+    """Effects of the causes of error on one profile."""
+
+    profile: _Profile
+    calibrated: Backscatter | None
+    air: AirColumn
+    cells: Cells
+    settings: RamanSettings
+    partial: Mask
+
+    def causes(self, molecular: Array) -> Iterator[_Cause]:
+        """Yield the effect of one standard error of each cause but noise."""
+        raman, elastic = self.profile.raman, self.profile.elastic
+        level = np.exp(-self.profile.fit.depth)
+        none = np.zeros(molecular.size)
+        for name in ("background", "dead_time"):
+            of_raman = raman.relative(-getattr(raman, name), level)
+            of_elastic = elastic.relative(-getattr(elastic, name), elastic.value)
+            yield self._signals(name, of_raman, none)
+            yield self._signals(name, none, of_elastic)
+        error = self.settings.reference_relative_error
+        yield _Cause("reference", none, error * self._total(molecular))
+        yield self._angstrom(none)
+        yield self._molecular(molecular)
+        seen = self.cells.mean(np.where(np.isnan(self.air.overlap), 1.0, self.air.overlap))
+        of_overlap = self.settings.overlap_relative_error * (1.0 - seen)
+        yield self._signals("overlap", of_overlap, of_overlap)
+
+    def _signals(self, name: str, raman: Array, elastic: Array) -> _Cause:
+        """Return the effect of relative changes of the signals."""
+        depth = self.profile.fit.respond(np.where(self.partial, 0.0, raman))
+        relative = elastic - np.where(self.partial, raman, 0.0)
+        alpha = slope(depth, self.cells.step) / (1.0 + self.settings.ratio)
+        return _Cause(name, alpha, self._respond(relative, depth))
+
+    def _angstrom(self, none: Array) -> _Cause:
+        change = self.settings.ratio_error / (1.0 + self.settings.ratio)
+        relative = -2.0 * self.profile.fit.depth * change / (1.0 + self.settings.ratio)
+        return _Cause(
+            "angstrom",
+            -change * self.profile.extinction.value,
+            self._respond(relative, none),
+        )
+
+    def _molecular(self, molecular: Array) -> _Cause:
+        error = self.settings.molecular_relative_error
+        depth = self.cells.mean(self.air.depth)
+        raman = error * (depth + self.cells.mean(self.air.raman_depth))
+        effect = self._signals("molecular", raman, 2.0 * error * depth)
+        shifted = effect.backscatter + error * (self._total(molecular) - molecular)
+        return _Cause("molecular", effect.extinction, shifted)
+
+    def _total(self, molecular: Array) -> Array:
+        """Return total backscatter; NaN without calibration."""
+        if self.calibrated is None:
+            return np.full(molecular.size, np.nan)
+        return self.calibrated.total
+
+    def _respond(self, relative: Array, depth: Array) -> Array:
+        if self.calibrated is None:
+            return np.full(depth.size, np.nan)
+        return self.calibrated.respond(relative, depth)
+
+
+def _summed(names: Sequence[str], causes: Sequence[tuple[str, Array]]) -> dict[str, Array]:
+    """Return the absolute error from each cause, those of both signals together."""
+    budget: dict[str, Array] = {}
+    for name in names:
+        parts = [error for known, error in causes if known == name]
+        budget[name] = np.sqrt(sum((part**2 for part in parts), np.zeros(1)))
+    return budget
+
+
+def _lidar_ratio(
+    extinction: Extinction,
+    calibrated: Backscatter,
+    value: Array,
+    noise: Array,
+    causes: Sequence[_Cause],
+) -> tuple[Array, Array, Array]:
+    """Return the lidar ratio with random and systematic error, from equally smoothed values."""
+    kernel = extinction.kernel
+    known = np.isfinite(value)
+    complete = np.abs(kernel[:, ~known]).sum(axis=1) < _MOST_UNKNOWN
+    kernel = np.where(known, kernel, 0.0)
+
+    def smoothed(values: Array) -> Array:
+        mask = known.reshape(-1, *(1,) * (values.ndim - 1))
+        return np.asarray(kernel @ np.where(mask, values, 0.0))
+
+    smooth = smoothed(value)
+    of_smooth = smoothed(noise)
+    own = kernel**2 @ np.where(known, calibrated.own, 0.0) ** 2
+    level = calibrated.reference * smoothed(calibrated.total)
+    error = np.sqrt((of_smooth**2).sum(axis=1) + own + level**2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = extinction.value / smooth
+
+        def change(of_extinction: Array, of_backscatter: Array) -> Array:
+            scale, slanted = (
+                array.reshape(-1, *(1,) * (of_extinction.ndim - 1)) for array in (smooth, ratio)
+            )
+            return np.asarray((of_extinction - slanted * of_backscatter) / scale)
+
+        raman = change(extinction.noise, of_smooth)
+        random = (raman**2).sum(axis=1) + (own + level**2) * (ratio / smooth) ** 2
+        systematic = np.zeros(value.size)
+        for cause in causes:
+            square = change(cause.extinction, smoothed(cause.backscatter)) ** 2
+            if cause.name in RANDOM:
+                random += square
+            else:
+                systematic += square
+        # A denominator that is too high by noise makes the value and its error too low.
+        skewed = 1.0 / (1.0 - error / smooth)
+    certain = complete & (smooth > THRESHOLDS.least_ratio_certainty * error)
+    return (
+        np.where(certain, ratio, np.nan),
+        np.where(certain, skewed * np.sqrt(random), np.nan),
+        np.where(certain, np.sqrt(systematic), np.nan),
+    )
+
+
+def _joined(
+    solved: Sequence[_Solution],
+    quality: Flags,
+    window: reference_window.ReferenceWindow,
+    rejections: Flags,
+    distance: Array,
+) -> RamanResult:
+    """Return the profiles together, NaN where a bit rejects them."""
+    shape = (quality.shape[0], distance.size)
+    weak = np.ones(shape, dtype=np.bool_)
+    arrays: dict[str, Array] = {}
+
+    def put(name: str, number: int, row: Array) -> None:
+        arrays.setdefault(name, np.full(shape, np.nan))[number] = row
+
+    for one in solved:
+        fit, extinction = one.profile.fit, one.profile.extinction
+        weak[one.number] = fit.standard_error > THRESHOLDS.most_uncertain
+        for name, row in _values(one, fit, extinction):
+            put(name, one.number, row)
+    flags = quality | np.where(weak, np.int32(RamanQuality.WEAK_SIGNAL), np.int32(0))
+    flags[~window.chosen] |= np.int32(RamanQuality.NO_REFERENCE)
+    partial = (quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
+
+    def values(name: str, hidden: Mask = weak) -> Array:
+        return np.where(hidden, np.nan, arrays.get(name, np.full(shape, np.nan)))
+
+    no_slope = weak | partial
+    return RamanResult(
+        extinction=values("extinction", no_slope),
+        extinction_budget={
+            cause: values(f"extinction {cause}", no_slope) for cause in EXTINCTION_CAUSES
+        },
+        extinction_smoothing_error=values("smoothing", no_slope),
+        vertical_resolution=values("resolution", no_slope),
+        backscatter=values("backscatter"),
+        backscatter_budget={cause: values(f"backscatter {cause}") for cause in BACKSCATTER_CAUSES},
+        lidar_ratio=values("lidar_ratio", no_slope),
+        lidar_ratio_random=values("random", no_slope),
+        lidar_ratio_systematic=values("systematic", no_slope),
+        raman_depth=values("depth"),
+        raman_depth_error=values("depth_error"),
+        reference_bottom=window.bottom,
+        reference_top=window.top,
+        reference_rejections=rejections,
+        quality=flags.astype(np.int32),
+    )
+
+
+def _values(one: _Solution, fit: DepthFit, extinction: Extinction) -> Iterator[tuple[str, Array]]:
+    """Yield the values of one profile by name."""
+    yield "extinction", extinction.value
+    yield "smoothing", extinction.smoothing_error
+    yield "resolution", extinction.vertical_resolution
+    yield "backscatter", one.backscatter
+    yield "depth", fit.depth
+    yield "depth_error", fit.standard_error
+    yield from zip(("lidar_ratio", "random", "systematic"), one.lidar_ratio, strict=True)
+    yield from ((f"extinction {name}", row) for name, row in one.extinction_budget.items())
+    yield from ((f"backscatter {name}", row) for name, row in one.backscatter_budget.items())

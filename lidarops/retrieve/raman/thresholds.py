@@ -1,0 +1,30 @@
+"""Thresholds of the Raman retrieval, each with what set it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Limits of fit, smoothing and ratios."""
+
+    rougher_share: float = 0.1
+    """Share of the likelihood of all weights of smoothness below the one that is used. Simulations
+    with 30 counts a bin at 1 km (`tests/retrieve/raman/test_raman_coverage.py`): 95 % intervals
+    cover 95 %; 93 % with a share of 0.16, 85 % with the most likely weight."""
+    most_uncertain: float = 0.2
+    """Standard error of the logarithm of the smoothed signal, beyond which first-order errors do
+    not hold: a signal of less than 5 standard errors. Assumed."""
+    least_ratio_certainty: float = 3.0
+    """Standard errors by which the smoothed backscatter must exceed zero for a lidar ratio. Below,
+    no error is symmetrical; with 5, none is left at 355 nm of the published simulations."""
+    fewest_cells: int = 8
+    """Cells with data of a profile that is fitted. Assumed."""
+    many_counts: float = 1000.0
+    """Counts of a cell from which on the stated variance tells more than that of counts: it then
+    shows the effect of the dead time beyond its own scatter of 3 %."""
+
+
+THRESHOLDS: Final = Thresholds()

@@ -1,0 +1,88 @@
+"""Errors of Raman products in simulated profiles, and the bias of ratios of few counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.raman_signals import make_sky, mean_over
+
+from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.raman import retrieve_raman
+from lidarops.retrieve.raman.backscatter import inverse_mean, ratio_of_counts
+from lidarops.retrieve.raman.flags import RamanQuality
+
+STEP = 30.0
+R = STEP * (np.arange(400) + 0.5)
+HAZE = 1.5e-4 * np.exp(-R / 1500.0) / (1.0 + np.exp((R - 4500.0) / 400.0))
+LEVELS = (30.0, 300.0, 5000.0)
+"""Counts of a Raman bin at 1 km."""
+
+
+def deviations(light, profiles, seed=1):
+    """Return deviations over stated errors of extinction and backscatter that are not rejected."""
+    sky = make_sky(HAZE, STEP, light)
+    rng = np.random.default_rng(seed)
+    shape = (profiles, R.size)
+    raman, elastic = (
+        sky.signal(rng.poisson(mean, shape).astype(float)) for mean in (sky.raman, sky.elastic)
+    )
+    quality = np.repeat(sky.quality, profiles, axis=0)
+    found = retrieve_raman(raman, elastic, sky.air, sky.cells, sky.settings, quality=quality)
+    usable = (found.quality & rejecting((*RamanQuality, *Quality))) == 0
+    inside = usable & (sky.cells.range < 6000.0)
+    length = np.where(np.isnan(found.vertical_resolution), 60.0, found.vertical_resolution)
+    true = mean_over(HAZE, STEP, sky.cells.range, length)
+    of_extinction = (found.extinction - true) / found.extinction_standard_error
+    of_backscatter = found.backscatter - sky.cells.mean(sky.backscatter)
+    of_backscatter /= found.backscatter_standard_error
+    return [z[inside & np.isfinite(z)] for z in (of_extinction, of_backscatter)]
+
+
+def covered(z):
+    return np.mean(np.abs(z) < 1.96)
+
+
+def test_intervals_cover_the_truth():
+    for z in deviations(300.0, 25):
+        assert 0.92 < covered(z) < 0.98
+        assert np.mean(np.abs(z) > 4.0) <= 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", LEVELS)
+def test_intervals_of_1000_profiles_cover_the_truth(light):
+    for z in deviations(light, 1000):
+        if z.size:
+            assert 0.94 <= covered(z) <= 0.96
+            assert np.mean(np.abs(z) > 4.0) <= 1e-3
+
+
+@pytest.mark.parametrize("mean", [0.3, 1.0, 3.0, 10.0, 30.0])
+def test_ratio_to_a_smooth_signal_has_no_bias(mean):
+    # The denominator is known from 20 bins, as the smooth Raman signal is.
+    rng = np.random.default_rng(7)
+    counts, smooth = rng.poisson(mean, 400_000), rng.poisson(20.0 * mean, 400_000)
+    seen = smooth > 0
+    inverse = np.zeros(counts.size)
+    inverse[seen] = inverse_mean(smooth[seen] / 20.0, 1.0 / smooth[seen])
+    ratio = counts * inverse
+    assert abs(ratio.mean() - 1.0) < 0.05 * ratio.std()
+    posterior, spread = ratio_of_counts(counts, smooth)
+    assert abs(20.0 * posterior.mean() - 1.0) < 0.05 * ratio.std()
+    if mean > 2.0:
+        assert 20.0 * spread.mean() == pytest.approx(ratio.std(), rel=0.2)
+
+
+def test_backscatter_of_few_counts_has_no_bias():
+    # Quotients of cells would be too large by a third at 3 counts a cell.
+    sky = make_sky(HAZE, STEP, 60.0, cell=STEP, window=(7000.0, 12_000.0, 4000.0))
+    rng = np.random.default_rng(5)
+    rows = 40
+    raman = sky.signal(rng.poisson(sky.raman, (rows, R.size)).astype(float))
+    elastic = sky.signal(np.repeat(sky.elastic[np.newaxis], rows, axis=0))
+    quality = np.repeat(sky.quality, rows, axis=0)
+    found = retrieve_raman(raman, elastic, sky.air, sky.cells, sky.settings, quality=quality)
+    inside = (sky.cells.range > 1000.0) & (sky.cells.range < 4000.0)
+    away = (found.backscatter - sky.cells.mean(sky.backscatter))[:, inside]
+    spread = np.nanstd(away, axis=0)
+    assert np.all(np.abs(np.nanmean(away, axis=0)) < 4.0 * spread / np.sqrt(rows))

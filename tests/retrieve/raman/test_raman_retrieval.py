@@ -1,0 +1,143 @@
+"""Extinction, backscatter and lidar ratio together: exactness, causes of error, flags."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.raman_signals import make_sky
+
+from lidarops.flags import Quality
+from lidarops.retrieve.raman import retrieve_raman
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.scattering import (
+    NITROGEN_SHIFT,
+    nitrogen_line_share,
+    raman_wavelength,
+)
+
+STEP = 30.0
+R = STEP * (np.arange(400) + 0.5)
+HAZE = np.where(R < 6500.0, 1.5e-4 * np.exp(-R / 2000.0) * (1.0 - (R / 6500.0) ** 2), 0.0)
+WINDOW = (7000.0, 12_000.0, 4000.0)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return make_sky(HAZE, STEP, 1e7, cell=STEP, window=WINDOW)
+
+
+def retrieved(sky, **settings):
+    quality = settings.pop("quality", sky.quality)
+    raman, elastic = (sky.signal(mean[np.newaxis]) for mean in (sky.raman, sky.elastic))
+    raman = replace(raman, **settings.pop("raman", {}))
+    elastic = replace(elastic, **settings.pop("elastic", {}))
+    changed = replace(sky.settings, **settings)
+    return retrieve_raman(raman, elastic, sky.air, sky.cells, changed, quality=quality)
+
+
+def test_values_without_noise_are_exact(sky):
+    found = retrieved(sky)
+    near = (R > 600.0) & (R < 5000.0)
+    np.testing.assert_allclose(found.backscatter[0, near], HAZE[near] / 50.0, rtol=1e-3)
+    np.testing.assert_allclose(found.lidar_ratio[0, near], 50.0, rtol=2e-3)
+    assert np.all(found.quality[0, near] == 0)
+
+
+def test_backscatter_of_a_clear_column_without_noise_is_exact():
+    # The smooth solution is exact, so that nothing of backscatter is left to resolution.
+    sky = make_sky(np.full(R.size, 1e-4), STEP, 1e7, cell=STEP, window=WINDOW)
+    assumed = 1.0 + 1e-4 / 50.0 / sky.air.backscatter
+    middle = (R > 9000.0) & (R < 11_000.0)
+    found = retrieved(sky, scattering_ratio=float(assumed[middle].mean()))
+    assert np.isnan(found.reference_bottom).all()  # no shape of air anywhere
+    assert np.all(found.quality & RamanQuality.NO_REFERENCE)
+    np.testing.assert_allclose(found.extinction[0, 20:300], 1e-4, rtol=1e-6)
+
+
+def test_partial_overlap_cancels_in_backscatter(sky):
+    found = retrieved(sky)
+    near = R < 300.0
+    assert np.isnan(found.extinction[0, near]).all()
+    # Extinction is continued with its slope, which attenuates by 0.1 % too little.
+    np.testing.assert_allclose(found.backscatter[0, near], HAZE[near] / 50.0, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("cause", "settings", "changed"),
+    [
+        ("reference", {"reference_relative_error": 1e-3}, {"scattering_ratio": 1.001}),
+        ("angstrom", {"angstrom_standard_error": 0.01}, {"angstrom_exponent": 1.21}),
+    ],
+)
+def test_errors_are_the_change_by_their_cause(sky, cause, settings, changed):
+    near = (R > 600.0) & (R < 5000.0)
+    before = retrieved(sky, **settings)
+    after = retrieved(sky, **changed)
+    for name in ("extinction", "backscatter"):
+        budget = getattr(before, f"{name}_budget")
+        if cause in budget:
+            change = np.abs(getattr(after, name) - getattr(before, name))[0, near]
+            stated = budget[cause][0, near]
+            np.testing.assert_allclose(change, stated, rtol=0.03, atol=1e-3 * stated.max())
+    change = np.abs(after.lidar_ratio - before.lidar_ratio)[0, near]
+    np.testing.assert_allclose(change, before.lidar_ratio_systematic[0, near], rtol=0.05, atol=2e-3)
+
+
+def test_errors_of_the_background_are_the_change_by_it(sky):
+    near = (R > 600.0) & (R < 5000.0)
+    error = np.array([1e-4 * sky.raman[160]])
+    before = retrieved(sky, raman={"background_standard_error": error})
+    after = retrieved(sky, raman={"power": (sky.raman - error)[np.newaxis]})
+    for name in ("extinction", "backscatter"):
+        change = np.abs(getattr(after, name) - getattr(before, name))[0, near]
+        stated = getattr(before, f"{name}_budget")["background"][0, near]
+        np.testing.assert_allclose(change, stated, rtol=0.05, atol=0.02 * stated.max())
+
+
+def test_profiles_without_raman_signal_have_no_values(sky):
+    none = {"power": np.full((1, R.size), -1.0)}
+    found = retrieved(sky, raman=none)
+    assert np.isnan(found.extinction).all()
+    assert np.isnan(found.backscatter).all()
+    assert np.all(found.quality & RamanQuality.WEAK_SIGNAL)
+
+
+def test_missing_bins_are_interpolated_by_the_smooth_solution(sky):
+    power = sky.raman[np.newaxis].copy()
+    power[0, 100:103] = np.nan
+    found = retrieved(sky, raman={"power": power})
+    assert found.extinction[0, 101] == pytest.approx(HAZE[101], rel=0.05)
+    assert np.all(found.quality[0, 100:103] & Quality.OUTLIER == 0)
+
+
+def test_profiles_do_not_depend_on_each_other():
+    sky = make_sky(HAZE, STEP, 300.0)
+    rng = np.random.default_rng(2)
+    raman, elastic = (rng.poisson(m, (3, R.size)).astype(float) for m in (sky.raman, sky.elastic))
+    signals = [sky.signal(raman), sky.signal(elastic)]
+    alone = [
+        replace(one, power=one.power[1:2], variance=one.variance[1:2],
+                background=one.background[1:2],
+                background_standard_error=one.background_standard_error[1:2],
+                counts_per_power=one.counts_per_power[1:2])
+        for one in signals
+    ]  # fmt: skip
+    quality = np.repeat(sky.quality, 3, axis=0)
+    three = retrieve_raman(*signals, sky.air, sky.cells, sky.settings, quality=quality)
+    one = retrieve_raman(*alone, sky.air, sky.cells, sky.settings, quality=sky.quality)
+    for name in ("extinction", "backscatter", "lidar_ratio", "vertical_resolution"):
+        np.testing.assert_array_equal(getattr(three, name)[1], getattr(one, name)[0])
+
+
+def test_lines_in_a_narrow_filter_change_with_temperature():
+    centre = raman_wavelength(354.7e-9, NITROGEN_SHIFT)
+    assert centre == pytest.approx(386.7e-9, abs=0.1e-9)
+    warm, cold = (
+        nitrogen_line_share(np.array([300.0, 220.0]), 354.7e-9, centre, width)
+        for width in (0.3e-9, 20e-9)
+    )
+    # Cold nitrogen has more of its lines near the centre of the branch.
+    assert 0.001 < warm[1] / warm[0] - 1.0 < 0.05
+    assert abs(cold[1] / cold[0] - 1.0) < 1e-3
