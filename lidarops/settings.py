@@ -199,6 +199,10 @@ class ChannelProduct(SettingsModel):
         """The channels that are requested by name."""
         return [] if self.channels == "all" else list(self.channels)
 
+    def companions(self, channel: str) -> tuple[str, ...]:  # noqa: ARG002 - most need none
+        """Return the other channels that the product of a channel is made of."""
+        return ()
+
     def covers(self, channel: str, *, of_files: bool) -> bool:
         """Return whether a channel is requested; `of_files` says whether the files hold it."""
         return (of_files and self.channels == "all") or channel in self.named

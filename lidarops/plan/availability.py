@@ -25,9 +25,16 @@ _LAST: Final = datetime.max.replace(tzinfo=UTC)
 
 
 def named_channels(instrument: Instrument) -> list[str]:
-    """Return the channels that the products of an instrument request by name."""
+    """Return the channels that the products of an instrument request by name, or are made of."""
     requested = instrument.products.requested().values()
-    return list(dict.fromkeys(name for settings in requested for name in settings.named))
+    return list(
+        dict.fromkeys(
+            name
+            for settings in requested
+            for channel in settings.named
+            for name in (channel, *settings.companions(channel))
+        )
+    )
 
 
 def missing_channels(

@@ -8,12 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lidarops.campaign.model import Campaign, channel_facts
+from lidarops.campaign.model import Campaign, Instrument, channel_facts
 from lidarops.kinds import Scope, kinds_of
 from lidarops.plan import availability
 from lidarops.records import LeftOut, Plan, PlannedStep, Scene
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import READ_STEP, file_channels, joined_layout
+from lidarops.steps.channels import (
+    READ_STEP,
+    file_channels,
+    joined_layout,
+    prepared_channels,
+)
 from lidarops.steps.registry import (
     SHARED,
     channel_steps,
@@ -82,15 +87,32 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
                     if settings.covers(channel.name, of_files=channel in scene.layout)
                 },
                 requesters=tuple(
-                    other.name
-                    for other in glued
-                    if other != channel and channel.name in file_channels(other.name)
+                    dict.fromkeys(
+                        (
+                            *(
+                                other.name
+                                for other in glued
+                                if other != channel and channel.name in file_channels(other.name)
+                            ),
+                            *_companions_of(channel.name, instrument),
+                        )
+                    )
                 ),
                 networks=tuple(
                     name for name, used in networks.items() if channel.name in file_channels(used)
                 ),
             )
         )
+
+
+def _companions_of(channel: str, instrument: Instrument) -> list[str]:
+    """Return the channels of which a requested product is made with another channel."""
+    return [
+        other
+        for settings in instrument.products.requested().values()
+        for other in settings.named
+        if channel in settings.companions(other)
+    ]
 
 
 def _channel_entries(case: ChannelCase) -> Entries:
@@ -136,7 +158,7 @@ def _drop_unused_channels(plan: Plan) -> Plan:
         part
         for step in plan.steps
         if step.product
-        for part in (step.channel, *file_channels(step.channel))
+        for part in prepared_channels(plan.steps, step.channel)
     }
     unused = {step.channel for step in plan.steps} - used
     reason = "no requested product of this channel can be made"

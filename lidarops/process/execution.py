@@ -13,7 +13,7 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.records import LeftOut, Plan, PlannedStep, Scene
-from lidarops.steps.channels import file_channels
+from lidarops.steps.channels import file_channels, prepared_channels
 from lidarops.steps.conditioning import PROFILES
 from lidarops.steps.data import (
     CHUNK_BYTES,
@@ -56,7 +56,7 @@ def channel_data(source: Source, steps: Sequence[PlannedStep], channel: str) -> 
         empty name.
     """
     shared: dict[str, Data] = {}
-    for name in dict.fromkeys((*file_channels(channel), channel)):
+    for name in prepared_channels(steps, channel):
         data = shared[name] = Data(source, name, shared)
         for step in steps:
             if step.channel == name and not step.product:
@@ -86,7 +86,7 @@ def profiles_of(
 ) -> Iterator[xr.Dataset]:
     """Yield power, variance and quality of all profiles of a source, some profiles at a time."""
     data = channel_data(source, [step for step in steps if not step.product], channel)[""]
-    for chunk in chunks(source, channel, (), profiles):
+    for chunk in chunks(source, file_channels(channel), (), profiles):
         yield data[PROFILES].of(chunk.counts)
 
 
@@ -124,25 +124,26 @@ def loaded(archive: xr.Dataset, channels: Iterable[str], rows: slice) -> xr.Data
 
 
 def chunks(
-    source: Source, channel: str, streams: Iterable[ProductStream], profiles: int
+    source: Source, channels: Sequence[str], streams: Iterable[ProductStream], profiles: int
 ) -> Iterator[Chunk]:
-    """Yield the profiles of a channel in chunks that end where its products allow it.
+    """Yield the profiles of a scene in chunks that end where its products allow it.
 
     Parameters
     ----------
     source : Source
-    channel : str
+    channels : sequence of str
+        Of the files, whose counts are loaded.
     streams : iterable of ProductStream
     profiles : int
         Number of profiles of a chunk, unless a product needs more together.
     """
-    archive, parts = source.archive, file_channels(channel)
+    archive = source.archive
     streams = list(streams)
     reads = not streams or any(
         not isinstance(stream, WholeProduct) or stream.reads for stream in streams
     )
     for rows in _rows(archive.sizes["time"], _ends(streams), profiles if reads else None):
-        counts = loaded(archive, parts, rows) if reads else archive.isel(time=rows)
+        counts = loaded(archive, channels, rows) if reads else archive.isel(time=rows)
         yield Chunk(counts, rows.start)
 
 

@@ -33,7 +33,12 @@ from lidarops.records import (
     Scene,
     SceneOutcome,
 )
-from lidarops.steps.channels import channel_ranges, file_channels, member_channel
+from lidarops.steps.channels import (
+    channel_ranges,
+    counted_channels,
+    file_channels,
+    member_channel,
+)
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.data import Chunk, ProductStream, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
@@ -178,9 +183,9 @@ class _Work:
         self.inputs += tuple(file for file in source.ancillaries.inputs if file not in self.inputs)
         return source
 
-    def _chunk_profiles(self, source: Source, channel: str) -> int:
-        """Return the number of profiles of a channel that are processed together."""
-        counts = [source.archive[name] for name in file_channels(channel)]
+    def _chunk_profiles(self, source: Source, channels: Sequence[str]) -> int:
+        """Return the number of profiles of channels of the files that are processed together."""
+        counts = [source.archive[name] for name in channels]
         requested = self.job.profiles_per_chunk
         if requested is None and sum(array.nbytes for array in counts) <= execution.IN_MEMORY:
             return int(source.archive.sizes["time"])
@@ -228,7 +233,7 @@ class _Instrument(_Work):
         few = replace(self._scene, granules=tuple(granules))
         # The signal is compared with bins beyond the sections.
         source = self._source(few, steps)
-        profiles = self._chunk_profiles(source, channel)
+        profiles = self._chunk_profiles(source, file_channels(channel))
         return execution.profiles_of(source, steps, channel, profiles)
 
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
@@ -244,8 +249,9 @@ class _Instrument(_Work):
         }
         with ExitStack() as until_written:
             writers: dict[str, ProductWriter] = {}
-            profiles = self._chunk_profiles(source, channel)
-            for chunk in execution.chunks(source, channel, streams.values(), profiles):
+            channels = counted_channels(steps, channel)
+            profiles = self._chunk_profiles(source, channels)
+            for chunk in execution.chunks(source, channels, streams.values(), profiles):
                 for kind, rows in _taken(chunk, streams):
                     self._clock.lap("retrieve")
                     if kind in writers:
@@ -283,8 +289,9 @@ class _Network(_Work):
             for member in members:
                 if member.data is not None:
                     source = member.data.source
-                    profiles = self._chunk_profiles(source, step.channel)
-                    for chunk in execution.chunks(source, step.channel, (), profiles):
+                    channels = file_channels(step.channel)
+                    profiles = self._chunk_profiles(source, channels)
+                    for chunk in execution.chunks(source, channels, (), profiles):
                         stream.add(member, chunk)
             made = stream.result()
             self._clock.lap("retrieve")

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
-from lidarops.records import ChannelLayout
+from lidarops.records import ChannelLayout, PlannedStep
 
 GLUED: Final = "glued_"
 """Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
@@ -34,6 +34,32 @@ def glued_parts(glued: str) -> tuple[str, str]:
 def file_channels(channel: str) -> tuple[str, ...]:
     """Return the channels of the files that a channel is made from."""
     return glued_parts(channel) if is_glued(channel) else (channel,)
+
+
+def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
+    """Return the channels from which the products of a channel take data, each after its parts.
+
+    The last one is the channel itself.
+    """
+    needed: dict[str, list[str]] = {}
+    for step in steps:
+        others = (need.rpartition("/")[0] for need in step.needs)
+        needed.setdefault(step.channel, []).extend(other for other in others if other)
+    order: dict[str, None] = {}
+
+    def visit(name: str) -> None:
+        for other in (*file_channels(name), *needed.get(name, ())):
+            if other not in order and other != name:
+                visit(other)
+        order[name] = None
+
+    visit(channel)
+    return tuple(order)
+
+
+def counted_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
+    """Return the channels of the files from which the products of a channel are made."""
+    return tuple(name for name in prepared_channels(steps, channel) if not is_glued(name))
 
 
 def range_channel(channel: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from lidarops.records import Plan, PlannedStep, Scene
-from lidarops.steps.channels import file_channels
+from lidarops.steps.channels import counted_channels, prepared_channels
 from lidarops.steps.data import CHUNK_BYTES
 from lidarops.steps.dependence import is_product, workloads
 from lidarops.steps.registry import definition
@@ -75,17 +75,17 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
     files = len(scene.granules) + len(scene.dark)
     products = [step for step in plan.steps if is_product(step)]
     # Channels are processed one after the other.
-    channels = [{step.channel, *file_channels(step.channel)} for step in products]
+    channels = [prepared_channels(plan.steps, step.channel) for step in products]
     most = max((sum(held[name] for name in names) for names in channels), default=0.0)
     return SceneMemory(
         held=OF_A_FILE * files + most,
-        profile=float(_COUNT * _most_bins(scene, products)),
+        profile=float(_COUNT * _most_bins(scene, plan, products)),
         together=together,
         profiles=max((len(member.granules) for member in scene.members or (scene,)), default=0),
     )
 
 
-def _most_bins(scene: Scene, products: list[PlannedStep]) -> int:
+def _most_bins(scene: Scene, plan: Plan, products: list[PlannedStep]) -> int:
     """Return the largest number of bins that a profile of a product is made from."""
     layouts = [
         {channel.name: channel.bins for channel in member.layout}
@@ -93,7 +93,7 @@ def _most_bins(scene: Scene, products: list[PlannedStep]) -> int:
     ]
     return max(
         (
-            sum(bins.get(name, 0) for name in file_channels(step.channel))
+            sum(bins.get(name, 0) for name in counted_channels(plan.steps, step.channel))
             for step in products
             for bins in layouts
         ),

@@ -19,6 +19,7 @@ from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import (
     READ_STEP,
     file_channels,
+    prepared_channels,
     range_channel,
     range_offset,
     wavelength,
@@ -156,7 +157,7 @@ def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
             for other in steps
             if other.instrument in ("", step.instrument)
             and other.product
-            and step.channel in (other.channel, *file_channels(other.channel))
+            and step.channel in prepared_channels(steps, other.channel)
             and (other.channel, other.product) not in windowed
         )
     )

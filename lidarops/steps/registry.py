@@ -144,6 +144,14 @@ def _needs(planned: PlannedStep, places: Collection[tuple[str, str, str, str]]) 
         names = [s.name for s in FILE_STEPS if not {*step.from_parts}.isdisjoint(s.outputs)]
         for part in glued_parts(planned.channel):
             needs += [f"{part}/{name}" for name in present(part, names)]
+    if isinstance(step, ProductStep):
+        for other in step.companions(step.typed(planned)):
+            names = [
+                s.name
+                for s in channel_steps(other)
+                if not {*step.from_companions}.isdisjoint(s.outputs)
+            ]
+            needs += [f"{other}/{name}" for name in present(other, names)]
     return tuple(needs)
 
 

@@ -144,6 +144,12 @@ class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):
 
     parts: tuple[Choice[ProductCase[R], Any], ...] = ()
     """In the order in which they are decided."""
+    from_companions: ClassVar[tuple[Datum[Any], ...]] = ()
+    """What it takes from the steps of other channels."""
+
+    def companions(self, settings: S) -> tuple[str, ...]:  # noqa: ARG002 - most need none
+        """Return the other channels that the product is made of."""
+        return ()
 
     @abstractmethod
     def stream(self, settings: S, data: Data) -> ProductStream:
