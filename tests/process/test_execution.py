@@ -24,6 +24,7 @@ from lidarops.process import execution
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
 from lidarops.steps import dependence
+from lidarops.steps.channels import counted_channels
 from lidarops.steps.data import Chunk, Data, RowProduct, Source, WholeProduct
 from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, product_step
 
@@ -146,7 +147,8 @@ def carry_out(
     data = execution.channel_data(source, plan.steps, channel)
     streams = execution.streams_of(plan.steps, data, channel)
     rows = {kind: [] for kind, stream in streams.items() if isinstance(stream, RowProduct)}
-    for chunk in execution.chunks(source, channel, streams.values(), profiles):
+    counted = counted_channels(plan.steps, channel)
+    for chunk in execution.chunks(source, counted, streams.values(), profiles):
         for kind, stream in streams.items():
             if isinstance(stream, RowProduct):
                 rows[kind] += stream.rows(chunk)
@@ -572,11 +574,11 @@ def test_the_background_follows_the_method_of_the_campaign() -> None:
 def test_a_chunk_holds_the_channel_that_is_processed_and_leaves_the_source_lazy() -> None:
     lazy = archive(profiles=3)
     source = Source(lazy, None, NONE, STATION)
-    (chunk,) = execution.chunks(source, "photon_532o", (), 7)
+    (chunk,) = execution.chunks(source, ["photon_532o"], (), 7)
     assert isinstance(chunk.counts["photon_532o"].data, np.ndarray)
     assert "analog_532o" not in chunk.counts
     assert isinstance(lazy["photon_532o"].data, da.Array)
-    (glued,) = execution.chunks(source, "glued_532o", (), 7)
+    (glued,) = execution.chunks(source, ["analog_532o", "photon_532o"], (), 7)
     assert {"photon_532o", "analog_532o"} <= set(glued.counts)
 
 
@@ -611,6 +613,6 @@ def test_chunks_end_where_all_products_allow_it(
     streams: tuple[WholeProduct, ...], profiles: int, edges: list[int]
 ) -> None:
     source = Source(archive(), None, NONE, STATION)
-    made = list(execution.chunks(source, "photon_532o", streams, profiles))
+    made = list(execution.chunks(source, ["photon_532o"], streams, profiles))
     assert [chunk.rows.stop for chunk in made] == edges
     assert [chunk.rows.start for chunk in made] == [0, *edges[:-1]]

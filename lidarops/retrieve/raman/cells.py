@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 
 Array = npt.NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +27,7 @@ class Cells:
     step: float
     """m."""
 
-    def split(self, values: Array) -> Array:
+    def split(self, values: npt.NDArray[T]) -> npt.NDArray[T]:
         """Return (..., bin) values as (..., cell, bin of the cell)."""
         stop = self.first + self.bins * self.range.size
         inside = values[..., self.first : stop]
