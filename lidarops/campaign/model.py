@@ -100,6 +100,17 @@ class ChannelFacts(SettingsModel):
         " the same detector, besides range_offset; or 'estimate'; for glued channels, of which it"
         " is estimated by default",
     )
+    water_vapour_calibration: float | None = quantity(
+        None,
+        unit="kg kg-1",
+        gt=0,
+        allow_inf_nan=False,
+        description="of a Raman channel of water vapour: mixing ratio per ratio of its signal to"
+        " that of nitrogen",
+    )
+    water_vapour_calibration_error: float = quantity(
+        0.0, unit="kg kg-1", ge=0, allow_inf_nan=False, description="standard error"
+    )
     lidar_ratio: float | None = quantity(
         None,
         unit="sr",

@@ -39,6 +39,7 @@ OWN = {
     "signal": {},
     "homogeneous": {"poorly_determined": 17, "poor_fit": 18, "at_bound": 19, "not_level": 20},
     "elastic": {"cloud": 17, "no_reference": 18, "unstable_inversion": 19},
+    "raman": {"no_reference": 17, "weak_signal": 18, "no_lidar_ratio": 19},
     "multiangle": {
         "no_leverage": 20,
         "poor_stratification": 21,
@@ -59,7 +60,14 @@ OWN = {
 }
 """Published places. Add new bits; never change or delete an entry, nor give its place to another
 bit: that needs a new version of the layout."""
-VERSION = {"signal": 2, "homogeneous": 2, "elastic": 2, "multiangle": 3, "visibility": 2}
+VERSION = {
+    "signal": 2,
+    "homogeneous": 2,
+    "elastic": 2,
+    "raman": 1,
+    "multiangle": 3,
+    "visibility": 2,
+}
 RETIRED = {"multiangle": {25, 30}}
 """Places of bits of former versions: one_sided and horizontal_gradient."""
 
@@ -68,6 +76,7 @@ LEFT = {
     "signal": 14,
     "homogeneous": 10,
     "elastic": 11,
+    "raman": 11,
     "multiangle": 3,
     "visibility": 10,
 }
@@ -100,6 +109,12 @@ SCENES = {
     "ElasticQuality.NO_REFERENCE": "test_labeled_elastic::test_an_opaque_cloud_leaves_no_reference",
     "ElasticQuality.UNSTABLE_INVERSION": "test_labeled_elastic::"
     "test_an_inversion_away_from_the_reference_stops_where_it_is_unstable",
+    "RamanQuality.NO_REFERENCE": "test_raman_retrieval::"
+    "test_particles_everywhere_leave_no_reference",
+    "RamanQuality.WEAK_SIGNAL": "test_raman_retrieval::"
+    "test_profiles_without_raman_signal_have_no_values",
+    "RamanQuality.NO_LIDAR_RATIO": "test_raman_retrieval::"
+    "test_profiles_without_raman_signal_have_no_values",
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
     "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"

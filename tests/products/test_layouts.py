@@ -21,6 +21,7 @@ from lidarops.netcdf.variables import (
     units,
 )
 from lidarops.records import DetectionMode
+from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 
 ROWS = [
     pytest.param(kind, row, id=f"{kind}-{row.name}")
@@ -108,6 +109,24 @@ def test_variables_without_standard_name():
             "scattering_ratio",
             "scattering_ratio_standard_error",
             *gluing,
+        },
+        "raman": {
+            *(f"extinction_error_{cause}" for cause in EXTINCTION_CAUSES),
+            *(f"backscatter_error_{cause}" for cause in BACKSCATTER_CAUSES),
+            *(
+                f"{quantity}_error_{kind}"
+                for quantity in ("lidar_ratio", "water_vapour_mixing_ratio")
+                for kind in ("random", "systematic")
+            ),
+            "extinction_smoothing_error",
+            "vertical_resolution",
+            "overlap",
+            "overlap_standard_error",
+            "molecular_backscatter",
+            "reference_bottom",
+            "reference_top",
+            "background",
+            "background_standard_error",
         },
         "multiangle": {
             *(

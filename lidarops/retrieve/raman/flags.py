@@ -21,3 +21,11 @@ class RamanQuality(FlagBit):
         Severity.REJECT,
         "the smoothed Raman signal is less than 5 times its standard error",
     )
+    NO_LIDAR_RATIO = (
+        FIRST_OWN + 2,
+        Severity.CARE,
+        (
+            "backscatter exceeds zero by less than 3 standard errors, so that the lidar ratio is"
+            " missing; other values are not concerned"
+        ),
+    )

@@ -577,6 +577,8 @@ def _joined(
         return np.where(hidden, np.nan, arrays.get(name, np.full(shape, np.nan)))
 
     no_slope = weak | partial
+    no_ratio = np.isnan(values("lidar_ratio", no_slope))
+    flags[no_ratio] |= np.int32(RamanQuality.NO_LIDAR_RATIO)
     return RamanResult(
         extinction=values("extinction", no_slope),
         extinction_budget={

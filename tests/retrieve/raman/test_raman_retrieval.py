@@ -45,8 +45,7 @@ def test_values_without_noise_are_exact(sky):
     assert np.all(found.quality[0, near] == 0)
 
 
-def test_backscatter_of_a_clear_column_without_noise_is_exact():
-    # The smooth solution is exact, so that nothing of backscatter is left to resolution.
+def test_particles_everywhere_leave_no_reference():
     sky = make_sky(np.full(R.size, 1e-4), STEP, 1e7, cell=STEP, window=WINDOW)
     assumed = 1.0 + 1e-4 / 50.0 / sky.air.backscatter
     middle = (R > 9000.0) & (R < 11_000.0)
@@ -102,6 +101,7 @@ def test_profiles_without_raman_signal_have_no_values(sky):
     assert np.isnan(found.extinction).all()
     assert np.isnan(found.backscatter).all()
     assert np.all(found.quality & RamanQuality.WEAK_SIGNAL)
+    assert np.all(found.quality & RamanQuality.NO_LIDAR_RATIO)
 
 
 def test_missing_bins_are_interpolated_by_the_smooth_solution(sky):

@@ -23,6 +23,8 @@ from lidarops.records import (
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.network.flags import NetworkQuality
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
 SCENE = "lidar-1_20260301T000000"
@@ -226,6 +228,59 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     )
 
 
+def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
+    """Return a made-up result of `raman.labeled.retrieve`."""
+    rng = np.random.default_rng(6)
+    dims = ("time", "range")
+    shape = (profiles, bins)
+    flags = np.zeros(shape, np.int32)
+    flags[:, :3] = Quality.INCOMPLETE_OVERLAP | RamanQuality.NO_LIDAR_RATIO
+    flags[-1] |= np.int32(RamanQuality.WEAK_SIGNAL | RamanQuality.NO_LIDAR_RATIO)
+    flags[0, 5:] |= np.int32(RamanQuality.NO_REFERENCE | RamanQuality.NO_LIDAR_RATIO)
+    scales = {
+        "extinction": 5e-5,
+        "backscatter": 1e-6,
+        "lidar_ratio": 50.0,
+        "water_vapour_mixing_ratio": 5e-3,
+    }
+    causes = {
+        "extinction": EXTINCTION_CAUSES,
+        "backscatter": BACKSCATTER_CAUSES,
+        "lidar_ratio": ("random", "systematic"),
+        "water_vapour_mixing_ratio": ("random", "systematic"),
+    }
+    values = {}
+    for name, scale in scales.items():
+        values[name] = rng.normal(scale, 0.1 * scale, shape)
+        values[f"{name}_standard_error"] = np.full(shape, 0.1 * scale)
+        for cause in causes[name]:
+            share = 0.1 * scale / np.sqrt(len(causes[name]))
+            values[f"{name}_error_{cause}"] = np.full(shape, share)
+    values |= {
+        "extinction_smoothing_error": np.full(shape, 5e-6),
+        "vertical_resolution": np.full(shape, 300.0),
+    }
+    values = {name: np.where(flags != 0, np.nan, array) for name, array in values.items()}
+    window = np.where(np.arange(profiles) < profiles - 1, 6000.0, np.nan)
+    return xr.Dataset(
+        {
+            **{name: (dims, array) for name, array in values.items()},
+            "overlap": (dims, np.where(flags & int(Quality.INCOMPLETE_OVERLAP), 0.5, 1.0)),
+            "overlap_standard_error": (dims, np.full(shape, 0.01)),
+            "molecular_backscatter": ("range", np.linspace(1.5e-6, 1e-6, bins)),
+            "reference_bottom": ("time", window),
+            "reference_top": ("time", window + 2000.0),
+            "reference_rejections": ("time", np.zeros(profiles, np.int32)),
+            "background": ("time", rng.uniform(0.1, 2.0, profiles)),
+            "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
+            "quality_flag": (dims, flags),
+            "profiles": ("time", np.full(profiles, 10, np.int32)),
+            "shots": ("time", np.full(profiles, 6000, np.int32)),
+        },
+        coords={**clock(profiles, **beam), "range": ("range", 60.0 * (np.arange(bins) + 0.5))},
+    )
+
+
 def multiangle(
     profiles: int = 5,
     levels: int = 20,
@@ -389,6 +444,7 @@ MAKERS = {
     "signal": signal,
     "homogeneous": homogeneous,
     "elastic": elastic,
+    "raman": raman,
     "multiangle": multiangle,
     "visibility": visibility,
 }

@@ -1,0 +1,23 @@
+"""Quality bits that products of kind ``raman`` can carry."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lidarops.flags import Flags, Quality
+from lidarops.retrieve.raman.flags import RamanQuality
+
+FLAGS: Final = Flags(
+    kind="raman",
+    version=1,
+    bits=(
+        Quality.INPUT_MISSING,
+        Quality.SATURATED,
+        Quality.PILE_UP,
+        Quality.INCOMPLETE_OVERLAP,
+        Quality.BACKGROUND_UNCERTAIN,
+        Quality.NO_GLUING,
+        *RamanQuality,
+    ),
+)
+"""Published places are in `tests/products/test_flags.py`."""

@@ -1,0 +1,94 @@
+"""Settings of the product ``raman`` in a campaign file."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from lidarops.settings import (
+    ChannelProduct,
+    Metres,
+    PartOfDay,
+    SettingsModel,
+    located_error,
+    quantity,
+)
+
+
+class RamanReferenceSettings(SettingsModel):
+    """Limits of the reference window of backscatter, and the scattering ratio there."""
+
+    lowest: Metres = quantity(6000.0, unit="m", description="above the station")
+    highest: Metres = quantity(12_000.0, unit="m", description="above the station")
+    width: float = quantity(2000.0, unit="m", ge=100, le=20_000)
+    scattering_ratio: float = quantity(1.0, unit="1", ge=1, le=10)
+    relative_error: float = quantity(
+        0.02, unit="1", ge=0, le=1, description="standard error of the scattering ratio, relative"
+    )
+
+    @model_validator(mode="after")
+    def _holds_a_window(self) -> Self:
+        if self.highest - self.lowest < self.width:
+            raise ValueError("highest must be at least width above lowest")
+        return self
+
+
+class RamanProductSettings(ChannelProduct):
+    """The ``raman`` product: extinction, backscatter and lidar ratio without an assumed one."""
+
+    channels: list[str] = Field(
+        min_length=1,
+        description="elastic channels, each with its Raman channel under nitrogen",
+    )
+    nitrogen: dict[str, str] = Field(
+        description="elastic channel -> channel of the vibrational Raman lines of nitrogen, such as"
+        " photon_355o: photon_387o"
+    )
+    water_vapour: dict[str, str] = Field(
+        default={},
+        description="elastic channel -> channel of the Raman lines of water vapour, whose facts"
+        " give water_vapour_calibration",
+    )
+    average: PartOfDay = timedelta(minutes=30)
+    cell: float = quantity(
+        60.0, unit="m", ge=3, le=1000, description="length of the bins of values"
+    )
+    highest: Metres = quantity(15_000.0, unit="m", description="farthest range")
+    background: Literal["known_shape", "tail_mean"] = "known_shape"
+    reference: RamanReferenceSettings = RamanReferenceSettings()
+    angstrom_exponent: float = quantity(
+        1.2,
+        unit="1",
+        ge=-1,
+        le=4,
+        description="of particle extinction, elastic to Raman wavelength",
+    )
+    angstrom_standard_error: float = quantity(0.5, unit="1", ge=0, le=3)
+    molecular_relative_error: float = quantity(
+        0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
+    )
+    overlap_relative_error: float = quantity(
+        0.1, unit="1", ge=0, le=1, description="standard error of 1 - overlap, relative"
+    )
+    filter_width: float | None = quantity(
+        None,
+        unit="m",
+        gt=1e-11,
+        lt=1e-7,
+        description="full width at half maximum of the filters of nitrogen; by default, all lines"
+        " pass at all temperatures",
+    )
+
+    @model_validator(mode="after")
+    def _has_raman_channels(self) -> Self:
+        for name in self.channels:
+            if name not in self.nitrogen:
+                raise located_error(f"names no Raman channel of {name}", "nitrogen")
+        return self
+
+    def companions(self, channel: str) -> tuple[str, ...]:
+        """Return the Raman channels of an elastic channel."""
+        pairs = (self.nitrogen, self.water_vapour)
+        return tuple(pair[channel] for pair in pairs if channel in pair)

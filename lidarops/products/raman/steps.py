@@ -1,0 +1,342 @@
+"""Steps of the product ``raman``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Final, cast
+
+import xarray as xr
+
+from lidarops.campaign.model import channel_facts
+from lidarops.products.raman.settings import RamanProductSettings
+from lidarops.records import LeftOut, PlannedStep
+from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
+from lidarops.retrieve.raman import labeled
+from lidarops.retrieve.raman.retrieval import RamanSettings
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
+from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
+from lidarops.settings import SettingsModel
+from lidarops.steps.case import ProductCase
+from lidarops.steps.channels import member_channel, range_channel, wavelength
+from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.data import Averages, Chunk, Data, ProductStream, RowProduct, WholeProduct
+from lidarops.steps.pointing import fixed_zenith
+from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
+from lidarops.steps.reading import WAVELENGTH
+from lidarops.steps.step import REQUESTED, Decisions, Leave, Look, ProductStep, Run
+from lidarops.steps.workload import Workload
+
+Case = ProductCase[RamanProductSettings]
+
+LOOKED_AT: Final = 64
+"""Profiles of a scene that are looked at for a Raman signal."""
+NEAREST: Final = 500.0
+FARTHEST: Final = 3000.0
+"""m; where the Raman signal is looked for: beyond most overlap, before it gets weak."""
+LEAST_SIGNAL: Final = 4.0
+"""Standard errors of the signal of a profile. In 64 profiles of noise, the largest exceeds this in
+0.2 % of scenes."""
+
+
+class RetrievalSettings(SettingsModel):
+    """Settings of the step ``raman``; lengths are along the beam."""
+
+    nitrogen: str
+    water_vapour: str | None = None
+    calibration: float | None = None
+    """kg kg-1 per ratio of the signals of water vapour and nitrogen."""
+    calibration_standard_error: float | None = None
+    lowest: float
+    """m, of the reference window."""
+    highest: float
+    """m, of the reference window."""
+    width: float
+    """m, of the reference window."""
+    scattering_ratio: float
+    reference_relative_error: float
+    cell: float
+    """m."""
+    farthest: float
+    """m."""
+    known_shape: bool
+    angstrom_exponent: float
+    angstrom_standard_error: float
+    molecular_relative_error: float
+    overlap_relative_error: float
+    filter_width: float | None = None
+    """m."""
+    dark: bool = False
+    """Whether a look at some profiles found no Raman signal, so that nothing is retrieved."""
+
+
+_AVERAGE: Final = Average("the noise of a single profile is too large for Raman signals")
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Stretch of ranges along the beam, and why there is none."""
+
+    stretch: float
+    reach: float
+    reason: str
+
+
+def _limits(case: Case) -> _Limits:
+    zenith, reason = fixed_zenith(case)
+    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
+    reach = case.last - 0.5 * case.channel.bin_width
+    window = case.request.reference
+    if (
+        not reason
+        and min(window.highest * stretch, reach) < (window.lowest + window.width) * stretch
+    ):
+        reason = (
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    return _Limits(stretch, reach, reason)
+
+
+def _absent(case: Case, channel: str) -> str:
+    """Return why a Raman channel cannot be used; empty where it can."""
+    layout = case.scene.layout
+    try:
+        found = member_channel(layout, channel)
+    except StopIteration:
+        held = ", ".join(known.name for known in layout)
+        return f"the files hold no channel {channel}, only {held}"
+    if found.bin_width != case.channel.bin_width:
+        return (
+            f"{channel} has bins of {found.bin_width:g} m, {case.channel.bin_width:g} m are needed"
+        )
+    length = wavelength(found, channel_facts(case.facts, range_channel(channel)))
+    own = wavelength(case.channel, channel_facts(case.facts, range_channel(case.channel.name)))
+    if not length > own:
+        return f"the wavelength of {channel}, {length * 1e9:g} nm, is not beyond {own * 1e9:g} nm"
+    return ""
+
+
+class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
+    """Retrieve extinction, backscatter and lidar ratio from averaged signals."""
+
+    name = "raman"
+    settings = RetrievalSettings
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, AVERAGE, MOLECULES)
+    from_companions = (PROFILES, WAVELENGTH)
+    parts = (_AVERAGE,)
+
+    def decide(self, case: Case) -> Decisions:
+        """Run where a fixed beam reaches the reference window, and the files hold the channels."""
+        request, name = case.request, case.channel.name
+        limits = _limits(case)
+        nitrogen, water = request.nitrogen[name], request.water_vapour.get(name)
+        reason = limits.reason or _absent(case, nitrogen)
+        if reason:
+            yield Leave(reason)
+            return
+        facts = None if water is None else channel_facts(case.facts, range_channel(water))
+        absent = "" if water is None else _absent(case, water)
+        if facts is not None and not absent and facts.water_vapour_calibration is None:
+            absent = f"the facts of {water} give no water_vapour_calibration"
+        if facts is None or absent:
+            water, facts = None, None
+        if absent:
+            yield Leave(f"no water vapour: {absent}")
+        window = request.reference
+        settings = RetrievalSettings(
+            nitrogen=nitrogen,
+            water_vapour=water,
+            calibration=facts.water_vapour_calibration if facts else None,
+            calibration_standard_error=facts.water_vapour_calibration_error if facts else None,
+            lowest=window.lowest * limits.stretch,
+            highest=min(window.highest * limits.stretch, limits.reach),
+            width=window.width * limits.stretch,
+            scattering_ratio=window.scattering_ratio,
+            reference_relative_error=window.relative_error,
+            cell=request.cell,
+            farthest=min(request.highest * limits.stretch, limits.reach),
+            known_shape=request.background == "known_shape",
+            angstrom_exponent=request.angstrom_exponent,
+            angstrom_standard_error=request.angstrom_standard_error,
+            molecular_relative_error=request.molecular_relative_error,
+            overlap_relative_error=request.overlap_relative_error,
+            filter_width=request.filter_width,
+        )
+        yield Run(REQUESTED, settings)
+
+    def companions(self, settings: RetrievalSettings) -> tuple[str, ...]:
+        """Return the Raman channels."""
+        water = settings.water_vapour
+        return (settings.nitrogen,) if water is None else (settings.nitrogen, water)
+
+    def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:
+        """Return the step that retrieves nothing, where sampled profiles have no Raman signal."""
+        settings = self.typed(planned)
+        granules = look.scene.granules
+        sample = [granules[k] for k in spaced_indices(len(granules), LOOKED_AT)]
+        seen, most = 0, 0.0
+        for profiles in look.profiles(settings.nitrogen, sample):
+            variance = (profiles["variance"] * profiles[CORRELATION_LENGTH]).to_numpy()
+            light = detect_light(
+                profiles["power"].to_numpy(),
+                variance,
+                profiles["quality"].to_numpy(),
+                profiles["range"].to_numpy(),
+                NEAREST,
+                FARTHEST,
+            )
+            seen, most = seen + light.profiles, max(most, light.significance)
+        if not seen or most >= LEAST_SIGNAL:
+            return planned, []
+        reason = (
+            f"no signal of {settings.nitrogen} from {NEAREST:g} to {FARTHEST:g} m in {seen}"
+            f" profiles looked at: at most {most:.1f} standard errors (limit {LEAST_SIGNAL:g});"
+            " nothing is retrieved"
+        )
+        left = LeftOut(
+            self.name, planned.channel, reason, rule="raman_dark", number=most, product=self.name
+        )
+        dark = settings.model_copy(update={"dark": True})
+        return replace(planned, settings=dark.model_dump(mode="json", exclude_none=True)), [left]
+
+    def stream(self, settings: RetrievalSettings, data: Data) -> ProductStream:
+        """Return the product, whose averages are retrieved as they become complete."""
+        return _Dark(settings, data) if settings.dark else _Retrieval(settings, data)
+
+    def cpu_time(self, settings: RetrievalSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the CPU time by the number of averages, s."""
+        return 0.1 + 0.02 * _averages(work)
+
+    def held(self, settings: RetrievalSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the bytes of the averages that are completed together, and of their solution."""
+        return _BYTES_OF_A_BIN * work.bins * min(_averages(work), MEANS_TOGETHER)
+
+
+_BYTES_OF_A_BIN: Final = 500.0
+"""Bytes per bin of an average that is open or being solved, of three channels."""
+
+
+def _averages(work: Workload) -> int:
+    average = _AVERAGE.settings_in(work.plan)
+    return work.intervals(average.seconds) if average else 0
+
+
+def _assumptions(settings: RetrievalSettings, laser: float, raman: float) -> labeled.Assumptions:
+    return labeled.Assumptions(
+        RamanSettings(
+            wavelength=laser,
+            raman_wavelength=raman,
+            angstrom_exponent=settings.angstrom_exponent,
+            angstrom_standard_error=settings.angstrom_standard_error,
+            lowest=settings.lowest,
+            highest=settings.highest,
+            width=settings.width,
+            scattering_ratio=settings.scattering_ratio,
+            reference_relative_error=settings.reference_relative_error,
+            molecular_relative_error=settings.molecular_relative_error,
+            overlap_relative_error=settings.overlap_relative_error,
+        ),
+        cell=settings.cell,
+        highest=settings.farthest,
+        known_shape=settings.known_shape,
+        filter_width=settings.filter_width,
+    )
+
+
+class _Retrieval(RowProduct):
+    """Averages of the profiles of all channels, and their retrieval."""
+
+    def __init__(self, settings: RetrievalSettings, data: Data) -> None:
+        self._settings, self._data = settings, data
+        self._begun = False
+        names = [data.channel, *STEP.companions(settings)]
+        source, shots = data.source, data[PROFILES].shots(data.source.archive)
+        self._averages: list[Averages] = [
+            _of(data, name)[PROFILES].averages(source.geometry, shots, data[AVERAGE])
+            for name in names
+        ]
+
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Add the next profiles to their averages, and yield those that are complete."""
+        for averages in self._averages:
+            averages.add(chunk)
+        for means in zip(*(averages.completed() for averages in self._averages), strict=True):
+            rows = self._retrieved(*means)
+            if not self._begun:
+                self._begun = True
+                yield rows.drop_dims("time").assign_coords(self._averages[0].times.coords)
+            yield rows
+
+    def _retrieved(
+        self, elastic: xr.Dataset, nitrogen: xr.Dataset, water: xr.Dataset | None = None
+    ) -> xr.Dataset:
+        data, settings = self._data, self._settings
+        raman = _of(data, settings.nitrogen)[WAVELENGTH]
+        overlap = data.get(OVERLAP)
+        return labeled.retrieve(
+            elastic.assign_coords(_pointing(data)),
+            nitrogen,
+            molecules=data[MOLECULES],
+            station_altitude=data.source.station_altitude,
+            assumptions=_assumptions(settings, data[WAVELENGTH], raman),
+            water=None if water is None else self._water(water),
+            overlap=None if overlap is None else overlap(elastic["range"].to_numpy()),
+        )
+
+    def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
+        settings = self._settings
+        # `Raman.decide` names the channel only with its calibration.
+        name = cast("str", settings.water_vapour)
+        constant = cast("float", settings.calibration)
+        error = settings.calibration_standard_error or 0.0
+        return labeled.WaterVapour(averages, _of(self._data, name)[WAVELENGTH], constant, error)
+
+
+def _of(data: Data, channel: str) -> Data:
+    """Return what the steps of a channel gave."""
+    return data if channel == data.channel else data.channels[channel]
+
+
+def _pointing(data: Data) -> Mapping[str, float]:
+    geometry = data.source.geometry
+    names = [name for name in ("zenith_angle", "azimuth") if name in geometry]
+    return {name: float(geometry[name][0]) for name in names}
+
+
+class _Dark(WholeProduct):
+    """A product without values, whose rows are the averages of a scene without Raman signal."""
+
+    def __init__(self, settings: RetrievalSettings, data: Data) -> None:
+        self._settings, self._data = settings, data
+
+    @property
+    def reads(self) -> bool:
+        """Nothing is read."""
+        return False
+
+    def add(self, chunk: Chunk) -> None:
+        """Take nothing of the profiles."""
+
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield the empty product."""
+        data, settings = self._data, self._settings
+        source = data.source
+        shots = data[PROFILES].shots(source.archive)
+        means = data[PROFILES].averages(source.geometry, shots, data[AVERAGE])
+        raman = _of(data, settings.nitrogen)[WAVELENGTH]
+        empty = labeled.without_signal(
+            means.times,
+            shots.compute(),
+            data[PROFILES].range,
+            _pointing(data),
+            molecules=data[MOLECULES],
+            station_altitude=source.station_altitude,
+            assumptions=_assumptions(settings, data[WAVELENGTH], raman),
+        )
+        yield empty
+        yield empty
+
+
+STEP: Final = Raman()

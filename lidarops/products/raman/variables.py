@@ -1,0 +1,308 @@
+"""The variables of the ``raman`` product."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from lidarops.netcdf.variables import (
+    NO_STANDARD_NAME,
+    RANGE,
+    SUBTRACTED_BACKGROUND,
+    Coverage,
+    ErrorBudget,
+    ErrorKind,
+    Layout,
+    Row,
+    altitude,
+    coordinates,
+    quality,
+    shots,
+)
+from lidarops.products.raman.flags import FLAGS
+from lidarops.retrieve.air.reference_window import Rejection
+from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
+
+_BINS: Final = ("time", "range")
+_BITS: Final = 12
+"""Significant bits of a retrieved value: 1.2e-4 of it."""
+_WORDS: Final = {
+    "noise": "the signal noise",
+    "resolution": "the difference between the weights of the value and a mean over"
+    " vertical_resolution",
+    "background": "the backgrounds",
+    "dead_time": "the dead times",
+    "reference": "the scattering ratio in the reference window",
+    "angstrom": "the Angstrom exponent",
+    "molecular": "the density of the air",
+    "overlap": "the overlap function",
+}
+_PARTS: Final = ("quality_flag", "profiles", "shots")
+_EXTINCTION: Final = (
+    "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient_aerosol_particles"
+)
+_BACKSCATTER: Final = (
+    "volume_backwards_scattering_coefficient_of_radiative_flux_by_ranging_instrument_in_air_due_to"
+    "_ambient_aerosol_particles"
+)
+_LIDAR_RATIO: Final = (
+    "ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering_coefficient_by_ranging"
+    "_instrument_in_air_due_to_ambient_aerosol_particles"
+)
+_COMMENT_OF_MEANS: Final = (
+    "Noise, resolution and background are independent from profile to profile; errors by all other"
+    " causes are shared by all profiles, so that they are averaged and do not decrease with the"
+    " number of profiles."
+)
+
+
+def _budget(name: str, units: str, causes: tuple[str, ...]) -> Iterator[Row]:
+    """Yield the rows of the error budget of a quantity."""
+    for cause in causes:
+        kind = ErrorKind.RANDOM if cause in RANDOM else ErrorKind.SYSTEMATIC
+        yield Row(
+            name=f"{name}_error_{cause}",
+            dims=_BINS,
+            dtype="f4",
+            units=units,
+            long_name=f"error of {name} for one standard error of {_WORDS[cause]}"
+            if cause != "resolution"
+            else f"standard error of {name} by {_WORDS[cause]}",
+            coverage=Coverage.QUALITY,
+            significant_bits=8,
+            error_kind=kind,
+            comment=f"{name}_standard_error is the root of the sum of squares of the error budget."
+            f" {NO_STANDARD_NAME}",
+        )
+
+
+def _terms(name: str, causes: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{name}_error_{cause}" for cause in causes)
+
+
+def _means(name: str, causes: tuple[str, ...]) -> ErrorBudget:
+    random = tuple(f"{name}_error_{cause}" for cause in causes if cause in RANDOM)
+    return ErrorBudget(random=random, comment=_COMMENT_OF_MEANS)
+
+
+def _part(name: str, units: str, words: str, kind: ErrorKind, *, optional: bool = False) -> Row:
+    """Return the row of the random or systematic error of a quantity."""
+    return Row(
+        name=f"{name}_error_{kind.value}",
+        dims=_BINS,
+        dtype="f4",
+        units=units,
+        long_name=f"{kind.value} standard error of {words}",
+        coverage=Coverage.QUALITY,
+        significant_bits=8,
+        error_kind=kind,
+        optional=optional,
+        comment=NO_STANDARD_NAME,
+    )
+
+
+LAYOUT: Final = Layout(
+    title="Extinction, backscatter and lidar ratio of aerosol from Raman signals",
+    summary="Extinction, backscatter and lidar ratio of aerosol from an elastic and a nitrogen"
+    " Raman signal, without an assumed lidar ratio, with error budgets and vertical resolution.",
+    keywords=(
+        "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL BACKSCATTER",
+        "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
+        "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
+    ),
+    processing_level="L2: retrieved quantities",
+    references=(
+        "Ansmann, A. et al. (1990), Opt. Lett. 15, 746-748.",
+        "Ansmann, A. et al. (1992), Appl. Opt. 31, 7113-7131.",
+        "Pappalardo, G. et al. (2004), Appl. Opt. 43, 5370-5385.",
+    ),
+    comment="Profiles are means over time; range is along the beam. Extinction and lidar ratio are"
+    " means over vertical_resolution, which follows from the signal; backscatter is that of the"
+    " bin. Below full overlap there is no extinction; backscatter is right there where both"
+    " channels have the same overlap. Particles in the reference window that decrease with height"
+    " nearly as molecules do look like aerosol-free air: only the error of the scattering ratio"
+    " declared in the settings covers them.",
+    sampled="range",
+    coordinates=coordinates((RANGE,), altitude("range")),
+    data=(
+        Row(
+            name="extinction",
+            dims=_BINS,
+            dtype="f4",
+            units="m-1",
+            standard_name=_EXTINCTION,
+            long_name="extinction coefficient of aerosol particles",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean range: mean",
+            ancillaries=(
+                *_terms("extinction", EXTINCTION_CAUSES),
+                "extinction_smoothing_error",
+                "vertical_resolution",
+                *_PARTS,
+            ),
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            budget=_means("extinction", EXTINCTION_CAUSES),
+            comment="Mean over vertical_resolution.",
+        ),
+        *_budget("extinction", "m-1", EXTINCTION_CAUSES),
+        Row(
+            name="extinction_smoothing_error",
+            dims=_BINS,
+            dtype="f4",
+            units="m-1",
+            long_name="standard error of extinction as that of the bin instead of its mean over"
+            " vertical_resolution",
+            coverage=Coverage.QUALITY,
+            significant_bits=8,
+            error_kind=ErrorKind.RANDOM,
+            comment="Not part of extinction_standard_error; from the smoothness of the profile, and"
+            f" too small at edges of layers. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="backscatter",
+            dims=_BINS,
+            dtype="f4",
+            units="m-1 sr-1",
+            standard_name=_BACKSCATTER,
+            long_name="backscatter coefficient of aerosol particles",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean range: mean",
+            ancillaries=(*_terms("backscatter", BACKSCATTER_CAUSES), *_PARTS),
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            budget=_means("backscatter", BACKSCATTER_CAUSES),
+        ),
+        *_budget("backscatter", "m-1 sr-1", BACKSCATTER_CAUSES),
+        Row(
+            name="lidar_ratio",
+            dims=_BINS,
+            dtype="f4",
+            units="sr",
+            standard_name=_LIDAR_RATIO,
+            long_name="ratio of extinction to backscatter of aerosol particles",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean range: mean",
+            ancillaries=(
+                "lidar_ratio_error_random",
+                "lidar_ratio_error_systematic",
+                "vertical_resolution",
+                *_PARTS,
+            ),
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            budget=ErrorBudget(random=("lidar_ratio_error_random",), comment=_COMMENT_OF_MEANS),
+            comment="Measured: extinction over backscatter, which is smoothed as extinction is."
+            " Missing where backscatter exceeds zero by less than 3 standard errors.",
+        ),
+        _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.RANDOM),
+        _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.SYSTEMATIC),
+        Row(
+            name="vertical_resolution",
+            dims=_BINS,
+            dtype="f4",
+            units="m",
+            long_name="effective resolution of extinction and lidar ratio along the beam",
+            coverage=Coverage.AUXILIARY,
+            significant_bits=8,
+            comment=f"Length over which a mean has the noise of the value. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="water_vapour_mixing_ratio",
+            dims=_BINS,
+            dtype="f4",
+            units="kg kg-1",
+            standard_name="humidity_mixing_ratio",
+            long_name="mass of water vapour over mass of dry air",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean range: mean",
+            ancillaries=(
+                "water_vapour_mixing_ratio_error_random",
+                "water_vapour_mixing_ratio_error_systematic",
+                *_PARTS,
+            ),
+            significant_bits=_BITS,
+            uncertain=True,
+            optional=True,
+            error_kind=ErrorKind.BOTH,
+            budget=ErrorBudget(
+                random=("water_vapour_mixing_ratio_error_random",), comment=_COMMENT_OF_MEANS
+            ),
+            comment="With the calibration constant of the campaign.",
+        ),
+        *(
+            _part(
+                "water_vapour_mixing_ratio",
+                "kg kg-1",
+                "water_vapour_mixing_ratio",
+                kind,
+                optional=True,
+            )
+            for kind in (ErrorKind.RANDOM, ErrorKind.SYSTEMATIC)
+        ),
+        Row(
+            name="overlap",
+            dims=_BINS,
+            dtype="f4",
+            units="1",
+            long_name="overlap of laser beam and field of view of the Raman channel",
+            coverage=Coverage.AUXILIARY,
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            comment="Below the range of full overlap, from the lidar ratio measured above it."
+            f" {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="molecular_backscatter",
+            dims=("range",),
+            dtype="f4",
+            units="m-1 sr-1",
+            long_name="backscatter coefficient of molecules",
+            coverage=Coverage.REFERENCE,
+            comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
+        ),
+        *(
+            Row(
+                name=f"reference_{end}",
+                dims=("time",),
+                dtype="f4",
+                units="m",
+                long_name=f"range at which the reference window {word}",
+                coverage=Coverage.AUXILIARY,
+                comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
+            )
+            for end, word in (("bottom", "begins"), ("top", "ends"))
+        ),
+        Row(
+            name="reference_rejections",
+            dims=("time",),
+            dtype="i4",
+            units="1",
+            standard_name="status_flag",
+            long_name="reasons for which candidates of the reference window were rejected",
+            coverage=Coverage.AUXILIARY,
+            reasons=Rejection,
+            comment="Of all candidates together; where none passed, no_reference is raised in"
+            " quality_flag. The elastic signal is corrected for the measured attenuation before it"
+            " is compared with air.",
+        ),
+        SUBTRACTED_BACKGROUND,
+        quality(_BINS, FLAGS),
+        Row(
+            name="profiles",
+            dims=("time",),
+            dtype="i4",
+            units="1",
+            standard_name="number_of_observations",
+            long_name="number of raw profiles in the mean",
+            coverage=Coverage.AUXILIARY,
+            cell_methods="time: sum",
+            valid_min=0.0,
+        ),
+        shots(of="all profiles in the mean"),
+    ),
+)

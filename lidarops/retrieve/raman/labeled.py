@@ -1,0 +1,408 @@
+"""The Raman retrieval of mean profiles in xarray.
+
+In this order: common bins of the channels, background of each, cells, extinction, backscatter and
+lidar ratio, water vapour, overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.flags import Quality
+from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
+from lidarops.retrieve.background import estimate
+from lidarops.retrieve.raman.cells import Cells, make_cells
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.overlap import overlap_of
+from lidarops.retrieve.raman.retrieval import (
+    AirColumn,
+    ChannelSignal,
+    RamanResult,
+    RamanSettings,
+    cell_signal,
+    retrieve_raman,
+)
+from lidarops.retrieve.raman.scattering import nitrogen_line_share, particle_ratio
+from lidarops.retrieve.raman.water_vapour import mixing_ratio
+from lidarops.retrieve.signal.labeled import (
+    CORRELATION_LENGTH,
+    actual_noise,
+    counts_per_power,
+    dead_time_error,
+)
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+Booleans = npt.NDArray[np.bool_]
+
+_ANY: Final = int(
+    Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
+)
+_WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
+_MISSING: Final = np.int32(Quality.INPUT_MISSING)
+
+
+@dataclass(frozen=True, slots=True)
+class WaterVapour:
+    """The channel of water vapour, and its calibration."""
+
+    averages: xr.Dataset
+    wavelength: float
+    """m."""
+    constant: float
+    """kg kg-1 per ratio of the signals of water vapour and nitrogen."""
+    constant_standard_error: float
+
+
+@dataclass(frozen=True, slots=True)
+class Assumptions:
+    """What is assumed for a retrieval; lengths are along the beam."""
+
+    settings: RamanSettings
+    cell: float
+    """m, length of a cell."""
+    highest: float
+    """m, farthest range of cells."""
+    known_shape: bool
+    """Whether the background is fitted with the shape of clean air."""
+    filter_width: float | None = None
+    """m, full width at half maximum of the filter of nitrogen; None where all lines pass."""
+
+
+class _Channel:
+    """Means of one channel on the bins that all channels have in common."""
+
+    def __init__(self, averages: xr.Dataset, bins: slice, distance: Array) -> None:
+        averages = averages.isel(range=bins).assign_coords(range=("range", distance))
+        self.averages = averages
+        self.quality = averages["quality"].to_numpy().astype(np.int32)
+        hidden = (self.quality & np.int32(_WITHHELD)) != 0
+        self.power = np.where(hidden, np.nan, averages["power"].to_numpy())
+        noise = actual_noise(averages)
+        self.variance = noise.variance * noise.correlation_length[:, np.newaxis]
+        counts = counts_per_power(averages, averages["shots"].to_numpy())
+        scale = noise.excess * noise.correlation_length
+        self.counts = None if counts is None else counts / scale
+
+    def signal(self, shape: Array, *, known_shape: bool) -> tuple[ChannelSignal, Booleans]:
+        """Return the signal without background, and whether the background is uncertain."""
+        r = self.averages["range"].to_numpy()
+        if known_shape:
+            sky = estimate.from_known_shape(
+                self.power, r, self.variance, shape, exposure=self.counts
+            )
+        else:
+            sky = estimate.from_tail(self.power, r, self.variance)
+        background = sky.background
+        change = dead_time_error(self.averages, xr.DataArray(background, dims="time"))
+        error = np.zeros((1, r.size))
+        if change is not None:
+            error = np.nan_to_num(change.transpose("time", "range").to_numpy())
+        signal = ChannelSignal(
+            self.power - background[:, np.newaxis],
+            self.variance,
+            np.nan_to_num(background),
+            sky.standard_error,
+            error,
+            self.counts,
+        )
+        return signal, sky.uncertain
+
+
+def retrieve(
+    elastic: xr.Dataset,
+    raman: xr.Dataset,
+    *,
+    molecules: MolecularProfile,
+    station_altitude: float,
+    assumptions: Assumptions,
+    water: WaterVapour | None = None,
+    overlap: Array | None = None,
+) -> xr.Dataset:
+    """Return the variables of the ``raman`` product of mean profiles.
+
+    Parameters
+    ----------
+    elastic, raman : xr.Dataset
+        Means over the same times: ``power``, ``variance``, ``quality`` over (time, range) and
+        ``shots``, ``profiles`` over time, with the scalar coordinate ``zenith_angle`` (degree),
+        from `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. Bins of both
+        have equal widths; ranges are those of `elastic`, to half a bin.
+    molecules : MolecularProfile
+    station_altitude : float
+        m above mean sea level.
+    assumptions : Assumptions
+    water : WaterVapour, optional
+    overlap : (range,) float, optional
+        Overlap function at the ranges of `elastic`, common to all channels; NaN where it is not
+        known.
+
+    Returns
+    -------
+    xr.Dataset
+        In memory, over (time, range) of cells. Where a value is NaN, a bit of ``quality_flag``
+        gives the reason.
+
+    Raises
+    ------
+    RetrievalInputError
+        For invalid arguments.
+    """
+    climb = float(np.cos(np.deg2rad(elastic["zenith_angle"])))
+    others = [raman] if water is None else [raman, water.averages]
+    distance, bins = _common_bins(elastic, others, climb, station_altitude)
+    channels = [
+        _Channel(averages, part, distance)
+        for averages, part in zip((elastic, *others), bins, strict=True)
+    ]
+    seen = np.ones(distance.size) if overlap is None else overlap[bins[0]]
+    settings = assumptions.settings
+    heights = station_altitude + climb * distance
+    air = _air(molecules, heights, distance, settings, assumptions.filter_width, seen)
+    cells = make_cells(distance, min(assumptions.highest, float(distance[-1])), assumptions.cell)
+    of_elastic, elastic_uncertain = channels[0].signal(
+        air.backscatter * air.elastic_shape, known_shape=assumptions.known_shape
+    )
+    of_raman, raman_uncertain = channels[1].signal(
+        air.raman_shape, known_shape=assumptions.known_shape
+    )
+    quality = _quality(cells, channels, seen)
+    uncertain = elastic_uncertain | raman_uncertain
+    quality[uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
+    result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
+    variables = _variables(result, cells, air, of_raman, settings)
+    if water is not None:
+        shape = replace(air, raman_depth=_depth(molecules, heights, distance, water.wavelength))
+        signal, _ = channels[2].signal(shape.raman_shape, known_shape=assumptions.known_shape)
+        variables |= _water(signal, shape, cells, result, settings, water)
+    coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
+    return xr.Dataset(
+        {
+            **variables,
+            "background": ("time", of_elastic.background),
+            "background_standard_error": ("time", of_elastic.background_standard_error),
+            "profiles": elastic["profiles"],
+            "shots": elastic["shots"],
+        },
+        coords={**coords, "range": ("range", cells.range)},
+    )
+
+
+def without_signal(
+    times: xr.Dataset,
+    shots: xr.DataArray,
+    distance: Array,
+    pointing: Mapping[str, float],
+    *,
+    molecules: MolecularProfile,
+    station_altitude: float,
+    assumptions: Assumptions,
+) -> xr.Dataset:
+    """Return the product of profiles in which a look found no Raman signal.
+
+    Parameters
+    ----------
+    times : xr.Dataset
+        ``time`` and ``time_bnds`` of the means.
+    shots : xr.DataArray, (time,)
+        Of all profiles, at their times.
+    distance : (range,) float
+        m, of the elastic channel.
+    pointing : mapping of str to float
+        Scalar coordinates in degree, ``zenith_angle`` among them.
+    molecules, station_altitude, assumptions
+        As for `retrieve`.
+
+    Returns
+    -------
+    xr.Dataset
+        As of `retrieve`, without values and water vapour; WEAK_SIGNAL everywhere.
+    """
+    starts = times["time_bnds"].to_numpy()[:, 0]
+    group = np.searchsorted(starts, shots["time"].to_numpy(), side="right") - 1
+    plane, shape = ("time", "range"), (starts.size, distance.size)
+    empty = xr.Dataset(
+        {
+            "power": (plane, np.full(shape, np.nan)),
+            "variance": (plane, np.full(shape, np.nan)),
+            "quality": (plane, np.zeros(shape, np.int32)),
+            CORRELATION_LENGTH: ("time", np.ones(starts.size)),
+            "profiles": ("time", np.bincount(group, minlength=starts.size).astype(np.int32)),
+            "shots": (
+                "time",
+                np.bincount(group, shots.to_numpy(), minlength=starts.size).astype(np.int32),
+            ),
+        },
+        coords={**times.coords, "range": ("range", distance), **pointing},
+    )
+    product = retrieve(
+        empty,
+        empty,
+        molecules=molecules,
+        station_altitude=station_altitude,
+        assumptions=replace(assumptions, known_shape=False),
+    )
+    bits = np.int32(sum(RamanQuality))
+    return product.assign(quality_flag=xr.full_like(product["quality_flag"], bits))
+
+
+def _common_bins(
+    elastic: xr.Dataset, others: list[xr.Dataset], climb: float, altitude: float
+) -> tuple[Array, list[slice]]:
+    """Return the ranges that all channels have, and the bins of each there."""
+    distance = elastic["range"].to_numpy().astype(np.float64)
+    width = float(np.median(np.diff(distance)))
+    grids = [one["range"].to_numpy().astype(np.float64) for one in others]
+    shifts = [round((distance[0] - grid[0]) / width) for grid in grids]
+    first = max(0, *(-shift for shift in shifts))
+    stop = min(distance.size, *(g.size - s for g, s in zip(grids, shifts, strict=True)))
+    # An offset may give negative ranges, without light; above the atmosphere there is no air.
+    inside = (distance > 0) & (altitude + climb * distance < HIGHEST)
+    first = max(first, int(np.argmax(inside)))
+    stop = min(stop, distance.size - int(np.argmax(inside[::-1])))
+    slices = [slice(first, stop), *(slice(first + s, stop + s) for s in shifts)]
+    return distance[first:stop], slices
+
+
+def _depth(
+    molecules: MolecularProfile, altitude: Array, distance: Array, wavelength: float
+) -> Array:
+    """Return the optical depth of air from the lidar, by trapezoids."""
+    extinction = molecules.extinction(altitude, wavelength)
+    gained = 0.5 * (extinction[1:] + extinction[:-1]) * np.diff(distance)
+    return np.asarray(extinction[0] * distance[0] + np.concatenate([[0.0], np.cumsum(gained)]))
+
+
+def _air(
+    molecules: MolecularProfile,
+    altitude: Array,
+    distance: Array,
+    settings: RamanSettings,
+    filter_width: float | None,
+    overlap: Array,
+) -> AirColumn:
+    laser, raman = settings.wavelength, settings.raman_wavelength
+    density = molecules.number_density(altitude)
+    if filter_width is not None:
+        temperature = molecules.at(altitude)[1]
+        density = density * nitrogen_line_share(temperature, laser, raman, filter_width)
+    return AirColumn(
+        distance,
+        molecules.backscatter(altitude, laser),
+        _depth(molecules, altitude, distance, laser),
+        _depth(molecules, altitude, distance, raman),
+        density,
+        overlap,
+    )
+
+
+def _quality(cells: Cells, channels: list[_Channel], overlap: Array) -> Flags:
+    """Return the bits of cells: those of any bin, and INPUT_MISSING where all bins lack data."""
+    rows = len(channels[0].quality)
+    bits = np.zeros((rows, cells.range.size), dtype=np.int32)
+    for channel in channels:
+        parts = cells.split(channel.quality & np.int32(_ANY))
+        bits |= np.bitwise_or.reduce(parts, axis=-1).astype(np.int32)
+        bits[cells.known(channel.power) == 0] |= _MISSING
+    unknown = np.isnan(cells.split(overlap)).any(axis=-1)
+    bits[:, unknown] |= np.int32(Quality.INCOMPLETE_OVERLAP)
+    return bits
+
+
+def _variables(
+    result: RamanResult,
+    cells: Cells,
+    air: AirColumn,
+    raman: ChannelSignal,
+    settings: RamanSettings,
+) -> dict[str, Any]:
+    both = ("time", "range")
+    profiles: dict[str, Array] = {
+        "extinction": result.extinction,
+        "extinction_standard_error": result.extinction_standard_error,
+        **_budget("extinction", result.extinction_budget),
+        "extinction_smoothing_error": result.extinction_smoothing_error,
+        "backscatter": result.backscatter,
+        "backscatter_standard_error": result.backscatter_standard_error,
+        **_budget("backscatter", result.backscatter_budget),
+        "lidar_ratio": result.lidar_ratio,
+        "lidar_ratio_standard_error": result.lidar_ratio_standard_error,
+        "lidar_ratio_error_random": result.lidar_ratio_random,
+        "lidar_ratio_error_systematic": result.lidar_ratio_systematic,
+        "vertical_resolution": result.vertical_resolution,
+        **_overlap(result, cells, air, raman, settings),
+    }
+    return {
+        **{name: (both, values) for name, values in profiles.items()},
+        "quality_flag": (both, result.quality),
+        "molecular_backscatter": ("range", cells.mean(air.backscatter)),
+        "reference_bottom": ("time", result.reference_bottom),
+        "reference_top": ("time", result.reference_top),
+        "reference_rejections": ("time", result.reference_rejections),
+    }
+
+
+def _budget(name: str, budget: Mapping[str, Array]) -> dict[str, Array]:
+    return {f"{name}_error_{cause}": error for cause, error in budget.items()}
+
+
+def _overlap(
+    result: RamanResult,
+    cells: Cells,
+    air: AirColumn,
+    raman: ChannelSignal,
+    settings: RamanSettings,
+) -> dict[str, Array]:
+    """Return the overlap of each profile, from a signal that is not corrected for overlap."""
+    unity = replace(air, overlap=np.ones(air.overlap.size))
+    value, error = np.full((2, *result.quality.shape), np.nan)
+    for row, bits in enumerate(result.quality):
+        signal = cell_signal(raman, row, unity.raman_shape, cells)
+        found = overlap_of(
+            signal.value,
+            signal.variance,
+            result.raman_depth[row],
+            result.backscatter[row],
+            (result.lidar_ratio[row], result.lidar_ratio_standard_error[row]),
+            (bits & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0,
+            cells.step,
+            settings.ratio,
+        )
+        value[row], error[row] = found.value, found.standard_error
+    return {"overlap": value, "overlap_standard_error": error}
+
+
+def _water(
+    signal: ChannelSignal,
+    air: AirColumn,
+    cells: Cells,
+    result: RamanResult,
+    settings: RamanSettings,
+    water: WaterVapour,
+) -> dict[str, Any]:
+    """Return the mixing ratio of water vapour and its errors."""
+    laser = settings.wavelength
+    of_water = particle_ratio(settings.angstrom_exponent, laser, water.wavelength)
+    value, random, systematic = np.full((3, *result.quality.shape), np.nan)
+    for row in range(len(value)):
+        found = mixing_ratio(
+            cell_signal(signal, row, air.raman_shape, cells),
+            result.raman_depth[row],
+            result.raman_depth_error[row],
+            constant=water.constant,
+            constant_standard_error=water.constant_standard_error,
+            ratios=(1.0, settings.ratio, of_water),
+        )
+        value[row], random[row], systematic[row] = found.value, found.random, found.systematic
+    names = ("", "_standard_error", "_error_random", "_error_systematic")
+    arrays = (value, np.hypot(random, systematic), random, systematic)
+    return {
+        f"water_vapour_mixing_ratio{name}": (("time", "range"), array)
+        for name, array in zip(names, arrays, strict=True)
+    }

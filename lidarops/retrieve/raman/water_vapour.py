@@ -1,0 +1,67 @@
+"""Water-vapour mixing ratio from the Raman signals of water vapour and nitrogen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.raman.backscatter import inverse_mean
+from lidarops.retrieve.raman.retrieval import CellSignal
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MixingRatio:
+    """Mass of water vapour over that of dry air, (cell,)."""
+
+    value: Array
+    random: Array
+    """Standard error by noise and background."""
+    systematic: Array
+    """Standard error by calibration and dead time."""
+
+
+def mixing_ratio(
+    water: CellSignal,
+    depth: Array,
+    depth_error: Array,
+    *,
+    constant: float,
+    constant_standard_error: float,
+    ratios: tuple[float, float, float],
+) -> MixingRatio:
+    r"""Return the mixing ratio, with the calibration constant of both channels.
+
+    .. math:: w = C \frac{y_W}{e^{-\theta}} e^{(\kappa_W - \kappa) \tau_p}
+
+    Signals are over those of clean air with equal shares of both gases, so that the transmission of
+    air is corrected; the nitrogen signal is the smooth one.
+
+    Parameters
+    ----------
+    water : CellSignal
+        Over the signal of air at the wavelength of water vapour.
+    depth, depth_error : (cell,) float
+        Fitted optical depth of the nitrogen signal, up to a constant, and its error by noise.
+    constant, constant_standard_error : float
+        Calibration constant, kg kg-1 per ratio of the signals.
+    ratios : (float, float, float)
+        Particle extinction at the wavelengths of the laser, of nitrogen and of water vapour, over
+        that at the laser's.
+
+    References
+    ----------
+    `whiteman2003`.
+    """
+    _, of_nitrogen, of_water = ratios
+    particles = (depth - depth[np.flatnonzero(np.isfinite(depth))[:1]].sum()) / (1.0 + of_nitrogen)
+    factor = constant * inverse_mean(np.exp(-depth), depth_error**2)
+    factor *= np.exp((of_water - of_nitrogen) * particles)
+    value = factor * water.value
+    noise = factor**2 * (water.variance + water.background**2) + (value * depth_error) ** 2
+    relative = constant_standard_error / constant
+    systematic = np.hypot(value * relative, factor * water.dead_time)
+    return MixingRatio(value, np.sqrt(noise), systematic)
