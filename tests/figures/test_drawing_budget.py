@@ -20,6 +20,7 @@ LONG: dict[str, dict[str, Any]] = {
     "signal": {"profiles": 1440, "bins": 800},
     "homogeneous": {"profiles": 10_000, "sections": 6},
     "elastic": {"profiles": 720, "bins": 800},
+    "raman": {"profiles": 720, "bins": 250},
     "multiangle": {
         "profiles": 300,
         "levels": 150,

@@ -82,7 +82,16 @@ def _terms(name: str, causes: tuple[str, ...]) -> tuple[str, ...]:
 
 def _means(name: str, causes: tuple[str, ...]) -> ErrorBudget:
     random = tuple(f"{name}_error_{cause}" for cause in causes if cause in RANDOM)
-    return ErrorBudget(random=random, comment=_COMMENT_OF_MEANS)
+    shared = tuple(f"{name}_error_{cause}" for cause in causes if cause not in RANDOM)
+    return ErrorBudget(random=random, shared=shared, comment=_COMMENT_OF_MEANS)
+
+
+def _of_two_parts(name: str) -> ErrorBudget:
+    return ErrorBudget(
+        random=(f"{name}_error_random",),
+        shared=(f"{name}_error_systematic",),
+        comment=_COMMENT_OF_MEANS,
+    )
 
 
 def _part(name: str, units: str, words: str, kind: ErrorKind, *, optional: bool = False) -> Row:
@@ -156,7 +165,7 @@ LAYOUT: Final = Layout(
             " vertical_resolution",
             coverage=Coverage.QUALITY,
             significant_bits=8,
-            error_kind=ErrorKind.RANDOM,
+            error_kind=ErrorKind.SYSTEMATIC,
             comment="Not part of extinction_standard_error; from the smoothness of the profile, and"
             f" too small at edges of layers. {NO_STANDARD_NAME}",
         ),
@@ -194,7 +203,7 @@ LAYOUT: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            budget=ErrorBudget(random=("lidar_ratio_error_random",), comment=_COMMENT_OF_MEANS),
+            budget=_of_two_parts("lidar_ratio"),
             comment="Measured: extinction over backscatter, which is smoothed as extinction is."
             " Missing where backscatter exceeds zero by less than 3 standard errors.",
         ),
@@ -228,9 +237,7 @@ LAYOUT: Final = Layout(
             uncertain=True,
             optional=True,
             error_kind=ErrorKind.BOTH,
-            budget=ErrorBudget(
-                random=("water_vapour_mixing_ratio_error_random",), comment=_COMMENT_OF_MEANS
-            ),
+            budget=_of_two_parts("water_vapour_mixing_ratio"),
             comment="With the calibration constant of the campaign.",
         ),
         *(
