@@ -148,6 +148,7 @@ def test_variables_without_standard_name():
             "inhomogeneity",
             "residual",
             "beam_signal",
+            "beam_obstruction",
             "effective_degrees_of_freedom",
             "reach",
         },

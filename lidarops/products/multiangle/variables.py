@@ -313,6 +313,17 @@ LAYOUT: Final = Layout(
             f" not stated; residual is missing where it is too large. {NO_STANDARD_NAME}",
         ),
         Row(
+            name="beam_obstruction",
+            dims=("time", "beam"),
+            dtype="f4",
+            units="m",
+            long_name="range from which the beam is blocked by an obstruction or a dense cloud",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            optional=True,
+            comment=f"Missing for a free beam. Farther bins are not used. {NO_STANDARD_NAME}",
+        ),
+        Row(
             name="residual",
             dims=("time", "beam", "altitude"),
             dtype="f4",

@@ -134,6 +134,7 @@ def retrieve_optical_depth(
             **values,
             **{name: ("time", getattr(retrieval, name)) for name in _PER_PROFILE},
             "beam_signal": (("time", "beam", "altitude"), signal),
+            "beam_obstruction": beams["obstruction"],
             "residual": (("time", "beam", "altitude"), retrieval.residual),
             "quality_flag": (("time", "altitude"), quality),
             "beams": ("time", sampled.sum(axis=1).astype(np.int32)),

@@ -16,6 +16,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
+from lidarops.retrieve.multiangle._obstructions import obstruction_range
 from lidarops.retrieve.signal.averaging import RunningMean
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
@@ -115,7 +116,7 @@ class AltitudeCycles:
             azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any()
         )
         self._batches = list(_batches(order))
-        self._pieces: list[tuple[Array, Array, Flags, Array]] = []
+        self._pieces: list[tuple[Array, Array, Flags, Array, Array]] = []
 
     def ends(self) -> Integers:
         """Return the profiles before which a chunk may end: those that begin a cycle."""
@@ -164,7 +165,8 @@ class AltitudeCycles:
         xr.Dataset
             ``signal`` (range-corrected) and ``variance`` over (time, beam, altitude), NaN where
             missing; ``quality`` (the bits of all bins at an altitude) over (time, altitude);
-            ``left`` (the standard error of the background by signal in the far range) over (time,
+            ``left`` (the standard error of the background by signal in the far range) and
+            ``obstruction`` (m, the range from which a beam is blocked; NaN if none) over (time,
             beam); ``response`` (the mean of the square of range over overlap, m2) over (beam,
             altitude); and ``shots`` over time. ``time`` is the middle of
             ``time_bnds``, which span the profiles of a cycle.
@@ -172,8 +174,8 @@ class AltitudeCycles:
         order = self._order
         arrays = [np.concatenate(pieces) for pieces in zip(*self._pieces, strict=True)]
         cube = ("time", "beam", "altitude")
-        dims = (cube, cube, ("time", "altitude"), ("time", "beam"))
-        names = ("signal", "variance", "quality", "left")
+        dims = (cube, cube, ("time", "altitude"), ("time", "beam"), ("time", "beam"))
+        names = ("signal", "variance", "quality", "left", "obstruction")
         bounds = _cycle_bounds(self._bounds, order)
         coordinates = {
             "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
@@ -312,11 +314,11 @@ def _batch_on_altitudes(
     cycle: Integers,
     beam: Integers,
     settings: _Settings,
-) -> tuple[Array, Array, Flags, Array]:
+) -> tuple[Array, Array, Flags, Array, Array]:
     """Return signal and variance as (cycle, beam, altitude), quality as (cycle, altitude).
 
-    The fourth array is, as (cycle, beam), the signal that may have been subtracted with the
-    background.
+    The fourth and fifth arrays are, as (cycle, beam), the signal that may have been subtracted with
+    the background, and the range from which the beam is blocked, m.
     """
     power, variance, quality, length = profiles
     bins = _net_bins(power, variance, quality, length, beam, settings)
@@ -328,8 +330,11 @@ def _batch_on_altitudes(
     shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
     signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     flags = np.zeros((shape[0], shape[2]), dtype=np.int32)
-    left_by_beam = np.full(shape[:2], np.nan)
+    left_by_beam, blocked = np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
     left_by_beam[cycle[first], beam[first]] = bins.left
+    blocked[cycle[first], beam[first]] = np.where(
+        np.isfinite(bins.obstruction), bins.obstruction, np.nan
+    )
     beam, cycle = beam[first], cycle[first]
     near, gain = settings.covered, settings.gain
     for number in np.unique(beam):
@@ -346,7 +351,7 @@ def _batch_on_altitudes(
         noise = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
         signal[cycle[rows], number], spread[cycle[rows], number] = at_centres(means.signal, noise)
         flags[cycle[rows]] |= means.quality
-    return signal, spread, flags, left_by_beam
+    return signal, spread, flags, left_by_beam, blocked
 
 
 class _Bins(NamedTuple):
@@ -362,6 +367,8 @@ class _Bins(NamedTuple):
     """(profile,): variance of the background."""
     left: Array
     """(profile,): signal that may have been subtracted with the background."""
+    obstruction: Array
+    """(profile,): m, range from which the beam is blocked; inf for a free beam."""
 
 
 def _net_bins(
@@ -397,7 +404,10 @@ def _net_bins(
     unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
     left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
-    return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left)
+    distance = settings.distance[near]
+    blocked = obstruction_range(net, of_means[:, near], distance)
+    net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)
+    return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left, blocked)
 
 
 def _shapes(
@@ -442,4 +452,5 @@ def _visit_means(bins: _Bins, shots: Array, first: npt.NDArray[np.intp]) -> _Bin
         np.bitwise_or.reduceat(bins.quality, first, axis=0),
         level / np.add.reduceat(shots, first) ** 2,
         left / count,
+        np.minimum.reduceat(bins.obstruction, first),
     )

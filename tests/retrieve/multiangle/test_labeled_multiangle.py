@@ -238,6 +238,7 @@ def test_extinction_stays_withheld_if_single_altitudes_replace_joint():
             "variance": (dims, (1e-5 * signal) ** 2),
             "quality": (dims[::2], np.zeros((cycles, 60), np.int32)),
             "left": (dims[:2], np.zeros((cycles, beams))),
+            "obstruction": (dims[:2], np.full((cycles, beams), np.nan)),
             "response": (dims[1:], np.ones((beams, 60))),
             "shots": ("time", np.ones(cycles, np.int32)),
         },
@@ -339,6 +340,26 @@ def test_an_angle_to_one_side_has_a_systematic_error():
     np.testing.assert_allclose(
         2.0 * half["optical_depth_gradient_error"], one_sided["optical_depth_gradient_error"]
     )
+
+
+def test_a_beam_ends_at_an_obstruction_and_says_where():
+    conditioned, pointing = scan(4, ONE_SIDE)
+    free = solve(conditioned, pointing)
+    assert np.isnan(free["beam_obstruction"]).all()
+    # The lowest beam of the second cycle hits a mast, and has no light from there on.
+    power = conditioned["power"].to_numpy()
+    power[19, RANGE > 2000.0] = power[19, -200:].mean()
+    power[19, (RANGE > 1990.0) & (RANGE < 2020.0)] *= 10.0
+    blocked = solve(conditioned, pointing)
+    found = blocked["beam_obstruction"].to_numpy()
+    assert np.argwhere(np.isfinite(found)).tolist() == [[1, 9]]
+    assert 1880.0 < found[1, 9] <= 2010.0
+    height = 2000.0 * np.cos(np.radians(70.0))
+    seen = np.isfinite(blocked["residual"].to_numpy()[1, 9])
+    assert seen[height - 200.0 > ALTITUDE - STATION].all()
+    assert not seen[height < ALTITUDE - STATION].any()
+    off, plain = errors(blocked)
+    assert np.nanmax(np.abs(off[1])[plain[1]]) < 4.0
 
 
 def test_a_plume_in_one_plane_of_a_volume_does_not_widen_the_errors_of_another():

@@ -327,6 +327,7 @@ def multiangle(
                 for name, scale in scales.items()
             },
             "beam_signal": (("time", "beam", "altitude"), np.exp(14.0 + residual)),
+            "beam_obstruction": (("time", "beam"), np.full((profiles, angles.size), np.nan)),
             "residual": (("time", "beam", "altitude"), residual),
             "effective_degrees_of_freedom": ("time", np.full(profiles, 12.5)),
             "reach": ("time", np.full(profiles, 800.0)),
