@@ -98,6 +98,19 @@ class Optics(SettingsModel):
         return photons * self.efficiency * self.area * 299_792_458.0 / 2.0 * 1e-6 / 1e6 * 1e-6
 
 
+class RamanLines(SettingsModel):
+    """Vibrational Raman lines that a detector receives, instead of elastic light."""
+
+    gas: Literal["nitrogen", "water_vapour"]
+    laser: int = quantity(unit="nm", ge=200, le=3000, description="wavelength of the laser")
+    surface_mixing_ratio: float = quantity(
+        0.01, unit="kg kg-1", gt=0, le=0.05, description="of water vapour at the origin"
+    )
+    scale_height: float = quantity(
+        2000.0, unit="m", ge=100, le=20_000, description="of the mixing ratio"
+    )
+
+
 class Detector(SettingsModel):
     """Detector of one wavelength with an analog recorder, a photon counter or both."""
 
@@ -114,6 +127,7 @@ class Detector(SettingsModel):
         " a range of 1 km, with full overlap and without extinction",
     )
     optics: Optics | None = Field(default=None, description="alternative to signal_rate")
+    raman: RamanLines | None = Field(default=None, description="by default, light is elastic")
     background: Background
     photon: PhotonCounter | None = None
     analog: AnalogRecorder | None = None

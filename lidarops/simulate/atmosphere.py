@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from lidarops.campaign.simulated_atmosphere import Gradient, Plume, Sounding, Turbulence
+from lidarops.campaign.simulated_instrument import RamanLines
 from lidarops.campaign.simulation import Aerosol, AtmosphereSettings, DiurnalCourse
 from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.retrieve.air.molecular import (
@@ -24,12 +25,19 @@ from lidarops.retrieve.air.molecular import (
     rayleigh_cross_section,
     us_standard,
 )
+from lidarops.retrieve.raman.scattering import MASS_RATIO, NITROGEN_SHARE
 
 Array = NDArray[np.float64]
 
 REFERENCE_WAVELENGTH: Final = 532e-9
 """m, wavelength of the extinction of aerosol in the settings."""
 
+_RAMAN_CROSS_SECTION: Final = 2.8e-34
+"""m2 sr-1, of the vibrational Raman lines of nitrogen at `_RAMAN_WAVELENGTH` (`wandinger2005`)."""
+_RAMAN_WAVELENGTH: Final = 355e-9
+"""m."""
+_WATER_OVER_NITROGEN: Final = 2.5
+"""Cross section of the lines of water vapour over that of nitrogen (`whiteman2003`)."""
 _MODES: Final = 256
 """Number of plane waves in the turbulence."""
 
@@ -153,18 +161,37 @@ class Air:
                 backscatter += inside * (cloud.extinction / cloud.lidar_ratio)
         return BeamPath(extinction, backscatter)
 
+    def raman_along(self, beam: Beam, distance: Array, lines: RamanLines) -> Array:
+        """Return the Raman backscatter along a beam, m-1 sr-1.
+
+        Parameters
+        ----------
+        beam : Beam
+        distance : ndarray, m, shape (bins,)
+        lines : RamanLines
+        """
+        height = _points(beam, np.maximum(distance, 0.0)).height
+        cross_section = _RAMAN_CROSS_SECTION * (_RAMAN_WAVELENGTH / (lines.laser * 1e-9)) ** 4
+        density = self._density(height)
+        if lines.gas == "nitrogen":
+            return np.asarray(NITROGEN_SHARE * density * cross_section)
+        ratio = lines.surface_mixing_ratio * np.exp(-np.maximum(height, 0.0) / lines.scale_height)
+        return np.asarray(ratio / MASS_RATIO * density * _WATER_OVER_NITROGEN * cross_section)
+
     def molecules(self, height: Array, wavelength: float) -> Array:
         """Return the molecular extinction at heights above the ground, m-1."""
+        return self._density(height) * rayleigh_cross_section(wavelength)
+
+    def _density(self, height: Array) -> Array:
+        """Return the number density of air at heights above the ground, m-3."""
         constant = self._settings.homogeneous is not None and (
             self._settings.homogeneous.molecules_constant
         )
         altitude = self._altitude + (np.zeros_like(height) if constant else height)
         if self._sounding is not None:
-            density = self._sounding.number_density(altitude)
-        else:
-            inside = np.clip(altitude, LOWEST, HIGHEST)
-            density = number_density(*us_standard(inside)) * (altitude <= HIGHEST)
-        return density * rayleigh_cross_section(wavelength)
+            return self._sounding.number_density(altitude)
+        inside = np.clip(altitude, LOWEST, HIGHEST)
+        return np.asarray(number_density(*us_standard(inside)) * (altitude <= HIGHEST))
 
     def _seconds(self, moment: datetime) -> float:
         return (moment - self._start).total_seconds()

@@ -382,6 +382,17 @@ class Simulator:
         distance = bin_centres(*grid)
         constant = detector.system_constant
         pulse = self.site.simulated.pulse
+        if detector.raman is not None:
+            rate = backscatter_signal(
+                distance,
+                extinction=self._path(conditions, detector.raman.laser * 1e-9, grid).extinction,
+                backscatter=self._air.raman_along(conditions.beam, distance, detector.raman),
+                system_constant=constant,
+                full_overlap_range=full,
+                returning_extinction=path.extinction,
+            )
+            signal = _LaserSignal(rate, math.nan, math.nan)
+            return _cache(self._signals, key, signal)
         if pulse is None:
             rate = backscatter_signal(
                 distance,

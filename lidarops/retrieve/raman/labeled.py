@@ -180,7 +180,8 @@ def retrieve(
     if water is not None:
         shape = replace(air, raman_depth=_depth(molecules, heights, distance, water.wavelength))
         signal, _ = channels[2].signal(shape.raman_shape, known_shape=assumptions.known_shape)
-        variables |= _water(signal, shape, cells, result, settings, water)
+        pair = (of_raman, air), (signal, shape)
+        variables |= _water(pair, cells, result, settings, water)
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
     return xr.Dataset(
         {
@@ -249,7 +250,12 @@ def without_signal(
         assumptions=replace(assumptions, known_shape=False),
     )
     bits = np.int32(sum(RamanQuality))
-    return product.assign(quality_flag=xr.full_like(product["quality_flag"], bits))
+    unknown = xr.full_like(product["overlap"], np.nan)
+    return product.assign(
+        quality_flag=xr.full_like(product["quality_flag"], bits),
+        overlap=unknown,
+        overlap_standard_error=unknown,
+    )
 
 
 def _common_bins(
@@ -379,22 +385,26 @@ def _overlap(
 
 
 def _water(
-    signal: ChannelSignal,
-    air: AirColumn,
+    pair: tuple[tuple[ChannelSignal, AirColumn], tuple[ChannelSignal, AirColumn]],
     cells: Cells,
     result: RamanResult,
     settings: RamanSettings,
     water: WaterVapour,
 ) -> dict[str, Any]:
-    """Return the mixing ratio of water vapour and its errors."""
+    """Return the mixing ratio of water vapour and its errors, from nitrogen and water vapour."""
+    partial = (result.quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
     laser = settings.wavelength
     of_water = particle_ratio(settings.angstrom_exponent, laser, water.wavelength)
     value, random, systematic = np.full((3, *result.quality.shape), np.nan)
     for row in range(len(value)):
+        nitrogen, vapour = (
+            cell_signal(signal, row, air.raman_shape, cells) for signal, air in pair
+        )
         found = mixing_ratio(
-            cell_signal(signal, row, air.raman_shape, cells),
-            result.raman_depth[row],
-            result.raman_depth_error[row],
+            vapour,
+            nitrogen,
+            (result.raman_depth[row], result.raman_depth_error[row]),
+            partial[row],
             constant=water.constant,
             constant_standard_error=water.constant_standard_error,
             ratios=(1.0, settings.ratio, of_water),

@@ -26,8 +26,9 @@ class MixingRatio:
 
 def mixing_ratio(
     water: CellSignal,
-    depth: Array,
-    depth_error: Array,
+    nitrogen: CellSignal,
+    fit: tuple[Array, Array],
+    partial: npt.NDArray[np.bool_],
     *,
     constant: float,
     constant_standard_error: float,
@@ -38,14 +39,17 @@ def mixing_ratio(
     .. math:: w = C \frac{y_W}{e^{-\theta}} e^{(\kappa_W - \kappa) \tau_p}
 
     Signals are over those of clean air with equal shares of both gases, so that the transmission of
-    air is corrected; the nitrogen signal is the smooth one.
+    air is corrected. The nitrogen signal is the smooth one; in partial overlap, that of the cell,
+    so that the overlap cancels.
 
     Parameters
     ----------
-    water : CellSignal
-        Over the signal of air at the wavelength of water vapour.
-    depth, depth_error : (cell,) float
+    water, nitrogen : CellSignal
+        Over the signals of air at their wavelengths.
+    fit : ((cell,) float, (cell,) float)
         Fitted optical depth of the nitrogen signal, up to a constant, and its error by noise.
+    partial : (cell,) bool
+        Cells without full overlap.
     constant, constant_standard_error : float
         Calibration constant, kg kg-1 per ratio of the signals.
     ratios : (float, float, float)
@@ -57,11 +61,17 @@ def mixing_ratio(
     `whiteman2003`.
     """
     _, of_nitrogen, of_water = ratios
-    particles = (depth - depth[np.flatnonzero(np.isfinite(depth))[:1]].sum()) / (1.0 + of_nitrogen)
-    factor = constant * inverse_mean(np.exp(-depth), depth_error**2)
+    depth, error = fit
+    nearest = float(depth[np.flatnonzero(np.isfinite(depth))[:1]].sum())
+    particles = (depth - nearest) / (1.0 + of_nitrogen)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = nitrogen.variance / nitrogen.value**2
+    level = np.where(partial, nitrogen.value, np.exp(-depth))
+    square = np.where(partial, own, error**2)
+    factor = constant * inverse_mean(level, square)
     factor *= np.exp((of_water - of_nitrogen) * particles)
     value = factor * water.value
-    noise = factor**2 * (water.variance + water.background**2) + (value * depth_error) ** 2
+    noise = factor**2 * (water.variance + water.background**2) + value**2 * square
     relative = constant_standard_error / constant
     systematic = np.hypot(value * relative, factor * water.dead_time)
     return MixingRatio(value, np.sqrt(noise), systematic)

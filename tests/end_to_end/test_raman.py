@@ -1,0 +1,243 @@
+"""Raman products from raw files: a simulated night and morning, and a real night."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+import yaml
+from support.raman_signals import mean_over
+
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.flags import Quality, rejecting
+from lidarops.kinds import flags_of
+from lidarops.records import RunRecord
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.run.archive import Options, reprocess
+from lidarops.simulate.campaign import simulate_campaign
+from lidarops.simulate.overlap import SineOverlap
+
+STEP = 15.0
+SURFACE, SCALE_HEIGHT = 0.008, 2000.0
+"""Simulated mixing ratio of water vapour at the ground, and its scale height, m."""
+
+
+def simulated(
+    repository: Path, folder: Path, start: str, hours: float
+) -> tuple[Campaign, xr.Dataset]:
+    """Return the example campaign, simulated for some hours, and its truth."""
+    path = repository / "catalogs/raman.yaml"
+    campaign = load_campaign(path, archive=folder / "raw", output=folder / "out")
+    assert campaign.simulation is not None
+    changes = {"start": datetime.fromisoformat(start), "duration": hours * 3600.0}
+    simulation = campaign.simulation.model_copy(update=changes)
+    campaign = campaign.model_copy(update={"simulation": simulation})
+    return campaign, simulate_campaign(campaign).truth
+
+
+@pytest.fixture(scope="module")
+def night(repository, tmp_path_factory):
+    """Two hours of a simulated night: campaign, truth, run."""
+    folder = tmp_path_factory.mktemp("night")
+    campaign, truth = simulated(repository, folder, "2024-09-20T21:00:00+00:00", 2.0)
+    record = reprocess(campaign)
+    assert record is not None
+    return campaign, truth, record
+
+
+def product_of(campaign: Campaign, record: RunRecord, kind: str = "raman") -> xr.Dataset:
+    """Return the product of the only scene."""
+    (scene,) = record.scenes
+    assert scene.error == ""
+    (path,) = (made.path for made in scene.products if made.kind == kind)
+    return xr.load_dataset(campaign.products_root / path)
+
+
+def particles(truth: xr.Dataset) -> dict[str, Any]:
+    """Return mean extinction and backscatter of particles in bins of 15 m, at 355 nm."""
+    r = truth["range_valley_raman"].values
+    air = MolecularProfile.us_standard()
+    fine = STEP * (np.arange(1000) + 0.5)
+    found = {}
+    for name in ("extinction", "backscatter"):
+        values = truth[f"profile_{name}_valley_raman"].values[:, 0].mean(axis=0)
+        values = values - getattr(air, name)(500.0 + r, 355e-9)
+        found[name] = np.interp(fine, r, values)
+    return found
+
+
+def deviations(product: xr.Dataset, name: str, true: Any) -> Any:
+    """Return deviations over stated errors of values below 6 km that are not rejected."""
+    usable = (product["quality_flag"].values & flags_of("raman").rejecting) == 0
+    usable &= product["range"].values < 6000.0
+    z = (product[name].values - true) / product[f"{name}_standard_error"].values
+    return z[usable & np.isfinite(z)]
+
+
+def test_a_simulated_night_agrees_with_the_truth(night):
+    campaign, truth, record = night
+    product, true = product_of(campaign, record), particles(truth)
+    r = product["range"].values
+    length = np.nan_to_num(product["vertical_resolution"].values, nan=60.0)
+    extinction = mean_over(true["extinction"], STEP, r, length)
+    backscatter = mean_over(true["backscatter"], STEP, r, np.full(r.size, 60.0))
+    ratio = extinction / np.maximum(mean_over(true["backscatter"], STEP, r, length), 1e-12)
+    water = SURFACE * np.exp(-r / SCALE_HEIGHT)
+    cases = (
+        ("extinction", extinction),
+        ("backscatter", backscatter),
+        ("lidar_ratio", ratio),
+        ("water_vapour_mixing_ratio", water),
+    )
+    for name, values in cases:
+        z = deviations(product, name, values)
+        assert z.size > 50, name
+        assert np.mean(np.abs(z) < 1.96) > 0.9, name
+        assert np.sqrt(np.mean(z**2)) < 1.2, name
+    # Errors are not just large: the boundary layer is known to 15 %.
+    layer = (r > 600.0) & (r < 1000.0)
+    error = product["extinction_standard_error"].values[:, layer]
+    assert np.all(error < 0.15 * extinction[:, layer])
+
+
+def test_water_vapour_needs_no_overlap(night):
+    campaign, _, record = night
+    product = product_of(campaign, record)
+    near = (product["range"].values > 100.0) & (product["range"].values < 400.0)
+    true = SURFACE * np.exp(-product["range"].values / SCALE_HEIGHT)
+    away = product["water_vapour_mixing_ratio"].values[:, near] / true[near] - 1.0
+    # The noise of a cell is 3 %; a signal without overlap correction is up to 60 % off.
+    assert np.nanmax(np.abs(away)) < 0.15
+
+
+def test_the_overlap_of_the_pair_is_the_simulated_one(night):
+    campaign, _, record = night
+    product = product_of(campaign, record)
+    near = (product["range"].values > 60.0) & (product["range"].values < 400.0)
+    true = SineOverlap(400.0)(product["range"].values)
+    away = product["overlap"].values - true
+    # Cells of 60 m average a curved function.
+    error = np.hypot(product["overlap_standard_error"].values, 0.01)
+    assert np.all(np.abs(away / error)[:, near] < 4.0)
+    assert np.abs(away[:, near]).max() < 0.15
+
+
+def test_results_do_not_depend_on_chunks(night):
+    campaign, _, record = night
+    digests = {made.path: made.sha256 for scene in record.scenes for made in scene.products}
+    again = reprocess(campaign, options=Options(force=True, profiles_per_chunk=5))
+    assert {made.path: made.sha256 for s in again.scenes for made in s.products} == digests
+
+
+def test_daylight_gives_an_empty_product_with_the_reason(repository, tmp_path):
+    campaign, _ = simulated(repository, tmp_path, "2024-09-21T09:00:00+00:00", 0.5)
+    record = reprocess(campaign)
+    product = product_of(campaign, record)
+    assert np.isnan(product["extinction"].values).all()
+    assert np.all(product["quality_flag"].values & int(RamanQuality.WEAK_SIGNAL))
+    (left,) = (left for left in record.scenes[0].plan.left_out if left.rule == "raman_dark")
+    assert "no signal of photon_387o" in left.reason
+    # It is up to date, although it is empty.
+    assert reprocess(campaign) is None or not reprocess(campaign).scenes
+
+
+def test_a_missing_raman_channel_leaves_the_product_out(repository, tmp_path):
+    tree = yaml.safe_load((repository / "catalogs/raman.yaml").read_text(encoding="utf-8"))
+    tree["simulation"]["duration"] = 1200
+    tree["simulation"]["instruments"]["valley-raman"]["detectors"].pop(1)
+    path = tmp_path / "raman.yaml"
+    path.write_text(yaml.safe_dump(tree | {"archive": "raw", "output": "out"}), encoding="utf-8")
+    campaign = load_campaign(path)
+    simulate_campaign(campaign)
+    (scene,) = reprocess(campaign).scenes
+    assert {made.kind for made in scene.products} == {"signal", "elastic"}
+    (left,) = (
+        left
+        for left in (*scene.plan.left_out, *scene.left_out)
+        if left.name == "raman" and left.channel == "photon_355o"
+    )
+    assert "photon_387o" in left.reason
+
+
+@pytest.fixture(scope="module")
+def manaus(data_root, tmp_path_factory):
+    """The real night of Manaus, with elastic inversion and Raman retrieval."""
+    archive = data_root / "manaus_raman"
+    if not archive.exists():
+        pytest.skip("no files of Manaus")
+    folder = tmp_path_factory.mktemp("manaus")
+    levels = np.genfromtxt(archive / "sounding.csv", delimiter=",", names=True)
+    rising = np.concatenate([[True], np.diff(np.maximum.accumulate(levels["alt"])) > 0])
+    lines = ["altitude,pressure,temperature"]
+    lines += [f"{a},{p},{t}" for p, t, a in levels[rising].tolist()]
+    (folder / "sounding.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    counting = {"dead_time": 4e-9}
+    reference = {"lowest": 7000, "highest": 11_000, "width": 2000}
+    station = {"name": "Manaus", "latitude": -2.89, "longitude": -59.97, "altitude": 100}
+    tree = {
+        "name": "manaus",
+        "title": "Night of Manaus",
+        "archive": str(archive),
+        "output": "out",
+        "stations": {"manaus": station},
+        "instruments": {
+            "lidar": {
+                "station": "manaus",
+                "files": "RM12616*",
+                "header_position": "ignore",
+                "facts": [
+                    {
+                        "zenith_angle": 0,
+                        "full_overlap_range": 2500,
+                        "molecular_profile": "sounding.csv",
+                        "channels": {"photon_355o": counting, "photon_387o": counting},
+                    }
+                ],
+                "products": {
+                    "elastic": {
+                        "channels": ["glued_355o"], "lidar_ratio": 55, "reference": reference,
+                    },
+                    "raman": {
+                        "channels": ["glued_355o"],
+                        "nitrogen": {"glued_355o": "photon_387o"},
+                        "reference": reference,
+                    },
+                },
+            }
+        },
+    }  # fmt: skip
+    path = folder / "manaus.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    campaign = load_campaign(path)
+    record = reprocess(campaign)
+    assert record is not None
+    scene = max(record.scenes, key=lambda one: one.granules)
+    return tuple(
+        xr.load_dataset(campaign.products_root / made.path)
+        for kind in ("elastic", "raman")
+        for made in scene.products
+        if made.kind == kind
+    )
+
+
+def test_the_night_of_manaus_agrees_with_clean_air_and_the_elastic_inversion(manaus):
+    elastic, raman = (product.isel(time=0) for product in manaus)
+    r = raman["range"].values
+    usable = (raman["quality_flag"].values & rejecting((*RamanQuality, *Quality))) == 0
+    # Clean air above the aerosol: no extinction within the errors. Below 6 km the signal rises by
+    # up to 1 % a kilometre more than air explains: overlap is not complete before.
+    clean = usable & (r > 6000.0) & (r < 8500.0)
+    assert clean.sum() > 30
+    z = (raman["extinction"].values / raman["extinction_standard_error"].values)[clean]
+    assert np.mean(np.abs(z) < 1.96) > 0.85
+    # Aerosol of the free atmosphere, by both methods.
+    haze = usable & (r > 2600.0) & (r < 5000.0)
+    with_55 = np.interp(r, elastic["range"].values, elastic["backscatter"].values)
+    away = raman["backscatter"].values - with_55
+    error = raman["backscatter_standard_error"].values
+    assert np.nanmean(np.abs(away[haze] / error[haze])) < 3.0
