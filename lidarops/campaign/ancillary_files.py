@@ -39,6 +39,10 @@ _SHORTEST: Final = 30.0
 """m; a shorter overlap profile is probably in km."""
 _LIDAR_RATIOS: Final = (1.0, 200.0)
 """sr; as for the fact ``lidar_ratio``."""
+_MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_systematic", "usable"})
+"""Variables of a product with measured lidar ratios."""
+_REJECTED: Final = 2
+"""``usable`` of a value that is not to be used."""
 _WIDEST: Final = 5000.0
 """m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
@@ -222,7 +226,7 @@ def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
     name : str
         Path of the file below `folder`. Columns: ``altitude`` (m above mean sea level, rising),
         ``lidar_ratio`` and ``lidar_ratio_standard_error`` (sr). A name that ends in ``.nc`` means
-        NetCDF.
+        NetCDF; in a product with measured lidar ratios, their weighted means over time are used.
 
     Raises
     ------
@@ -230,6 +234,9 @@ def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
         If the file holds no lidar ratios; the message names the file.
     """
     content = _read(folder, name)
+    raw = _table(content, folder, name)
+    if raw.keys() >= _MEASURED:
+        return _measured_lidar_ratio(raw, name), hashlib.sha256(content).hexdigest()
     names = ("altitude", "lidar_ratio", "lidar_ratio_standard_error")
     columns, _ = _columns(content, folder, name, names)
     altitude, ratio, error = (columns[column] for column in names)
@@ -271,6 +278,32 @@ def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
     return LidarRatio(altitude, ratio, error), hashlib.sha256(content).hexdigest()
 
 
+def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:
+    """Return the mean over time of the lidar ratios of a product, where there are any.
+
+    Values are weighted by their random errors; systematic errors are those of all times.
+    """
+    ratio, random, systematic = (
+        raw[f"lidar_ratio{error}"][1] for error in ("", "_error_random", "_error_systematic")
+    )
+    least, largest = _LIDAR_RATIOS
+    known = (ratio >= least) & (ratio <= largest) & (random > 0.0) & (raw["usable"][1] < _REJECTED)
+    weight = np.where(known, 1.0 / np.where(known, random, 1.0) ** 2, 0.0)
+    total = weight.sum(axis=0)
+    measured = total > 0.0
+    if not measured.any():
+        raise AncillaryError(
+            "holds no usable value", file=name, field="lidar_ratio", remedy="choose another night"
+        )
+
+    def mean(values: Array) -> Array:
+        sums = (weight * np.where(known, values, 0.0)).sum(axis=0)
+        return np.asarray(sums[measured] / total[measured])
+
+    error = np.hypot(np.sqrt(1.0 / total[measured]), mean(systematic))
+    return LidarRatio(raw["altitude"][1][measured], mean(ratio), error)
+
+
 def _read(folder: Path, name: str) -> bytes:
     path = folder / name
     try:
@@ -294,7 +327,7 @@ def _columns(
     content: bytes, folder: Path, file: str, names: tuple[str, ...]
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Return the columns in SI units, and the names of those with a unit."""
-    raw = _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
+    raw = _table(content, folder, file)
     columns = {}
     for name in names:
         if name not in raw:
@@ -316,6 +349,11 @@ def _columns(
             raise AncillaryError("is not a column of finite numbers", file=file, field=name)
         columns[name] = values * scale + (_ZERO_CELSIUS if unit == "degC" else 0.0)
     return columns, frozenset(name for name in names if raw[name][0])
+
+
+def _table(content: bytes, folder: Path, file: str) -> dict[str, tuple[str, Array]]:
+    """Return the columns of a file with their units."""
+    return _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
 
 
 def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:

@@ -123,8 +123,8 @@ class ChannelFacts(SettingsModel):
     lidar_ratio_profile: Inside | None = Field(
         default=None,
         description="in place of both: CSV or NetCDF file of altitude (m above mean sea level),"
-        " lidar_ratio and lidar_ratio_standard_error (sr); beyond its altitudes, the end values"
-        " hold",
+        " lidar_ratio and lidar_ratio_standard_error (sr), or a product raman, whose mean over time"
+        " is used; beyond its altitudes, the end values hold",
     )
 
     @model_validator(mode="after")

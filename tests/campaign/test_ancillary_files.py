@@ -108,6 +108,33 @@ def test_lidar_ratios_are_linear_between_their_altitudes(tmp_path: Path) -> None
     assert digest == hashlib.sha256((tmp_path / "s.csv").read_bytes()).hexdigest()
 
 
+def _product(folder: Path, ratio: object, usable: object) -> None:
+    """Write the variables of a product with measured lidar ratios over 3 times and 2 heights."""
+    plane, shape = ("time", "range"), (3, 2)
+    xr.Dataset(
+        {
+            "lidar_ratio": (plane, np.broadcast_to(np.asarray(ratio, float), shape)),
+            "lidar_ratio_error_random": (plane, np.array([[3.0, 3.0], [6.0, 3.0], [3.0, 3.0]])),
+            "lidar_ratio_error_systematic": (plane, np.full(shape, 2.0)),
+            "usable": (plane, np.broadcast_to(np.asarray(usable, np.int8), shape)),
+        },
+        coords={"altitude": ("range", np.array([1000.0, 2000.0]))},
+    ).to_netcdf(folder / "night.nc")
+
+
+def test_measured_lidar_ratios_are_averaged_by_their_random_errors(
+    tmp_path: Path,
+) -> None:
+    _product(tmp_path, [[50.0, 40.0], [60.0, 40.0], [np.nan, 40.0]], [[0, 2], [1, 2], [0, 2]])
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    assert profile.altitude.tolist() == [1000.0]
+    assert profile.ratio[0] == pytest.approx((50.0 / 9 + 60.0 / 36) / (1 / 9 + 1 / 36))
+    assert profile.standard_error[0] == pytest.approx(np.hypot((1 / 9 + 1 / 36) ** -0.5, 2.0))
+    _product(tmp_path, 40.0, 2)
+    with pytest.raises(AncillaryError, match="usable"):
+        lidar_ratio_profile(tmp_path, "night.nc")
+
+
 @pytest.mark.parametrize(
     ("rows", "field", "words"),
     [

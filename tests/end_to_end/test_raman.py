@@ -12,6 +12,7 @@ import xarray as xr
 import yaml
 from support.raman_signals import mean_over
 
+from lidarops.campaign.ancillary_files import lidar_ratio_profile
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.flags import Quality, rejecting
 from lidarops.kinds import flags_of
@@ -132,6 +133,31 @@ def test_results_do_not_depend_on_chunks(night):
     digests = {made.path: made.sha256 for scene in record.scenes for made in scene.products}
     again = reprocess(campaign, options=Options(force=True, profiles_per_chunk=5))
     assert {made.path: made.sha256 for s in again.scenes for made in s.products} == digests
+
+
+def test_the_elastic_inversion_takes_the_measured_lidar_ratio(repository, night, tmp_path):
+    campaign, _, record = night
+    (path,) = (made.path for made in record.scenes[0].products if made.kind == "raman")
+    measured = tmp_path / "night.nc"
+    measured.write_bytes((campaign.products_root / path).read_bytes())
+    profile, digest = lidar_ratio_profile(tmp_path, "night.nc")
+    layer = (profile.altitude > 1000.0) & (profile.altitude < 1700.0)
+    # The simulated boundary layer has 60 sr.
+    z = (profile.ratio - 60.0)[layer] / profile.standard_error[layer]
+    assert np.abs(z).max() < 3.0
+    assert profile.standard_error[layer].max() < 25.0
+    tree = yaml.safe_load((repository / "catalogs/raman.yaml").read_text(encoding="utf-8"))
+    channels = tree["instruments"]["valley-raman"]["facts"][0]["channels"]
+    channels["photon_355o"]["lidar_ratio_profile"] = "night.nc"
+    path = tmp_path / "day.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    day = load_campaign(path, archive=campaign.archive, output=tmp_path / "out")
+    again = reprocess(day)
+    product = product_of(day, again, "elastic")
+    at = np.interp(product["altitude"].values, profile.altitude, profile.ratio)
+    np.testing.assert_allclose(product["lidar_ratio"].values, at, rtol=1e-4)
+    made = {record.path: record.sha256 for record in again.scenes[0].inputs}
+    assert made["night.nc"] == digest
 
 
 def test_daylight_gives_an_empty_product_with_the_reason(repository, tmp_path):

@@ -14,11 +14,12 @@ bias. Where signal is strong the data decide, where it is weak the smoothness do
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
@@ -26,7 +27,7 @@ Array = npt.NDArray[np.float64]
 
 _LEAST_WEIGHT: Final = 1e-2
 """Weight of smoothness over the mean information of a cell: a length of 0.3 cells."""
-_PER_DECADE: Final = 3
+_PER_DECADE: Final = 2
 _START: Final = 1e6
 """The same for the first fit: a length of about 30 cells."""
 _ITERATIONS: Final = 50
@@ -61,8 +62,9 @@ class DepthFit:
     """(cell,): reciprocal variance of the logarithm of the signal of a cell."""
     inverse: Array
     """(cell, cell): covariance of the depth as the smoothness that is used permits."""
-    weight: float
-    """The weight of smoothness."""
+    walk: float
+    """Weight of smoothness that is likely: reciprocal variance of the second differences of the
+    depth."""
 
     @property
     def noise(self) -> Array:
@@ -110,14 +112,14 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
         smooth = _scored(values, noise, depth, weight)
         if smooth is None:
             return None
-        depth, weight = smooth, _likely_weight(*_working(values, noise, smooth))
+        depth, (weight, walk) = smooth, _likely_weights(*_working(values, noise, smooth))
     used = _scored(values, noise, depth, weight)
     if used is None:
         return None
     information = _working(values, noise, used)[0]
-    absolute = weight * float(information.mean())
-    inverse = _solved(information, absolute, np.eye(signal.size))
-    return DepthFit(used, information, inverse, absolute)
+    mean = float(information.mean())
+    inverse = _solved(information, weight * mean, np.eye(signal.size))
+    return DepthFit(used, information, inverse, walk * mean)
 
 
 def _level(signal: Array, noise: SignalNoise, known: npt.NDArray[np.bool_]) -> float:
@@ -159,23 +161,25 @@ def _solved(information: Array, weight: float, right: Array) -> Array:
     Information and smoothness differ by up to 14 orders of magnitude; the refinement restores the
     digits that the factor loses.
     """
-    factor = (_factor(information, weight), False)
-    solved = cho_solve_banded(factor, right, check_finite=False)
+    factor = _factor(information, weight)
+    solved = dpbtrs(factor, right)[0]
     bend = np.diff(solved, 2, axis=0)
     left = (information * solved.T).T
     left[2:] += weight * bend
     left[1:-1] -= 2.0 * weight * bend
     left[:-2] += weight * bend
-    return np.asarray(solved + cho_solve_banded(factor, right - left, check_finite=False))
+    return np.asarray(solved + dpbtrs(factor, right - left)[0])
 
 
 def _factor(information: Array, weight: float) -> Array:
-    """Return the banded Cholesky factor of information and smoothness."""
+    """Return the banded Cholesky factor of information and smoothness; NaN where there is none."""
     bands = weight * _penalty(information.size)
     bands[2] += information
-    return np.asarray(cholesky_banded(bands, overwrite_ab=True, check_finite=False))
+    factor, fault = dpbtrf(bands)
+    return np.asarray(factor) if fault == 0 else np.full_like(bands, np.nan)
 
 
+@cache
 def _penalty(cells: int) -> Array:
     """Return the sum of squared second differences as the upper bands of a quadratic form."""
     bands = np.zeros((3, cells))
@@ -184,14 +188,15 @@ def _penalty(cells: int) -> Array:
     bands[1, 1:] = -4.0
     bands[1, [1, -1]] = -2.0
     bands[0, 2:] = 1.0
+    bands.setflags(write=False)
     return bands
 
 
-def _likely_weight(information: Array, response: Array) -> float:
-    """Return the relative weight of smoothness by restricted likelihood, at the rough end.
+def _likely_weights(information: Array, response: Array) -> tuple[float, float]:
+    """Return relative weights of smoothness by restricted likelihood: to be used, and for errors.
 
-    With few counts, straight lines are as likely as structure; the most likely weight then often
-    leaves no structure, with errors that are too small.
+    Both are at the rough end. With few counts, straight lines are as likely as structure; the most
+    likely weight then often leaves no structure, with errors that are too small.
     """
     mean = float(information.mean())
     right = information * response
@@ -199,13 +204,15 @@ def _likely_weight(information: Array, response: Array) -> float:
     scores = np.empty(weights.size)
     for number, weight in enumerate(weights):
         factor = _factor(information, weight * mean)
-        solved = cho_solve_banded((factor, False), right, check_finite=False)
+        solved = dpbtrs(factor, right)[0]
         logarithm = 2.0 * np.log(factor[2]).sum()
         misfit = float(right @ (response - solved))
         scores[number] = misfit + logarithm - (information.size - 2) * np.log(weight)
     share = np.exp(-0.5 * (scores - np.nanmin(scores)))
     below = np.cumsum(np.nan_to_num(share)) / np.nansum(share)
-    return float(np.exp(np.interp(THRESHOLDS.rougher_share, below, np.log(weights))))
+    shares = (THRESHOLDS.rougher_share, THRESHOLDS.walk_share)
+    used, walk = np.exp(np.interp(shares, below, np.log(weights)))
+    return float(used), float(walk)
 
 
 def _weights(cells: int) -> Array:

@@ -67,7 +67,7 @@ def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
     beyond = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
     kernel = step * (beyond - 0.5 * weights)
     resolution = step / (kernel**2).sum(axis=1)
-    walk = np.sqrt(1.0 / fit.weight) / (step * both)
+    walk = np.sqrt(1.0 / fit.walk) / (step * both)
     away = kernel - mean_weights(resolution, step)
     return Extinction(
         value=slope(fit.depth, step) / both,
