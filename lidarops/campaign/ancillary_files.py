@@ -40,7 +40,7 @@ _SHORTEST: Final = 30.0
 _LIDAR_RATIOS: Final = (1.0, 200.0)
 """sr; as for the fact ``lidar_ratio``."""
 _MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_systematic", "usable"})
-"""Variables of a product with measured lidar ratios."""
+"""Variables of a product with measured lidar ratios and overlap."""
 _REJECTED: Final = 2
 """``usable`` of a value that is not to be used."""
 _WIDEST: Final = 5000.0
@@ -175,7 +175,8 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
         Folder of the campaign file.
     name : str
         Path of the file below `folder`. Columns: ``range`` (m, rising) and ``overlap`` (above 0,
-        at most 1). A name that ends in ``.nc`` means NetCDF.
+        at most 1). A name that ends in ``.nc`` means NetCDF; in a product with measured overlap,
+        its weighted mean over time is used.
 
     Raises
     ------
@@ -183,6 +184,9 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
         If the file holds no overlap function; the message names the file.
     """
     content = _read(folder, name)
+    raw = _table(content, folder, name)
+    if raw.keys() >= _MEASURED:
+        return _measured_overlap(raw, name), hashlib.sha256(content).hexdigest()
     columns, _ = _columns(content, folder, name, ("range", "overlap"))
     ranges, overlap = columns["range"], columns["overlap"]
     if ranges.size != overlap.size or ranges.size < 2 or not np.all(np.diff(ranges) > 0):
@@ -276,6 +280,24 @@ def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
             remedy=f"give values from 0 to {largest:g} sr",
         )
     return LidarRatio(altitude, ratio, error), hashlib.sha256(content).hexdigest()
+
+
+def _measured_overlap(raw: Mapping[str, tuple[str, Array]], name: str) -> Overlap:
+    """Return the mean over time of the overlap of a product, up to where it is full."""
+    overlap, error = raw["overlap"][1], raw["overlap_standard_error"][1]
+    known = (overlap > 0.0) & (error > 0.0)
+    weight = np.where(known, 1.0 / np.where(known, error, 1.0) ** 2, 0.0)
+    total = weight.sum(axis=0)
+    measured = np.flatnonzero(total > 0.0)
+    if not measured.size:
+        raise AncillaryError(
+            "holds no measured value", file=name, field="overlap", remedy="choose another night"
+        )
+    mean = (weight * np.where(known, overlap, 0.0)).sum(axis=0)[measured] / total[measured]
+    ranges = raw["range"][1]
+    # Full overlap begins with the next cell.
+    full = ranges[measured[-1]] + float(np.median(np.diff(ranges)))
+    return Overlap(np.append(ranges[measured], full), np.append(np.minimum(mean, 1.0), 1.0))
 
 
 def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:

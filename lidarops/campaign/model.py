@@ -154,7 +154,9 @@ class InstrumentFacts(SettingsModel):
     )
     full_overlap_range: Metres = quantity(0.0, unit="m")
     overlap_profile: Inside | None = Field(
-        default=None, description="CSV or NetCDF file of range (m) and overlap (0 to 1)"
+        default=None,
+        description="CSV or NetCDF file of range (m) and overlap (0 to 1), or a product raman,"
+        " whose mean over time is used",
     )
     molecular_profile: Inside | None = Field(
         default=None,
