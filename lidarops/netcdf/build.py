@@ -34,6 +34,7 @@ __all__ = ["Context", "ProductEncoder", "bitround", "product_path"]
 
 _MANTISSA_BITS: Final = 23
 _TIME: Final = rows.TIME.name
+_BEAMS: Final = ("time", "beam")
 
 
 class ProductEncoder:
@@ -256,9 +257,9 @@ def _stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Valu
 def _auxiliary_names(row: Row, coordinates: list[Coordinate]) -> tuple[str, ...]:
     """Return the names of the auxiliary coordinates of a variable."""
     # CDO 2.1 cannot read a position that changes along a beam, nor a variable of three dimensions
-    # with a scalar position.
+    # with a scalar position, nor one over beams beside another with a scalar position.
     excluded = tuple(position.name for position in rows.SOUNDED)
-    excluded += ("latitude", "longitude") if len(row.dims) > 2 else ()
+    excluded += ("latitude", "longitude") if len(row.dims) > 2 or row.dims == _BEAMS else ()
     return tuple(
         coordinate.row.name
         for coordinate in coordinates

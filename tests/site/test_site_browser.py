@@ -94,7 +94,7 @@ def test_calendar_to_download_by_mouse(site: Path, watched: Watched) -> None:
     page = watched.page
     watched.open(site / "index.html")
     page.get_by_role("link", name="March 2026").click()
-    page.get_by_role("link", name="usable, 5 products").first.click()
+    page.get_by_role("link", name="usable, 6 products").first.click()
     assert "2026-03-01" in page.get_by_role("heading", level=1).inner_text()
     page.get_by_role("link", name="elastic, photon_532o").click()
     assert "Backscatter" in page.get_by_role("heading", level=1).inner_text()
@@ -140,7 +140,7 @@ def test_calendar_to_download_by_keyboard(site: Path, watched: Watched) -> None:
     assert page.evaluate("document.activeElement.getBoundingClientRect().left") > 0
     page.keyboard.press("Enter")
     assert page.evaluate("document.activeElement.id") == "main"
-    for words in ("March 2026", "usable, 5 products", "elastic, photon_532o"):
+    for words in ("March 2026", "usable, 6 products", "elastic, photon_532o"):
         _tab_to(page, words)
         with page.expect_navigation():
             page.keyboard.press("Enter")

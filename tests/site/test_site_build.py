@@ -60,7 +60,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def site(archive: Path) -> Path:
     made = build_site(archive)
-    assert made.products == made.made == 17
+    assert made.products == made.made == 20
     assert [problem.path for problem in made.problems] == ["odesa/wind.nc"]
     return archive / "site"
 
@@ -72,7 +72,7 @@ def _copy(archive: Path, target: Path) -> Path:
 
 def test_every_link_leads_to_a_file_of_the_output(archive: Path, site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
-    assert len(pages) == 1 + 2 + 4 + 17
+    assert len(pages) == 1 + 2 + 4 + 20
     for page in pages:
         tags = _page(page)
         targets = [
@@ -212,7 +212,7 @@ def test_unchanged_pages_are_kept_and_pages_of_removed_products_deleted(
     gone.unlink()
     third = build_site(output)
     assert third.made == 2
-    assert third.products == 16
+    assert third.products == 19
     assert "Another title" in (
         output / "site" / paths.product_page(changed.relative_to(output / "products").as_posix())
     ).read_text(encoding="utf-8")
