@@ -76,6 +76,10 @@ class RawFormatError(LidarOpsError, ValueError):
     """A raw file that cannot be read in its format."""
 
 
+class UnreadableFileError(RawFormatError):
+    """A raw file that the disk or the network did not give; another try may succeed."""
+
+
 class CampaignError(LidarOpsError, ValueError):
     """A campaign file that is missing, unreadable, inconsistent or unsuitable for the request."""
 

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 
 from lidarops.catalog.database import BATCH
 from lidarops.catalog.granules import Granules
-from lidarops.catalog.rows import RETRY, aware, naive
+from lidarops.catalog.rows import RETRY, aware, naive, row_of
 from lidarops.catalog.schema import (
     FILE_SET,
     GRANULE,
@@ -38,7 +38,6 @@ from lidarops.records import (
     ProductRecord,
     Role,
     SceneOutcome,
-    Status,
 )
 
 
@@ -364,12 +363,10 @@ class Ledger(Granules):
 
     def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
         """Enter granules that could not be read; the next scan tries them again."""
-        for granule in refused:
-            connection.execute(
-                sa.update(GRANULE)
-                .where(GRANULE.c.campaign == self.campaign, GRANULE.c.path == granule.path)
-                .values(status=Status.REFUSED.value, reason=granule.reason, scan_key=RETRY)
-            )
+        # Whole rows: a scan leaves a row whose stamp is that of the file as it reads it.
+        rows = [row_of(granule, self.campaign, RETRY).values for granule in refused]
+        if rows:
+            connection.execute(self.upsert(GRANULE), rows)
 
     # Products
 

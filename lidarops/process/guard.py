@@ -7,7 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
-from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
+from lidarops.errors import (
+    CatalogError,
+    LidarOpsError,
+    ProductError,
+    SceneError,
+    UnreadableFileError,
+)
 from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.system.stores import without_keys
 
@@ -53,7 +59,8 @@ def guarded(work: Callable[[], T]) -> T | Failure:
     try:
         return work()
     except LidarOpsError as error:
-        may_pass = isinstance(error, CatalogError | ProductError) and not error.wrong_use
+        passing = isinstance(error, CatalogError | ProductError | UnreadableFileError)
+        may_pass = passing and not error.wrong_use
         return Failure(str(error), final=not may_pass)
     except MemoryError as error:
         return Failure(str(_too_large(error)), final=False)

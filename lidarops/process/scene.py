@@ -82,7 +82,8 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     outcome = guarded(process)
     if isinstance(outcome, Failure):
         return outcome.outcome(job.scene, job.plan), outcome.final
-    return replace(outcome, cpu_seconds=time.thread_time() - begin), True
+    # The next scan reads refused files again.
+    return replace(outcome, cpu_seconds=time.thread_time() - begin), not outcome.refused
 
 
 def _process(job: Job, root: Path) -> SceneOutcome:

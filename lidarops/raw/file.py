@@ -9,7 +9,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
-from lidarops.errors import RawFormatError
+from lidarops.errors import RawFormatError, UnreadableFileError
 from lidarops.raw.header import IncompleteHeaderError
 
 _Header = TypeVar("_Header")
@@ -34,7 +34,9 @@ class RawFile:
         try:
             # Without O_NONBLOCK, opening a pipe would wait for a writer.
             self._descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise UnreadableFileError(f"cannot be opened: {error}", file=self.path) from None
+        except ValueError as error:
             raise RawFormatError(f"cannot be opened: {error}", file=self.path) from None
         try:
             status = os.fstat(self._descriptor)
@@ -100,5 +102,5 @@ class RawFile:
                 remedy="open the archive again when no process writes to it",
             )
 
-    def _unreadable(self, error: OSError) -> RawFormatError:
-        return RawFormatError(f"cannot be read: {error.strerror}", file=self.path)
+    def _unreadable(self, error: OSError) -> UnreadableFileError:
+        return UnreadableFileError(f"cannot be read: {error.strerror}", file=self.path)

@@ -114,14 +114,16 @@ class Session:
         Returns
         -------
         SceneOutcome
-            As entered; failed if its product files are missing or changed.
+            As entered; failed if its product files are missing or changed, which another try may
+            mend.
         """
+        reported = len(outcome.products)
         new, outcome = self._new_products(judged, outcome)
         entry = SceneEntry(
             outcome=outcome,
             day=judged.day,
             key=self._judge.key(judged, internal=bool(outcome.internal)),
-            final=final,
+            final=final and len(new) == reported,
             products=tuple(new),
             digests=_unknown_digests(judged.scene, outcome),
         )
