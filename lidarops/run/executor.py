@@ -150,6 +150,7 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
     """Start a dask cluster of single-threaded processes on this machine.
 
     netCDF4 writes from only one thread of a process, and BLAS and numba gain nothing from more.
+    Only processes that hold its certificate, made for this run, can use the cluster.
 
     Parameters
     ----------
@@ -171,6 +172,9 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
+            # With certificates of this run: any user of the machine reaches its loopback, and who
+            # reaches a scheduler can run code on its workers.
+            security=True,
             dashboard_address=None,
             # Without a dashboard dask still serves HTTP, by default on all interfaces.
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},

@@ -5,6 +5,8 @@ from __future__ import annotations
 import http.server
 import json
 import os
+import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -13,6 +15,7 @@ from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, ClassVar
+from urllib.parse import urlsplit
 
 import dask.config
 import pytest
@@ -96,10 +99,28 @@ def test_local_workers_are_processes_of_one_thread_on_loopback() -> None:
         about = client.scheduler_info()["workers"]
         assert {each["nthreads"] for each in about.values()} == {1}
         assert {each["memory_limit"] for each in about.values()} == {600 * 2**20}
-        assert all(address.startswith("tcp://127.0.0.1:") for address in about)
+        assert all(address.startswith("tls://127.0.0.1:") for address in about)
         process, threads = client.submit(where).result()
         assert process != os.getpid()
         assert threads == "1"
+
+
+def test_local_clusters_refuse_whoever_has_no_certificate_of_the_run() -> None:
+    """Any user of a machine reaches its loopback, and can run code where a scheduler lets him."""
+    with clusters.connect_client(clusters.Local(workers=1)) as client:
+        workers = client.scheduler_info()["workers"]
+        stranger = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        stranger.check_hostname = False
+        stranger.verify_mode = ssl.CERT_NONE
+        nannies = [each["nanny"] for each in workers.values()]
+        for address in (client.scheduler.address, *workers, *nannies):
+            place = urlsplit(address)
+            with (
+                socket.create_connection((place.hostname, place.port)) as plain,
+                stranger.wrap_socket(plain) as connection,
+                pytest.raises(ssl.SSLError, match="certificate required"),
+            ):
+                connection.recv(1)
 
 
 def test_an_absent_scheduler_is_reported() -> None:
