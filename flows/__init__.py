@@ -6,12 +6,14 @@
 - `notifications`: set up automations that report failed or missing runs.
 
 Importing this package sets the environment variables that a temporary Prefect server needs and that
-`maintenance` relies on; variables that are already set are kept.
+`maintenance` relies on; variables that are already set are kept. Where no server is configured, it
+also gives the temporary one a password.
 """
 
 from __future__ import annotations
 
 import os
+import secrets
 from typing import Final
 
 WITH_FAILURES: Final = "Completed with failures"
@@ -39,3 +41,21 @@ for _service in (
     "TRIGGERS",
 ):
     os.environ.setdefault(f"PREFECT_SERVER_SERVICES_{_service}_ENABLED", "false")
+
+
+def _lock_temporary_server() -> None:
+    """Give a temporary server a random password; any user of the machine reaches its loopback."""
+    # After the settings above, which Prefect reads when it is imported.
+    from prefect.context import refresh_global_settings_context  # noqa: PLC0415
+    from prefect.settings import get_current_settings  # noqa: PLC0415
+
+    settings = get_current_settings()
+    if settings.api.url or settings.api.auth_string or settings.server.api.auth_string:
+        return
+    password = f"lidarops:{secrets.token_urlsafe()}"
+    os.environ["PREFECT_API_AUTH_STRING"] = password
+    os.environ["PREFECT_SERVER_API_AUTH_STRING"] = password
+    refresh_global_settings_context()
+
+
+_lock_temporary_server()

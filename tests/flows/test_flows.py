@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -11,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
+import httpx
 import jsonschema
 import pytest
 import typer
@@ -66,6 +70,27 @@ def campaign_file(tmp_path: Path) -> Path:
     path = tmp_path / "campaign.yaml"
     path.write_text(yaml.safe_dump(campaign))
     return path
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_a_temporary_server_refuses_whoever_has_no_password() -> None:
+    """Any user of a machine reaches its loopback."""
+    with get_client(sync_client=True) as client:
+        assert client.hello().status_code == 200
+        address = f"{client.api_url}/variables/filter"
+    with httpx.Client() as stranger:
+        assert stranger.post(address, json={}).status_code == 401
+
+
+def test_a_configured_server_gets_no_password_of_a_temporary_one() -> None:
+    code = "import flows, os; print(os.environ.get('PREFECT_API_AUTH_STRING'))"
+    configured = os.environ | {"PREFECT_API_URL": "http://127.0.0.1:1/api"}
+    for name in ("PREFECT_API_AUTH_STRING", "PREFECT_SERVER_API_AUTH_STRING"):
+        configured.pop(name, None)
+    process = subprocess.run(
+        [sys.executable, "-c", code], env=configured, capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "None"
 
 
 @pytest.mark.parametrize("flow", [catalog, reprocess])
