@@ -182,7 +182,7 @@ class Session:
             started=self.started,
             finished=datetime.now(UTC),
             version=__version__,
-            archive=self._campaign.archive,
+            archive=without_keys(self._campaign.archive),
             products=str(self._campaign.products_root),
             scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
             refused=refused,
