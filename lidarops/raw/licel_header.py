@@ -37,6 +37,8 @@ CONVENTION: Final = (
 
 _LINE_LIMIT = 1024
 _CACHED_BLOCK = 4 * 1024
+_WITNESSES: Final = 2
+"""Least number of datasets that, with line 3, contradict the shots of another one."""
 _MAX_DATASETS = 1000
 _MAX_BINS = 1_000_000
 _MAX_BIN_WIDTH = 1000.0
@@ -377,6 +379,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     except RawFormatError:
         _refuse_export(buffer[data_start:])
         raise
+    _refuse_outlying_shots(datasets, lasers)
     if written_stop < start:
         notes += ("stop lies 1 s before start: the interval follows from the shots",)
     if len(memories(datasets)) < sum(dataset.is_signal for dataset in datasets):
@@ -493,6 +496,26 @@ def memories(datasets: tuple[Dataset, ...]) -> tuple[tuple[Dataset, ...], ...]:
         if dataset.is_signal:
             groups.setdefault(dataset.recorded_as, []).append(dataset)
     return tuple(tuple(group) for group in groups.values())
+
+
+@lru_cache(maxsize=128)
+def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, ...]) -> None:
+    """Refuse a file if line 3 and two or more datasets contradict the shots of a single dataset.
+
+    A recorder that misses triggers misses them for all its datasets; a damaged digit is one. All
+    1936 datasets of 180 real files state the shots of line 3, and in 92 files of recorders with two
+    memories those of several datasets differ. A dataset without shots gives no values.
+    """
+    fired = {laser.shots for laser in lasers}
+    counted = [dataset for dataset in datasets if dataset.is_signal and dataset.shots]
+    outlying = [dataset for dataset in counted if dataset.shots not in fired]
+    if len(outlying) == 1 and len(counted) > _WITNESSES:
+        raise RawFormatError(
+            f"states {outlying[0].shots} shots, line 3 and all other datasets state"
+            f" {', '.join(map(str, sorted(fired)))}: its values would be wrong by that ratio",
+            field=f"shots of {outlying[0].name}",
+            remedy="leave the file out, or correct the shots in its header",
+        )
 
 
 @lru_cache(maxsize=1024)

@@ -192,6 +192,30 @@ def test_mistyped_wavelength():
     assert math.isnan(dataset.wavelength)
 
 
+@pytest.mark.parametrize(
+    ("shots", "refused"),
+    [
+        (("101", "101", "101"), False),
+        (("101", "181", "101"), True),
+        # The lasers fired 101 times; a recorder of two datasets may have missed triggers.
+        (("100", "100", "101"), False),
+        (("101", "100"), False),
+        (("000", "101", "101"), False),
+    ],
+)
+def test_shots_that_line_3_and_all_other_datasets_contradict_are_refused(shots, refused):
+    lines = (ANALOG, PHOTON, ANALOG.replace("00532.p", "00355.o"))
+    data = tuple(
+        line.replace("000101", number.zfill(6)) for line, number in zip(lines, shots, strict=False)
+    )
+    if refused:
+        with pytest.raises(RawFormatError, match="states 181 shots, line 3") as error:
+            parse(line_3=LINE_3.format(len(data)), datasets=data)
+        assert error.value.field == "shots of photon_532p"
+    else:
+        assert parse(line_3=LINE_3.format(len(data)), datasets=data).datasets
+
+
 def test_values_without_shots_are_nan(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(raw_file((ANALOG.replace("000101", "000000"), PHOTON)))
