@@ -195,7 +195,7 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
         ) from error
     try:
         document: dict[str, Any] = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
     return document
 

@@ -59,7 +59,7 @@ class Recipe:
                 versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
                 epoch=_epoch(file),
             )
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise _insufficient(file, repr(error)) from error
         for record in recipe.inputs:
             # Copies are written under this path, which a forged product could choose freely.

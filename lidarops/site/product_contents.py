@@ -204,7 +204,7 @@ def origin(product: xr.Dataset) -> Origin:
         text = str(product[PROVENANCE].item())
         document = json.loads(text)
         return _origin(text, document)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return Origin(problem=f"the provenance cannot be read: {error!r:.200}")
 
 

@@ -214,6 +214,18 @@ def test_the_same_content_in_other_bytes_is_reported(campaign: Campaign, tmp_pat
     assert names(result, "bytes") == ["same.nc"]
 
 
+def test_a_product_whose_settings_nest_too_deep_is_refused(tmp_path: Path):
+    product = {"lidarops:settings": "[" * 100_000}
+    names = ("lidarops:kind", "lidarops:channel", "lidarops:campaign")
+    document = {
+        "entity": {"lidarops:product": product | dict.fromkeys(names, "a")},
+        "agent": {"lidarops:software": {}},
+    }
+    xr.Dataset({"provenance": json.dumps(document)}).to_netcdf(tmp_path / "deep.nc")
+    with pytest.raises(ProductError, match="RecursionError"):
+        reproduce_product(tmp_path / "deep.nc")
+
+
 def test_a_product_with_too_little_provenance_is_refused(campaign: Campaign, tmp_path: Path):
     source = of_kind(campaign, "homogeneous")
     with xr.open_dataset(source, decode_cf=False) as opened:

@@ -155,6 +155,9 @@ def test_files_without_provenance_are_refused(tmp_path: Path):
     write_plain(xr.Dataset({"provenance": "not json"}), tmp_path / "odd.nc")
     with pytest.raises(ProductError, match="not JSON"):
         read_provenance(tmp_path / "odd.nc")
+    write_plain(xr.Dataset({"provenance": "[" * 100_000}), tmp_path / "deep.nc")
+    with pytest.raises(ProductError, match="not JSON"):
+        read_provenance(tmp_path / "deep.nc")
     write_plain(xr.Dataset({"provenance": ("n", np.arange(3.0))}), tmp_path / "array.nc")
     with pytest.raises(ProductError, match=r"array\.nc"):
         read_provenance(tmp_path / "array.nc")

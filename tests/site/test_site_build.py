@@ -250,12 +250,14 @@ def test_damaged_products_are_listed_and_the_others_shown(tmp_path: Path) -> Non
     assert "it cannot be drawn as multiangle" in damaged
 
 
-def test_damaged_provenance_is_a_problem(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [b"{", b"["])
+def test_damaged_provenance_is_a_problem(tmp_path: Path, damage: bytes) -> None:
+    """Brackets nest too deep for the parser."""
     output = tmp_path / "out"
     path = add(output, "homogeneous")
     with netCDF4.Dataset(path, "a") as file:
         file["provenance"][...] = (
-            b"{" * file["provenance"].shape[0] if file["provenance"].ndim else "{"
+            damage * file["provenance"].shape[0] if file["provenance"].ndim else "{"
         )
     made = build_site(output)
     assert made.products == 1
