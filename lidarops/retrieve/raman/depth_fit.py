@@ -76,6 +76,17 @@ class DepthFit:
         """Standard error of the depth by noise, (cell,)."""
         return np.asarray(np.sqrt((self.noise**2).sum(axis=1)))
 
+    @property
+    def expected_error(self) -> Array:
+        """Standard error of the depth for clean air beyond the most certain cell, (cell,).
+
+        What is decided by it is not decided by the noise of the cell: by its own standard error,
+        cells that noise makes bright would be kept, and the depth there biased.
+        """
+        error = self.standard_error
+        nearer = self.depth[int(np.argmin(error))]
+        return np.asarray(error * np.exp(-0.5 * (self.depth - nearer)))
+
     def respond(self, relative: Array) -> Array:
         """Return the change of the depth when the signal changes by a share of it, (cell,)."""
         return np.asarray(-self.inverse @ (self.information * relative))

@@ -341,7 +341,7 @@ def _reference(
             continue
         depth = row.fit.depth - row.fit.depth.min()
         shape[number] *= np.exp(-2.0 / (1.0 + settings.ratio) * depth)
-        power[number, row.fit.standard_error > THRESHOLDS.most_uncertain] = np.nan
+        power[number, row.fit.expected_error > THRESHOLDS.most_uncertain] = np.nan
     highest = min(settings.highest, float(cells.range[-1]))
     width = min(settings.width, highest - settings.lowest)
     candidates = reference_window.candidate_windows(
@@ -566,7 +566,7 @@ def _joined(
 
     for one in solved:
         fit, extinction = one.profile.fit, one.profile.extinction
-        weak[one.number] = fit.standard_error > THRESHOLDS.most_uncertain
+        weak[one.number] = fit.expected_error > THRESHOLDS.most_uncertain
         for name, row in _values(one, fit, extinction):
             put(name, one.number, row)
     flags = quality | np.where(weak, np.int32(RamanQuality.WEAK_SIGNAL), np.int32(0))

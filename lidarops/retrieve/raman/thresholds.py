@@ -19,8 +19,8 @@ class Thresholds:
     intervals cover 95 to 96 %; with the weight that is used, up to 96.1 %, with a share of 0.3 down
     to 94.0 %."""
     most_uncertain: float = 0.2
-    """Standard error of the logarithm of the smoothed signal, beyond which first-order errors do
-    not hold: a signal of less than 5 standard errors. Assumed."""
+    """Expected standard error of the logarithm of the smoothed signal, beyond which first-order
+    errors do not hold: a signal of less than 5 standard errors. Assumed."""
     least_ratio_certainty: float = 3.0
     """Standard errors by which the smoothed backscatter must exceed zero for a lidar ratio. Below,
     no error is symmetrical; with 5, none is left at 355 nm of the published simulations."""
