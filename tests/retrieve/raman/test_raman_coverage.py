@@ -51,8 +51,10 @@ def test_intervals_cover_the_truth():
 @pytest.mark.slow
 @pytest.mark.parametrize("light", LEVELS)
 def test_intervals_of_1000_profiles_cover_the_truth(light):
-    for z in deviations(light, 1000):
-        if z.size:
+    extinction, backscatter = deviations(light, 1000)
+    for z in (extinction, backscatter):
+        # Values of a profile share an error: those of a few profiles cover nothing.
+        if z.size > 0.01 * extinction.size:
             assert 0.94 <= covered(z) <= 0.96
             assert np.mean(np.abs(z) > 4.0) <= 1e-3
 
