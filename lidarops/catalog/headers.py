@@ -192,7 +192,10 @@ def _contradictions(
         latitude, longitude = position
         remedy = "correct the station, or set header_position: ignore or position_tolerance"
         if place.is_near(longitude, latitude):
-            remedy = "they look swapped: set header_position, or correct the station"
+            remedy = (
+                "they look swapped: correct the station, or set header_position if the header has"
+                " them in another order"
+            )
         yield (
             f"the header states the position {latitude:.1f} N {longitude:.1f} E, the station of the"
             f" campaign {place.latitude:.1f} N {place.longitude:.1f} E ({remedy})"
