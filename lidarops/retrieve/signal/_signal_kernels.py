@@ -42,16 +42,6 @@ _SATURATED: Final = int(Quality.SATURATED)
 _PILE_UP: Final = int(Quality.PILE_UP)
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-_finding = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
-# Inlined by force: a reassociated sum as a symbol of its own has other bits fresh than cached.
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-_summing = numba.njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    forceinline=True,
-    fastmath={"contract", "nsz", "reassoc"},
-)
 
 
 class Windows(NamedTuple):
@@ -62,17 +52,6 @@ class Windows(NamedTuple):
     """One past the last bin; for the last bin of the profile, the end of its block."""
     bins: Array
     """Number of values in the window of a profile without gaps."""
-
-
-class NoiseModel(NamedTuple):
-    """Windows and limits of the noise model on a range grid."""
-
-    narrow: Windows
-    """For smoothing the signal."""
-    wide: Windows
-    """For smoothing squared third differences."""
-    leak: Array
-    """Least noise per unit signal at which third differences may neglect the fall of the signal."""
 
 
 class _Sums(NamedTuple):
@@ -101,7 +80,6 @@ class SignalScratch(NamedTuple):
     sums: _Sums
     mean: Array
     local: Array
-    weight: Array
 
 
 def scratch(bins: int) -> SignalScratch:
@@ -118,7 +96,7 @@ def scratch(bins: int) -> SignalScratch:
         np.zeros(padded + 1, np.int64),
         np.zeros(bins),
     )
-    return SignalScratch(sums, np.zeros(bins), np.zeros(bins), np.zeros(bins))
+    return SignalScratch(sums, np.zeros(bins), np.zeros(bins))
 
 
 @_compiled
@@ -131,23 +109,6 @@ def _load(values: Array, s: _Sums) -> bool:
         s.finite[i] = 1 if finite else 0
         count += s.finite[i]
     return bool(count == values.size)
-
-
-@_compiled
-def _load_squares(power: Array, s: _Sums) -> bool:
-    """Load squared third differences, scaled to the variance of white noise."""
-    for i in (0, max(power.size - 2, 0), power.size - 1):
-        s.values[i] = 0.0
-        s.finite[i] = 0
-    count = 0
-    for i in range(power.size - 3):
-        third = power[i + 3] - 3.0 * power[i + 2] + 3.0 * power[i + 1] - power[i]
-        square = third * third / 20.0
-        finite = square < math.inf
-        s.values[i + 1] = square if finite else 0.0
-        s.finite[i + 1] = 1 if finite else 0
-        count += s.finite[i + 1]
-    return bool(count == power.size - 3)
 
 
 @_compiled
@@ -218,100 +179,6 @@ def _bins(s: _Sums, windows: Windows, complete: bool) -> Array:
     return s.bins
 
 
-@_finding
-def _lowest(values: Array) -> float:
-    lowest = math.inf
-    for i in range(values.size):
-        lowest = min(lowest, values[i])
-    return lowest
-
-
-@_compiled
-def _weigh(s: SignalScratch, leak: Array) -> None:
-    """Weight squared differences by the inverse square of their mean, at most 1."""
-    for i in range(leak.size):
-        mean, local = s.mean[i], s.local[i]
-        signal_fall = leak[i] * mean
-        usable = (s.sums.finite[i] != 0) & (abs(mean) < math.inf) & (local > 0.0)
-        s.weight[i] = local if usable & (signal_fall * signal_fall < local) else math.inf
-    lowest = _lowest(s.weight)
-    for i in range(leak.size):
-        share = lowest / s.weight[i]
-        s.weight[i] = share * share
-
-
-@_summing
-def _means(x: Array, y: Array, weight: Array) -> tuple[float, float]:
-    total = x_sum = y_sum = 0.0
-    for i in range(weight.size):
-        w = weight[i]
-        total += w
-        x_sum += w * (x[i] if w > 0.0 else 0.0)
-        y_sum += w * y[i]
-    return x_sum / total, y_sum / total
-
-
-@_summing
-def _moments(
-    x: Array, y: Array, weight: Array, x_mean: float, y_mean: float, floor: float
-) -> tuple[float, float, float, float, float]:
-    square = product = from_zero = from_floor = through = 0.0
-    for i in range(weight.size):
-        w = weight[i]
-        value = x[i] if w > 0.0 else 0.0
-        distance = value - x_mean
-        square += w * distance * distance
-        product += w * distance * (y[i] - y_mean)
-        from_zero += w * value * value
-        above = value - floor if w > 0.0 else 0.0
-        from_floor += w * above * above
-        through += w * above * y[i]
-    return square, product, from_zero, from_floor, through
-
-
-@_compiled
-def _floor(x: Array, weight: Array) -> float:
-    """Return the least x with a positive weight."""
-    lowest = math.inf
-    for i in range(x.size):
-        if weight[i] > 0.0 and x[i] < lowest:
-            lowest = x[i]
-    return lowest
-
-
-@_inlined
-def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float]:
-    """Return y at the floor of x and the slope, neither below zero; NaN without weights."""
-    x_mean, y_mean = _means(x, y, weight)
-    moments = _moments(x, y, weight, x_mean, y_mean, floor)
-    square, product, from_zero, from_floor, through = moments
-    slope = product / square
-    if not (slope > 0.0) & (square > _FLAT * _FLAT * from_zero):
-        slope = 0.0
-    lowest = y_mean - slope * (x_mean - floor)
-    if lowest < 0.0:
-        # A negative value at the floor: fit the slope through zero at the floor instead.
-        return 0.0, through / from_floor
-    return lowest, slope
-
-
-@_inlined
-def _estimate(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> None:
-    complete = _load(power, s.sums)
-    _averages(s.sums, noise.narrow, complete, s.mean)
-    complete = _load_squares(power, s.sums)
-    _averages(s.sums, noise.wide, complete, s.local)
-    _weigh(s, noise.leak)
-    # Light is the excess over the lowest level: an offset of the electronics makes no noise.
-    floor = _floor(s.mean, s.weight)
-    a, b = _line(s.mean, s.sums.values[: power.size], s.weight, floor)
-    for i in range(power.size):
-        light = s.mean[i] - floor
-        variance = a + b * (0.0 if light < 0.0 else light)
-        # Too few differences for a line, or no noise: use the local mean of the squares.
-        out[i] = variance if (variance > 0.0) & (variance < math.inf) else s.local[i]
-
-
 @_compiled
 def _is_off(counts: npt.NDArray[np.int32]) -> bool:
     """Return whether all counts are zero, as those of a recorder that is off."""
@@ -371,22 +238,6 @@ def voltage_profiles(
         missing = (not shots[k] > 0.0) | _is_off(counts[k])
         profile_dark = dark[k % dark.shape[0]]
         _voltage(counts[k], missing, step[k], full[k], profile_dark, overlap, power[k], quality[k])
-
-
-@_compiled
-def noise_profiles(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> None:
-    """Estimate the noise variance of each profile from third differences.
-
-    Parameters
-    ----------
-    power : (profile, bin) float64
-    noise : NoiseModel
-    s : SignalScratch
-    out : (profile, bin) float64
-        Output: the variance.
-    """
-    for k in range(power.shape[0]):
-        _estimate(power[k], noise, s, out[k])
 
 
 class Counter(NamedTuple):

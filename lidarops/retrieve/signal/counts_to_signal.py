@@ -12,7 +12,7 @@ missing. The result of a profile does not depend on the other profiles, to the l
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.signal import _noise_kernels as noise_kernels
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
@@ -37,6 +38,9 @@ Singles = npt.NDArray[np.float32]
 MIN_NOISE_BINS = kernels.BLOCK
 """Smallest half-width of such a window in bins: 16."""
 
+_DIFFERENCE_ERROR: Final = 4.62
+"""Relative variance of a mean of squared third differences, times their number: 2 times the sum of
+squares of their correlations 1, 3/4, 3/10 and 1/20 on either side. Computed."""
 _Number = TypeVar("_Number", bound=np.generic)
 _COUNT_LIMITS = np.iinfo(np.int32)
 
@@ -146,7 +150,8 @@ def analog_signal(
         correlation = estimate_noise_correlation(_rows(power), _rows(variance))
         variance *= correlation.excess.reshape(*leading, 1)
         length = correlation.length.reshape(leading)
-        return Signal(power, _add_rounding(variance, scale), quality, length)
+        error = np.sqrt(_DIFFERENCE_ERROR / summed.shape[-1])
+        return Signal(power, _add_rounding(variance, scale, error), quality, length)
     _require(0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2")
     noise = np.full(power.shape, noise_variance)
     dark_noise = _per_bin(dark_variance, "dark_variance", summed.shape)
@@ -169,7 +174,7 @@ class _Scale(NamedTuple):
     """(profile,)"""
 
 
-def _add_rounding(variance: Array, scale: _Scale) -> Array:
+def _add_rounding(variance: Array, scale: _Scale, relative_error: float = 0.0) -> Array:
     """Return the noise variances plus that of rounding errors which the scatter does not show.
 
     Each shot is rounded separately. With noise of half a step or more, rounding adds a variance
@@ -178,7 +183,8 @@ def _add_rounding(variance: Array, scale: _Scale) -> Array:
     shows in the scatter, uniform within half a step where there is no noise at all. In between,
     shots fall on two steps with variance m (1 - m), and their mean m may be off by
     sqrt(1/4 - m (1 - m)); above a variance of 1/4 the first harmonic of the error remains. The
-    variance of a bin scatters, the median of a profile does not: the smaller of the two decides.
+    variance of a bin scatters, the median of a profile does not: the smaller of the two decides,
+    less its standard error.
     """
     raised_variance = variance.copy()
     rows = _rows(raised_variance)
@@ -190,7 +196,7 @@ def _add_rounding(variance: Array, scale: _Scale) -> Array:
         unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
         measured = rows[coarse] / unit
         median = np.sort(measured, axis=-1)[:, (measured.shape[-1] - 1) // 2, np.newaxis]
-        noise = np.fmin(measured, median)
+        noise = np.fmin(measured, median) * (1.0 - min(relative_error, 0.5))
         harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(noise - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
         common = np.maximum((0.25 - noise) / 3.0, harmonic)
         raised = unit * (np.maximum(measured, 1.0 / 12.0) + shots * common)
@@ -431,8 +437,8 @@ def _overlap_bits(grid: Array, full_overlap_range: float) -> Flags:
     return frozen(np.where(near, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0)))
 
 
-def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kernels.Windows:
-    """Return the smoothing window of each bin; `ends` bins at either end never hold a value."""
+def _windows(grid: Array, window: float) -> kernels.Windows:
+    """Return the smoothing window of each bin."""
     size = grid.size
     index = np.arange(size)
     steps = np.abs(np.diff(grid))
@@ -444,12 +450,12 @@ def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kern
     # Windows stay symmetric near the ends; a one-sided one would bias a steep signal.
     half = np.minimum(half, np.maximum(np.minimum(index - begin, end - 1 - index), MIN_NOISE_BINS))
     first, past = np.maximum(index - half, begin), np.minimum(index + half + 1, end)
-    bins = np.minimum(past, size - ends[1]) - np.maximum(first, ends[0])
+    bins = (past - first).astype(np.float64)
     past[past == size] = -(-size // kernels.BLOCK) * kernels.BLOCK
     return kernels.Windows(
         frozen(first.astype(np.uint32)),
         frozen(past.astype(np.uint32)),
-        frozen(np.maximum(bins, 0).astype(np.float64)),
+        frozen(bins),
     )
 
 
@@ -465,16 +471,15 @@ def _gap_free_stretch(
     return np.repeat(edges[:-1], lengths), np.repeat(edges[1:], lengths)
 
 
-def _noise_model(grid: Array) -> kernels.NoiseModel:
-    spacing = np.abs(np.gradient(grid)) if grid.size > 1 else np.ones(1)
+def _noise_model(grid: Array) -> noise_kernels.NoiseModel:
+    nearest = noise_kernels.BLOCK * np.arange(noise_kernels.block_count(grid.size))
+    steps = np.abs(np.diff(grid))[nearest] if nearest.size else np.ones(0)
     with np.errstate(divide="ignore"):
-        # The third difference of R^-2 is 24 (h / R)^3 of the signal.
-        leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * THRESHOLDS.leak)
-    return kernels.NoiseModel(
+        # The third difference of R^-2 is 24 (h / R)^3 of the light.
+        fall = 24.0 * (noise_kernels.DISTANCE * steps / grid[nearest]) ** 3
+    return noise_kernels.NoiseModel(
         narrow=_windows(grid, THRESHOLDS.noise_window),
-        # A third difference takes one bin before and two after.
-        wide=_windows(grid, THRESHOLDS.weight_window, ends=(1, 2)),
-        leak=frozen(leak),
+        leak=frozen(fall / np.sqrt(20.0 * THRESHOLDS.leak)),
     )
 
 
@@ -483,28 +488,34 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
 
     Electronic noise is constant and shot noise is proportional to the light, so
 
-    .. math:: v(R) = a + b \, (\overline{P}(R) - \overline{P}_{min}), \qquad
-              \left\langle \frac{(P_{i-1} - 3 P_i + 3 P_{i+1} - P_{i+2})^2}{20} \right\rangle
+    .. math:: v(R) = a + b \, (\overline{P}(R) - \overline{P}_{far}), \qquad
+              \left\langle \frac{(P_i - 3 P_{i+4} + 3 P_{i+8} - P_{i+12})^2}{20} \right\rangle
               = v(R_i)
 
-    is fitted by weighted least squares with :math:`a, b \ge 0`, one pair per profile. The lowest
-    level :math:`\overline{P}_{min}` is subtracted because an offset of the electronics makes no
-    noise. Weights that derive from two well-determined numbers do not follow the noise of the
-    single bin. The estimate is exact for white noise along range and too small for noise that is
-    correlated from bin to bin. Near bins in which the fall of the signal would count as noise
-    are excluded from the fit.
+    with the smoothed signal :math:`\overline{P}` and its median :math:`\overline{P}_{far}` in the
+    far half. The squares are averaged in blocks of 16; :math:`a` is the median of the blocks of
+    the far half, :math:`b \ge 0` that of :math:`(v - a) / (\overline{P} - \overline{P}_{far})`
+    over the blocks that are brighter than the drift of the baseline in the far half. Two
+    well-determined numbers give weights that do not follow the noise of the single bin. A baseline
+    that drifts by as much as the light makes no noise: where the median of a band of 32 blocks or
+    more contradicts the line, the line is multiplied by the ratio of the two, interpolated
+    logarithmically between the centres of bands.
+
+    The estimate is exact for noise that is independent 4 bins apart and farther. Blocks in which
+    the fall of the signal would count as noise are left out. A profile of fewer than 4 blocks in
+    its far half has the mean square of third differences of neighbours in all bins.
 
     Parameters
     ----------
     power : (..., range) float
-        NaN where unusable; differences that include NaN are ignored.
+        NaN where unusable; blocks that include NaN are ignored.
     range : (range,) float
         m.
 
     Returns
     -------
     (..., range) float
-        In the square of the unit of `power`; NaN where no difference is finite.
+        In the square of the unit of `power`; NaN for a profile without a finite difference.
 
     Raises
     ------
@@ -514,7 +525,7 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
     grid = _grid(range)
     profiles = _profiles(power, "power", grid.size)
     variance = np.empty(profiles.shape)
-    kernels.noise_profiles(
+    noise_kernels.noise_profiles(
         frozen(_rows(profiles)), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)
     )
     return variance

@@ -38,9 +38,7 @@ class Thresholds:
     # Noise
     noise_window: float = 0.1
     """Half-width, relative to range, of the window in which noise is smoothed. Assumed."""
-    weight_window: float = 0.3
-    """The same for the weights of the noise model. Assumed."""
-    leak: float = 0.05
+    leak: float = 0.02
     """Share of a squared third difference that may come from the fall of the signal. Assumed."""
 
     # Correlation of noise

@@ -261,9 +261,11 @@ def test_a_real_station_is_glued_after_lag_correction(data_root, wavelength):
     before, after = results
     assert not after.no_window.any()
     assert not after.poor_fit.any()
-    assert before.poor_fit.sum() > 8
-    assert (after.chi2 / after.degrees_of_freedom).mean() < 0.5
-    assert after.slope.std() / after.slope.mean() < 0.02
+    misfits = [(result.chi2 / result.degrees_of_freedom).mean() for result in results]
+    assert misfits[0] > 1.2
+    assert misfits[1] < 0.5
+    # The window ends where the signal is 10 times its noise.
+    assert after.slope.std() / after.slope.mean() < {"355": 0.02, "532": 0.035}[wavelength]
     assert after.slope.std() < 0.6 * before.slope.std()
     far = range_ > after.stop.max()
     np.testing.assert_array_equal(after.power[:, far], (photon - sky[:, np.newaxis])[:, far])

@@ -51,7 +51,8 @@ def analog(
         with_clipping = clipped.any(axis=-1)
         variance[with_clipping] = difference_variance(power, range)[with_clipping]
         excess, length = correlated_noise(power, variance)
-        raised = rounded(variance * excess[..., np.newaxis], whole, fired)
+        error = min(np.sqrt(4.62 / range.size), 0.5)
+        raised = rounded(variance * excess[..., np.newaxis], whole, fired, error)
         return Signal(power, raised, quality, length)
     known = rounded(np.full(power.shape, noise_variance), whole, fired) + dark_variance
     return Signal(power, known, quality, correlated_noise(power, known)[1])
@@ -105,7 +106,7 @@ def _correlated(power, variance):
     return chi_square, length * (1.0 + np.sqrt(2.0 * (2.0 * len(r) + 1.0) / number))
 
 
-def rounded(variance, step, shots):
+def rounded(variance, step, shots, error=0.0):
     """Return the variance of a mean of shots, each rounded by the digitiser to whole steps."""
     result = variance.copy()
     for row, size, fired in zip(result, step[:, 0], shots[:, 0], strict=True):
@@ -115,6 +116,7 @@ def rounded(variance, step, shots):
         shot = row * fired / size**2
         middle = np.sort(shot)[(shot.size - 1) // 2]
         least = shot if np.isnan(middle) else np.where(shot < middle, shot, middle)
+        least = least * (1.0 - error)
         few = np.where(least < 1 / 12, 1.0, np.exp(-4 * np.pi**2 * (least - 1 / 12)))
         bias = np.maximum((1 / 4 - least) / 3, few / (2 * np.pi**2))
         coarse = (np.maximum(shot, 1 / 12) / fired + bias) * size**2
@@ -193,39 +195,77 @@ def smooth(values, range, *, window=0.1):  # noqa: A002
 
 
 def difference_variance(power, range):  # noqa: A002
-    third = power[..., 3:] - 3.0 * power[..., 2:-1] + 3.0 * power[..., 1:-2] - power[..., :-3]
-    squares = np.full(power.shape, np.nan)
-    squares[..., 1:-2] = third**2 / 20.0
-    local = smooth(squares, range, window=0.3)
-    mean = smooth(power, range)
-    spacing = np.abs(np.gradient(range)) if range.size > 1 else np.ones(1)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        leak = (24.0 * (spacing / range) ** 3 * mean) ** 2 / 20.0
-        usable = np.isfinite(squares) & np.isfinite(mean) & (local > 0)
-        usable &= leak < THRESHOLDS.leak * local
-        weight = np.where(usable, 1.0 / local**2, 0.0)
-        weight /= np.max(weight, axis=-1, keepdims=True)
-        weighty = usable & (weight > 0.0)
-        floor = np.min(np.where(weighty, mean, np.inf), axis=-1, keepdims=True)
-        x, y = np.where(weighty, mean, 0.0), np.where(weighty, squares, 0.0)
-        a, b = line(x, y, weight, floor)
-        variance = a + b * np.maximum(mean - floor, 0.0)
-    return np.where(np.isfinite(variance) & (variance > 0), variance, local)
+    rows = [_difference_variance(row, range) for row in power.reshape(-1, power.shape[-1])]
+    return np.array(rows).reshape(power.shape)
 
 
-def line(x, y, weight, floor):
-    total = weight.sum(axis=-1, keepdims=True)
-    x_mean = (weight * x).sum(axis=-1, keepdims=True) / total
-    y_mean = (weight * y).sum(axis=-1, keepdims=True) / total
-    from_mean = x - x_mean
-    square = (weight * from_mean**2).sum(axis=-1, keepdims=True)
-    slope = (weight * from_mean * (y - y_mean)).sum(axis=-1, keepdims=True) / square
-    x_square = (weight * x**2).sum(axis=-1, keepdims=True)
-    # Values of x that differ only by rounding define no slope.
-    slope = np.where((slope > 0) & (square > 1e-24 * x_square), slope, 0.0)
-    lowest = y_mean - slope * (x_mean - floor)
-    above = np.where(weight > 0.0, x - floor, 0.0)
-    through = (weight * above * y).sum(axis=-1, keepdims=True)
-    through /= (weight * above**2).sum(axis=-1, keepdims=True)
-    negative = lowest < 0
-    return np.where(negative, 0.0, lowest), np.where(negative, through, slope)
+def _difference_variance(power, range):  # noqa: A002
+    """Return the line through the far half and the bright blocks, corrected by bands."""
+    size = power.size
+    count = max(size - 12, 0) // 16
+    light, drift = _light(smooth(power, range), size // 2)
+    index = np.arange(max(size - 12, 0))
+    third = power[index + 12] - 3.0 * power[index + 8] + 3.0 * power[index + 4] - power[index]
+    squares = (third[: 16 * count] ** 2 / 20.0).reshape(count, 16).mean(axis=1)
+    far = squares[(size // 2) // 16 :]
+    far = far[np.isfinite(far)]
+    dark = _clipped_mean(far)
+    if not dark > 0.0:
+        neighbours = np.diff(power, 3) ** 2 / 20.0
+        neighbours = neighbours[np.isfinite(neighbours)]
+        return np.full(size, neighbours.mean() if neighbours.size else np.nan)
+    first = 16 * np.arange(count)
+    spread = light[first + 13]
+    fall = 24.0 * (4 * np.abs(np.diff(range))[first] / range[first]) ** 3 * spread
+    usable = np.isfinite(squares) & (fall**2 / 20.0 <= THRESHOLDS.leak * dark)
+    bright = usable & (spread > 5.0 * max(drift, np.sqrt(dark / 16)))
+    slope = _slope(squares[bright], spread[bright], dark)
+    lines = np.maximum(dark + slope * spread, 0.5 * dark)
+    kept = usable & (squares <= 8.0 * lines)
+    improved = np.average(dark + (squares - lines)[kept], weights=lines[kept] ** -2.0)
+    dark = improved if improved > 0.5 * dark else dark
+    line = np.maximum(dark + slope * np.nan_to_num(light), 0.5 * dark)
+    return line * _band_ratio(squares / line[first + 13], usable, size)
+
+
+def _light(mean, far):
+    levels = mean[far::16]
+    levels = levels[np.isfinite(levels)]
+    if levels.size < 4:
+        return np.full(mean.size, np.nan), np.nan
+    departures = np.sort(np.abs(levels - np.median(levels)))
+    return mean - np.median(levels), departures[int(0.9 * departures.size)]
+
+
+def _clipped_mean(values):
+    if values.size < 4:
+        return np.nan
+    median = np.median(values)
+    return values[values <= 8.0 * median].mean() if median > 0.0 else values.mean()
+
+
+def _slope(squares, light, dark):
+    if light.size < 4:
+        return 0.0
+    line = dark + max(np.median((squares - dark) / light), 0.0) * light
+    weights = light / line**2 * (squares <= 8.0 * line)
+    slope = np.sum(weights * (squares - dark)) / np.sum(weights * light)
+    return slope if slope > 0.49 / np.sqrt(np.sum(weights * light)) else 0.0
+
+
+def _band_ratio(ratio, usable, size):
+    centres, logarithms, significant, start = [], [], False, 0
+    while start < ratio.size:
+        end = start + max(32, int(0.25 * start))
+        end = ratio.size if ratio.size - end < 32 else end
+        places = start + np.flatnonzero(usable[start:end])
+        excess = _clipped_mean(ratio[places])
+        if excess > 0.0:
+            centres.append(16 * places.mean() + 13)
+            logarithms.append(np.log(excess))
+            error = 0.49 * np.sqrt(1.0 / places.size + 2.0 / ratio.size)
+            significant |= abs(logarithms[-1]) > 3.5 * error
+        start = end
+    if not significant:
+        return np.ones(size)
+    return np.exp(np.interp(np.arange(size), centres, logarithms))
