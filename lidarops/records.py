@@ -367,8 +367,18 @@ class Unmade:
     instrument: str
     kind: str
     channel: str
+    """Empty if all channels are requested, and none gives the product."""
     reason: str
     """Why examined scenes do not give it."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdleFacts:
+    """Facts whose period of validity holds no file of their instrument."""
+
+    instrument: str
+    period: str
+    """Such as ``facts from 2024-01-01T00:00:00Z``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,6 +403,7 @@ class Findings:
     idle_patterns: tuple[IdlePattern, ...] = ()
     unusable_files: tuple[UnusableFile, ...] = ()
     unmade: tuple[Unmade, ...] = ()
+    idle_facts: tuple[IdleFacts, ...] = ()
 
     @property
     def failed(self) -> bool:

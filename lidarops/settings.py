@@ -23,6 +23,8 @@ NO_UNIT: Final = "1"
 """Unit of a pure number or count."""
 _LEAST_RANGE: Final = 10.0
 """m; bins of lidars are 3.75 to 15 m long, and nothing is known within the first."""
+_LEAST_BACKGROUND: Final = 60.0
+"""m; 16 bins of 3.75 m, whose mean is known within a quarter of the noise of a bin."""
 IDENTIFIER: Final = r"^[A-Za-z0-9][A-Za-z0-9-]*$"
 
 
@@ -154,6 +156,21 @@ Metres = Annotated[
     float, Field(ge=0, le=150_000, allow_inf_nan=False), AfterValidator(_no_kilometres)
 ]
 """Range or height: 0, or at least `_LEAST_RANGE`."""
+
+
+def _wide_enough(limits: tuple[float, float]) -> tuple[float, float]:
+    first, last = limits
+    if first >= last:
+        raise ValueError("must end farther than it starts")
+    if last - first < _LEAST_BACKGROUND:
+        raise ValueError(
+            f"must span at least {_LEAST_BACKGROUND:g} m, not {last - first:g} m: is it in km?"
+        )
+    return limits
+
+
+BackgroundRange = Annotated[tuple[Metres, Metres], AfterValidator(_wide_enough)]
+"""Near and far end of the bins that give the background."""
 
 
 class SettingsModel(BaseModel):

@@ -227,13 +227,25 @@ class Granules(Database):
                 for instrument, index, _, files, channels in connection.execute(query)
             ]
 
-    def days_of_instruments(self) -> dict[str, tuple[int, int]]:
-        """Return the first and the last day with good signal granules, by instrument."""
+    def days_of_instruments(
+        self, first: int | None = None, last: int | None = None
+    ) -> dict[str, tuple[int, int]]:
+        """Return the first and the last day with good signal granules, by instrument.
+
+        Parameters
+        ----------
+        first, last : int, optional
+            Days outside of these do not count.
+        """
         query = (
             sa.select(_C.instrument, sa.func.min(_C.day), sa.func.max(_C.day))
             .where(*self._signals())
             .group_by(_C.instrument)
         )
+        if first is not None:
+            query = query.where(_C.day >= first)
+        if last is not None:
+            query = query.where(_C.day <= last)
         with self.transaction() as connection:
             return {name: (first, last) for name, first, last in connection.execute(query)}
 

@@ -383,26 +383,32 @@ class Ledger(Granules):
         with self.stream(query) as rows:
             yield (_made_from(row) for row in rows)
 
-    def has_product(self, owner: str, kind: str, channel: str, *, without: Collection[str]) -> bool:
-        """Return whether there is a product of an instrument or network.
+    def scenes_with_product(
+        self, owner: str, kind: str, channel: str, *, without: Collection[str]
+    ) -> Iterator[str]:
+        """Yield the ids of the scenes of which an instrument or network has a product.
 
         Parameters
         ----------
         owner : str
             Key of the instrument or network.
         kind, channel : str
+            An empty channel means any.
         without : collection of str
             Paths of products that do not count.
         """
         # Keys hold no underscore, which stands before the time in the id of a scene.
         query = (
-            sa.select(_P.path)
-            .where(_P.campaign == self.campaign, _P.kind == kind, _P.channel == channel)
+            sa.select(_P.path, _P.scene)
+            .where(_P.campaign == self.campaign, _P.kind == kind)
             .where(_P.scene.startswith(f"{owner}_", autoescape=True))
-            .limit(len(without) + 1)
         )
+        if channel:
+            query = query.where(_P.channel == channel)
         with self.transaction() as connection:
-            return any(path not in without for (path,) in connection.execute(query))
+            for path, scene in connection.execute(query):
+                if path not in without:
+                    yield scene
 
     def products(self) -> list[Mapping[str, Any]]:
         """Return the rows of all products, ordered by path."""

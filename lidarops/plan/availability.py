@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.records import ChannelLayout, Holding, LeftOut, Unmet
+from lidarops.records import ChannelLayout, Holding, IdleFacts, LeftOut, Unmet
 from lidarops.steps.channels import LAG_STEP, READ_STEP, glued_parts, is_glued, joined_layout
 
 FACTS: Final = "facts"
@@ -59,12 +59,37 @@ def missing_channels(
                 yield LeftOut(kind, name, reason, rule=_ABSENT, product=kind)
     for name, facts_of_channel in facts.channels.items():
         if name not in present:
-            held = ", ".join(present)
-            reason = f"the facts name a channel that the files lack; they hold {held}"
+            reason = f"the facts name a channel that the files lack; {_instead(name, present)}"
             yield LeftOut(READ_STEP, name, reason, rule=_UNMATCHED)
         elif facts_of_channel.lag is not None and not name.startswith("analog_"):
             reason = "a lag belongs to the facts of the analog channel"
             yield LeftOut(LAG_STEP, name, reason, rule=_UNMATCHED)
+    yield from _unused_lidar_ratios(instrument, facts)
+
+
+def _unused_lidar_ratios(instrument: Instrument, facts: InstrumentFacts) -> Iterator[LeftOut]:
+    """Yield the analog channels whose lidar ratio a glued channel does not take."""
+    named = named_channels(instrument)
+    for glued in filter(is_glued, named):
+        analog, photon = glued_parts(glued)
+        of_analog, of_photon = (_has_lidar_ratio(facts, part) for part in (analog, photon))
+        if of_analog and not of_photon and analog not in named:
+            reason = f"{glued} takes the lidar ratio of {photon}: give it there"
+            yield LeftOut(READ_STEP, analog, reason, rule=_UNMATCHED)
+
+
+def _has_lidar_ratio(facts: InstrumentFacts, channel: str) -> bool:
+    given = facts.channels.get(channel)
+    return given is not None and (
+        given.lidar_ratio is not None or given.lidar_ratio_profile is not None
+    )
+
+
+def _instead(name: str, present: Mapping[str, ChannelLayout]) -> str:
+    if is_glued(name) and set(glued_parts(name)) <= set(present):
+        analog, photon = glued_parts(name)
+        return f"give the lag to {analog}, and dead time and lidar ratio to {photon}"
+    return f"they hold {', '.join(present)}"
 
 
 def _why_absent(name: str, present: Mapping[str, ChannelLayout]) -> str:
@@ -122,6 +147,28 @@ def _lacking(
     """Return the channels that files lack, without misplaced facts about a lag."""
     missing = missing_channels(layout, instrument, facts)
     return [omission for omission in missing if omission.name != LAG_STEP]
+
+
+def idle_facts(campaign: Campaign, holdings: Iterable[Holding]) -> tuple[IdleFacts, ...]:
+    """Return the periods of facts in which an instrument with files has none.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    holdings : iterable of Holding
+        Of all files, cut at `validity_edges`.
+    """
+    used: dict[str, set[str]] = defaultdict(set)
+    for holding in holdings:
+        instrument = campaign.instruments.get(holding.instrument)
+        if instrument is not None:
+            used[holding.instrument].add(_period(instrument.facts_at(holding.since)))
+    return tuple(
+        IdleFacts(name, _period(facts))
+        for name, periods in used.items()
+        for facts in campaign.instruments[name].facts
+        if _period(facts) not in periods
+    )
 
 
 def unavailable_channels(

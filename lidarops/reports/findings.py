@@ -28,7 +28,10 @@ def finding_rows(findings: Findings) -> list[FindingRow]:
 
 def unmade_words(findings: Findings) -> list[str]:
     """Return the products that no scene gives, such as ``elastic glued_532o of hill-lidar``."""
-    return [f"{unmade.kind} {unmade.channel} of {unmade.instrument}" for unmade in findings.unmade]
+    return [
+        f"{unmade.kind} {unmade.channel or 'of all channels'} of {unmade.instrument}"
+        for unmade in findings.unmade
+    ]
 
 
 def lacking(unmet: Unmet) -> str:
@@ -44,6 +47,9 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
         near = f"; unclaimed files with similar names: {', '.join(idle.near)}" if idle.near else ""
         problem = f"matches no file of the archive{near}"
         yield FindingRow(idle.instrument, f"{idle.key}: {idle.pattern}", problem, fails=True)
+    for facts in findings.idle_facts:
+        problem = "hold for no file: their period and the times of the files do not overlap"
+        yield FindingRow(facts.instrument, facts.period, problem, fails=False)
     for note in findings.file_notes:
         files = counted(note.files, "file")
         yield FindingRow(note.instrument, files, note.text, fails=note.contradicts)
@@ -51,5 +57,5 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
         subject = f"{unusable.key}: {unusable.path}"
         yield FindingRow(unusable.instrument, subject, unusable.problem, fails=True)
     for unmade in findings.unmade:
-        subject = f"products: {unmade.kind} {unmade.channel}"
+        subject = f"products: {unmade.kind} {unmade.channel or 'of all channels'}"
         yield FindingRow(unmade.instrument, subject, f"not made: {unmade.reason}", fails=False)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan import availability
-from lidarops.records import Findings, IdlePattern, Role, Unmade, Unmet, UnusableFile
+from lidarops.records import Findings, IdleFacts, IdlePattern, Role, Unmade, Unmet, UnusableFile
 from lidarops.run.selection import Selection, station_of
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps import dependence
@@ -50,6 +50,7 @@ def find(
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
         unmade=tuple(_unmade(judge, store, selection, owners, orphans)),
+        idle_facts=_idle_facts(campaign, store, instruments),
     )
 
 
@@ -77,6 +78,16 @@ def _unmet(
         since=selection.since,
         until=selection.until,
     )
+
+
+def _idle_facts(
+    campaign: Campaign, store: Store, instruments: Collection[str]
+) -> tuple[IdleFacts, ...]:
+    """Return the facts whose period holds no file."""
+    edges = availability.validity_edges(campaign)
+    # Facts that always hold are never idle.
+    found = availability.idle_facts(campaign, store.holdings(edges)) if edges else ()
+    return tuple(idle for idle in found if idle.instrument in instruments)
 
 
 def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[UnusableFile]:
@@ -108,47 +119,52 @@ def _unmade(
     owners: Iterable[str],
     orphans: Collection[str],
 ) -> Iterator[Unmade]:
-    """Yield the products that are requested by name, have files, and do not exist."""
+    """Yield the requested products that have files and that no selected scene has."""
     missing = [
         (owner, kind, channel)
         for owner in owners
         for kind, channel in _requested(judge.campaign, owner)
         if (not selection.kinds or kind in selection.kinds)
-        and not store.has_product(owner, kind, channel, without=orphans)
+        and not any(
+            selection.scene(scene, judge.campaign)
+            for scene in store.scenes_with_product(owner, kind, channel, without=orphans)
+        )
     ]
-    spans = store.days_of_instruments() if missing else {}
+    spans = store.days_of_instruments(*selection.day_limits) if missing else {}
     judged: dict[int, Sequence[Judgement]] = {}
     for owner, kind, channel in missing:
-        days = _examined(judge.campaign, owner, spans, selection)
+        days = _first_and_last_day(judge.campaign, owner, spans)
         for day in days:
             if day not in judged:
                 judged[day] = judge.days([day]).judgements
-        scenes = [scene for day in days for scene in judged[day] if scene.scene.instrument == owner]
+        scenes = [
+            scene
+            for day in days
+            for scene in judged[day]
+            if scene.scene.instrument == owner and selection.scene(scene.scene.id, judge.campaign)
+        ]
         reason = _why_not(scenes, kind, channel)
         if days and reason:
             yield Unmade(owner, kind, channel, reason)
 
 
 def _requested(campaign: Campaign, owner: str) -> Iterator[ProductKey]:
-    """Yield kind and channel of the products that are requested by name."""
+    """Yield kind and channel of the requested products; an empty channel if all are requested."""
     if owner in campaign.networks:
         for kind, joint in campaign.networks[owner].requested().items():
             yield kind, joint.channel
         return
     for kind, settings in campaign.instruments[owner].products.requested().items():
-        for channel in settings.named:
+        for channel in settings.named or [""]:
             yield kind, channel
 
 
-def _examined(
-    campaign: Campaign,
-    owner: str,
-    spans: Mapping[str, tuple[int, int]],
-    selection: Selection,
+def _first_and_last_day(
+    campaign: Campaign, owner: str, spans: Mapping[str, tuple[int, int]]
 ) -> list[int]:
-    """Return the first and last day on which an owner has files, within the selection."""
+    """Return the first and last day on which an owner has files."""
     days = [day for name in _members(campaign, owner) for day in spans.get(name, ())]
-    return selection.days(sorted({min(days), max(days)})) if days else []
+    return sorted({min(days), max(days)}) if days else []
 
 
 def _why_not(scenes: Sequence[Judgement], kind: str, channel: str) -> str:
@@ -157,11 +173,14 @@ def _why_not(scenes: Sequence[Judgement], kind: str, channel: str) -> str:
         return "its instruments have no files at the same time, on the first and the last day"
     reasons: dict[str, None] = {}
     for judged in scenes:
-        if (kind, channel) in dependence.planned_products(judged.requested):
+        planned = dependence.planned_products(judged.requested)
+        if any(made == kind and channel in ("", name) for made, name in planned):
             return ""
         reasons |= dict.fromkeys(
             left.reason
             for left in judged.requested.left_out
-            if left.name in (kind, READ_STEP) and left.channel == channel and left.rule != REQUEST
+            if left.name in (kind, READ_STEP)
+            and channel in ("", left.channel)
+            and left.rule != REQUEST
         )
     return "; ".join(reasons)

@@ -33,10 +33,17 @@ class Selection:
         """Whether the selection contains everything."""
         return self == Selection()
 
+    @property
+    def day_limits(self) -> tuple[int | None, int | None]:
+        """The first and the last day that may hold selected scenes; None without a limit."""
+        return (
+            None if self.since is None else day_of(self.since),
+            None if self.until is None else day_of(self.until),
+        )
+
     def days(self, days: Iterable[int]) -> list[int]:
         """Return the days that may hold selected scenes."""
-        first = None if self.since is None else day_of(self.since)
-        last = None if self.until is None else day_of(self.until)
+        first, last = self.day_limits
         return [
             day for day in days if (first is None or day >= first) and (last is None or day <= last)
         ]

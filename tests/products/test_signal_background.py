@@ -41,6 +41,7 @@ def test_the_background_is_planned_as_requested(settings, method, words):
         ({"background": "cubic"}, "cubic needs background_range"),
         ({"background": "known_shape"}, "'tail_mean' or 'cubic'"),
         ({"background_range": [900, 900]}, "must end farther"),
+        ({"background_range": [27, 30]}, "must span at least 60 m, not 3 m: is it in km?"),
     ],
 )
 def test_an_impossible_request_is_refused(settings, words):

@@ -133,6 +133,46 @@ def test_a_product_that_no_scene_gives_is_named_in_the_last_line_and_the_report(
     assert document(archive, "plan")["never_made"][0]["kind"] == "elastic"
 
 
+def test_a_kind_that_no_channel_gives_is_named(archive: Archive) -> None:
+    products = archive.tree["instruments"]["poor"]["products"]
+    products["signal"] = {"channels": "all", "background_range": [20_000, 30_000]}
+    shown = invoke(archive, "reprocess")
+    assert "requested, but made in no scene: signal of all channels of poor" in shown.output
+
+
+def test_products_of_other_times_do_not_count_for_a_selection(archive: Archive) -> None:
+    rich = archive.tree["instruments"]["rich"]
+    rich["facts"][1]["zenith_angle"] = 90
+    whole = invoke(archive, "reprocess")
+    assert "made in no scene" not in whole.output
+    words = "requested, but made in no scene: elastic analog_532o of rich"
+    assert words in invoke(archive, "reprocess", "--since", "2026-03-03").output
+    assert words not in invoke(archive, "reprocess", "--until", "2026-03-03").output
+
+
+def test_facts_that_hold_for_no_file_are_noted(archive: Archive) -> None:
+    rich = archive.tree["instruments"]["rich"]
+    rich["facts"][0]["valid_from"] = "2026-01-01T00:00:00Z"
+    rich["facts"].append({"valid_to": "2020-01-01T00:00:00Z", "zenith_angle": 10})
+    for command in COMMANDS[1:]:
+        shown = invoke(archive, command)
+        assert shown.exit_code == 0
+        assert "facts to 2020-01-01T00:00:00Z" in " ".join(shown.output.split())
+    assert document(archive, "plan")["facts_without_file"] == [
+        {"instrument": "rich", "period": "facts to 2020-01-01T00:00:00Z"}
+    ]
+
+
+def test_a_lidar_ratio_that_a_glued_channel_does_not_take_is_named(archive: Archive) -> None:
+    rich = archive.tree["instruments"]["rich"]
+    rich["facts"][1]["channels"]["analog_532o"] = {"lidar_ratio": 70}
+    rich["products"]["elastic"]["channels"] = ["glued_532o"]
+    shown = invoke(archive, "plan")
+    assert "lidar ratio of photon_532o" in " ".join(shown.output.split())
+    rich["facts"][1]["channels"]["photon_532o"]["lidar_ratio"] = 70
+    assert "lidar ratio of photon_532o" not in " ".join(invoke(archive, "plan").output.split())
+
+
 def test_a_wavelength_that_contradicts_the_header_is_noted(archive: Archive) -> None:
     facts = archive.tree["instruments"]["rich"]["facts"]
     facts[1]["channels"]["photon_532o"]["wavelength"] = 355e-9

@@ -7,6 +7,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from lidarops.settings import (
+    BackgroundRange,
     ChannelProduct,
     Metres,
     VisibilitySettings,
@@ -25,7 +26,7 @@ class HomogeneousSettings(ChannelProduct):
         description="known_background takes the background from the far range, for paths that end"
         " there; the other methods retrieve it from the section",
     )
-    background_range: tuple[Metres, Metres] | None = quantity(
+    background_range: BackgroundRange | None = quantity(
         None,
         unit="m",
         description="far range of known_background; the last tenth of the bins by default",
@@ -41,9 +42,6 @@ class HomogeneousSettings(ChannelProduct):
         for near, far in self.sections:
             if far <= near:
                 raise ValueError(f"section [{near}, {far}] must end farther than it starts")
-        limits = self.background_range
-        if limits is not None and self.method != "known_background":
+        if self.background_range is not None and self.method != "known_background":
             raise located_error("is used by the method known_background only", "background_range")
-        if limits is not None and limits[1] <= limits[0]:
-            raise located_error("must end farther than it starts", "background_range")
         return self

@@ -6,26 +6,20 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, quantity
+from lidarops.settings import BackgroundRange, ChannelProduct, quantity
 
 
 class SignalSettings(ChannelProduct):
     """The ``signal`` product: background-subtracted, range-corrected signals."""
 
     channels: list[str] | Literal["all"] = "all"
-    background_range: tuple[Metres, Metres] | None = quantity(
+    background_range: BackgroundRange | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
     )
     background: Literal["tail_mean", "cubic"] = Field(
         default="tail_mean",
         description="mean of background_range, or the cubic of a homogeneous section there",
     )
-
-    @model_validator(mode="after")
-    def _rising(self) -> Self:
-        if self.background_range and self.background_range[0] >= self.background_range[1]:
-            raise ValueError("background_range must end farther than it starts")
-        return self
 
     @model_validator(mode="after")
     def _has_its_section(self) -> Self:
