@@ -373,8 +373,10 @@ def _show_orphans(result: Result, removed: int | None) -> None:
 
 
 def _show_scenes_with_problems(result: Result) -> None:
+    from lidarops.run.options import NO_USABLE_VALUE
+
     processed = _processed_scenes(result)
-    unusable = dict.fromkeys(result.unusable_scenes, "its retrievals gave no usable value")
+    unusable = dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE)
     columns = ("scene", "problem")
     now = ((scene, problem) for scene, problem in unusable.items() if scene in processed)
     show_rows("Without a usable value", columns, now)

@@ -61,7 +61,8 @@ def show_plan(
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.plan.cost_estimate import RunTime
-    from lidarops.run.archive import assess, failed_before, survey
+    from lidarops.run.archive import assess, failed_before, survey, unusable_before
+    from lidarops.run.options import NO_USABLE_VALUE
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
 
@@ -74,11 +75,13 @@ def show_plan(
     no_scene = True
     failed = False
     waiting = failed_before(settings, selection)
+    unusable = dict.fromkeys(unusable_before(settings, selection), NO_USABLE_VALUE)
     for judged in judgements:
         no_scene = False
         failed |= not judged.planned
         if judged.due or judged.held:
-            waiting.pop(judged.scene.id, None)
+            for earlier in (waiting, unusable):
+                earlier.pop(judged.scene.id, None)
         failed |= judged.held
         scene, whole = judged.scene, settings.all_steps
         times = {
@@ -113,6 +116,7 @@ def show_plan(
             "scenes": scenes,
             **no_scene_found,
             "failed_before": waiting,
+            "without_a_usable_value": list(unusable),
             **findings_document(findings),
             "estimated_cpu_seconds": estimate,
         }
@@ -121,7 +125,7 @@ def show_plan(
         if no_scene:
             typer.echo(NO_SCENE)
         show_findings(findings)
-        _show_failed(waiting)
+        _show_earlier(waiting, unusable)
         _show_times(runs)
     exit_with_status(failed=failed or bool(waiting) or findings.failed)
 
@@ -193,10 +197,11 @@ def _show_times(runs: Mapping[str, RunTime]) -> None:
     show_rows("Estimated CPU time in s on a common server core", columns, rows)
 
 
-def _show_failed(failed: Mapping[str, str]) -> None:
-    """Print the scenes that failed in earlier runs and are not due."""
-    title = "Failed before; not tried again, because nothing has changed"
-    show_rows(title, ("scene", "error"), failed.items())
+def _show_earlier(failed: Mapping[str, str], unusable: Mapping[str, str]) -> None:
+    """Print the scenes that failed or gave nothing in earlier runs and are not due."""
+    unchanged = "not tried again, because nothing has changed"
+    show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed.items())
+    show_rows(f"Without a usable value; {unchanged}", ("scene", "problem"), unusable.items())
 
 
 def _show_stale(title: str, judged: Judgement) -> None:

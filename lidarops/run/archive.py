@@ -203,6 +203,12 @@ def failed_before(campaign: Campaign, selection: Selection) -> dict[str, str]:
         }
 
 
+def unusable_before(campaign: Campaign, selection: Selection) -> list[str]:
+    """Return the selected scenes whose retrievals gave no usable value; a catalog must exist."""
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        return [scene for scene in store.unusable_scenes() if selection.scene(scene, campaign)]
+
+
 def update_catalog(
     campaign: Campaign,
     *,

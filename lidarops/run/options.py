@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RunStatus
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Progress = Callable[[SceneOutcome], None]
+NO_USABLE_VALUE: Final = "its retrievals gave no usable value"
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,8 @@ def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) 
     assert summary["run"] is None
     assert summary["unusable_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
     assert not (archive.folder / "out/report").exists()
+    idle = json.loads(runner.invoke(app, ["plan", file, "--stale", "--json"]).stdout)
+    assert idle["without_a_usable_value"] == summary["unusable_scenes"]
     archive.flip("raw/poor/h10")
     planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
     summary = json.loads(planned.stdout)
