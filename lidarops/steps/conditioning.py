@@ -63,7 +63,10 @@ class Overlap(Step[ChannelCase, OverlapSettings]):
         """Run where the campaign states the overlap."""
         full, profile = case.facts.full_overlap_range, case.facts.overlap_profile
         if not profile and full <= 0:
-            yield Leave("the campaign gives no full_overlap_range")
+            yield Leave(
+                "the campaign gives no full_overlap_range: near bins are used as they are, and the"
+                " rise of the signal to full overlap may be flagged as a cloud"
+            )
             return
         reason = "bins nearer than full overlap are flagged and excluded"
         if profile:
