@@ -55,6 +55,14 @@ def quantity(
     return Field(default, description=text or None, json_schema_extra={"unit": unit}, **limits)
 
 
+def unit_of(model: type[BaseModel], key: str) -> str:
+    """Return the unit of a field; empty for pure numbers, texts and keys without a field."""
+    field = model.model_fields.get(key)
+    stated = field.json_schema_extra if field else None
+    unit = stated.get("unit", NO_UNIT) if isinstance(stated, dict) else NO_UNIT
+    return "" if unit == NO_UNIT else str(unit)
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a question for the nearest known name, with a space behind it, or an empty text.
 

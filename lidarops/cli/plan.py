@@ -180,12 +180,19 @@ def _effect(step: PlannedStep, plan: Plan) -> str:
     from lidarops.steps.reading import idle_window
 
     idle = idle_window(step, plan.steps)
-    return f"no effect: {idle}" if idle else ", ".join(_settings(step.settings))
+    return f"no effect: {idle}" if idle else ", ".join(_settings(step))
 
 
-def _settings(settings: Mapping[str, Any]) -> Iterator[str]:
-    for key, value in settings.items():
-        yield f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}"
+def _settings(step: PlannedStep) -> Iterator[str]:
+    """Yield the settings of a step with their units."""
+    from lidarops.settings import unit_of
+    from lidarops.steps.registry import definition
+
+    model = definition(step).settings
+    for key, value in step.settings.items():
+        number = f"{value:.6g}" if isinstance(value, float) else f"{value}"
+        unit = "" if value is None else unit_of(model, key)
+        yield f"{key} {number} {unit}".rstrip()
 
 
 def _show_times(runs: Mapping[str, RunTime]) -> None:

@@ -15,7 +15,7 @@ from lidarops.records import DetectionMode, Granule, Role
 from lidarops.retrieve.signal import labeled
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import range_offset
 from lidarops.steps.data import Data, Profiles
@@ -46,8 +46,7 @@ PROFILES: Final = Datum[Profiles]("profiles")
 class OverlapSettings(SettingsModel):
     """Settings of the step ``overlap``."""
 
-    full_overlap_range: float
-    """m."""
+    full_overlap_range: float = quantity(unit="m")
     overlap_profile: str | None = None
     """Ancillary file of the overlap function."""
 
@@ -88,8 +87,7 @@ class Overlap(Step[ChannelCase, OverlapSettings]):
 class RangeOffsetSettings(SettingsModel):
     """Settings of the step ``range_offset``."""
 
-    range_offset: float
-    """m."""
+    range_offset: float = quantity(unit="m")
 
 
 class RangeOffset(Step[ChannelCase, RangeOffsetSettings]):
@@ -202,8 +200,7 @@ def _times_around(times: Sequence[datetime], first: datetime, last: datetime) ->
 class DeadTimeSettings(SettingsModel):
     """Settings of the step ``dead_time``."""
 
-    dead_time: float
-    """s."""
+    dead_time: float = quantity(unit="s")
     dead_time_uncertainty: float
     """Relative standard error."""
 
@@ -240,8 +237,9 @@ class NoiseSettings(SettingsModel):
     """Settings of the step ``noise``."""
 
     method: Literal["poisson", "given", "differences"]
-    noise_variance: float | None = None
-    """mV2, with the method ``given``."""
+    noise_variance: float | None = quantity(
+        None, unit="mV2", description="with the method ``given``"
+    )
 
 
 class Noise(Step[ChannelCase, NoiseSettings]):

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.step import Datum
 
 T = TypeVar("T")
@@ -68,8 +68,7 @@ class BackgroundSettings(SettingsModel):
     """How a background is estimated."""
 
     method: Literal["tail_mean", "cubic", "known_shape"]
-    range: tuple[float, float]
-    """m."""
+    range: tuple[float, float] = quantity(unit="m")
 
 
 class Profiles(ABC):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lidarops.campaign.model import channel_facts
 from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.lag import enough_bins, profile_groups
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import LAG_STEP, glued_parts
 from lidarops.steps.conditioning import PROFILES
@@ -33,8 +33,7 @@ class LagSettings(SettingsModel):
     """Settings of the step ``lag``."""
 
     method: Literal["estimate", "given"]
-    lag: float | None = None
-    """Bins, with the method ``given``."""
+    lag: float | None = quantity(None, unit="bins", description="with the method ``given``")
 
 
 class Lag(Step[ChannelCase, LagSettings]):

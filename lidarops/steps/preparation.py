@@ -9,7 +9,7 @@ from typing import Final, Literal, Protocol
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.thresholds import THRESHOLDS
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase, ProductCase
 from lidarops.steps.data import BackgroundSettings, Data
 from lidarops.steps.step import Datum, Decisions, Run, Step
@@ -80,7 +80,7 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
 class AverageSettings(SettingsModel):
     """Settings of the step ``average``."""
 
-    seconds: float
+    seconds: float = quantity(unit="s")
 
 
 class AverageRequest(Protocol):

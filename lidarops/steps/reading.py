@@ -14,7 +14,7 @@ from lidarops.raw.model import count_bins
 from lidarops.records import PlannedStep
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import (
     READ_STEP,
@@ -40,8 +40,7 @@ ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its b
 class ReadSettings(SettingsModel):
     """Settings of the step ``read``."""
 
-    wavelength: float
-    """m."""
+    wavelength: float = quantity(unit="m")
 
 
 class Read(Step[ChannelCase, ReadSettings]):

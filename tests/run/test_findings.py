@@ -252,6 +252,12 @@ def test_a_plan_prints_equal_lines_of_channels_once(archive: Archive) -> None:
     assert max(map(len, output.splitlines())) > 80
 
 
+def test_a_plan_states_the_units_of_settings(archive: Archive) -> None:
+    shown = " ".join(invoke(archive, "plan", "--instrument", "rich").output.split())
+    assert "wavelength 5.32e-07 m;" in shown
+    assert "dead_time 4e-09 s," in shown
+
+
 def test_the_version_is_printed() -> None:
     shown = CliRunner().invoke(app, ["--version"])
     assert shown.exit_code == 0

@@ -15,7 +15,7 @@ from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.records import Role
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
 from lidarops.steps.conditioning import OVERLAP, PROFILES
@@ -91,12 +91,9 @@ class KnownShape(Step[Case, NoSettings]):
 class ReferenceWindowSettings(SettingsModel):
     """Settings of the step ``reference``."""
 
-    lowest: float
-    """m along the beam."""
-    highest: float
-    """m along the beam."""
-    width: float
-    """m along the beam."""
+    lowest: float = quantity(unit="m", description="along the beam")
+    highest: float = quantity(unit="m", description="along the beam")
+    width: float = quantity(unit="m", description="along the beam")
     scattering_ratio: float
     relative_error: float
 
@@ -142,10 +139,12 @@ def _lidar_ratio(case: Case) -> dict[str, Any]:
 class InversionSettings(SettingsModel):
     """Settings of the step ``elastic``."""
 
-    lidar_ratio: float | None = None
-    """sr; None where a profile is given."""
-    lidar_ratio_standard_error: float | None = None
-    """sr; None where a profile is given."""
+    lidar_ratio: float | None = quantity(
+        None, unit="sr", description="None where a profile is given"
+    )
+    lidar_ratio_standard_error: float | None = quantity(
+        None, unit="sr", description="None where a profile is given"
+    )
     lidar_ratio_profile: str | None = None
     """Ancillary file of both over altitude."""
     molecular_relative_error: float

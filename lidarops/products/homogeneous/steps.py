@@ -26,7 +26,7 @@ from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit
-from lidarops.settings import SettingsModel, VisibilitySettings
+from lidarops.settings import SettingsModel, VisibilitySettings, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
@@ -154,10 +154,10 @@ class PathSettings(SettingsModel):
     """Settings of the step ``homogeneous``."""
 
     method: Literal["auto", "direct", "cubic", "known_background"]
-    sections: tuple[Section, ...]
-    """m."""
-    background_range: tuple[float, float] | None = None
-    """m, far range of `known_background`."""
+    sections: tuple[Section, ...] = quantity(unit="m")
+    background_range: tuple[float, float] | None = quantity(
+        None, unit="m", description="far range of `known_background`"
+    )
     visibility: VisibilitySettings | None = None
     left_out: tuple[tuple[float, float, OmittedBit], ...] = ()
     """Sections that are not retrieved, with the quality bit that says why."""

@@ -22,7 +22,7 @@ from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, Indices, WholeProduct, in_one_batch
@@ -252,15 +252,11 @@ class Layers(PartOfRetrieval):
 class ScanSettings(SettingsModel):
     """Settings of the step ``multiangle``."""
 
-    highest: float
-    """m above the station."""
-    step: float
-    """m."""
+    highest: float = quantity(unit="m", description="above the station")
+    step: float = quantity(unit="m")
     method: Method
-    largest_gradient: float
-    """m-1."""
-    layers: tuple[tuple[float, float], ...]
-    """m above the station."""
+    largest_gradient: float = quantity(unit="m-1")
+    layers: tuple[tuple[float, float], ...] = quantity(unit="m", description="above the station")
 
 
 class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):

@@ -17,7 +17,7 @@ from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.retrieval import RamanSettings
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
-from lidarops.settings import SettingsModel
+from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import member_channel, range_channel, wavelength
 from lidarops.steps.conditioning import OVERLAP, PROFILES
@@ -48,25 +48,19 @@ class RetrievalSettings(SettingsModel):
     calibration: float | None = None
     """kg kg-1 per ratio of the signals of water vapour and nitrogen."""
     calibration_standard_error: float | None = None
-    lowest: float
-    """m, of the reference window."""
-    highest: float
-    """m, of the reference window."""
-    width: float
-    """m, of the reference window."""
+    lowest: float = quantity(unit="m", description="of the reference window")
+    highest: float = quantity(unit="m", description="of the reference window")
+    width: float = quantity(unit="m", description="of the reference window")
     scattering_ratio: float
     reference_relative_error: float
-    cell: float
-    """m."""
-    farthest: float
-    """m."""
+    cell: float = quantity(unit="m")
+    farthest: float = quantity(unit="m")
     known_shape: bool
     angstrom_exponent: float
     angstrom_standard_error: float
     molecular_relative_error: float
     overlap_relative_error: float
-    filter_width: float | None = None
-    """m."""
+    filter_width: float | None = quantity(None, unit="m")
     dark: bool = False
     """Whether a look at some profiles found no Raman signal, so that nothing is retrieved."""
 
