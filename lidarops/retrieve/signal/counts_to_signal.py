@@ -493,11 +493,11 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
               = v(R_i)
 
     with the smoothed signal :math:`\overline{P}` and its median :math:`\overline{P}_{far}` in the
-    far half. The squares are averaged in blocks of 16; :math:`a` is the median of the blocks of
-    the far half, :math:`b \ge 0` that of :math:`(v - a) / (\overline{P} - \overline{P}_{far})`
-    over the blocks that are brighter than the drift of the baseline in the far half. Two
+    far half. The squares are averaged in blocks of 16. The slope :math:`b` is fitted to the blocks
+    that are brighter than the drift of the baseline in the far half, and is 0 within its standard
+    error; :math:`a` is fitted to all. Blocks far noisier than the line are left out. Two
     well-determined numbers give weights that do not follow the noise of the single bin. A baseline
-    that drifts by as much as the light makes no noise: where the median of a band of 32 blocks or
+    that drifts by as much as the light makes no noise: where the mean of a band of 32 blocks or
     more contradicts the line, the line is multiplied by the ratio of the two, interpolated
     logarithmically between the centres of bands.
 
