@@ -69,7 +69,7 @@ GLUED = with_products(elastic={"channels": ["glued_532o"]})
 LATE = {**GLUED, **with_facts(channels={"analog_532o": {"range_offset": -45}})}
 MULTI = with_products(multiangle={"channels": ["photon_532o"]})
 CALM = with_products(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
-FEW = with_products(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
+FEW = with_products(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_050]})
 OF_ANALOG = with_products(homogeneous={**SECTIONS, "channels": ["analog_532o"]})
 OFFSET = with_facts(channels={"photon_532o": {"range_offset": 5}})
 SEEN = with_products(homogeneous={**SECTIONS, "visibility": {}})
