@@ -15,37 +15,29 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.signal import _signal_kernels as kernels
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
 DISTANCE: Final = 4
-"""Bins between the values of a third difference. The filters of the electronics correlate bins up
-to 3 apart in the real archives, which hides noise from differences of neighbours."""
+"""Bins between the values of a third difference. The electronics correlate neighbouring bins by
+0.1 to 0.4 in real archives, which differences of neighbours do not show, and hardly any others."""
 BLOCK: Final = 16
 """Differences in a block."""
 _REACH: Final = 3 * DISTANCE
 """Bins from the first to the last value of a difference."""
 CENTRE: Final = (BLOCK - 1 + _REACH) // 2
 """Bins from the first bin of a block to its centre."""
-_OUTLYING: Final = 8.0
-"""Mean square of a block over the median, or over the line, from which it is left out. Steps of a
-quiet digitiser come in bursts of up to 5; edges of clouds exceed the noise by more. Simulated."""
 _BLOCK_ERROR: Final = 0.49
 """Standard deviation of the mean square of a block of white noise, over its mean. Simulated."""
 _FEWEST: Final = 4
 """Blocks of which a mean is taken."""
-_DARKEST: Final = 0.5
-"""Least noise over that in the far half, where the signal lies below its level there. Assumed."""
-_BAND: Final = 32
-"""Blocks of a band, which give its noise within 5 %; more where that is less than `_GROWTH`."""
-_GROWTH: Final = 0.25
-"""Share of a band in the range from the first block to its end."""
-_BRIGHT: Final = 5.0
-"""Light over the drift of the baseline, and over the noise of its mean, from which the noise of
-light is measured: they then change the slope by a fifth at most. Assumed."""
-_SIGNIFICANT: Final = 3.5
-"""Standard errors beyond which the noise of a band differs from the line: of white noise, one
-profile in a hundred has such a band."""
+_OUTLYING: Final = THRESHOLDS.outlying_block
+_DARKEST: Final = THRESHOLDS.darkest
+_BRIGHT: Final = THRESHOLDS.bright
+_BAND: Final = THRESHOLDS.noise_band
+_GROWTH: Final = THRESHOLDS.band_growth
+_SIGNIFICANT: Final = THRESHOLDS.significant_band
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -68,6 +60,17 @@ class _Blocks(NamedTuple):
     """Signal over its level in the far half."""
     usable: npt.NDArray[np.bool_]
     """Whether all bins are known, and the fall of the signal is negligible."""
+
+
+class _Line(NamedTuple):
+    """Noise variance as a function of light."""
+
+    dark: float
+    """At the level of the far half."""
+    slope: float
+    """Per unit of light."""
+    least: float
+    """Light from which the slope holds."""
 
 
 def block_count(bins: int) -> int:
@@ -118,22 +121,27 @@ def _far_level(mean: Array, far: int) -> tuple[float, float]:
 
 
 @_compiled
-def _blocks(power: Array, mean: Array, level: float, leak: Array) -> _Blocks:
-    count = leak.size
-    square, light = np.empty(count), np.empty(count)
+def _squares(power: Array, count: int) -> Array:
+    squares = np.empty(count)
     for k in range(count):
-        square[k] = _mean_square(power, k * BLOCK, BLOCK, DISTANCE)
-        light[k] = mean[k * BLOCK + CENTRE] - level
-    return _Blocks(square, light, square < math.inf)
+        squares[k] = _mean_square(power, k * BLOCK, BLOCK, DISTANCE)
+    return squares
 
 
 @_compiled
-def _slope(blocks: _Blocks, dark: float, drift: float) -> float:
-    """Return the noise variance per unit of light; 0 where it cannot be told from none."""
-    # Windows of the smoothed signal hold a block or more.
-    unclear = max(drift, math.sqrt(dark / BLOCK))
-    bright = blocks.usable & (blocks.light > _BRIGHT * unclear)
-    light, square = blocks.light[bright], blocks.square[bright]
+def _blocks(squares: Array, mean: Array, level: float, fall: Array, dark: float) -> _Blocks:
+    light, usable = np.empty(squares.size), np.empty(squares.size, dtype=np.bool_)
+    for k in range(squares.size):
+        light[k] = mean[k * BLOCK + CENTRE] - level
+        # Against the least noise, so that the noise of a block does not select it.
+        leak = fall[k] * light[k]
+        usable[k] = (squares[k] < math.inf) & (leak * leak <= dark)
+    return _Blocks(squares, light, usable)
+
+
+@_compiled
+def _fit(light: Array, square: Array, dark: float) -> float:
+    """Return the noise variance per unit of light; 0 within its standard error."""
     if light.size < _FEWEST:
         return 0.0
     line = dark + max(float(np.median((square - dark) / light)), 0.0) * light
@@ -145,18 +153,47 @@ def _slope(blocks: _Blocks, dark: float, drift: float) -> float:
 
 
 @_compiled
-def _line(dark: float, slope: float, light: float) -> float:
-    noise = dark + slope * (0.0 if math.isnan(light) else light)
-    return max(noise, _DARKEST * dark)
+def _line(blocks: _Blocks, dark: float, drift: float) -> _Line:
+    """Return the noise as a function of light."""
+    # Windows of the smoothed signal hold a block or more.
+    clear = _BRIGHT * max(drift, math.sqrt(dark / BLOCK))
+    bright = (blocks.light > clear) & (blocks.square < math.inf)
+    known = bright & blocks.usable
+    if np.sum(known) >= _FEWEST or np.sum(bright) < _FEWEST:
+        slope = _fit(blocks.light[known], blocks.square[known], dark)
+        return _Line(_dark_noise(blocks, _Line(dark, slope, -math.inf)), slope, -math.inf)
+    # As before an opaque cloud: the structure of the signal bounds the noise of its light.
+    return _Line(dark, _fit(blocks.light[bright], blocks.square[bright], dark), clear)
 
 
 @_compiled
-def _bands(blocks: _Blocks, dark: float, slope: float) -> tuple[Array, Array, bool]:
+def _dark_noise(blocks: _Blocks, line: _Line) -> float:
+    """Return the noise in the far half, from all blocks."""
+    total = weights = 0.0
+    for k in range(blocks.square.size):
+        variance = _variance(line, blocks.light[k])
+        if blocks.usable[k] and blocks.square[k] <= _OUTLYING * variance:
+            weight = (line.dark / variance) ** 2
+            total += weight * (line.dark + blocks.square[k] - variance)
+            weights += weight
+    return total / weights if total > 0.0 else line.dark
+
+
+@_compiled
+def _variance(line: _Line, light: float) -> float:
+    # Light is missing where no bin of its window is known.
+    if math.isnan(light) or light < line.least:
+        return line.dark
+    return max(line.dark + line.slope * light, _DARKEST * line.dark)
+
+
+@_compiled
+def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
     """Return centres of bands, logarithms of their noise over the line, and their significance."""
     count = blocks.square.size
     ratio = np.empty(count)
     for k in range(count):
-        ratio[k] = blocks.square[k] / _line(dark, slope, blocks.light[k])
+        ratio[k] = blocks.square[k] / _variance(line, blocks.light[k])
     centres, excesses = np.empty(count), np.empty(count)
     found, significant = 0, False
     start = 0
@@ -179,40 +216,22 @@ def _bands(blocks: _Blocks, dark: float, slope: float) -> tuple[Array, Array, bo
 
 
 @_compiled
-def _dark_noise(blocks: _Blocks, dark: float, slope: float) -> float:
-    """Return the noise in the far half, from all blocks."""
-    total = weights = 0.0
-    for k in range(blocks.square.size):
-        line = _line(dark, slope, blocks.light[k])
-        if blocks.usable[k] and blocks.square[k] <= _OUTLYING * line:
-            weight = (dark / line) ** 2
-            total += weight * (dark + blocks.square[k] - line)
-            weights += weight
-    return total / weights
-
-
-@_compiled
 def _estimate(power: Array, noise: NoiseModel, s: kernels.SignalScratch, out: Array) -> None:
-    complete = kernels._load(power, s.sums)  # noqa: SLF001 - kernels of one package
-    kernels._averages(s.sums, noise.narrow, complete, s.mean)  # noqa: SLF001
+    complete = kernels.load_values(power, s.sums)
+    kernels.write_averages(s.sums, noise.narrow, complete, s.mean)
     far = power.size // 2
-    level, drift = _far_level(s.mean, far)
-    blocks = _blocks(power, s.mean, level, noise.leak)
-    far_blocks = far // BLOCK
-    dark = _clipped_mean(blocks.square[far_blocks:][blocks.usable[far_blocks:]])
+    squares = _squares(power, noise.leak.size)
+    far_squares = squares[far // BLOCK :]
+    dark = _clipped_mean(far_squares[far_squares < math.inf])
     if not dark > 0.0:
         out[:] = _constant(power)
         return
-    for k in range(blocks.usable.size):
-        # Against the least noise, so that the noise of a block does not select it.
-        fall = noise.leak[k] * blocks.light[k]
-        blocks.usable[k] &= fall * fall <= dark
-    slope = _slope(blocks, dark, drift)
-    improved = _dark_noise(blocks, dark, slope)
-    dark = improved if improved > _DARKEST * dark else dark
+    level, drift = _far_level(s.mean, far)
+    blocks = _blocks(squares, s.mean, level, noise.leak, dark)
+    line = _line(blocks, dark, drift)
     for i in range(power.size):
-        out[i] = _line(dark, slope, s.mean[i] - level)
-    centres, excesses, significant = _bands(blocks, dark, slope)
+        out[i] = _variance(line, s.mean[i] - level)
+    centres, excesses, significant = _bands(blocks, line)
     if significant:
         out *= np.exp(np.interp(np.arange(power.size), centres, excesses))
 

@@ -100,7 +100,7 @@ def scratch(bins: int) -> SignalScratch:
 
 
 @_compiled
-def _load(values: Array, s: _Sums) -> bool:
+def load_values(values: Array, s: _Sums) -> bool:
     """Load the finite values of a profile; return whether all are finite."""
     count = 0
     for i in range(values.size):
@@ -156,7 +156,7 @@ def _window_sum(s: _Sums, first: np.uint32, past: np.uint32) -> float:
 
 
 @_compiled
-def _averages(s: _Sums, windows: Windows, complete: bool, out: Array) -> None:
+def write_averages(s: _Sums, windows: Windows, complete: bool, out: Array) -> None:
     """Write averages of the loaded values over windows."""
     _accumulate(s)
     if complete:
@@ -373,7 +373,7 @@ def photon_profiles(
         )
         bins = _bins(s.sums, windows, complete)
         if counter.dead_time > 0.0:
-            _averages(s.sums, windows, complete, s.mean)
+            write_averages(s.sums, windows, complete, s.mean)
         _photons(counts[k], windows, s.sums, s.local)
         _photon_variance(exposure[k], counter, s.local, bins, s.mean, variance[k])
         if not missing:

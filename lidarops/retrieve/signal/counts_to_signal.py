@@ -196,7 +196,7 @@ def _add_rounding(variance: Array, scale: _Scale, relative_error: float = 0.0) -
         unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
         measured = rows[coarse] / unit
         median = np.sort(measured, axis=-1)[:, (measured.shape[-1] - 1) // 2, np.newaxis]
-        noise = np.fmin(measured, median) * (1.0 - min(relative_error, 0.5))
+        noise = np.fmin(measured, median) / (1.0 + relative_error)
         harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(noise - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
         common = np.maximum((0.25 - noise) / 3.0, harmonic)
         raised = unit * (np.maximum(measured, 1.0 / 12.0) + shots * common)

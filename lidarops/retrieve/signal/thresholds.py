@@ -40,6 +40,19 @@ class Thresholds:
     """Half-width, relative to range, of the window in which noise is smoothed. Assumed."""
     leak: float = 0.02
     """Share of a squared third difference that may come from the fall of the signal. Assumed."""
+    outlying_block: float = 8.0
+    """Noise variance of a block over that of the others from which it is a cloud edge."""
+    darkest: float = 0.5
+    """Least noise variance over that in the far half, where the signal lies below its level."""
+    bright: float = 5.0
+    """Light over the drift of the baseline, and over the noise of its mean, from which it gives the
+    noise of light: they change the slope by a fifth at most."""
+    noise_band: int = 32
+    """Blocks of a band, which give its noise within 5 %."""
+    band_growth: float = 0.25
+    """Least length of a band over the distance of its start from the first bin."""
+    significant_band: float = 3.5
+    """Standard errors beyond which the noise of a band differs from the line."""
 
     # Correlation of noise
     noise_sections: int = 8

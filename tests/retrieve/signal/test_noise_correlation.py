@@ -156,8 +156,9 @@ def test_two_layers_are_not_homogeneous_whatever_the_correlation_of_noise(bins, 
 
 
 ARCHIVES = {
-    "pilar/20241002/h*": {"analog_1064o": (0.2, 1.3), "photon_53200o": (0.8, 1.1)},
+    "pilar/20241002/h*": {"analog_1064o": (0.2, 1.25), "photon_53200o": (0.8, 1.1)},
     "saopaulo/20170928/signals/*": {"analog_1064o": (0.8, 1.1)},
+    "manaus/RM*": {},
     "manaus_raman/RM*": {"photon_355o": (0.9, 1.25)},
     "savant/2018-10-18-0703tRANSITION/R18*": {},
 }
@@ -198,7 +199,8 @@ LIT = {
 the light, and with periodic interference."""
 
 
-@pytest.mark.parametrize("files", ARCHIVES)
+# At Manaus in 2010, an opaque cloud at 1.5 km leaves its own structure instead of noise.
+@pytest.mark.parametrize("files", sorted(ARCHIVES.keys() - {"manaus/RM*"}))
 def test_stated_noise_of_real_archives_holds_where_there_is_light(files, data_root):
     """Analog bins within 10 %, by differences over 8 bins in bands from 1.5 km."""
     compared = 0
@@ -246,6 +248,18 @@ def test_a_baseline_that_drifts_makes_no_noise(drift):
         band = (distance >= first) & (distance < last)
         # Of variances: 20 % is 10 % of the noise.
         assert 0.8 < np.mean(stated[:, band] / variance[band]) < 1.22, first
+
+
+def test_an_opaque_cloud_does_not_hide_the_noise_of_its_light():
+    """The light ends before differences show its noise, which is not stated too small."""
+    rng = np.random.default_rng(9)
+    light = 200.0 * np.exp(-(((np.minimum(RANGE, 900.0) - 500.0) / 250.0) ** 2)) * (RANGE < 900.0)
+    light *= 1.0 + 0.1 * np.sin(RANGE / 40.0)
+    variance = 1e-4 + 1e-2 * light
+    power = light + rng.normal(0.0, np.sqrt(variance), (50, RANGE.size))
+    stated = difference_variance(power, RANGE)
+    assert (stated / variance)[:, light > 1.0].min() > 0.8
+    assert np.abs(stated[:, 200:] / 1e-4 - 1.0).mean() < 0.1
 
 
 def test_clouds_are_not_noise():

@@ -51,7 +51,7 @@ def analog(
         with_clipping = clipped.any(axis=-1)
         variance[with_clipping] = difference_variance(power, range)[with_clipping]
         excess, length = correlated_noise(power, variance)
-        error = min(np.sqrt(4.62 / range.size), 0.5)
+        error = np.sqrt(4.62 / range.size)
         raised = rounded(variance * excess[..., np.newaxis], whole, fired, error)
         return Signal(power, raised, quality, length)
     known = rounded(np.full(power.shape, noise_variance), whole, fired) + dark_variance
@@ -116,7 +116,7 @@ def rounded(variance, step, shots, error=0.0):
         shot = row * fired / size**2
         middle = np.sort(shot)[(shot.size - 1) // 2]
         least = shot if np.isnan(middle) else np.where(shot < middle, shot, middle)
-        least = least * (1.0 - error)
+        least = least / (1.0 + error)
         few = np.where(least < 1 / 12, 1.0, np.exp(-4 * np.pi**2 * (least - 1 / 12)))
         bias = np.maximum((1 / 4 - least) / 3, few / (2 * np.pi**2))
         coarse = (np.maximum(shot, 1 / 12) / fired + bias) * size**2
@@ -218,13 +218,19 @@ def _difference_variance(power, range):  # noqa: A002
     spread = light[first + 13]
     fall = 24.0 * (4 * np.abs(np.diff(range))[first] / range[first]) ** 3 * spread
     usable = np.isfinite(squares) & (fall**2 / 20.0 <= THRESHOLDS.leak * dark)
-    bright = usable & (spread > 5.0 * max(drift, np.sqrt(dark / 16)))
-    slope = _slope(squares[bright], spread[bright], dark)
-    lines = np.maximum(dark + slope * spread, 0.5 * dark)
-    kept = usable & (squares <= 8.0 * lines)
-    improved = np.average(dark + (squares - lines)[kept], weights=lines[kept] ** -2.0)
-    dark = improved if improved > 0.5 * dark else dark
+    clear = 5.0 * max(drift, np.sqrt(dark / 16))
+    bright = np.isfinite(squares) & (spread > clear)
+    if (bright & usable).sum() < 4 <= bright.sum():
+        slope, least = _slope(squares[bright], spread[bright], dark), clear
+    else:
+        bright &= usable
+        slope, least = _slope(squares[bright], spread[bright], dark), -np.inf
+        lines = np.maximum(dark + slope * spread, 0.5 * dark)
+        kept = usable & (squares <= 8.0 * lines)
+        improved = np.average(dark + (squares - lines)[kept], weights=lines[kept] ** -2.0)
+        dark = improved if improved > 0.0 else dark
     line = np.maximum(dark + slope * np.nan_to_num(light), 0.5 * dark)
+    line[light < least] = dark
     return line * _band_ratio(squares / line[first + 13], usable, size)
 
 
