@@ -16,7 +16,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
 from lidarops.catalog.headers import Headers, UnreadFile, read_row
 from lidarops.catalog.rows import GranuleRow
-from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
+from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import IdlePattern, Role, Status
@@ -404,20 +404,14 @@ def _split(pattern: str) -> tuple[re.Pattern[str] | None, re.Pattern[str]]:
     folder, slash, name = pattern.rpartition("/")
     if "**" in name:
         # Such a name also matches files in subfolders.
-        return None, _regex(pattern)
-    return _regex(folder + slash), _regex(name)
+        return None, path_pattern(pattern)
+    return path_pattern(folder + slash), path_pattern(name)
 
 
 def _key(owners: list[_Claim]) -> str:
     if len(owners) == 1:
         return owners[0].scan_key
     return hashlib.sha256("+".join(owner.scan_key for owner in owners).encode()).hexdigest()[:16]
-
-
-def _regex(pattern: str) -> re.Pattern[str]:
-    expressions = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-    tokens = re.split(r"(\*\*/|\*\*|\*|\?)", pattern)
-    return re.compile("".join(expressions.get(token, re.escape(token)) for token in tokens) + r"\Z")
 
 
 def _due(file: RawFile, owners: list[_Claim], key: str) -> UnreadFile:

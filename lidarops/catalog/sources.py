@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,13 @@ class RawFile(NamedTuple):
 def printable(path: str) -> str:
     """Return a path that can be stored and shown: names may hold bytes that are not UTF-8."""
     return path if path.isascii() else path.encode("utf-8", "backslashreplace").decode()
+
+
+def path_pattern(pattern: str) -> re.Pattern[str]:
+    """Return the expression of a pattern of paths, in which ** stands for any folders."""
+    expressions = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+    tokens = re.split(r"(\*\*/|\*\*|\*|\?)", pattern)
+    return re.compile("".join(expressions.get(token, re.escape(token)) for token in tokens) + r"\Z")
 
 
 def _rank(entry: os.DirEntry[str]) -> str:

@@ -3,7 +3,18 @@
 Exit codes: 0 success, 1 something was refused or failed, 2 wrong use.
 """
 
-from lidarops.cli import aggregate, archive, bench, files, ledger, plan, preparation, site
+from lidarops.cli import aggregate, archive, bench, files, init, ledger, plan, preparation, site
 from lidarops.cli.app import app
 
-__all__ = ["aggregate", "app", "archive", "bench", "files", "ledger", "plan", "preparation", "site"]
+__all__ = [
+    "aggregate",
+    "app",
+    "archive",
+    "bench",
+    "files",
+    "init",
+    "ledger",
+    "plan",
+    "preparation",
+    "site",
+]

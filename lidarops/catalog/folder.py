@@ -1,0 +1,311 @@
+"""What a folder holds that no campaign describes yet: groups of like raw files, and instruments."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Final
+
+from lidarops.catalog.sources import RawFile, Source, path_pattern, printable
+from lidarops.errors import RawFormatError
+from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
+from lidarops.raw.header import RawHeader
+from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, raman_wavelength
+
+_HEADER_BYTES: Final = 16384
+_FILTER: Final = 2e-9
+"""m; headers round wavelengths to nanometres, and those of water vapour are stated as 407 or 408.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class FileGroup:
+    """Raw files of one folder with like names, site, position and channels."""
+
+    folder: str
+    """Relative to the root, with a slash at its end; empty for the root."""
+    stem: str
+    """Letters with which the names begin."""
+    dark: bool
+    """Whether folder or name says that these are dark files."""
+    site: str
+    coordinates: tuple[float, float] | None
+    """degree, as the header orders them."""
+    layout: tuple[ChannelLayout, ...]
+    files: tuple[str, ...]
+    """Paths relative to the root."""
+    start: datetime
+    stop: datetime
+    altitude: float | None
+    """m."""
+    zenith_angles: tuple[float, ...]
+    """degree, distinct and rising."""
+    azimuths: tuple[float, ...]
+    """degree, distinct and rising."""
+    without_zenith: int
+    """Number of files that state no zenith angle, or a doubtful one."""
+    doubts: tuple[str, ...]
+    """Why pointings are doubtful, in words."""
+
+    @property
+    def pattern(self) -> str:
+        """Pattern of the paths of the files; those of another group may match it too."""
+        return f"{self.folder}{self.stem}*"
+
+
+@dataclass(frozen=True, slots=True)
+class FolderContents:
+    """The raw files of a folder and the folders below it."""
+
+    groups: tuple[FileGroup, ...]
+    refused: tuple[tuple[str, str], ...]
+    """Path of each damaged raw file, and what is wrong with it."""
+    other: tuple[str, ...]
+    """Paths of files of no raw format."""
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentHeaders:
+    """What the headers of one instrument state."""
+
+    groups: tuple[FileGroup, ...]
+    files: tuple[str, ...]
+    """Patterns of its files, which match those of no other instrument."""
+    dark_files: tuple[str, ...]
+
+    @property
+    def signal(self) -> tuple[FileGroup, ...]:
+        """The groups that are not dark; all if all are."""
+        return tuple(group for group in self.groups if not group.dark) or self.groups
+
+    @property
+    def layout(self) -> tuple[ChannelLayout, ...]:
+        """Channels of its first files."""
+        return self.signal[0].layout
+
+    @property
+    def without_zenith(self) -> int:
+        """Number of its signal files that state no zenith angle, or a doubtful one."""
+        return sum(group.without_zenith for group in self.signal)
+
+    @property
+    def zenith_angle(self) -> float:
+        """Mean of its zenith angles in degree; 0 where none is known."""
+        angles = self._zenith_angles
+        return sum(angles) / len(angles) if angles else 0.0
+
+    @property
+    def zenith_span(self) -> float:
+        """Largest minus smallest zenith angle, degree."""
+        angles = self._zenith_angles
+        return max(angles) - min(angles) if angles else 0.0
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Glued channels that its analog and photon-counting channels can make."""
+        widths = {channel.name: channel.bin_width for channel in self.layout}
+        labels = (_label(name) for name in widths if name.startswith("analog_"))
+        return tuple(
+            f"glued_{label}"
+            for label in labels
+            if widths.get(f"photon_{label}") == widths[f"analog_{label}"]
+        )
+
+    @property
+    def elastic_channels(self) -> tuple[str, ...]:
+        """One channel of each elastic detector, photon counting where there is one.
+
+        Cross-polarised ones are left out, because they hold little light of molecules.
+        """
+        return tuple(channel.name for channel in self._elastic)
+
+    @property
+    def joined_channels(self) -> tuple[str, ...]:
+        """The elastic channels, glued where they can be."""
+        glued = {_label(name): name for name in self.pairs}
+        return tuple(glued.get(_label(name), name) for name in self.elastic_channels)
+
+    @property
+    def nitrogen_channels(self) -> dict[str, str]:
+        """Elastic channels -> channels of their nitrogen Raman lines."""
+        pairs: dict[str, str] = {}
+        for elastic in self._elastic:
+            line = raman_wavelength(elastic.wavelength, NITROGEN_SHIFT)
+            for raman in self._by_mode:
+                near = abs(raman.wavelength - line) < _FILTER
+                if near and raman.bin_width == elastic.bin_width:
+                    pairs.setdefault(elastic.name, raman.name)
+        return pairs
+
+    @property
+    def _zenith_angles(self) -> tuple[float, ...]:
+        return tuple(angle for group in self.signal for angle in group.zenith_angles)
+
+    @property
+    def _by_mode(self) -> tuple[ChannelLayout, ...]:
+        """The channels, photon counting first."""
+        return tuple(sorted(self.layout, key=lambda channel: channel.mode is DetectionMode.ANALOG))
+
+    @property
+    def _elastic(self) -> tuple[ChannelLayout, ...]:
+        detectors: dict[str, ChannelLayout] = {}
+        for channel in self._by_mode:
+            label = _label(channel.name)
+            if channel.wavelength > 0 and not label.endswith("s") and not self._is_raman(channel):
+                detectors.setdefault(label, channel)
+        return tuple(detectors.values())
+
+    def _is_raman(self, channel: ChannelLayout) -> bool:
+        return any(
+            abs(channel.wavelength - raman_wavelength(other.wavelength, shift)) < _FILTER
+            for other in self.layout
+            for shift in (NITROGEN_SHIFT, WATER_SHIFT)
+        )
+
+
+def read_folder(root: str) -> FolderContents:
+    """Return the raw files of a folder or URL, grouped; reads all headers.
+
+    Raises
+    ------
+    CatalogError
+        If it cannot be listed.
+    """
+    source = Source.of(root)
+    headers: dict[tuple[object, ...], list[tuple[str, RawHeader]]] = defaultdict(list)
+    refused: list[tuple[str, str]] = []
+    other: list[str] = []
+    for file in source.files():
+        try:
+            header = _header(source, file)
+        except (RawFormatError, OSError) as error:
+            if UNKNOWN_FORMAT in str(error):
+                other.append(printable(file.path))
+            else:
+                refused.append((printable(file.path), str(error)))
+        else:
+            headers[_likeness(file.path, header)].append((file.path, header))
+    return FolderContents(
+        tuple(_group(members) for _, members in sorted(headers.items(), key=_place)),
+        tuple(refused),
+        tuple(other),
+    )
+
+
+def _header(source: Source, file: RawFile) -> RawHeader:
+    if printable(file.path) != file.path:
+        raise RawFormatError("has a name that is not UTF-8", remedy="rename it")
+    return parse_raw_header(source.head(file.path, _HEADER_BYTES), file=file.path, size=file.size)
+
+
+def _label(channel: str) -> str:
+    """Return wavelength and polarisation of a channel, such as 532p."""
+    return channel.partition("_")[2]
+
+
+def _split(path: str) -> tuple[str, str]:
+    """Return the folder of a path, with a slash at its end, and the stem of its name."""
+    folder, slash, name = path.rpartition("/")
+    match = re.match(r"[^\W\d][^\W\d.]*", name)
+    return folder + slash, match[0] if match else ""
+
+
+def _likeness(path: str, header: RawHeader) -> tuple[object, ...]:
+    grids = tuple((c.name, c.bins, c.bin_width, c.adc_bits) for c in header.layout)
+    return (*_split(path), header.format, header.site, header.coordinates, grids)
+
+
+def _place(item: tuple[tuple[object, ...], list[tuple[str, RawHeader]]]) -> str:
+    return item[1][0][0]
+
+
+def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
+    headers = [header for _, header in members]
+    first, known = headers[0], [header for header in headers if not header.doubt]
+    folder, stem = _split(members[0][0])
+    angles = [header.zenith_angle for header in known if header.zenith_angle is not None]
+    return FileGroup(
+        folder=folder,
+        stem=stem,
+        dark="dark" in f"{folder}{stem}".lower(),
+        site=first.site,
+        coordinates=first.coordinates,
+        layout=first.layout,
+        files=tuple(path for path, _ in members),
+        start=min(header.start for header in headers),
+        stop=max(header.stop for header in headers),
+        altitude=first.altitude,
+        zenith_angles=tuple(sorted(set(angles))),
+        azimuths=tuple(sorted({h.azimuth for h in known if h.azimuth is not None})),
+        without_zenith=len(headers) - len(angles),
+        doubts=tuple(sorted({header.doubt for header in headers if header.doubt})),
+    )
+
+
+def instruments_of(groups: Iterable[FileGroup]) -> tuple[InstrumentHeaders, ...]:
+    """Return the instruments of groups of files: one for each site, position and set of channels.
+
+    Groups with one pattern are of one instrument, because its files could not be told apart.
+    """
+    groups = tuple(groups)
+    sets: list[list[FileGroup]] = []
+    for group in groups:
+        alike = [own for own in sets if any(_one_instrument(group, other) for other in own)]
+        sets = [own for own in sets if own not in alike]
+        sets.append([member for own in alike for member in own] + [group])
+    everything = [path for group in groups for path in group.files]
+    return tuple(
+        InstrumentHeaders(
+            tuple(own),
+            tuple(_patterns([group for group in own if not group.dark], everything)),
+            tuple(_patterns([group for group in own if group.dark], everything)),
+        )
+        for own in sets
+    )
+
+
+def _one_instrument(one: FileGroup, other: FileGroup) -> bool:
+    if one.pattern == other.pattern:
+        return True
+    return (one.site, one.coordinates, {c.name for c in one.layout}) == (
+        other.site,
+        other.coordinates,
+        {c.name for c in other.layout},
+    )
+
+
+def _patterns(groups: Sequence[FileGroup], everything: Sequence[str]) -> Iterator[str]:
+    """Yield patterns that match the files of some groups, and no other raw file."""
+    by_stem: dict[str, list[FileGroup]] = defaultdict(list)
+    own = {path for group in groups for path in group.files}
+    for group in groups:
+        by_stem[group.stem].append(group)
+    foreign = [path for path in everything if path not in own]
+    for stem, members in by_stem.items():
+        folders = {group.folder for group in members}
+        common = _common(folders)
+        whole = f"{common}**/{stem}*"
+        if len(folders) > 1 and not _matches(whole, foreign):
+            yield whole
+            continue
+        for pattern in dict.fromkeys(group.pattern for group in members):
+            if _matches(pattern, foreign):
+                yield from (p for p in sorted(own) if _matches(pattern, [p]))
+            else:
+                yield pattern
+
+
+def _common(folders: Iterable[str]) -> str:
+    """Return the deepest folder that holds all folders, with a slash at its end."""
+    common = os.path.commonpath([f"/{folder}" for folder in folders]).strip("/")
+    return f"{common}/" if common else ""
+
+
+def _matches(pattern: str, paths: Iterable[str]) -> bool:
+    matcher = path_pattern(pattern)
+    return any(matcher.match(path) for path in paths)

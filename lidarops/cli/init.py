@@ -1,0 +1,54 @@
+"""The command that writes the first campaign file of an archive."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from lidarops.cli.app import command, no_url
+
+_SCHEMA: Final = "campaign.schema.json"
+
+
+@command()
+def init(
+    folder: Annotated[
+        str, typer.Argument(help="Folder of raw files.", metavar="FOLDER", callback=no_url)
+    ],
+    campaign: Annotated[
+        Path, typer.Argument(help="Campaign file to write.", metavar="CAMPAIGN")
+    ] = Path("campaign.yaml"),
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the campaign file.")] = False,
+) -> None:
+    """Write a commented campaign file for a folder of raw files, from their headers.
+
+    The JSON schema of its keys is written beside it, so that editors complete them. What headers
+    do not state is marked with a question in a comment.
+
+    Example: lidarops init raw harbour.yaml
+    """
+    from lidarops.campaign.model import campaign_schema
+    from lidarops.catalog.folder import read_folder
+    from lidarops.errors import CampaignError
+    from lidarops.plan.draft import draft_campaign
+
+    if campaign.exists() and not force:
+        raise CampaignError(
+            "exists", file=campaign, remedy="give another name, or --force", wrong_use=True
+        )
+    root, base = Path(folder).resolve(), campaign.resolve().parent
+    text = draft_campaign(
+        read_folder(str(root)),
+        archive=Path(os.path.relpath(root, base)).as_posix(),
+        name=root.name,
+        schema=_SCHEMA,
+    )
+    base.mkdir(parents=True, exist_ok=True)
+    (base / _SCHEMA).write_text(json.dumps(campaign_schema(), indent=2) + "\n", encoding="utf-8")
+    campaign.write_text(text, encoding="utf-8")
+    questions = sum("# ?" in line or "; ?" in line for line in text.splitlines())
+    typer.echo(f"{campaign}: {questions} lines have a question; next: lidarops plan {campaign}")

@@ -1,0 +1,244 @@
+"""The first campaign file of an archive, from what the headers of its files state.
+
+What headers cannot tell stands in the file with an assumed value and a question in a comment.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from lidarops.catalog.folder import FolderContents, InstrumentHeaders, instruments_of
+from lidarops.errors import CatalogError
+from lidarops.kinds import Scope, kinds_of
+from lidarops.raw.header import HeaderOrder
+from lidarops.records import ChannelLayout, DetectionMode
+
+_SCRATCH: Final = "temp"
+"""Stem of the file into which the acquisition of Licel writes before it gives a name."""
+_SHOWN: Final = 5
+"""Most files of a kind that a comment names."""
+_PROFILES: Final = (".csv", ".nc")
+"""Endings of files that may be soundings."""
+
+Position = tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """One station, as headers state it."""
+
+    key: str
+    name: str
+    coordinates: Position
+    altitude: float | None
+    order: HeaderOrder
+
+    def lines(self) -> Iterator[str]:
+        first, second = self.coordinates or (0.0, 0.0)
+        longitude, latitude = (
+            (first, second) if self.order == "longitude_first" else (second, first)
+        )
+        source = (
+            "from the header; exact, and not swapped?"
+            if self.coordinates
+            else "headers state no position"
+        )
+        height = "from the header" if self.altitude is not None else "headers state none"
+        yield f"  {self.key}:"
+        yield f"    name: {_text(self.name or self.key)}"
+        yield f"    latitude: {latitude:g}  # ? degree north, {source}"
+        yield f"    longitude: {longitude:g}  # ? degree east"
+        yield f"    altitude: {self.altitude or 0.0:g}  # ? m above the geoid, {height}"
+
+
+def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema: str) -> str:
+    """Return the text of a campaign file for the raw files of a folder.
+
+    Parameters
+    ----------
+    contents : FolderContents
+    archive : str
+        Folder of the raw files, as the file states it.
+    name : str
+        From which the name of the campaign is made.
+    schema : str
+        Place of the JSON schema, for editors.
+
+    Raises
+    ------
+    CatalogError
+        If the folder holds no raw file that can be used.
+    """
+    groups = [group for group in contents.groups if group.stem != _SCRATCH]
+    instruments = instruments_of(groups)
+    if not any(instrument.files for instrument in instruments):
+        reasons = [reason for _, reason in contents.refused[:1]]
+        raise CatalogError(
+            "holds no raw file that can be used" + "".join(f": {reason}" for reason in reasons),
+            file=archive,
+            remedy="give the folder of the raw files",
+        )
+    instruments = tuple(instrument for instrument in instruments if instrument.files)
+    sites = _sites(instruments)
+    keys = _keys(f"{site.key}-lidar" for site in sites)
+    lines = [
+        f"# yaml-language-server: $schema={schema}",
+        "# Written by `lidarops init` from the headers of the raw files.",
+        "# A question mark in a comment: headers do not state it, or cannot be trusted; check it.",
+        f"name: {_key(name)}",
+        f"title: {_text(f'Lidar measurements of {name}')}  # ?",
+        f"archive: {_text(archive)}",
+        "output: out  # folder of catalog, products and reports",
+        "",
+        "stations:",
+        *(line for site in dict.fromkeys(sites) for line in site.lines()),
+        "",
+        "instruments:",
+    ]
+    for key, instrument, site in zip(keys, instruments, sites, strict=True):
+        lines += [*_instrument(key, instrument, site), ""]
+    lines.append("scenes: {window: day}  # products of one file each: day, 6h, 30min")
+    return "\n".join([*lines, *_left_out(contents), ""])
+
+
+def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
+    """Return the station of each instrument: one for each site and position of headers."""
+    first = [instrument.signal[0] for instrument in instruments]
+    places = list(dict.fromkeys((group.site, group.coordinates) for group in first))
+    keys = dict(zip(places, _keys(site or "station" for site, _ in places), strict=True))
+    stations = {
+        (group.site, group.coordinates): _Site(
+            keys[group.site, group.coordinates],
+            group.site,
+            group.coordinates,
+            group.altitude,
+            _order(group.coordinates),
+        )
+        for group in reversed(first)
+    }
+    return [stations[group.site, group.coordinates] for group in first]
+
+
+def _order(coordinates: Position) -> HeaderOrder:
+    """Return the order of coordinates: longitude first, unless the second cannot be a latitude."""
+    swapped = coordinates is not None and abs(coordinates[1]) > 90.0
+    return "latitude_first" if swapped else "longitude_first"
+
+
+def _instrument(key: str, headers: InstrumentHeaders, site: _Site) -> Iterator[str]:
+    groups = headers.signal
+    count = sum(len(group.files) for group in groups)
+    start, stop = min(g.start for g in groups), max(g.stop for g in groups)
+    yield f"  # {count} files, {start:%Y-%m-%d %H:%M} to {stop:%Y-%m-%d %H:%M} by their clock"
+    yield f"  {key}:"
+    yield f"    station: {site.key}"
+    yield f"    files: {_list(headers.files)}"
+    if headers.dark_files:
+        yield f"    dark_files: {_list(headers.dark_files)}  # ? by the word dark in their path"
+    else:
+        yield '    # dark_files: "dark/*"  # ? none of the paths holds the word dark'
+    if site.coordinates is None:
+        yield "    # header_position: headers state no position"
+    else:
+        yield f"    header_position: {site.order}  # ? order of {_pair(site.coordinates)}"
+    yield from _facts(headers)
+    yield from _products(headers)
+
+
+def _facts(headers: InstrumentHeaders) -> Iterator[str]:
+    yield "    facts:"
+    yield "      - clock_offset: 0  # ? s, clock of the files minus UTC; -18000 for UTC-5"
+    yield from (f"        {line}" for line in _pointing(headers))
+    yield "        full_overlap_range: 500  # ? m, nearer bins are not used; assumed"
+    if headers.pairs:
+        yield f"        # pairs that can be joined: {', '.join(headers.pairs)}"
+    if len({group.layout for group in headers.signal}) > 1:
+        yield "        # ? Other files have other bins: each set of bins makes scenes of its own."
+    yield "        channels:"
+    for channel in headers.layout:
+        grid = f"{channel.bins} bins of {channel.bin_width:g} m"
+        yield f"          {channel.name}: {{}}  # {grid}{_unknown(channel)}"
+
+
+def _unknown(channel: ChannelLayout) -> str:
+    """Return the question on a channel; empty where there is none."""
+    if not channel.wavelength > 0:
+        return "; ? wavelength in m, such as 5.32e-7: that of the header is not plausible"
+    if channel.mode is DetectionMode.PHOTON:
+        return "; ? dead_time in s, such as 4.0e-9: without it, high rates are too low"
+    return ""
+
+
+def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
+    angles = sorted({angle for group in headers.signal for angle in group.zenith_angles})
+    sides = {side for group in headers.signal for side in group.azimuths}
+    if not angles:
+        yield "zenith_angle: 0  # ? degree, headers state none; 0 is up, 90 level"
+    elif len(angles) > 1:
+        yield (
+            f"# zenith_angle: the beam moves from {angles[0]:g} to {angles[-1]:g} degree by the"
+            f" headers, over {len(sides) or 'no known'} azimuths"
+        )
+    else:
+        yield f"zenith_angle: {angles[0]:g}  # ? degree, fixed by all headers"
+    if angles and headers.without_zenith:
+        doubts = [doubt for group in headers.signal for doubt in group.doubts]
+        yield f"# ? {headers.without_zenith} files state no sure pointing and are refused"
+        yield from (f"#   {doubt}" for doubt in doubts[:1])
+
+
+def _products(headers: InstrumentHeaders) -> Iterator[str]:
+    yield "    products:"
+    for kind in kinds_of(Scope.CHANNEL):
+        section = kind.optional_part("draft", "DRAFT")
+        yield from (f"      {line}" for line in (section(headers) if section else ()))
+
+
+def _left_out(contents: FolderContents) -> Iterator[str]:
+    """Yield comments on the files that no instrument has."""
+    scratch = [p for group in contents.groups if group.stem == _SCRATCH for p in group.files]
+    tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
+    rest = [path for path in contents.other if path not in tables]
+    for title, paths in (
+        ("the last record of the acquisition, left out", scratch),
+        ("? soundings, lidar ratios or overlap? Name them in the facts: molecular_profile", tables),
+        ("of no raw format", rest),
+        ("damaged", [f"{path}: {reason}" for path, reason in contents.refused]),
+    ):
+        if paths:
+            yield f"# {len(paths)} files, {title}:"
+            yield from (f"#   {json.dumps(path)}" for path in paths[:_SHOWN])
+
+
+def _text(value: str) -> str:
+    """Return a text in quotes, as YAML reads it."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _list(patterns: Sequence[str]) -> str:
+    texts = [_text(pattern) for pattern in patterns]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
+
+
+def _pair(coordinates: tuple[float, float]) -> str:
+    return f"{coordinates[0]:g}, {coordinates[1]:g} in headers"
+
+
+def _key(name: str) -> str:
+    """Return a key of a campaign file that a name makes."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:30].strip("-") or "archive"
+
+
+def _keys(names: Iterable[str]) -> list[str]:
+    """Return different keys for names, numbered where they would be equal."""
+    keys: list[str] = []
+    for name in names:
+        key, number = _key(name), 2
+        while key in keys:
+            key, number = f"{_key(name)}-{number}", number + 1
+        keys.append(key)
+    return keys

@@ -1,0 +1,130 @@
+"""The first campaign file of a folder: what headers state, and the questions they leave."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from support.archives.raw_archives import content, write
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.catalog.scan import scan_archive
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.records import Granule, Role, Status
+
+
+def drafted(folder: Path, campaign: Path) -> tuple[Campaign, str]:
+    shown = CliRunner().invoke(app, ["init", str(folder), str(campaign)])
+    assert shown.exit_code == 0, shown.output
+    return load_campaign(campaign), campaign.read_text(encoding="utf-8")
+
+
+def granules(campaign: Campaign) -> list[Granule]:
+    store = Store(campaign.catalog_url, campaign.name)
+    summary = scan_archive(campaign, store)
+    assert summary.idle_patterns == ()
+    found = sorted(store.granules(), key=lambda granule: granule.path)
+    store.close()
+    return found
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """Raw files of two sites in folders of days, with dark files, a damaged file and a text."""
+    raw = tmp_path / "raw"
+    hill = {"site": "Hill", "position": (47.8, 11.0), "zenith_angle": 0.0}
+    for day in range(2):
+        for number in range(3):
+            minutes = 1440.0 * day + 5.0 * number
+            write(raw / f"day{day}/h26{number}", content(minutes, seed=number))
+            write(raw / f"day{day}/v26{number}", content(minutes, seed=number, **hill))
+    write(raw / "dark/h26", content(20.0))
+    write(raw / "day1/h269", content(30.0)[:-500])
+    write(raw / "notes.txt", b"Measured with the new telescope, in the evening, above the harbour.")
+    return raw
+
+
+def test_every_good_file_gets_its_instrument_and_role(raw: Path, tmp_path: Path) -> None:
+    campaign, text = drafted(raw, tmp_path / "campaign.yaml")
+    known = granules(campaign)
+    assert {g.path: (g.instrument, g.role) for g in known if g.status is Status.GOOD} == {
+        **{f"day{d}/h26{n}": ("coast-lidar", Role.SIGNAL) for d in (0, 1) for n in range(3)},
+        **{f"day{d}/v26{n}": ("hill-lidar", Role.SIGNAL) for d in (0, 1) for n in range(3)},
+        "dark/h26": ("coast-lidar", Role.DARK),
+    }
+    assert all(granule.contradictions == () for granule in known)
+    assert [g.path for g in known if g.status is Status.REFUSED] == ["day1/h269"]
+    assert "day1/h269" in text
+    assert "notes.txt" in text
+
+
+def test_products_follow_from_the_pointing(raw: Path, tmp_path: Path) -> None:
+    campaign, text = drafted(raw, tmp_path / "campaign.yaml")
+    level, steep = (campaign.instruments[f"{site}-lidar"] for site in ("coast", "hill"))
+    assert set(level.products.requested()) == {"signal", "homogeneous"}
+    assert set(steep.products.requested()) == {"signal", "elastic"}
+    assert steep.products.requested()["elastic"].channels == ["glued_532o"]
+    assert "pairs that can be joined: glued_532o" in text
+    assert level.facts[0].zenith_angle == 90.0
+
+
+def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
+    for number, angle in enumerate((0.0, 30.0, 60.0)):
+        write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert set(lidar.products.requested()) == {"signal", "multiangle"}
+    assert [granule.zenith_angle for granule in granules(campaign)] == [0.0, 30.0, 60.0]
+
+
+def test_patterns_of_instruments_are_disjoint(tmp_path: Path) -> None:
+    """The stem of one instrument begins with that of the other."""
+    write(tmp_path / "raw/h261", content())
+    write(tmp_path / "raw/hill26", content(site="Hill", position=(47.8, 11.0)))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert {g.path: g.instrument for g in granules(campaign) if g.status is Status.GOOD} == {
+        "h261": "coast-lidar",
+        "hill26": "hill-lidar",
+    }
+
+
+def test_editors_find_the_schema(raw: Path, tmp_path: Path) -> None:
+    _, text = drafted(raw, tmp_path / "new/campaign.yaml")
+    first = text.splitlines()[0]
+    schema = tmp_path / "new" / first.partition("$schema=")[2]
+    assert first.startswith("# yaml-language-server: ")
+    assert "instruments" in yaml.safe_load(schema.read_text(encoding="utf-8"))["properties"]
+
+
+def test_a_campaign_file_is_not_overwritten(raw: Path, tmp_path: Path) -> None:
+    campaign = tmp_path / "campaign.yaml"
+    campaign.write_text("mine")
+    shown = CliRunner().invoke(app, ["init", str(raw), str(campaign)])
+    assert shown.exit_code == 2
+    assert campaign.read_text() == "mine"
+
+
+def test_a_folder_without_raw_files_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "raw/notes.txt", b"nothing was measured")
+    shown = CliRunner().invoke(app, ["init", str(tmp_path / "raw"), str(tmp_path / "new.yaml")])
+    assert shown.exit_code == 1
+    assert "no raw file" in shown.output
+    assert not (tmp_path / "new.yaml").exists()
+
+
+@pytest.mark.parametrize("name", ["manaus", "manaus_raman", "pilar", "saopaulo", "savant", ""])
+def test_files_of_real_archives_are_those_of_their_headers(
+    name: str, data_root: Path, tmp_path: Path
+) -> None:
+    campaign, text = drafted(data_root / name, tmp_path / "campaign.yaml")
+    known = granules(campaign)
+    unused = [granule.reason for granule in known if granule.status is Status.REFUSED]
+    assert all("not on the grid of its scan" in reason for reason in unused)
+    assert all(granule.contradictions == () for granule in known)
+    if name == "saopaulo":
+        assert sum(granule.role is Role.DARK for granule in known) == 12
+    if name == "manaus_raman":
+        assert "nitrogen: {photon_355o: photon_387o}" in text
