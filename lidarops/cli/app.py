@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 app = typer.Typer(
     help="Reprocess archives of atmospheric lidar data into CF-compliant products.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 

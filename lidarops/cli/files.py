@@ -33,13 +33,16 @@ def report(
 
 @command()
 def inspect(
-    file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
+    file: Annotated[
+        Path,
+        typer.Argument(help="A raw file, a product, or a folder of raw files.", metavar="FILE"),
+    ],
     provenance: Annotated[
         bool, typer.Option("--provenance", help="Print the PROV-JSON of a product.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the content of a raw file or a product.
+    """Show the content of a raw file or a product, or the groups of raw files of a folder.
 
     Example: lidarops inspect demo/raw/coast/h2492106.010000
     """
@@ -53,6 +56,31 @@ def inspect(
         return
     for table in inspection.tables(file):
         show(table)
+
+
+@command()
+def plot(
+    file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder of the figures.", file_okay=False)
+    ] = Path(),
+) -> None:
+    """Draw a raw file or a product as SVG files, which browsers show.
+
+    Example: lidarops plot demo/raw/coast/h2492106.010000 --out figures
+    """
+    from lidarops.figures import svg
+    from lidarops.reports import plotting
+    from lidarops.system.files import write_atomically
+
+    figures = plotting.draw_file(file)
+    out.mkdir(parents=True, exist_ok=True)
+    for number, figure in enumerate(figures, 1):
+        target = (
+            out / f"{file.name.removesuffix('.nc')}{'' if len(figures) == 1 else f'_{number}'}.svg"
+        )
+        write_atomically(target, svg.file(figure))
+        typer.echo(f"{target}: {figure.caption}")
 
 
 @command()

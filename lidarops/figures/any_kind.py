@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.kind_figures import ProductSource, View, preferred_variables
+from lidarops.figures.kind_figures import (
+    ProductSource,
+    View,
+    figures_of,
+    preferred_variables,
+)
 from lidarops.figures.panels import Figure, units
 from lidarops.figures.series_data import NumberedSeries, SeriesEstimate, join, quality_bits
 from lidarops.figures.series_panels import SERIES, Quantity, series_figures
@@ -114,6 +119,12 @@ def _table(variable: xr.DataArray) -> Floats:
 def view_of(kind: str) -> View[MainVariable]:
     """Return the view of products of a kind that states no figures, or is unknown."""
     return View(kind, _variables(kind), partial(_read, kind), _draw)
+
+
+def views_of(kind: str) -> Sequence[View[Any]]:
+    """Return the views of products of any kind, known or not."""
+    figures = figures_of(kind)
+    return figures.views if figures is not None else (view_of(kind),)
 
 
 def _read(kind: str, product: xr.Dataset, _: ProductSource) -> MainVariable | None:

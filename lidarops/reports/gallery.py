@@ -15,8 +15,9 @@ from typing import Any, Final
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.figures import any_kind, svg
-from lidarops.figures.kind_figures import View, figures_of
+from lidarops.figures import svg
+from lidarops.figures.any_kind import views_of
+from lidarops.figures.kind_figures import View
 from lidarops.figures.panels import Figure
 from lidarops.figures.wording import counted
 from lidarops.flags import Severity
@@ -83,7 +84,7 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
             full = len(gallery.pictures) >= limit
             if full:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
-            for view in _views(group.kind):
+            for view in views_of(group.kind):
                 compares = truth is not None and view.compare is not None
                 contents = list(sources.read(group, view)) if compares or not full else []
                 if contents and compares:
@@ -93,11 +94,6 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
                     write_atomically(folder / file, svg.file(drawn))
                     gallery.pictures.append(_picture(file, drawn, group))
     return gallery
-
-
-def _views(kind: str) -> Sequence[View[Any]]:
-    figures = figures_of(kind)
-    return figures.views if figures is not None else (any_kind.view_of(kind),)
 
 
 def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterator[Compared]:

@@ -18,16 +18,20 @@ import xarray as xr
 from rich.table import Table
 from rich.text import Text
 
+from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.netcdf.stored_flags import count_bits, stored_bits
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
+from lidarops.records import Role
 
 _LONG: Final = {"comment", "history", "references"}
 """Attributes too long for a table; the JSON output has them."""
 _CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits", "device")
 """Channel properties in the table; the JSON output has all."""
+_GROUP: Final = ("files", "count", "role", "start", "stop", "site", "zenith_angle", "channels")
+"""Properties of a group of raw files in the table."""
 _UNITS: Final = {
     **dict.fromkeys(("altitude", "bin_width", "wavelength"), "m"),
     **dict.fromkeys(("zenith_as_written", "zenith_angle", "azimuth"), "degree"),
@@ -43,7 +47,7 @@ _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
 def describe(file: Path) -> dict[str, Any]:
-    """Describe a raw file or a NetCDF product.
+    """Describe a raw file or a NetCDF product, or the raw files of a folder, grouped.
 
     Parameters
     ----------
@@ -52,13 +56,16 @@ def describe(file: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        Plain JSON types. Key ``type`` is ``raw`` or ``netcdf``; unknown values are None.
+        Plain JSON types. Key ``type`` is ``raw``, ``netcdf`` or ``folder``; unknown values are
+        None.
 
     Raises
     ------
     LidarOpsError
         If the file cannot be read, or is neither.
     """
+    if file.is_dir():
+        return _folder(file)
     try:
         with file.open("rb") as stream:
             magic = stream.read(4)
@@ -76,6 +83,9 @@ def tables(file: Path) -> list[Table]:
     for key, value in description.items():
         if key != _HEADER and (isinstance(value, str | int | float) or value is None):
             _row(about, key.replace("_", " "), _with_unit(key, value))
+    if description["type"] == "folder":
+        refused = _listed("Damaged files", description["refused"], ("file", "reason"))
+        return [about, _listed("Groups of like files", description["groups"], _GROUP), refused]
     if description["type"] == "raw":
         for note in description["notes"] or ["none"]:
             _row(about, "notes", note)
@@ -119,6 +129,38 @@ def _raw(file: Path) -> dict[str, Any]:
     description: dict[str, Any] = _plain(header._asdict())
     # What only its format holds comes besides.
     return {"type": "raw", "file": str(file), **(description.pop("record") or {}), **description}
+
+
+def _folder(folder: Path) -> dict[str, Any]:
+    contents = read_folder(str(folder))
+    return {
+        "type": "folder",
+        "file": str(folder),
+        "raw_files": sum(len(group.files) for group in contents.groups),
+        "damaged_files": len(contents.refused),
+        "other_files": len(contents.other),
+        "groups": [_grouped(group) for group in contents.groups],
+        "refused": [{"file": path, "reason": reason} for path, reason in contents.refused],
+        "other": list(contents.other),
+    }
+
+
+def _grouped(group: FileGroup) -> dict[str, Any]:
+    angles = group.zenith_angles
+    return {
+        "files": group.pattern,
+        "count": len(group.files),
+        "role": (Role.DARK if group.dark else Role.SIGNAL).value,
+        "start": f"{group.start:%Y-%m-%d %H:%M:%S}",
+        "stop": f"{group.stop:%Y-%m-%d %H:%M:%S}",
+        "site": group.site,
+        "zenith_angle": " to ".join(
+            f"{end:g}" for end in dict.fromkeys((*angles[:1], *angles[-1:]))
+        )
+        or None,
+        "files_without_zenith_angle": group.without_zenith,
+        "channels": ", ".join(channel.name for channel in group.layout),
+    }
 
 
 def _product(file: Path) -> dict[str, Any]:

@@ -45,6 +45,26 @@ def test_products_show_verdicts_bits_and_extremes(kind: str, tmp_path: Path):
     assert all(word in table.output for word in ("Variables", "Quality", "do_not_use", "units"))
 
 
+def test_a_folder_shows_a_line_for_each_group_of_like_files(tmp_path: Path):
+    for number in range(3):
+        raw_archives.write(tmp_path / f"day/h{number}", raw_archives.content(5.0 * number))
+    raw_archives.write(tmp_path / "dark/h9", raw_archives.content(20.0, zenith_angle=0.0))
+    raw_archives.write(tmp_path / "day/h4", raw_archives.content(25.0)[:-100])
+    raw_archives.write(tmp_path / "notes.txt", b"words " * 40)
+    shown = CliRunner().invoke(app, ["inspect", str(tmp_path), "--json"])
+    description = json.loads(shown.output)
+    lines = {
+        row["files"]: (row["count"], row["role"], row["zenith_angle"])
+        for row in description["groups"]
+    }
+    assert lines == {"day/h*": (3, "signal", "90"), "dark/h*": (1, "dark", "0")}
+    assert description["groups"][0]["channels"] == "analog_532o, photon_532o"
+    assert [row["file"] for row in description["refused"]] == ["day/h4"]
+    assert description["other"] == ["notes.txt"]
+    table = CliRunner().invoke(app, ["inspect", str(tmp_path)], env={"COLUMNS": "200"})
+    assert "day/h*" in table.output
+
+
 def test_raw_files_show_all_their_channels(tmp_path: Path):
     path = raw_archives.write(tmp_path / "h0", raw_archives.content(0, bins=4000))
     shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
