@@ -192,7 +192,7 @@ def test_the_command_line_reprocesses_and_reports(
             "requested: homogeneous",
         ),
         (["inspect", "/nowhere"], 2, "/nowhere"),
-        (["inspect", "/"], 2, "directory"),
+        (["plot", "/"], 2, "directory"),
         (["inspect", "/nowhere", "--provenance"], 2, "/nowhere"),
         (["reproduce", "/nowhere"], 2, "/nowhere"),
         (["reproduce", "CAMPAIGN"], 2, "a product of lidarops"),
