@@ -76,6 +76,18 @@ def test_extinction_agrees_with_the_truth(demo: tuple[Campaign, RunRecord]) -> N
     assert 0.8 < score[good].std() < 1.2
 
 
+def test_every_retrieval_but_raman_gives_usable_values(demo: tuple[Campaign, RunRecord]) -> None:
+    campaign, record = demo
+    usable = dict.fromkeys(("homogeneous", "elastic", "multiangle", "visibility"), 0.0)
+    for scene in record.scenes:
+        for product in scene.products:
+            with xr.open_dataset(campaign.products_root / product.path) as opened:
+                share = float((opened["usable"] < 2).mean())
+            if product.kind in usable:
+                usable[product.kind] = max(share, usable[product.kind])
+    assert min(usable.values()) > 0.8, usable
+
+
 def test_a_vertical_path_is_left_out_of_homogeneous_retrievals(
     demo: tuple[Campaign, RunRecord],
 ) -> None:
@@ -187,9 +199,9 @@ def test_the_command_line_reprocesses_and_reports(
         (["reprocess", "CAMPAIGN", "--workers", "0"], 2, "workers"),
         (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 2, "/nowhere"),
         (
-            ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "multiangle"],
+            ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "raman"],
             2,
-            "requested: homogeneous",
+            "requested: visibility, homogeneous, multiangle, elastic, signal",
         ),
         (["inspect", "/nowhere"], 2, "/nowhere"),
         (["plot", "/"], 2, "directory"),

@@ -37,9 +37,13 @@ KINDS = ["signal", "homogeneous", "elastic", "multiangle"]
 
 
 def tree(repository: Path) -> dict[str, Any]:
-    """Both instruments of the demo and a scanner, for little more than an hour."""
+    """The level and the vertical lidar of the demo, and a scanner, for half an hour."""
     found = yaml.safe_load((repository / "catalogs/demo.yaml").read_text(encoding="utf-8"))
     found |= {"archive": "raw", "output": "out", "name": "again"}
+    found.pop("networks")
+    for lidars in (found["instruments"], found["simulation"]["instruments"]):
+        for name in set(lidars) - {"coast-horizontal", "hill-vertical"}:
+            del lidars[name]
     vertical = found["instruments"]["hill-vertical"]
     vertical["facts"][0] |= {"molecular_profile": "air.csv", "overlap_profile": "overlap.csv"}
     channels = vertical["facts"][0].setdefault("channels", {})
