@@ -46,8 +46,8 @@ class ProductEncoder:
         What is known before the first profile, in memory: ``time`` and ``time_bnds`` (datetime64,
         UTC) of all profiles, ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over
         time), and the coordinates and variables of the layout without time, in its units. An
-        attribute ``steps`` becomes ``lidarops_steps``. NaN is missing. Other variables of the
-        layout are not used.
+        attribute ``steps`` becomes ``lidarops_steps``; ``references`` adds to those of the kind.
+        NaN is missing. Other variables of the layout are not used.
     context : Context
         Kind, channel, station, instrument, campaign, scene and provenance of the product.
 
@@ -66,6 +66,7 @@ class ProductEncoder:
         self._context = context
         self._coordinates, self._extents = locate_product(source, layout, context)
         self._steps = _steps(frame)
+        self._references = str(frame.attrs.get("references", ""))
         self._times = frame.variables[_TIME].values
         self._profiles = 0
         self._names: frozenset[str] = frozenset()
@@ -180,6 +181,8 @@ class ProductEncoder:
         """
         layout, context = self._layout, self._context
         attrs = global_attributes(context, layout, self._extents) | self._steps
+        if self._references:
+            attrs["references"] = f"{attrs['references']}\n{self._references}"
         variables = {
             **_place(self._coordinates, context.mode),
             **dict(self._declared(encoded)),

@@ -15,6 +15,7 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.products.homogeneous.settings import HomogeneousSettings
 
 MINIMAL = """\
 name: small
@@ -34,6 +35,26 @@ def _write(folder: Path, text: str) -> Path:
     path = folder / "campaign.yaml"
     path.write_text(text)
     return path
+
+
+@pytest.mark.parametrize(
+    ("settings", "accepted"),
+    [
+        ({"method": "linearized", "extinction": 1e-4}, True),
+        ({"method": "known_extinction", "extinction": 1e-4}, True),
+        ({"method": "known_extinction"}, False),
+        ({"extinction": 1e-4}, False),
+    ],
+)
+def test_an_extinction_is_given_where_the_method_needs_it(
+    settings: dict[str, object], accepted: bool
+) -> None:
+    whole = {"channels": ["photon_532o"], "sections": [[750, 4500]], **settings}
+    if accepted:
+        assert HomogeneousSettings.model_validate(whole).extinction == 1e-4
+    else:
+        with pytest.raises(ValidationError, match="linearized and known_extinction"):
+            HomogeneousSettings.model_validate(whole)
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

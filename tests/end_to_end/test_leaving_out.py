@@ -113,6 +113,8 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
         ("gradient_regressor", (BOTH_SIDES, MULTI), (BOTH_SIDES, multi(method="mld"))),
         ("robust", (ONE_SIDE, MULTI), (TWO_BEAMS, MULTI)),
         ("vertical", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="kano_hamilton"))),
+        ("vertical", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="mld"))),
+        ("vertical", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="mld_prior"))),
         ("vertical", (ONE_SIDE, MULTI), (TWO_BEAMS, MULTI)),
         ("correlation", (ONE_SIDE, MULTI), (TWO_BEAMS, multi(method="joint"))),
         ("correlation", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="mld"))),

@@ -66,6 +66,26 @@ def test_scans_become_optical_depths_within_their_errors(tmp_path):
         assert again.products[0].sha256 == product.sha256
 
 
+def test_a_product_names_the_paper_and_the_steps_of_its_own_method(tmp_path):
+    settings, _ = campaign(tmp_path, duration=1200)
+    lidar = settings.instruments["scanner"]
+    shown = {}
+    for method in ("mld", "two_angle", "joint"):
+        scan = lidar.products.multiangle.model_copy(update={"method": method})
+        products = lidar.products.model_copy(update={"multiangle": scan})
+        instruments = {"scanner": lidar.model_copy(update={"products": products})}
+        again = settings.model_copy(
+            update={"instruments": instruments, "output": str(tmp_path / method)}
+        )
+        (outcome,) = reprocess(again).scenes
+        (path,) = (product.path for product in outcome.products if product.kind == "multiangle")
+        with xr.open_dataset(again.products_root / path) as product:
+            shown[method] = product.attrs["references"], product.attrs["lidarops_steps"]
+    assert {method for method, (cited, _) in shown.items() if "Gobrusenko" in cited} == {"mld"}
+    fitted = {m for m, (_, steps) in shown.items() if "left out horizontal_gradient" not in steps}
+    assert fitted == {"joint"}
+
+
 def test_a_fixed_beam_is_not_a_scan(tmp_path):
     simulation = dict(TREE["simulation"])
     instrument = simulation["instruments"]["scanner"]

@@ -213,6 +213,15 @@ def deviation(product, inside):
                 "method": "known_background",
             },
         ),
+        (
+            "homogeneous",
+            {
+                "channels": ["photon_532o"],
+                "sections": [[750, 4500]],
+                "method": "linearized",
+                "extinction": 2e-4,
+            },
+        ),
     ],
 )
 def test_steps_take_no_data_but_their_inputs(kind, request_, monkeypatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -15,16 +15,29 @@ from lidarops.settings import (
     quantity,
 )
 
+Method = Literal["auto", "direct", "cubic", "known_background", "linearized", "known_extinction"]
+_GIVEN_EXTINCTION: Final = ("linearized", "known_extinction")
+"""Methods that start from a given extinction."""
+
 
 class HomogeneousSettings(ChannelProduct):
     """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
 
     channels: list[str] = Field(min_length=1)
     sections: list[tuple[Metres, Metres]] = quantity(unit="m", min_length=1)
-    method: Literal["auto", "direct", "cubic", "known_background"] = Field(
+    method: Method = Field(
         default="auto",
         description="known_background takes the background from the far range, for paths that end"
-        " there; the other methods retrieve it from the section",
+        " there; the other methods retrieve it from the section. linearized takes one step from"
+        " extinction, known_extinction takes it as exact",
+    )
+    extinction: float | None = quantity(
+        None,
+        unit="m-1",
+        ge=0,
+        le=0.1,
+        description="of molecules and particles, for linearized (known to some percent) and"
+        " known_extinction",
     )
     background_range: BackgroundRange | None = quantity(
         None,
@@ -44,4 +57,9 @@ class HomogeneousSettings(ChannelProduct):
                 raise ValueError(f"section [{near}, {far}] must end farther than it starts")
         if self.background_range is not None and self.method != "known_background":
             raise located_error("is used by the method known_background only", "background_range")
+        if (self.extinction is not None) != (self.method in _GIVEN_EXTINCTION):
+            raise located_error(
+                f"is required by {' and '.join(_GIVEN_EXTINCTION)}, and used by no other method",
+                "extinction",
+            )
         return self

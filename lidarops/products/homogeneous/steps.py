@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from lidarops.products.homogeneous.look import (
     empty_sections,
     omitted_sections,
 )
-from lidarops.products.homogeneous.settings import HomogeneousSettings
+from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
 from lidarops.records import DetectionMode, LeftOut, PlannedStep
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
@@ -153,7 +153,10 @@ class AlongPath(Choice[Case, NoSettings]):
 class PathSettings(SettingsModel):
     """Settings of the step ``homogeneous``."""
 
-    method: Literal["auto", "direct", "cubic", "known_background"]
+    method: Method
+    extinction: float | None = quantity(
+        None, unit="m-1", description="of `linearized` and `known_extinction`"
+    )
     sections: tuple[Section, ...] = quantity(unit="m")
     background_range: tuple[float, float] | None = quantity(
         None, unit="m", description="far range of `known_background`"
@@ -169,6 +172,11 @@ class PathSettings(SettingsModel):
 
 
 _LOOK: Final = LookForSignal()
+_BACKGROUNDS: Final = {
+    "known_background": "comes from the far range",
+    "known_extinction": "is retrieved at the extinction of the campaign",
+}
+"""Where the background comes from, by method, unless from the section with extinction."""
 
 
 class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
@@ -196,13 +204,12 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
             settings = case.request
             definition = settings.visibility
             known = settings.method == "known_background"
-            whence = (
-                "comes from the far range" if known else "is retrieved together with extinction"
-            )
+            whence = _BACKGROUNDS.get(settings.method, "is retrieved together with extinction")
             yield Run(
                 f"{REQUESTED}; background {whence}",
                 PathSettings(
                     method=settings.method,
+                    extinction=settings.extinction,
                     sections=tuple(level),
                     background_range=tail(case, settings.background_range) if known else None,
                     visibility=definition and definition.resolved,
@@ -316,6 +323,7 @@ class _Sections(WholeProduct):
             variance=conditioned["variance"],
             quality=quality,
             method=self._settings.method,
+            extinction=self._settings.extinction,
             # An estimated variance scatters, which must not count as misfit.
             relative_variance=self._data[RELATIVE_VARIANCE],
             noise_correlation_length=conditioned[CORRELATION_LENGTH],

@@ -50,10 +50,16 @@ _FEWEST_DIRECTIONS: Final = 2
 """Two paths define a slope."""
 LOWEST_ELEVATION: Final = math.degrees(math.asin(1.0 / THRESHOLDS.longest_path))
 """degree; lower beams are longer than the longest path, but for the curvature of the Earth."""
-_SIMPLE: Final = frozenset({"kano_hamilton", "two_angle"})
+_SIMPLE: Final = frozenset({"kano_hamilton", "two_angle", "mld", "mld_prior"})
 """Methods that treat each altitude independently."""
 _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
 """Methods that cannot fit a horizontal gradient."""
+_DIFFERENTIATING: Final = frozenset({"mld", "mld_prior"})
+"""Methods of Gobrusenko and Ivanenko."""
+_PAPER: Final = (
+    "Gobrusenko, K. I. and Ivanenko, B. P. (1989): Restoring the optical depth of the atmosphere"
+    " from multiangle lidar sensing (in Russian), Institute of Atmospheric Optics, Tomsk."
+)
 _JOINT: Final = frozenset({"auto", "joint"})
 
 
@@ -365,6 +371,8 @@ class _Scans(WholeProduct):
             largest_gradient=settings.largest_gradient,
             layers=[(low + self._station, high + self._station) for low, high in settings.layers],
         )
+        if settings.method in _DIFFERENTIATING:
+            optical_depth = optical_depth.assign_attrs(references=_PAPER)
         return in_one_batch(optical_depth)
 
 

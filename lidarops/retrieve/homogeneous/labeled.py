@@ -48,6 +48,7 @@ def fit_homogeneous_path(
     relative_variance: bool = False,
     noise_correlation_length: xr.DataArray | None = None,
     background_range: tuple[float, float] | None = None,
+    extinction: xr.DataArray | float | None = None,
 ) -> xr.Dataset:
     """Return background, amplitude and extinction of sections of range.
 
@@ -65,8 +66,9 @@ def fit_homogeneous_path(
         overlapping bins are excluded; a section takes over SATURATED, PILE_UP and
         INCOMPLETE_OVERLAP from its bins.
     method : str
-        A method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path` that needs no
-        argument other than the power, or "known_background" with `background_range`.
+        A method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`;
+        "known_background" needs `background_range`, "linearized" and "known_extinction" need
+        `extinction`.
     relative_variance : bool
         Whether `variance` is known up to a factor only, which each section estimates: for a
         variance estimated from the same data.
@@ -77,6 +79,9 @@ def fit_homogeneous_path(
         m; far range whose mean is the background of "known_background", which needs `variance`. Its
         error holds the signal that may be left there. Where that cannot be estimated,
         BACKGROUND_UNCERTAIN is raised.
+    extinction : xr.DataArray or float, optional
+        m-1, of molecules and particles, over the dimensions of `power` but range: the prior of
+        "linearized", which must be known to some percent, and exact for "known_extinction".
 
     Returns
     -------
@@ -98,6 +103,10 @@ def fit_homogeneous_path(
     inputs = {
         name: array.isel(range=used, missing_dims="ignore") for name, array in checked.items()
     }
+    if extinction is not None:
+        given = xr.DataArray(extinction)
+        _check_dimensions(given, power, "extinction")
+        inputs["extinction"] = given
     if background_range is not None:
         inputs |= _far_background(checked, distance, background_range)
     outputs = xr.apply_ufunc(
@@ -303,6 +312,7 @@ def _solve_section(
     background: _Block | None = None,
     background_error: _Block | None = None,
     background_bits: _Block | None = None,
+    extinction: _Block | None = None,
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
@@ -317,9 +327,9 @@ def _solve_section(
         with np.errstate(divide="ignore"):
             weights = 1.0 / variance
         variance = None
-    length, level, error, doubt = (
-        None if values is None else values[..., 0]
-        for values in (correlation_length, background, background_error, background_bits)
+    whole = (correlation_length, background, background_error, background_bits, extinction)
+    length, level, error, doubt, prior = (
+        None if values is None else values[..., 0] for values in whole
     )
     fit = _homogeneous.fit_homogeneous_path(
         power,
@@ -330,6 +340,7 @@ def _solve_section(
         noise_correlation_length=length,
         background=level,
         background_standard_error=error,
+        extinction=prior,
     )
     values = tuple(getattr(fit, name) for name in _VALUES)
     bits = fit.quality | carried

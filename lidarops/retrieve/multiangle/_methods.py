@@ -22,6 +22,9 @@ from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
+_BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
+"""Methods that do not use the horizontal gradient that the regression fits."""
+
 
 @dataclass(frozen=True, slots=True)
 class BlockSettings:
@@ -53,7 +56,7 @@ def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> Mul
     fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
     method, reason = _choose_method(beams, settings)
     profiles = _solve(method, beams, fit, settings)
-    steps = [*_steps(beams, fit, settings), StepRecord(method, ran=True, reason=reason)]
+    steps = [*_steps(beams, fit, settings, method), StepRecord(method, ran=True, reason=reason)]
     doubt = _doubt(profiles) if settings.method == "auto" and method == "joint" else ""
     if doubt:
         profiles = _solve("kano_hamilton", beams, fit, settings)
@@ -90,7 +93,9 @@ def _doubt(profiles: MultiAngleResult) -> str:
     return f"its standard errors would be too small ({' and '.join(causes)})"
 
 
-def _steps(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Iterator[StepRecord]:
+def _steps(
+    beams: BeamBlock, fit: Regression, settings: BlockSettings, method: str
+) -> Iterator[StepRecord]:
     """Yield what the data decided before the method."""
     number = int(np.count_nonzero(~settings.scan.usable))
     count = number or "no"
@@ -110,7 +115,10 @@ def _steps(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Iterat
     yield StepRecord("robust_passes", fit.robust, why)
     around = "beams point to all sides"
     free = "a half turn around the zenith has no beam"
-    yield StepRecord("horizontal_gradient", beams.sides, around if beams.sides else free)
+    if method in _BLIND:
+        yield StepRecord("horizontal_gradient", ran=False, reason=f"{method} fits none")
+    else:
+        yield StepRecord("horizontal_gradient", beams.sides, around if beams.sides else free)
 
 
 def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]:

@@ -324,3 +324,36 @@ def test_the_far_background_needs_variances():
             method="known_background",
             background_range=(27_000.0, 30_000.0),
         )
+
+
+@pytest.mark.parametrize("method", ["linearized", "known_extinction"])
+def test_a_given_extinction_is_that_of_each_profile(method):
+    power = far_path(2e-4, profiles=7)
+    given = xr.DataArray(2e-4 * np.linspace(0.9, 1.1, 7), dims="time")
+    options = {"sections": [(1500.0, 4000.0)], "variance": 0.25, "method": method}
+    fit = labeled.fit_homogeneous_path(power, **options, extinction=given)
+    inside = (FAR >= 1500.0) & (FAR < 4000.0)
+    for k in range(7):
+        expected = path_fit.fit_homogeneous_path(
+            power.values[k, inside],
+            FAR[inside],
+            variance=0.25,
+            method=method,
+            extinction=given.values[k],
+        )
+        for name in VALUES:
+            np.testing.assert_array_equal(fit[name].values[k, 0], getattr(expected, name))
+    chunked = labeled.fit_homogeneous_path(
+        power.chunk(time=3, range=500), **options, extinction=given
+    )
+    xr.testing.assert_identical(fit, chunked.compute())
+
+
+def test_a_given_extinction_must_fit_the_power():
+    with pytest.raises(RetrievalInputError, match="extinction"):
+        labeled.fit_homogeneous_path(
+            far_path(2e-4, profiles=2),
+            sections=[(1500.0, 4000.0)],
+            method="known_extinction",
+            extinction=xr.DataArray(np.full(3, 2e-4), dims="time"),
+        )
