@@ -16,6 +16,7 @@ from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.homogeneous.settings import HomogeneousSettings
+from lidarops.products.multiangle.settings import MultiAngleSettings
 
 MINIMAL = """\
 name: small
@@ -55,6 +56,13 @@ def test_an_extinction_is_given_where_the_method_needs_it(
     else:
         with pytest.raises(ValidationError, match="linearized and known_extinction"):
             HomogeneousSettings.model_validate(whole)
+
+
+def test_a_regularisation_needs_a_method_with_a_penalty() -> None:
+    whole = {"channels": ["photon_532o"], "regularisation": 0.1}
+    assert MultiAngleSettings.model_validate(whole | {"method": "mld"}).regularisation == 0.1
+    with pytest.raises(ValidationError, match="mld and mld_prior only"):
+        MultiAngleSettings.model_validate(whole)
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,25 @@ def test_a_product_names_the_paper_and_the_steps_of_its_own_method(tmp_path):
     assert fitted == {"joint"}
 
 
+def test_a_campaign_fixes_the_regularisation(tmp_path):
+    settings, _ = campaign(tmp_path, duration=600)
+    lidar = settings.instruments["scanner"]
+    share = []
+    for strength in (1e-3, 1.0):
+        changes = {"method": "mld", "regularisation": strength}
+        scan = lidar.products.multiangle.model_copy(update=changes)
+        products = lidar.products.model_copy(update={"multiangle": scan})
+        instruments = {"scanner": lidar.model_copy(update={"products": products})}
+        again = settings.model_copy(
+            update={"instruments": instruments, "output": str(tmp_path / f"{strength}")}
+        )
+        (outcome,) = reprocess(again).scenes
+        with xr.open_dataset(again.products_root / outcome.products[0].path) as product:
+            share.append(product["data_share"].median())
+    assert 0.99 < share[0] <= 1.0
+    assert share[1] < 0.9
+
+
 def test_a_fixed_beam_is_not_a_scan(tmp_path):
     simulation = dict(TREE["simulation"])
     instrument = simulation["instruments"]["scanner"]

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, quantity
+from lidarops.settings import ChannelProduct, Metres, located_error, quantity
 
 Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"]
 
@@ -18,6 +18,14 @@ class MultiAngleSettings(ChannelProduct):
     highest: Metres = quantity(6000.0, unit="m", description="above the station")
     step: float = quantity(60.0, unit="m", ge=5, le=1000, description="between altitudes")
     method: Method = "auto"
+    regularisation: float | None = quantity(
+        None,
+        unit="1",
+        ge=0,
+        le=1e6,
+        description="strength of the penalty of mld and mld_prior; by default the largest with"
+        " residuals not larger than the noise, at each altitude",
+    )
     background: Literal["known_shape", "tail_mean"] = "known_shape"
     background_range: ClassVar[None] = None
     layers: list[tuple[float, float]] = quantity(
@@ -37,6 +45,8 @@ class MultiAngleSettings(ChannelProduct):
     def _holds_altitudes(self) -> Self:
         if self.highest < 10 * self.step:
             raise ValueError("highest must be at least 10 times step")
+        if self.regularisation is not None and not self.method.startswith("mld"):
+            raise located_error("is used by the methods mld and mld_prior only", "regularisation")
         for low, high in self.layers:
             if not 0 <= low <= high - self.step or high > self.highest:
                 raise ValueError("layers must be at least one step deep, between 0 and highest")

@@ -261,6 +261,9 @@ class ScanSettings(SettingsModel):
     highest: float = quantity(unit="m", description="above the station")
     step: float = quantity(unit="m")
     method: Method
+    regularisation: float | None = quantity(
+        None, unit="1", description="of `mld` and `mld_prior`; chosen from the noise if none"
+    )
     largest_gradient: float = quantity(unit="m-1")
     layers: tuple[tuple[float, float], ...] = quantity(unit="m", description="above the station")
 
@@ -298,6 +301,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
                 highest=settings.highest,
                 step=settings.step,
                 method=settings.method,
+                regularisation=settings.regularisation,
                 largest_gradient=settings.largest_gradient,
                 layers=tuple(settings.layers),
             ),
@@ -368,6 +372,7 @@ class _Scans(WholeProduct):
             self._cycles.result(),
             station_altitude=self._station,
             method=settings.method,
+            regularisation=settings.regularisation,
             largest_gradient=settings.largest_gradient,
             layers=[(low + self._station, high + self._station) for low, high in settings.layers],
         )

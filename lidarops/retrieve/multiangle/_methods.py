@@ -42,6 +42,8 @@ class BlockSettings:
     robust: bool
     layers: tuple[tuple[int, int], ...]
     """Indices of the altitudes at bottom and top of layers, -1 for the lidar."""
+    regularisation: float | None = None
+    """Strength of the penalty of "mld" and "mld_prior"; chosen from the noise where None."""
 
 
 def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> MultiAngleResult:
@@ -156,7 +158,9 @@ def _mld(
 ) -> MultiAngleResult:
     """Differentiate along the slant path, each altitude on its own."""
     profiles = _start(beams, fit, settings)
-    estimates = mld.solve_mld(beams, fit.inhomogeneity, from_below=from_below)
+    estimates = mld.solve_mld(
+        beams, fit.inhomogeneity, from_below=from_below, strength=settings.regularisation
+    )
     single = _Single(
         estimates.optical_depth, np.sqrt(estimates.variance), estimates.data_share,
         estimates.freedom, settings.largest_gradient * settings.height * estimates.slopes,

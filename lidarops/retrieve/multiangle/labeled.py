@@ -82,6 +82,7 @@ def retrieve_optical_depth(
     method: str = "auto",
     largest_gradient: float = optical_depth.LARGEST_GRADIENT,
     layers: Sequence[tuple[float, float]] = (),
+    regularisation: float | None = None,
 ) -> xr.Dataset:
     """Retrieve optical depth and extinction from the cycles of a scan.
 
@@ -98,6 +99,9 @@ def retrieve_optical_depth(
     layers : sequence of (float, float)
         m above mean sea level: bottom and top of the layers whose optical depth is requested;
         moved to the nearest of the altitudes and the station.
+    regularisation : float, optional
+        Strength of the penalty of "mld" and "mld_prior"; see
+        `lidarops.retrieve.multiangle.optical_depth.retrieve_optical_depth`.
 
     Returns
     -------
@@ -119,6 +123,7 @@ def retrieve_optical_depth(
         "method": method,
         "station_altitude": station_altitude,
         "largest_gradient": largest_gradient,
+        "regularisation": regularisation,
     }
     signals = _agreed_signals(beams, zenith_angle, altitude, settings)
     levels = np.searchsorted(altitude, bounds, side="right")

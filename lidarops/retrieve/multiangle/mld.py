@@ -75,7 +75,9 @@ def make_operator(path: Array) -> Operator:
     return Operator(np.ascontiguousarray(left.T), values**-2.0, gain)
 
 
-def solve_mld(beams: BeamBlock, inhomogeneity: Array, *, from_below: bool) -> MldEstimates:
+def solve_mld(
+    beams: BeamBlock, inhomogeneity: Array, *, from_below: bool, strength: float | None = None
+) -> MldEstimates:
     """Solve every altitude with the beams that have a sample there.
 
     Parameters
@@ -85,7 +87,10 @@ def solve_mld(beams: BeamBlock, inhomogeneity: Array, *, from_below: bool) -> Ml
         Variance of the logarithms on top of the noise.
     from_below : bool
         Whether the prior is the optical depth at the altitude below, instead of 0.
+    strength : float, optional
+        Of the penalty, dimensionless; chosen from `STRENGTHS` at each altitude if not given.
     """
+    strengths = STRENGTHS if strength is None else np.array([strength])
     profiles, _, altitudes = beams.noise.shape
     out = np.full((profiles, altitudes, _ESTIMATES), np.nan)
     prior = np.zeros((profiles, 2))
@@ -108,6 +113,7 @@ def solve_mld(beams: BeamBlock, inhomogeneity: Array, *, from_below: bool) -> Ml
                 beams.design[:2, pattern, k],
                 operators[key],
                 prior[members],
+                strengths,
             )
         if from_below:
             solved = np.isfinite(out[:, k, 0])
@@ -117,11 +123,17 @@ def solve_mld(beams: BeamBlock, inhomogeneity: Array, *, from_below: bool) -> Ml
 
 
 def _solve_altitude(
-    y: Array, variance: Array, path: Array, distance: Array, operator: Operator, prior: Array
+    y: Array,
+    variance: Array,
+    path: Array,
+    distance: Array,
+    operator: Operator,
+    prior: Array,
+    strengths: Array,
 ) -> Array:
     """Return the estimates of profiles that share one set of beams at one altitude.
 
-    The strength is the largest with residuals not larger than the noise.
+    The strength is the largest with residuals not larger than the noise, or else the smallest.
 
     Parameters
     ----------
@@ -131,6 +143,8 @@ def _solve_altitude(
     operator : Operator
     prior : (profile, 2) float
         Optical depth and its variance.
+    strengths : (strength,) float
+        To choose from, rising.
 
     Returns
     -------
@@ -142,7 +156,7 @@ def _solve_altitude(
     scaled = left / np.sqrt(variance.mean(axis=1, keepdims=True))
     b = np.einsum("ci,ti->tc", operator.coordinates, scaled)
     rest = np.maximum((scaled**2).sum(axis=1) - (b**2).sum(axis=1), 0.0)
-    kept = 1.0 / (1.0 + STRENGTHS[:, np.newaxis] * operator.penalty)
+    kept = 1.0 / (1.0 + strengths[:, np.newaxis] * operator.penalty)
     rss = rest[:, np.newaxis] + np.einsum("tc,sc->ts", b**2, (1.0 - kept) ** 2)
     # The residuals grow with the strength.
     chosen = np.maximum((rss <= path.size - 1.0).sum(axis=1) - 1, 0)

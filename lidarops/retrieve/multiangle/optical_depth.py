@@ -51,6 +51,10 @@ class MultiAngleMethod(StrEnum):
     """`MLD` applied to the difference from the altitude below, its formula 4."""
 
 
+REGULARISED: Final = frozenset({MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR})
+"""Methods with a penalty, which accept `regularisation`."""
+
+
 def retrieve_optical_depth(
     signal: npt.ArrayLike,
     zenith_angle: npt.ArrayLike,
@@ -64,6 +68,7 @@ def retrieve_optical_depth(
     largest_gradient: float = LARGEST_GRADIENT,
     robust: bool = True,
     layers: Sequence[tuple[float, float]] = (),
+    regularisation: float | None = None,
 ) -> MultiAngleResult:
     """Retrieve optical depth and extinction from signals at several zenith angles.
 
@@ -97,6 +102,10 @@ def retrieve_optical_depth(
     layers : sequence of (float, float)
         m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
         altitudes and the station, by at most half the distance to the next one.
+    regularisation : float, optional
+        Strength of the penalty of "mld" and "mld_prior", dimensionless, for slant paths scaled to a
+        span of 1; by default the largest with residuals not larger than the noise, at each
+        altitude.
 
     Returns
     -------
@@ -124,6 +133,7 @@ def retrieve_optical_depth(
         _positive(largest_gradient, "largest_gradient") or 0.0,
         robust,
         _layers(layers, np.append(height, 0.0) + station_altitude),
+        _regularisation(regularisation, chosen),
     )
     result = _methods.solve_cycles(rows, noise, settings)
     observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
@@ -224,6 +234,16 @@ def _positive(value: float | None, name: str) -> float | None:
     if value is not None and not (np.isfinite(value) and value >= 0):
         raise RetrievalInputError(f"is {value}", field=name, remedy="give zero or more")
     return value
+
+
+def _regularisation(strength: float | None, method: MultiAngleMethod) -> float | None:
+    if strength is not None and method not in REGULARISED:
+        raise RetrievalInputError(
+            f"is not accepted by the method {str(method)!r}",
+            field="regularisation",
+            remedy=f"leave it out, or choose {' or '.join(sorted(REGULARISED))}",
+        )
+    return _positive(strength, "regularisation")
 
 
 def _quality(profiles: MultiAngleResult, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:

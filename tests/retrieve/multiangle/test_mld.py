@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles.multiangle import PER_KM, rms
 
+from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle import mld
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
@@ -71,6 +72,23 @@ def test_weights_minimise_the_functional(strength):
     slope = np.linalg.solve(normal, centred.T @ (y - y.mean()))
     expected = -0.5 * (width @ slope) / np.ptp(path)
     assert weights(path, strength) @ y == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("strength", [0.0, 1e-2, 1.0])
+def test_a_given_strength_is_used_at_every_altitude(strength):
+    signal, angles = published(50.0, profiles=5)
+    fixed = retrieve(signal, angles, "mld", regularisation=strength)
+    path = 1 / np.cos(np.radians(angles))
+    expected = np.einsum("b,tbk->tk", weights(path, strength), np.log(signal))
+    np.testing.assert_allclose(fixed.optical_depth, expected, rtol=1e-9, atol=1e-12)
+    share = -2 * weights(path, strength) @ path
+    np.testing.assert_allclose(fixed.data_share, share, rtol=1e-9)
+
+
+def test_a_strength_needs_a_method_with_a_penalty():
+    signal, angles = published(50.0, profiles=2)
+    with pytest.raises(RetrievalInputError, match="regularisation: is not accepted"):
+        retrieve(signal, angles, "kano_hamilton", regularisation=1.0)
 
 
 @pytest.mark.parametrize("strength", [1e-6, 1e-2, 1.0, 1e4])
