@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,9 +16,12 @@ from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import HeaderOrder
 from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.steps.pointing import LEAST_SPREAD
 
 _SCRATCH: Final = "temp"
 """Stem of the file into which the acquisition of Licel writes before it gives a name."""
+_NEAR: Final = 0.2
+"""degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
 _PROFILES: Final = (".csv", ".nc")
@@ -36,6 +39,11 @@ class _Site:
     coordinates: Position
     altitude: float | None
     order: HeaderOrder
+
+    def is_near(self, other: _Site) -> bool:
+        """Return whether beams from here may cross those from another station."""
+        pairs = zip(self.coordinates or (), other.coordinates or (), strict=True)
+        return all(abs(here - there) <= _NEAR for here, there in pairs)
 
     def lines(self) -> Iterator[str]:
         first, second = self.coordinates or (0.0, 0.0)
@@ -101,6 +109,7 @@ def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema:
     ]
     for key, instrument, site in zip(keys, instruments, sites, strict=True):
         lines += [*_instrument(key, instrument, site), ""]
+    lines += _networks(dict(zip(keys, zip(instruments, sites, strict=True), strict=True)))
     lines.append("scenes: {window: day}  # products of one file each: day, 6h, 30min")
     return "\n".join([*lines, *_left_out(contents), ""])
 
@@ -196,6 +205,32 @@ def _products(headers: InstrumentHeaders) -> Iterator[str]:
     for kind in kinds_of(Scope.CHANNEL):
         section = kind.optional_part("draft", "DRAFT")
         yield from (f"      {line}" for line in (section(headers) if section else ()))
+
+
+def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[str]:
+    """Yield comments on the networks that instruments may form: near stations, no vertical beam."""
+    left = [
+        key
+        for key, (headers, site) in known.items()
+        if site.coordinates and headers.zenith_angle > LEAST_SPREAD
+    ]
+    while left:
+        first = known[left[0]][1]
+        members = [key for key in left if known[key][1].is_near(first)]
+        left = [key for key in left if key not in members]
+        sections = [
+            line
+            for kind in kinds_of(Scope.NETWORK)
+            if len(members) > 1 and (section := kind.optional_part("draft", "DRAFT"))
+            for line in section([known[key][0] for key in members])
+        ]
+        if sections:
+            yield "# ? Do their beams cross? Then give exact positions, and azimuths in the facts:"
+            yield "# networks:"
+            yield f"#   {first.key}-network:"
+            yield f"#     instruments: [{', '.join(members)}]"
+            yield from (f"#     {line}" for line in sections)
+            yield ""
 
 
 def _left_out(contents: FolderContents) -> Iterator[str]:

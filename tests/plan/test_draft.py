@@ -80,6 +80,22 @@ def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
     assert [granule.zenith_angle for granule in granules(campaign)] == [0.0, 30.0, 60.0]
 
 
+def test_lidars_of_near_stations_are_shown_as_a_network(tmp_path: Path) -> None:
+    places = {"west": (47.2, 11.3), "east": (47.2, 11.4), "far": (52.0, 11.3), "up": (47.2, 11.4)}
+    for site, position in places.items():
+        angle = 0.0 if site == "up" else 90.0
+        data = content(site=site, position=position, zenith_angle=angle)
+        write(tmp_path / f"raw/{site}/h0", data)
+    _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    _, _, comment = text.partition("# networks:\n")
+    block = "".join(line[2:] + "\n" for line in comment.splitlines() if line.startswith("#  "))
+    campaign = tmp_path / "with_network.yaml"
+    campaign.write_text(f"{text}\nnetworks:\n{block}", encoding="utf-8")
+    (network,) = load_campaign(campaign).networks.values()
+    assert set(network.instruments) == {"west-lidar", "east-lidar"}
+    assert network.requested()["visibility"].channel == "photon_532o"
+
+
 def test_patterns_of_instruments_are_disjoint(tmp_path: Path) -> None:
     """The stem of one instrument begins with that of the other."""
     write(tmp_path / "raw/h261", content())
