@@ -175,6 +175,9 @@ _LOOK: Final = LookForSignal()
 _BACKGROUNDS: Final = {
     "known_background": "comes from the far range",
     "known_extinction": "is retrieved at the extinction of the campaign",
+    # `test_the_cubic_needs_a_strong_signal`
+    "cubic": "is that of the cubic, which rejects all values where the signal of the first bin of a"
+    " section is less than 30 times its noise, and some up to 300 times",
 }
 """Where the background comes from, by method, unless from the section with extinction."""
 

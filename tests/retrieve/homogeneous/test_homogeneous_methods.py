@@ -424,3 +424,20 @@ def test_arguments_that_a_method_does_not_accept_are_refused(arguments, field):
     with pytest.raises(RetrievalInputError) as caught:
         fit_homogeneous_path(given.pop("power"), LONG, **given)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("near", [750.0, 2500.0])
+@pytest.mark.parametrize("extinction", [3e-5, 3e-4])
+def test_the_cubic_needs_a_strong_signal(near, extinction):
+    """The plan states these limits."""
+    rng = np.random.default_rng(1)
+    distance = np.arange(near, near + 6000.0, 7.5)
+    shape = (near / distance) ** 2 * np.exp(-2 * extinction * (distance - near))
+    rejecting = int(flags_of("homogeneous").rejecting)
+    kept = {}
+    for strength in (30.0, 300.0):
+        power = 50.0 + strength * shape + rng.normal(size=(100, distance.size))
+        fit = fit_homogeneous_path(power, distance, variance=1.0, method="cubic")
+        kept[strength] = np.mean((fit.quality & rejecting) == 0)
+    assert kept[30.0] == 0.0
+    assert kept[300.0] > 0.98
