@@ -84,9 +84,14 @@ class InstrumentHeaders:
         return tuple(group for group in self.groups if not group.dark) or self.groups
 
     @property
+    def main(self) -> FileGroup:
+        """Its largest group of signal files; a few headers of an archive may be damaged."""
+        return max(self.signal, key=lambda group: len(group.files))
+
+    @property
     def layout(self) -> tuple[ChannelLayout, ...]:
-        """Channels of its first files."""
-        return self.signal[0].layout
+        """Channels of most of its files."""
+        return self.main.layout
 
     @property
     def without_zenith(self) -> int:

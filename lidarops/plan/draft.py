@@ -11,7 +11,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from lidarops.catalog.folder import FolderContents, InstrumentHeaders, instruments_of
+from lidarops.catalog.folder import (
+    FileGroup,
+    FolderContents,
+    InstrumentHeaders,
+    instruments_of,
+)
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import HeaderOrder
@@ -22,6 +27,8 @@ _SCRATCH: Final = "temp"
 """Stem of the file into which the acquisition of Licel writes before it gives a name."""
 _NEAR: Final = 0.2
 """degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""
+_ALTITUDES: Final = (-500.0, 9000.0)
+"""m; those that a station of a campaign may have."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
 _PROFILES: Final = (".csv", ".nc")
@@ -53,13 +60,13 @@ class _Site:
         source = (
             "from the header; exact, and not swapped?"
             if self.coordinates
-            else "headers state no position"
+            else "headers state none on Earth"
         )
         height = "from the header" if self.altitude is not None else "headers state none"
         yield f"  {self.key}:"
         yield f"    name: {_text(self.name or self.key)}"
-        yield f"    latitude: {latitude:g}  # ? degree north, {source}"
-        yield f"    longitude: {longitude:g}  # ? degree east"
+        yield f"    latitude: {latitude:.8g}  # ? degree north, {source}"
+        yield f"    longitude: {longitude:.8g}  # ? degree east"
         yield f"    altitude: {self.altitude or 0.0:g}  # ? m above the geoid, {height}"
 
 
@@ -116,26 +123,35 @@ def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema:
 
 def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
     """Return the station of each instrument: one for each site and position of headers."""
-    first = [instrument.signal[0] for instrument in instruments]
+    first = [instrument.main for instrument in instruments]
     places = list(dict.fromkeys((group.site, group.coordinates) for group in first))
     keys = dict(zip(places, _keys(site or "station" for site, _ in places), strict=True))
     stations = {
         (group.site, group.coordinates): _Site(
             keys[group.site, group.coordinates],
             group.site,
-            group.coordinates,
-            group.altitude,
-            _order(group.coordinates),
+            *_position(group),
         )
         for group in reversed(first)
     }
     return [stations[group.site, group.coordinates] for group in first]
 
 
-def _order(coordinates: Position) -> HeaderOrder:
-    """Return the order of coordinates: longitude first, unless the second cannot be a latitude."""
-    swapped = coordinates is not None and abs(coordinates[1]) > 90.0
-    return "latitude_first" if swapped else "longitude_first"
+def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
+    """Return coordinates, altitude and order of coordinates; None for what is not on Earth.
+
+    Longitude is first, unless the second one cannot be a latitude.
+    """
+    low, high = _ALTITUDES
+    altitude = group.altitude
+    known = altitude if altitude is not None and low <= altitude <= high else None
+    coordinates = group.coordinates
+    if coordinates is None or max(map(abs, coordinates)) > 180.0:
+        return None, known, "longitude_first"
+    first, second = map(abs, coordinates)
+    if min(first, second) > 90.0:
+        return None, known, "longitude_first"
+    return coordinates, known, "latitude_first" if second > 90.0 else "longitude_first"
 
 
 def _instrument(key: str, headers: InstrumentHeaders, site: _Site) -> Iterator[str]:
@@ -151,7 +167,7 @@ def _instrument(key: str, headers: InstrumentHeaders, site: _Site) -> Iterator[s
     else:
         yield '    # dark_files: "dark/*"  # ? none of the paths holds the word dark'
     if site.coordinates is None:
-        yield "    # header_position: headers state no position"
+        yield "    header_position: ignore  # headers state no position on Earth"
     else:
         yield f"    header_position: {site.order}  # ? order of {_pair(site.coordinates)}"
     yield from _facts(headers)
@@ -193,7 +209,7 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
             f" headers, over {len(sides) or 'no known'} azimuths"
         )
     else:
-        yield f"zenith_angle: {angles[0]:g}  # ? degree, fixed by all headers"
+        yield f"zenith_angle: {abs(angles[0]):g}  # ? degree, {angles[0]:g} in all headers"
     if angles and headers.without_zenith:
         doubts = [doubt for group in headers.signal for doubt in group.doubts]
         yield f"# ? {headers.without_zenith} files state no sure pointing and are refused"
@@ -251,7 +267,7 @@ def _left_out(contents: FolderContents) -> Iterator[str]:
 
 def _text(value: str) -> str:
     """Return a text in quotes, as YAML reads it."""
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=not value.isprintable())
 
 
 def _list(patterns: Sequence[str]) -> str:

@@ -96,6 +96,42 @@ def test_lidars_of_near_stations_are_shown_as_a_network(tmp_path: Path) -> None:
     assert network.requested()["visibility"].channel == "photon_532o"
 
 
+@pytest.mark.parametrize(
+    ("header", "changed", "position"),
+    [
+        (b"0030.7 0046.4", b"0230.7 0046.4", None),
+        (b"0030.7 0046.4", b"0095.0 0099.0", None),
+        (b"0030.7 0046.4", b"0030.7 0146.4", (30.7, 146.4)),
+        (b"0020 0030.7", b"9999 0030.7", (46.4, 30.7)),
+        (b"Coast   ", b"K\xfcste:# ", (46.4, 30.7)),
+        (b"Coast   ", b'C"\x85\x01a\\ ', (46.4, 30.7)),
+        (b"0046.4 90 ", b"0046.4 -30", (46.4, 30.7)),
+    ],
+    ids=["nowhere", "no latitude", "swapped", "high", "umlaut", "control", "negative"],
+)
+def test_odd_headers_give_a_campaign_file_that_can_be_used(
+    header: bytes, changed: bytes, position: tuple[float, float] | None, tmp_path: Path
+) -> None:
+    data = content()
+    assert header in data
+    for number in range(2):
+        write(tmp_path / f"raw/h{number}", content(number).replace(header, changed))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (station,) = campaign.stations.values()
+    assert (station.latitude, station.longitude) == (position or (0.0, 0.0))
+    assert [granule.status for granule in granules(campaign)] == [Status.GOOD] * 2
+
+
+def test_one_damaged_position_does_not_count(tmp_path: Path) -> None:
+    for number in range(4):
+        data = content(number)
+        damaged = data.replace(b"0030.7 0046.4", b"0987.6 0765.4") if number == 0 else data
+        write(tmp_path / f"raw/h{number}", damaged)
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (station,) = campaign.stations.values()
+    assert (station.latitude, station.longitude) == (46.4, 30.7)
+
+
 def test_patterns_of_instruments_are_disjoint(tmp_path: Path) -> None:
     """The stem of one instrument begins with that of the other."""
     write(tmp_path / "raw/h261", content())
