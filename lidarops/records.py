@@ -374,11 +374,12 @@ class Unmade:
 
 @dataclass(frozen=True, slots=True)
 class IdleFacts:
-    """Facts whose period of validity holds no file of their instrument."""
+    """Facts that no file or product uses."""
 
     instrument: str
-    period: str
+    subject: str
     """Such as ``facts from 2024-01-01T00:00:00Z``."""
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import BATCH, Database
-from lidarops.catalog.rows import NO_NOTES, GranuleRow, naive
+from lidarops.catalog.rows import NO_NOTES, GranuleRow, day_of, naive
 from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.records import ChannelLayout, DetectionMode, FileNote, Granule, Holding, Role, Status
 
@@ -248,6 +248,19 @@ class Granules(Database):
             query = query.where(_C.day <= last)
         with self.transaction() as connection:
             return {name: (first, last) for name, first, last in connection.execute(query)}
+
+    def has_files(
+        self, instrument: str, since: datetime | None = None, until: datetime | None = None
+    ) -> bool:
+        """Return whether an instrument has good signal granules that start in [since, until)."""
+        query = sa.select(_C.path).where(*self._signals(), _C.instrument == instrument).limit(1)
+        # Days have an index.
+        if since is not None:
+            query = query.where(_C.day >= day_of(since), _C.start >= naive(since))
+        if until is not None:
+            query = query.where(_C.day <= day_of(until), _C.start < naive(until))
+        with self.transaction() as connection:
+            return connection.execute(query).first() is not None
 
     def file_notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
         """Return the notes on good signal granules, contradictions first, then by frequency.

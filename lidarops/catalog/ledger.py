@@ -405,8 +405,8 @@ class Ledger(Granules):
         )
         if channel:
             query = query.where(_P.channel == channel)
-        with self.transaction() as connection:
-            for path, scene in connection.execute(query):
+        with self.stream(query) as rows:
+            for path, scene in rows:
                 if path not in without:
                     yield scene
 

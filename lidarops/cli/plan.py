@@ -31,6 +31,7 @@ from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, se
 if TYPE_CHECKING:
     from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import LeftOut, Plan, PlannedStep
+    from lidarops.run.archive import EarlierProblems
     from lidarops.run.staleness import Judgement
 
 
@@ -55,14 +56,13 @@ def show_plan(
     """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
 
     Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
-    code 1 if a scene cannot be planned or failed before, a pattern or channel is in no file, or
-    headers contradict a station.
+    code 1 if a scene cannot be planned, failed before or gave no usable value, a pattern or channel
+    is in no file, or headers contradict a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.plan.cost_estimate import RunTime
-    from lidarops.run.archive import assess, failed_before, survey, unusable_before
-    from lidarops.run.options import NO_USABLE_VALUE
+    from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
 
@@ -74,14 +74,13 @@ def show_plan(
     scenes = []
     no_scene = True
     failed = False
-    waiting = failed_before(settings, selection)
-    unusable = dict.fromkeys(unusable_before(settings, selection), NO_USABLE_VALUE)
+    earlier = earlier_problems(settings, selection)
     for judged in judgements:
         no_scene = False
         failed |= not judged.planned
         if judged.due or judged.held:
-            for earlier in (waiting, unusable):
-                earlier.pop(judged.scene.id, None)
+            for problems in earlier:
+                problems.pop(judged.scene.id, None)
         failed |= judged.held
         scene, whole = judged.scene, settings.all_steps
         times = {
@@ -115,8 +114,8 @@ def show_plan(
         document = {
             "scenes": scenes,
             **no_scene_found,
-            "failed_before": waiting,
-            "without_a_usable_value": list(unusable),
+            "failed_before": earlier.failed,
+            "without_a_usable_value": list(earlier.unusable),
             **findings_document(findings),
             "estimated_cpu_seconds": estimate,
         }
@@ -125,9 +124,9 @@ def show_plan(
         if no_scene:
             typer.echo(NO_SCENE)
         show_findings(findings)
-        _show_earlier(waiting, unusable)
+        _show_earlier(earlier)
         _show_times(runs)
-    exit_with_status(failed=failed or bool(waiting) or findings.failed)
+    exit_with_status(failed=failed or any(earlier) or findings.failed)
 
 
 def _show_plan(title: str, plan: Plan) -> None:
@@ -204,11 +203,13 @@ def _show_times(runs: Mapping[str, RunTime]) -> None:
     show_rows("Estimated CPU time in s on a common server core", columns, rows)
 
 
-def _show_earlier(failed: Mapping[str, str], unusable: Mapping[str, str]) -> None:
+def _show_earlier(earlier: EarlierProblems) -> None:
     """Print the scenes that failed or gave nothing in earlier runs and are not due."""
     unchanged = "not tried again, because nothing has changed"
-    show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed.items())
-    show_rows(f"Without a usable value; {unchanged}", ("scene", "problem"), unusable.items())
+    show_rows(f"Failed before; {unchanged}", ("scene", "error"), earlier.failed.items())
+    show_rows(
+        f"Without a usable value; {unchanged}", ("scene", "problem"), earlier.unusable.items()
+    )
 
 
 def _show_stale(title: str, judged: Judgement) -> None:

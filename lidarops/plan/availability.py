@@ -64,18 +64,27 @@ def missing_channels(
         elif facts_of_channel.lag is not None and not name.startswith("analog_"):
             reason = "a lag belongs to the facts of the analog channel"
             yield LeftOut(LAG_STEP, name, reason, rule=_UNMATCHED)
-    yield from _unused_lidar_ratios(instrument, facts)
 
 
-def _unused_lidar_ratios(instrument: Instrument, facts: InstrumentFacts) -> Iterator[LeftOut]:
-    """Yield the analog channels whose lidar ratio a glued channel does not take."""
+def unused_lidar_ratios(
+    name: str, facts: InstrumentFacts, instrument: Instrument
+) -> Iterator[IdleFacts]:
+    """Yield the lidar ratios of analog channels that a glued channel does not take.
+
+    Parameters
+    ----------
+    name : str
+        Key of the instrument.
+    facts : InstrumentFacts
+    instrument : Instrument
+    """
     named = named_channels(instrument)
     for glued in filter(is_glued, named):
         analog, photon = glued_parts(glued)
         of_analog, of_photon = (_has_lidar_ratio(facts, part) for part in (analog, photon))
         if of_analog and not of_photon and analog not in named:
-            reason = f"{glued} takes the lidar ratio of {photon}: give it there"
-            yield LeftOut(READ_STEP, analog, reason, rule=_UNMATCHED)
+            reason = f"not used: {glued} takes the lidar ratio of {photon}"
+            yield IdleFacts(name, f"lidar ratio of {analog}", reason)
 
 
 def _has_lidar_ratio(facts: InstrumentFacts, channel: str) -> bool:
@@ -149,28 +158,6 @@ def _lacking(
     return [omission for omission in missing if omission.name != LAG_STEP]
 
 
-def idle_facts(campaign: Campaign, holdings: Iterable[Holding]) -> tuple[IdleFacts, ...]:
-    """Return the periods of facts in which an instrument with files has none.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    holdings : iterable of Holding
-        Of all files, cut at `validity_edges`.
-    """
-    used: dict[str, set[str]] = defaultdict(set)
-    for holding in holdings:
-        instrument = campaign.instruments.get(holding.instrument)
-        if instrument is not None:
-            used[holding.instrument].add(_period(instrument.facts_at(holding.since)))
-    return tuple(
-        IdleFacts(name, _period(facts))
-        for name, periods in used.items()
-        for facts in campaign.instruments[name].facts
-        if _period(facts) not in periods
-    )
-
-
 def unavailable_channels(
     campaign: Campaign,
     holdings: Iterable[Holding],
@@ -213,7 +200,7 @@ def unavailable_channels(
         for channel_layout in holding.layout:
             held[name, channel_layout.name] += holding.files
         facts = instrument.facts_at(holding.since)
-        period = _period(facts)
+        period = period_of(facts)
         for requester in {"", period}:
             all_files[name, requester] += holding.files
         touched = (since is None or facts.valid_to > since) and (
@@ -237,7 +224,8 @@ def unavailable_channels(
     return tuple(sorted(unmet, key=lambda request: (not request.nowhere, request.instrument)))
 
 
-def _period(facts: InstrumentFacts) -> str:
+def period_of(facts: InstrumentFacts) -> str:
+    """Return the period of facts, such as ``facts from 2024-01-01T00:00:00Z``."""
     first = "" if facts.valid_from == _FIRST else f" from {facts.valid_from:%Y-%m-%dT%H:%M:%SZ}"
     last = "" if facts.valid_to == _LAST else f" to {facts.valid_to:%Y-%m-%dT%H:%M:%SZ}"
     return f"{FACTS}{first}{last}"

@@ -48,8 +48,7 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
         problem = f"matches no file of the archive{near}"
         yield FindingRow(idle.instrument, f"{idle.key}: {idle.pattern}", problem, fails=True)
     for facts in findings.idle_facts:
-        problem = "hold for no file: their period and the times of the files do not overlap"
-        yield FindingRow(facts.instrument, facts.period, problem, fails=False)
+        yield FindingRow(facts.instrument, facts.subject, facts.reason, fails=False)
     for note in findings.file_notes:
         files = counted(note.files, "file")
         yield FindingRow(note.instrument, files, note.text, fails=note.contradicts)

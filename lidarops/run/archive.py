@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from dask.utils import parse_bytes
 
@@ -35,7 +35,7 @@ from lidarops.run.executor import (
 )
 from lidarops.run.findings import find
 from lidarops.run.leftovers import Orphan
-from lidarops.run.options import Options, Result
+from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
@@ -50,7 +50,6 @@ __all__ = [
     "Selection",
     "assess",
     "bring_up_to_date",
-    "failed_before",
     "remove_orphans",
     "report_run",
     "reprocess",
@@ -193,20 +192,23 @@ def survey(
         return find(judge, store, selection, summary.idle_patterns)
 
 
-def failed_before(campaign: Campaign, selection: Selection) -> dict[str, str]:
-    """Return the selected scenes whose last try failed, with the errors; a catalog must exist."""
-    with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        return {
-            scene: error
-            for scene, error in store.failures().items()
-            if selection.scene(scene, campaign)
-        }
+class EarlierProblems(NamedTuple):
+    """Scenes that gave nothing when they were last processed, with the reasons."""
+
+    failed: dict[str, str]
+    unusable: dict[str, str]
 
 
-def unusable_before(campaign: Campaign, selection: Selection) -> list[str]:
-    """Return the selected scenes whose retrievals gave no usable value; a catalog must exist."""
+def earlier_problems(campaign: Campaign, selection: Selection) -> EarlierProblems:
+    """Return the selected scenes that failed or gave no usable value; a catalog must exist."""
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        return [scene for scene in store.unusable_scenes() if selection.scene(scene, campaign)]
+        unusable = dict.fromkeys(store.unusable_scenes(), NO_USABLE_VALUE)
+        return EarlierProblems(
+            *(
+                {scene: why for scene, why in found.items() if selection.scene(scene, campaign)}
+                for found in (store.failures(), unusable)
+            )
+        )
 
 
 def update_catalog(

@@ -50,7 +50,7 @@ def find(
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
         unmade=tuple(_unmade(judge, store, selection, owners, orphans)),
-        idle_facts=_idle_facts(campaign, store, instruments),
+        idle_facts=tuple(_idle_facts(campaign, store, sorted(instruments))),
     )
 
 
@@ -81,13 +81,19 @@ def _unmet(
 
 
 def _idle_facts(
-    campaign: Campaign, store: Store, instruments: Collection[str]
-) -> tuple[IdleFacts, ...]:
-    """Return the facts whose period holds no file."""
-    edges = availability.validity_edges(campaign)
-    # Facts that always hold are never idle.
-    found = availability.idle_facts(campaign, store.holdings(edges)) if edges else ()
-    return tuple(idle for idle in found if idle.instrument in instruments)
+    campaign: Campaign, store: Store, instruments: Iterable[str]
+) -> Iterator[IdleFacts]:
+    """Yield the facts that no file or product uses, of instruments with files."""
+    for name in instruments:
+        instrument = campaign.instruments[name]
+        if not (instrument.facts and store.has_files(name)):
+            continue
+        for facts in instrument.facts:
+            if store.has_files(name, facts.valid_from, facts.valid_to):
+                yield from availability.unused_lidar_ratios(name, facts, instrument)
+            else:
+                reason = "hold for no file: their period and the times of the files do not overlap"
+                yield IdleFacts(name, availability.period_of(facts), reason)
 
 
 def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[UnusableFile]:

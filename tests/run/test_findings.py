@@ -158,19 +158,21 @@ def test_facts_that_hold_for_no_file_are_noted(archive: Archive) -> None:
         shown = invoke(archive, command)
         assert shown.exit_code == 0
         assert "facts to 2020-01-01T00:00:00Z" in " ".join(shown.output.split())
-    assert document(archive, "plan")["facts_without_file"] == [
-        {"instrument": "rich", "period": "facts to 2020-01-01T00:00:00Z"}
-    ]
+    (idle,) = document(archive, "plan")["unused_facts"]
+    assert (idle["instrument"], idle["subject"]) == ("rich", "facts to 2020-01-01T00:00:00Z")
 
 
 def test_a_lidar_ratio_that_a_glued_channel_does_not_take_is_named(archive: Archive) -> None:
     rich = archive.tree["instruments"]["rich"]
     rich["facts"][1]["channels"]["analog_532o"] = {"lidar_ratio": 70}
     rich["products"]["elastic"]["channels"] = ["glued_532o"]
-    shown = invoke(archive, "plan")
-    assert "lidar ratio of photon_532o" in " ".join(shown.output.split())
+    found = document(archive, "plan")
+    (unused,) = found["unused_facts"]
+    assert unused["subject"] == "lidar ratio of analog_532o"
+    assert "takes the lidar ratio of photon_532o" in unused["reason"]
+    assert not found["not_in_files"]
     rich["facts"][1]["channels"]["photon_532o"]["lidar_ratio"] = 70
-    assert "lidar ratio of photon_532o" not in " ".join(invoke(archive, "plan").output.split())
+    assert not document(archive, "plan")["unused_facts"]
 
 
 def test_a_wavelength_that_contradicts_the_header_is_noted(archive: Archive) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from lidarops.settings import (
-    Metres,
+    BackgroundRange,
     NetworkProduct,
     PartOfDay,
     VisibilitySettings,
@@ -67,7 +67,7 @@ class VisibilityProductSettings(NetworkProduct):
         le=0.5,
         description="relative error of the overlap at the nearest crossing of a beam",
     )
-    background_range: tuple[Metres, Metres] | None = quantity(
+    background_range: BackgroundRange | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
     )
 
@@ -75,8 +75,6 @@ class VisibilityProductSettings(NetworkProduct):
     def _consistent(self) -> Self:
         if self.block % self.average:
             raise ValueError("block must be a multiple of average")
-        if self.background_range and self.background_range[0] >= self.background_range[1]:
-            raise ValueError("background_range must end farther than it starts")
         return self
 
     def check_members(self, instruments: Sequence[str]) -> None:
