@@ -36,7 +36,6 @@ _OUTLYING: Final = THRESHOLDS.outlying_block
 _DARKEST: Final = THRESHOLDS.darkest
 _BRIGHT: Final = THRESHOLDS.bright
 _BAND: Final = THRESHOLDS.noise_band
-_GROWTH: Final = THRESHOLDS.band_growth
 _SIGNIFICANT: Final = THRESHOLDS.significant_band
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -196,11 +195,10 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
         ratio[k] = blocks.square[k] / _variance(line, blocks.light[k])
     centres, excesses = np.empty(count), np.empty(count)
     found, significant = 0, False
-    start = 0
-    while start < count:
-        end = start + max(_BAND, int(_GROWTH * start))
-        if count - end < _BAND:
-            end = count
+    bands = max(count // _BAND, 1)
+    for band in range(bands):
+        start = band * _BAND
+        end = start + _BAND if band < bands - 1 else count
         places = np.flatnonzero(blocks.usable[start:end])
         # Without noise above zero, nothing is known of the band.
         excess = _clipped_mean(ratio[start + places])
@@ -211,7 +209,6 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
             error = _BLOCK_ERROR * math.sqrt(1.0 / places.size + 2.0 / count)
             significant |= abs(excesses[found]) > _SIGNIFICANT * error
             found += 1
-        start = end
     return centres[:found], excesses[:found], significant
 
 

@@ -497,12 +497,13 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
     that are brighter than the drift of the baseline in the far half, and is 0 within its standard
     error; :math:`a` is fitted to all. Blocks far noisier than the line are left out. Two
     well-determined numbers give weights that do not follow the noise of the single bin. A baseline
-    that drifts by as much as the light makes no noise: where the mean of a band of 32 blocks or
-    more contradicts the line, the line is multiplied by the ratio of the two, interpolated
+    that drifts by as much as the light makes no noise: where the mean of a band of 32 blocks
+    contradicts the line, the line is multiplied by the ratio of the two, interpolated
     logarithmically between the centres of bands.
 
     The estimate is exact for noise that is independent 4 bins apart and farther. Blocks in which
-    the fall of the signal would count as noise are left out. A profile of fewer than 4 blocks in
+    the fall of the signal would count as noise are left out; where no others are bright, as before
+    an opaque cloud, they give an upper bound of :math:`b`. A profile of fewer than 4 blocks in
     its far half has the mean square of third differences of neighbours in all bins.
 
     Parameters

@@ -49,10 +49,9 @@ class Thresholds:
     noise of light: they change the slope by a fifth at most."""
     noise_band: int = 32
     """Blocks of a band, which give its noise within 5 %."""
-    band_growth: float = 0.25
-    """Least length of a band over the distance of its start from the first bin."""
     significant_band: float = 3.5
-    """Standard errors beyond which the noise of a band differs from the line."""
+    """Standard errors beyond which the noise of a band differs from the line. With 0 the stated
+    variance of white noise scatters five times as much in the first bins of 16,380."""
 
     # Correlation of noise
     noise_sections: int = 8

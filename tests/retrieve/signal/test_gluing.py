@@ -264,8 +264,8 @@ def test_a_real_station_is_glued_after_lag_correction(data_root, wavelength):
     misfits = [(result.chi2 / result.degrees_of_freedom).mean() for result in results]
     assert misfits[0] > 1.2
     assert misfits[1] < 0.5
-    # The window ends where the signal is 10 times its noise.
-    assert after.slope.std() / after.slope.mean() < {"355": 0.02, "532": 0.035}[wavelength]
+    # Both channels count the same photons, whose noise cancels in the ratio.
+    assert after.slope.std() < 0.5 * after.slope_standard_error.mean()
     assert after.slope.std() < 0.6 * before.slope.std()
     far = range_ > after.stop.max()
     np.testing.assert_array_equal(after.power[:, far], (photon - sky[:, np.newaxis])[:, far])

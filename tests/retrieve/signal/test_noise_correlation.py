@@ -262,6 +262,14 @@ def test_an_opaque_cloud_does_not_hide_the_noise_of_its_light():
     assert np.abs(stated[:, 200:] / 1e-4 - 1.0).mean() < 0.1
 
 
+def test_bands_add_no_scatter_where_the_line_holds():
+    rng = np.random.default_rng(11)
+    range_ = 7.5 * np.arange(1.0, 16381.0)
+    stated = difference_variance(rng.standard_normal((200, range_.size)), range_)
+    # A band alone would give 0.1.
+    assert stated[:, :200].mean(axis=1).std() < 0.04
+
+
 def test_clouds_are_not_noise():
     """A layer with steep edges changes the stated noise around it by a few percent only."""
     rng = np.random.default_rng(8)
