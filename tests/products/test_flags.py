@@ -38,7 +38,12 @@ SHARED = {
 OWN = {
     "signal": {},
     "homogeneous": {"poorly_determined": 17, "poor_fit": 18, "at_bound": 19, "not_level": 20},
-    "elastic": {"cloud": 17, "no_reference": 18, "unstable_inversion": 19},
+    "elastic": {
+        "cloud": 17,
+        "no_reference": 18,
+        "unstable_inversion": 19,
+        "negative_backscatter": 20,
+    },
     "raman": {"no_reference": 17, "weak_signal": 18, "no_lidar_ratio": 19},
     "multiangle": {
         "no_leverage": 20,
@@ -63,7 +68,7 @@ bit: that needs a new version of the layout."""
 VERSION = {
     "signal": 2,
     "homogeneous": 2,
-    "elastic": 2,
+    "elastic": 3,
     "raman": 1,
     "multiangle": 3,
     "visibility": 2,
@@ -75,7 +80,7 @@ LEFT = {
     "shared": 4,
     "signal": 14,
     "homogeneous": 10,
-    "elastic": 11,
+    "elastic": 10,
     "raman": 11,
     "multiangle": 3,
     "visibility": 10,
@@ -109,6 +114,8 @@ SCENES = {
     "ElasticQuality.NO_REFERENCE": "test_labeled_elastic::test_an_opaque_cloud_leaves_no_reference",
     "ElasticQuality.UNSTABLE_INVERSION": "test_labeled_elastic::"
     "test_an_inversion_away_from_the_reference_stops_where_it_is_unstable",
+    "ElasticQuality.NEGATIVE_BACKSCATTER": "test_labeled_elastic::"
+    "test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatter",
     "RamanQuality.NO_REFERENCE": "test_raman_retrieval::"
     "test_particles_everywhere_leave_no_reference",
     "RamanQuality.WEAK_SIGNAL": "test_raman_retrieval::"

@@ -29,3 +29,11 @@ class ElasticQuality(FlagBit):
             " value constrains"
         ),
     )
+    NEGATIVE_BACKSCATTER = (
+        FIRST_OWN + 3,
+        Severity.REJECT,
+        (
+            "backscatter is below zero by several standard errors, here or between here and the"
+            " start of the inversion: the signal is not as assumed (overlap, baseline, gluing)"
+        ),
+    )

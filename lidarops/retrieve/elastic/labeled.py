@@ -173,7 +173,11 @@ def invert_elastic(
     )
     quality = means.quality
     quality |= _solution_flags(solution, window, signal, quality)
-    quality |= _cloud_flags(distance, window, clouds)
+    for mask, bit in (
+        (clouds.mask, ElasticQuality.CLOUD),
+        (_negative(solution), ElasticQuality.NEGATIVE_BACKSCATTER),
+    ):
+        quality |= _with_beyond(mask, distance, window).astype(np.int32) * np.int32(bit)
     profiles = {
         name: np.where(solution.valid, values, np.nan)
         for name, values in _profile_variables(solution).items()
@@ -351,19 +355,33 @@ def _solution_flags(
     return bits
 
 
-def _cloud_flags(
-    distance: Array, window: _reference.ReferenceWindow, clouds: _layers.Layers
-) -> Flags:
-    """Return CLOUD for bins in a cloud, or beyond one as seen from the reference window.
+def _negative(solution: _elastic.ElasticResult) -> npt.NDArray[np.bool_]:
+    """Return where runs of bins have a backscatter that lies below zero by more than its error."""
+    error: Array = solution.budget.total
+    low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
+    length = THRESHOLDS.negative_bins
+    if low.shape[-1] < length:
+        return np.zeros_like(low)
+    runs = np.lib.stride_tricks.sliding_window_view(low, length, axis=-1).all(axis=-1)
+    negative = np.zeros_like(low)
+    for first in range(length):
+        negative[:, first : first + runs.shape[-1]] |= runs
+    return negative
+
+
+def _with_beyond(
+    mask: npt.NDArray[np.bool_], distance: Array, window: _reference.ReferenceWindow
+) -> npt.NDArray[np.bool_]:
+    """Return the bins of a mask, and those beyond one as seen from the reference window.
 
     The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
     that was assumed in the cloud.
     """
     bottom = np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
     near, far = distance < bottom, distance >= bottom
-    above = np.logical_or.accumulate(clouds.mask & far, axis=-1)
-    below = np.logical_or.accumulate((clouds.mask & near)[:, ::-1], axis=-1)[:, ::-1]
-    return (above | below).astype(np.int32) * np.int32(ElasticQuality.CLOUD)
+    above = np.logical_or.accumulate(mask & far, axis=-1)
+    below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
+    return np.asarray(above | below)
 
 
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:

@@ -58,6 +58,11 @@ class Thresholds:
     order. A reference that is too high by noise makes both values and errors too low, so noise
     errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1. Simulations: less than 0.1 %
     of the values are then off by more than 4 errors, without it 1 to 3 % where s is 5 to 8."""
+    negative: float = 4.0
+    """Standard errors below zero at which backscatter contradicts the signal. Manaus, 355 nm, with
+    an overlap that is not full where it was stated to be: 57 standard errors."""
+    negative_bins: int = 4
+    """Bins in a row that must be that low, so that noise alone is none. Assumed."""
     largest_backscatter: float = 5e-4
     """m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
 

@@ -453,6 +453,29 @@ def test_no_reference_window_holds_a_cloud():
         assert not np.any((bottom < height) & (top > height))
 
 
+def not_full():
+    """Return an overlap that nothing corrects."""
+    return 1.0 - np.exp(-((distance / 800.0) ** 2))
+
+
+def test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatter():
+    retrieved = solved(counted(truth() * not_full(), 20))
+    calibrated = np.isfinite(retrieved["reference_bottom"].to_numpy())
+    assert calibrated.sum() > 5
+    retrieved = retrieved.isel(time=calibrated)
+    negative = has(retrieved, ElasticQuality.NEGATIVE_BACKSCATTER)
+    value, error = (retrieved[f"backscatter{end}"].to_numpy() for end in ("", "_standard_error"))
+    assert negative[:, between(100.0, 350.0)].all()
+    # Everything nearer is flagged, and nothing is as low that is not.
+    assert not (np.diff(negative.astype(int), axis=1) > 0).any()
+    runs = np.lib.stride_tricks.sliding_window_view(value < -4.0 * error, 4, axis=1).all(axis=2)
+    assert not (runs & ~negative[:, 3:]).any()
+
+
+def test_noise_is_no_negative_backscatter():
+    assert not has(many(), ElasticQuality.NEGATIVE_BACKSCATTER).any()
+
+
 def test_an_opaque_cloud_leaves_no_reference():
     signal = light(distance, backscatter=cloud(2500.0, 2e-3, 100.0))
     retrieved = solved(counted(signal, 10))
@@ -628,7 +651,8 @@ def test_every_bit_of_the_product_occurs():
     )
     outlying = counted(light(distance))
     outlying["power"][:, 300] *= 2.0
-    bits |= np.bitwise_or.reduce(solved(outlying)["quality_flag"].to_numpy(), axis=None)
+    for data in (outlying, counted(truth() * not_full(), 20)):
+        bits |= np.bitwise_or.reduce(solved(data)["quality_flag"].to_numpy(), axis=None)
     assert FLAGS.raised(int(bits)) == FLAGS.bits
 
 
