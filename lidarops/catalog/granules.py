@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+import re
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -21,6 +22,9 @@ _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 
+_NUMBER: Final = re.compile(r"-?\d+(\.\d+)?(e[-+]?\d+)?")
+_MOST_VALUES: Final = 3
+"""Notes that differ by a number only, as of the angles of a scan, of which each is reported."""
 MOST_NOTES: Final = 100
 """Different notes on files that are reported; others are counted."""
 
@@ -280,7 +284,8 @@ class Granules(Database):
                 for stored, contradicts in ((notes, False), (contradictions, True)):
                     for text in _sentences(stored) if instrument in instruments else ():
                         files[contradicts, instrument, text] += count
-        ordered = sorted(files.items(), key=lambda item: (not item[0][0], -item[1], item[0]))
+        by_wording = _by_wording(files).items()
+        ordered = sorted(by_wording, key=lambda item: (not item[0][0], -item[1], item[0]))
         notes = [
             FileNote(instrument, text, contradicts, count)
             for (contradicts, instrument, text), count in ordered
@@ -319,6 +324,22 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
         ChannelLayout(**{**channel, "mode": DetectionMode(channel["mode"])})
         for channel in json.loads(text)
     )
+
+
+def _by_wording(files: Counter[tuple[bool, str, str]]) -> Counter[tuple[bool, str, str]]:
+    """Return counts of notes, with one note for many that differ by numbers only."""
+    groups: dict[tuple[bool, str, str], list[tuple[int, str]]] = defaultdict(list)
+    for (contradicts, instrument, text), count in files.items():
+        groups[contradicts, instrument, _NUMBER.sub("#", text)].append((count, text))
+    found: Counter[tuple[bool, str, str]] = Counter()
+    for (contradicts, instrument, _), notes in groups.items():
+        if len(notes) > _MOST_VALUES:
+            text = f"{max(notes)[1]}; {len(notes) - 1} other values in other files"
+            found[contradicts, instrument, text] = sum(count for count, _ in notes)
+            continue
+        for count, text in notes:
+            found[contradicts, instrument, text] = count
+    return found
 
 
 def _sentences(stored: str) -> tuple[str, ...]:

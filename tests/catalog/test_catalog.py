@@ -237,6 +237,19 @@ def test_notes_of_files_are_listed_with_contradictions_first_then_by_their_numbe
     ]
 
 
+def test_notes_that_differ_by_numbers_only_become_one(store: Store) -> None:
+    def note(angle: float) -> str:
+        return f"zenith_angle 0 degree of the campaign overrides {angle:g} of the header"
+
+    scan = [factories.granule(number, notes=(note(number - 2.5),)) for number in range(40)]
+    few = [factories.granule(40 + number, notes=(f"{number} shots",)) for number in range(2)]
+    store.replace([row_of(granule, store.campaign, "key") for granule in (*scan, *few)])
+    notes = store.file_notes({scan[0].instrument})
+    assert [note.files for note in notes] == [40, 1, 1]
+    assert notes[0].text.startswith("zenith_angle 0 degree of the campaign overrides")
+    assert notes[0].text.endswith("39 other values in other files")
+
+
 def test_campaigns_share_a_database(campaign: Campaign, store: Store) -> None:
     store.replace([row_of(factories.granule(0), store.campaign, "key")])
     other = Store(campaign.catalog_url, "other")
