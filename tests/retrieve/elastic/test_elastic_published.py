@@ -217,3 +217,20 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
     # At 1064 nm air is too faint for a reference in one file.
     if channel != "1064":
         assert used[:, compared].mean() > 0.95
+        mean, error = mean_of_files(result.isel(range=compared))
+        score = np.abs(mean - true[compared]) / error
+        # All windows hold some aerosol: the error of the reference is common to the files.
+        assert np.mean(score > 2.0) < 0.05
+        assert np.sqrt(np.mean(score**2)) < 1.1
+
+
+def mean_of_files(result):
+    """Return mean backscatter and its error; random errors decrease with the number of files."""
+    errors = {
+        source: np.abs(result[f"backscatter_error_{source}"].values)
+        for source in ("noise", "background", "reference", "lidar_ratio", "molecular")
+    }
+    random = sum(np.nansum(errors.pop(source) ** 2, axis=0) for source in ("noise", "background"))
+    files = np.isfinite(result["backscatter"].values).sum(axis=0)
+    shared = sum(np.nanmean(error, axis=0) ** 2 for error in errors.values())
+    return np.nanmean(result["backscatter"].values, axis=0), np.sqrt(random / files**2 + shared)
