@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
 
 from lidarops.kinds import kinds
 
@@ -23,6 +23,15 @@ class DetectionMode(StrEnum):
 
     ANALOG = "analog"
     PHOTON = "photon"
+
+
+GLUED: Final = "glued_"
+"""Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
+
+
+def is_glued(channel: str) -> bool:
+    """Return whether a channel is glued from two of the files."""
+    return channel.startswith(GLUED)
 
 
 class Role(StrEnum):

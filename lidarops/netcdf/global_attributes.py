@@ -13,7 +13,7 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_date, product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import DetectionMode
+from lidarops.records import DetectionMode, is_glued
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def _description(context: Context, layout: Layout, date: datetime, origin: str) 
     wavelength = _wavelength(context)
     summary = (
         f"{layout.summary} Channel {context.channel} ({wavelength},"
-        f" {_DETECTION[context.mode]}) of {context.instrument_name} at {station}."
+        f" {_detection(context)}) of {context.instrument_name} at {station}."
     )
     dates = (
         f"Dates of creation and modification are {origin}, so that equal inputs give equal files."
@@ -75,6 +75,8 @@ def _description(context: Context, layout: Layout, date: datetime, origin: str) 
         "source": f"surface observation: {context.raw_format} raw files of the lidar"
         f" {context.instrument_name}",
         "processing_level": layout.processing_level,
+        # As the templates of NCEI name time series of profiles at stations.
+        "cdm_data_type": "Station",
         "product_version": f"{__version__}+{context.provenance.code_version}",
         "history": _history(context, date),
         "references": "\n".join(text for text in references if text) or "Not stated.",
@@ -86,6 +88,12 @@ def _description(context: Context, layout: Layout, date: datetime, origin: str) 
 
 
 _DETECTION = {DetectionMode.ANALOG: "analog detection", DetectionMode.PHOTON: "photon counting"}
+
+
+def _detection(context: Context) -> str:
+    if is_glued(context.channel):
+        return "analog detection glued to photon counting"
+    return _DETECTION[context.mode]
 
 
 def _sentences(*texts: str) -> str:

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.records import ChannelLayout, Holding, IdleFacts, LeftOut, Unmet
-from lidarops.steps.channels import LAG_STEP, READ_STEP, glued_parts, is_glued, joined_layout
+from lidarops.records import ChannelLayout, Holding, IdleFacts, LeftOut, Unmet, is_glued
+from lidarops.steps.channels import LAG_STEP, READ_STEP, glued_parts, joined_layout
 
 FACTS: Final = "facts"
 _ABSENT: Final = "channel_present"

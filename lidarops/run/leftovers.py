@@ -12,9 +12,8 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RecordedProduct
 from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.process.scene import nothing_to_do
-from lidarops.records import Granule, InputRecord, LeftOut, Plan, Scene
+from lidarops.records import GLUED, Granule, InputRecord, LeftOut, Plan, Scene
 from lidarops.steps import dependence
-from lidarops.steps.channels import GLUED
 
 Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""

@@ -10,19 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
-from lidarops.records import ChannelLayout, PlannedStep
-
-GLUED: Final = "glued_"
-"""Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
+from lidarops.records import GLUED, ChannelLayout, PlannedStep, is_glued
 
 READ_STEP: Final = "read"
 LAG_STEP: Final = "lag"
 """Names of steps, for commands that need no plan and should not load the steps."""
-
-
-def is_glued(channel: str) -> bool:
-    """Return whether a channel is glued from two of the files."""
-    return channel.startswith(GLUED)
 
 
 def glued_parts(glued: str) -> tuple[str, str]:

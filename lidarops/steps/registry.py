@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import kind_of
-from lidarops.records import LeftOut, PlannedStep
+from lidarops.records import LeftOut, PlannedStep, is_glued
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import glued_parts, is_glued
+from lidarops.steps.channels import glued_parts
 from lidarops.steps.conditioning import Dark, DeadTime, Noise, Overlap, RangeOffset
 from lidarops.steps.data import Data
 from lidarops.steps.gluing import Glue, Lag

@@ -267,6 +267,15 @@ def test_history_has_one_line_for_each_step_of_the_channel():
     assert "wrote the elastic product" in last
 
 
+def test_the_summary_states_the_detection():
+    for channel, words in (
+        ("photon_532o", "photon counting) of"),
+        ("glued_532o", "analog detection glued to photon counting) of"),
+    ):
+        attrs = build_product(MAKERS["signal"](), context("signal", channel=channel)).attrs
+        assert words in attrs["summary"]
+
+
 def test_empty_metadata_have_defaults():
     bare = Metadata(publisher_name="", references="", acknowledgement="", license="")
     attrs = build_product(homogeneous(), context(metadata=bare)).attrs

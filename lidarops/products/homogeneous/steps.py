@@ -20,7 +20,7 @@ from lidarops.products.homogeneous.look import (
     omitted_sections,
 )
 from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
-from lidarops.records import DetectionMode, LeftOut, PlannedStep
+from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
@@ -28,7 +28,6 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit
 from lidarops.settings import SettingsModel, VisibilitySettings, quantity
 from lidarops.steps.case import ProductCase
-from lidarops.steps.channels import is_glued
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
 from lidarops.steps.preparation import FEWEST_BINS, tail

@@ -22,7 +22,7 @@ from lidarops.products.visibility.network import (
     crossings,
 )
 from lidarops.products.visibility.settings import PriorName, VisibilityProductSettings
-from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene
+from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene, is_glued
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.left_signal import window_before
 from lidarops.retrieve.network import geometry, labeled
@@ -31,7 +31,7 @@ from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled_averaging import joined
 from lidarops.settings import VisibilitySettings
 from lidarops.steps.case import ChannelCase, ProductCase
-from lidarops.steps.channels import file_channels, is_glued, member_channel
+from lidarops.steps.channels import file_channels, member_channel
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Averages, Chunk, Data, Indices
 from lidarops.steps.network import Decided, Member, NetworkProductStep, NetworkStream

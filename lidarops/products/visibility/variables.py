@@ -112,8 +112,8 @@ LAYOUT: Final = Layout(
     ),
     processing_level="L2: retrieved quantities",
     references=(
-        "Drabenko, V. A. et al. (2021): Multi-position sensing of visibility.",
-        "Yegorov, A. D. et al. (2008): Multi-position lidar sounding of the atmosphere.",
+        "Drabenko, Vad. A. et al. (2021), doi:10.54092/25421085_2021_10_60.",
+        "Yegorov, A. D. et al. (2008), Int. J. Remote Sensing 29, 2449-2468.",
         "Koschmieder, H. (1924), Beitr. Phys. freien Atmos. 12, 33-53.",
     ),
     comment="Model: along a beam, a = (P r^2 / overlap)^m is proportional to extinction times"
