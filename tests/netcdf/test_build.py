@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
 
@@ -272,7 +273,10 @@ def test_the_summary_states_the_detection():
         ("photon_532o", "photon counting) of"),
         ("glued_532o", "analog detection glued to photon counting) of"),
     ):
-        attrs = build_product(MAKERS["signal"](), context("signal", channel=channel)).attrs
+        about = context("elastic")
+        of_channel = replace(about.provenance, channel=channel)
+        about = replace(about, channel=channel, provenance=of_channel)
+        attrs = build_product(MAKERS["elastic"](), about).attrs
         assert words in attrs["summary"]
 
 
