@@ -43,6 +43,7 @@ OWN = {
         "no_reference": 18,
         "unstable_inversion": 19,
         "negative_backscatter": 20,
+        "unknown_overlap": 21,
     },
     "raman": {"no_reference": 17, "weak_signal": 18, "no_lidar_ratio": 19},
     "multiangle": {
@@ -68,7 +69,7 @@ bit: that needs a new version of the layout."""
 VERSION = {
     "signal": 2,
     "homogeneous": 2,
-    "elastic": 3,
+    "elastic": 4,
     "raman": 1,
     "multiangle": 3,
     "visibility": 2,
@@ -80,7 +81,7 @@ LEFT = {
     "shared": 4,
     "signal": 14,
     "homogeneous": 10,
-    "elastic": 10,
+    "elastic": 9,
     "raman": 11,
     "multiangle": 3,
     "visibility": 10,
@@ -116,6 +117,8 @@ SCENES = {
     "test_an_inversion_away_from_the_reference_stops_where_it_is_unstable",
     "ElasticQuality.NEGATIVE_BACKSCATTER": "test_labeled_elastic::"
     "test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatter",
+    "ElasticQuality.UNKNOWN_OVERLAP": "test_labeled_elastic::"
+    "test_an_overlap_that_is_not_stated_is_no_cloud",
     "RamanQuality.NO_REFERENCE": "test_raman_retrieval::"
     "test_particles_everywhere_leave_no_reference",
     "RamanQuality.WEAK_SIGNAL": "test_raman_retrieval::"

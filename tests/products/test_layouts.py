@@ -103,6 +103,7 @@ def test_variables_without_standard_name():
             "molecular_extinction",
             "reference_bottom",
             "reference_top",
+            "reference_detection_limit",
             "cloud_base_range",
             "background",
             "background_standard_error",

@@ -242,6 +242,18 @@ LAYOUT: Final = Layout(
             comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
         ),
         Row(
+            name="reference_detection_limit",
+            dims=("time",),
+            dtype="f4",
+            units="1",
+            long_name="least ratio of backscatter of particles to that of molecules in the"
+            " reference window that other windows show with a probability of 0.95",
+            coverage=Coverage.AUXILIARY,
+            comment="Fewer particles may remain undetected: backscatter_error_reference includes"
+            " them. Missing where no window passed the tests, or none beside it is"
+            f" comparable. {NO_STANDARD_NAME}",
+        ),
+        Row(
             name="reference_rejections",
             dims=("time",),
             dtype="i4",

@@ -32,6 +32,9 @@ CURVATURE, SCATTER, COUNT, EXCLUDED_BINS = 4, 5, 6, 7
 RESPONSE: Final = 8
 FIELDS: Final = 9
 
+_PROBABLE: Final = 1.645
+"""Standard errors that 95 % of normal errors do not exceed."""
+
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -72,6 +75,9 @@ class ReferenceWindow:
     comparison_standard_error: Array
     """Error of the anchor's scale, and of the background in the difference of both; in the unit of
     the scale, 0 where the anchor itself is chosen."""
+    detection_limit: Array
+    """Scattering ratio minus 1 of particles in the window that the comparison with other windows
+    shows with a probability of 0.95. Infinite where no other window is comparable."""
     rejections: Codes
     """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
 
@@ -214,7 +220,8 @@ def choose_reference(
     level_error = np.broadcast_to(
         inputs.real_array(background_standard_error, "background_standard_error"), leading
     ).reshape(-1, 1)
-    index, comparison_error = _pick(statistics, rejections, level_error.astype(np.float64))
+    level_error = level_error.astype(np.float64)
+    index, comparison_error = _pick(statistics, rejections, level_error)
     chosen = index >= 0
     profile = np.arange(index.size)
 
@@ -228,6 +235,9 @@ def choose_reference(
         scale=of_chosen(statistics[profile, index, SCALE]),
         scale_standard_error=of_chosen(statistics[profile, index, SCALE_ERROR]),
         comparison_standard_error=of_chosen(comparison_error),
+        detection_limit=of_chosen(
+            _detection_limit(statistics, rejections, level_error, windows, index)
+        ),
         rejections=rejections.reshape(*leading, windows.shape[0]),
     )
 
@@ -323,6 +333,29 @@ def _pick(
     best = np.argmin(np.where(passed, error, np.inf), axis=-1)
     index = np.where(np.any(passed, axis=-1), best, -1).astype(np.int64)
     return index, comparison_error[np.arange(index.size), index]
+
+
+def _detection_limit(
+    statistics: Array,
+    rejections: Codes,
+    level_error: Array,
+    windows: Array,
+    index: npt.NDArray[np.int64],
+) -> Array:
+    """Return the detection limit of the chosen windows, by the best window beside each."""
+    bottom, top = windows[index, :1], windows[index, 1:]
+    beside = (windows[:, 1] <= bottom) | (windows[:, 0] >= top)
+    comparable = beside & ((rejections & ~np.int32(Rejection.LOW_SIGNAL)) == 0)
+    scale, error = statistics[..., SCALE], statistics[..., SCALE_ERROR]
+    by_level = level_error * statistics[..., RESPONSE]
+
+    def of_chosen(values: Array) -> Array:
+        return np.take_along_axis(values, index[:, np.newaxis], axis=-1)
+
+    difference = np.hypot(error, by_level - of_chosen(by_level))
+    difference = np.where(comparable, difference, np.inf).min(axis=-1)
+    total = np.hypot(of_chosen(error)[:, 0], difference)
+    return np.asarray((THRESHOLDS.most_deviation + _PROBABLE) * total / of_chosen(scale)[:, 0])
 
 
 @_compiled

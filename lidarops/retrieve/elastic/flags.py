@@ -37,3 +37,11 @@ class ElasticQuality(FlagBit):
             " start of the inversion: the signal is not as assumed (overlap, baseline, gluing)"
         ),
     )
+    UNKNOWN_OVERLAP = (
+        FIRST_OWN + 4,
+        Severity.CARE,
+        (
+            "the signal shows incomplete overlap nearer than here, where it was stated to be full"
+            " or not stated: it may be incomplete here too"
+        ),
+    )

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.ndimage import uniform_filter1d
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window as _reference
@@ -28,6 +29,7 @@ from lidarops.retrieve.signal.labeled import actual_noise, counts_per_power, dea
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
 RatioAt = Callable[[Array], tuple[Array, Array]]
 """Altitudes in m -> lidar ratio and its standard error, sr."""
 
@@ -81,7 +83,7 @@ class _Signal:
     power: Array
     background: Array
     background_standard_error: Array
-    uncertain: npt.NDArray[np.bool_]
+    uncertain: Mask
 
 
 def constant_ratio(ratio: float, standard_error: float) -> RatioAt:
@@ -153,7 +155,7 @@ def invert_elastic(
     ratio, ratio_error = lidar_ratio(station_altitude + climb * distance)
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
     means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
-    signal, clouds = _signal_and_clouds(means, known_shape=known_shape)
+    signal, clouds = _signal_and_clouds(means, reference, known_shape=known_shape)
     window = _window(signal, means, reference, clouds.mask)
     solution = _elastic.invert_elastic(
         signal.power,
@@ -191,6 +193,10 @@ def invert_elastic(
             "lidar_ratio_standard_error": ("range", ratio_error),
             "reference_bottom": ("time", window.bottom),
             "reference_top": ("time", window.top),
+            "reference_detection_limit": (
+                "time",
+                np.where(np.isinf(window.detection_limit), np.nan, window.detection_limit),
+            ),
             "reference_rejections": (
                 "time",
                 np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32),
@@ -254,6 +260,17 @@ class _Means:
         power = (self.raw - background[:, np.newaxis]) / self.overlap
         return np.where((self.quality & _WITHHELD) != 0, np.nan, power)
 
+    def ratio_to_air(self, power: Array) -> Array:
+        """Return the ratio of a signal to air in means over `Thresholds.overlap_length`."""
+        step = float(np.median(np.diff(self.distance)))
+        size = max(round(THRESHOLDS.overlap_length / step), 1)
+        means = (
+            uniform_filter1d(np.nan_to_num(values), size, axis=-1, mode="nearest")
+            for values in (power, np.where(np.isnan(power), 0.0, self.air.shape))
+        )
+        signal, air = means
+        return np.divide(signal, air, out=np.zeros_like(signal), where=air > 0.0)
+
     def find_clouds(self, power: Array) -> _layers.Layers:
         """Return the clouds of a signal without background."""
         return _layers.find_layers(
@@ -265,10 +282,18 @@ class _Means:
         )
 
 
-def _signal_and_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _layers.Layers]:
-    """Return signals without background, and their clouds."""
-    signal = _subtract_background(means, np.ones_like(means.raw, bool), known_shape=known_shape)
+def _signal_and_clouds(
+    means: _Means, reference: Reference, *, known_shape: bool
+) -> tuple[_Signal, _layers.Layers]:
+    """Return signals without background, and their clouds, with incomplete overlap flagged."""
+    everywhere = np.ones_like(means.raw, bool)
+    signal = _subtract_background(means, everywhere, known_shape=known_shape)
     clouds = means.find_clouds(signal.power)
+    partial = _overlap_bits(means, signal, clouds.mask, reference)
+    if partial.any():
+        means.quality = means.quality | partial
+        signal = _subtract_background(means, everywhere, known_shape=known_shape)
+        clouds = means.find_clouds(signal.power)
     if not known_shape or not clouds.cloudy.any():
         return signal, clouds
     # Only beyond the cloud does the signal have the shape of air: fit the background there.
@@ -284,9 +309,34 @@ def _signal_and_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _l
     return signal, means.find_clouds(signal.power)
 
 
-def _subtract_background(
-    means: _Means, usable: npt.NDArray[np.bool_], *, known_shape: bool
-) -> _Signal:
+def _overlap_bits(means: _Means, signal: _Signal, layers: Mask, reference: Reference) -> Flags:
+    """Return the bits of overlap where the signal rises to that of clean air.
+
+    A layer that begins before the search range of the window, and in which a window passes as clean
+    air, is no cloud. The overlap is incomplete up to the largest ratio to air, and may be so
+    farther away, where particles decrease.
+    """
+    near = layers & _begin_before(layers, means.distance < reference.lowest)
+    if not near.any():
+        return np.zeros(layers.shape, np.int32)
+    window = _window(signal, means, reference, layers & ~near)
+    bottom, top = (np.nan_to_num(edge)[:, np.newaxis] for edge in window.edges)
+    before = means.distance < bottom
+    has_rise = np.any(near & ~before & (means.distance <= top), axis=-1, keepdims=True)
+    ratio = np.where(before, means.ratio_to_air(signal.power), -np.inf)
+    partial = np.arange(means.distance.size) < ratio.argmax(axis=-1)[:, np.newaxis]
+    bits = np.where(partial, int(Quality.INCOMPLETE_OVERLAP), int(ElasticQuality.UNKNOWN_OVERLAP))
+    return np.where(before & has_rise, bits, 0).astype(np.int32)
+
+
+def _begin_before(mask: Mask, near: Mask) -> Mask:
+    """Return whether the last run of a mask that began up to a bin began near."""
+    begins = np.diff(mask.astype(np.int8), axis=-1, prepend=0) == 1
+    begin = np.maximum.accumulate(np.where(begins, np.arange(near.size), 0), axis=-1)
+    return np.asarray(near[begin])
+
+
+def _subtract_background(means: _Means, usable: Mask, *, known_shape: bool) -> _Signal:
     noise, r = means.noise * means.correlation_length[:, np.newaxis], means.distance
     # The mean of a bin that was saturated in some profiles is that of the others.
     raw = np.where((means.quality & np.int32(Quality.SATURATED)) != 0, np.nan, means.raw)
@@ -315,7 +365,7 @@ def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -
 
 
 def _window(
-    signal: _Signal, means: _Means, reference: Reference, clouds: npt.NDArray[np.bool_]
+    signal: _Signal, means: _Means, reference: Reference, clouds: Mask
 ) -> _reference.ReferenceWindow:
     highest = min(reference.highest, float(means.distance[-1]))
     width = min(reference.width, highest - reference.lowest)
@@ -355,7 +405,7 @@ def _solution_flags(
     return bits
 
 
-def _negative(solution: _elastic.ElasticResult) -> npt.NDArray[np.bool_]:
+def _negative(solution: _elastic.ElasticResult) -> Mask:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
     error: Array = solution.budget.total
     low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
@@ -369,9 +419,7 @@ def _negative(solution: _elastic.ElasticResult) -> npt.NDArray[np.bool_]:
     return negative
 
 
-def _with_beyond(
-    mask: npt.NDArray[np.bool_], distance: Array, window: _reference.ReferenceWindow
-) -> npt.NDArray[np.bool_]:
+def _with_beyond(mask: Mask, distance: Array, window: _reference.ReferenceWindow) -> Mask:
     """Return the bins of a mask, and those beyond one as seen from the reference window.
 
     The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol

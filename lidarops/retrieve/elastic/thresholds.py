@@ -45,6 +45,10 @@ class Thresholds:
     least_share_beyond: float = 0.1
     """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
 
+    # Overlap
+    overlap_length: float = 120.0
+    """m; in which the ratio to air is averaged where its largest value is sought. Assumed."""
+
     # Inversion
     longest_gap: float = 150.0
     """m; a longer gap without data ends the integration. Assumed."""

@@ -178,6 +178,24 @@ def test_a_noisy_window_shows_particles_in_less_noisy_ones():
     assert np.mean(same.bottom <= 5e3) > 0.9
 
 
+def test_particles_at_the_detection_limit_are_found_as_often_as_stated():
+    """Of two windows of equal noise, the nearer one holds particles."""
+    rng = np.random.default_rng(10)
+    windows, noise = np.array([[3e3, 4e3], [6e3, 7e3]]), 0.5 * SHAPE
+    settings = {"molecular_attenuated": SHAPE, "candidates": windows}
+    limit = choose_reference(SHAPE, RANGE, noise**2, **settings).detection_limit
+    alone = settings | {"candidates": windows[:1]}
+    assert choose_reference(SHAPE, RANGE, noise**2, **alone).detection_limit == np.inf
+    for share, least, most in ((1.0, 0.93, 0.97), (0.3, 0.0, 0.15)):
+        signal = SHAPE * (1.0 + np.where(RANGE < 5e3, share * float(limit), 0.0))
+        power = signal + noise * rng.standard_normal((2000, RANGE.size))
+        rejections = choose_reference(power, RANGE, noise**2, **settings).rejections[:, 0]
+        # Of the windows that pass the tests of shape.
+        tested = (rejections & ~np.int32(Rejection.MORE_PARTICLES)) == 0
+        found = np.mean(rejections[tested] == Rejection.MORE_PARTICLES)
+        assert least < found < most
+
+
 def test_profiles_are_independent_and_their_windows_fit_the_inversion():
     rng = np.random.default_rng(7)
     true = attenuated(layered(20, rng))

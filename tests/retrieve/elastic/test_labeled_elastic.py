@@ -454,8 +454,8 @@ def test_no_reference_window_holds_a_cloud():
 
 
 def not_full():
-    """Return an overlap that nothing corrects."""
-    return 1.0 - np.exp(-((distance / 800.0) ** 2))
+    """Return an overlap that nothing corrects, and that rises less than a cloud does."""
+    return 1.0 - 0.85 * np.exp(-((distance / 1500.0) ** 2))
 
 
 def test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatter():
@@ -465,11 +465,70 @@ def test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatt
     retrieved = retrieved.isel(time=calibrated)
     negative = has(retrieved, ElasticQuality.NEGATIVE_BACKSCATTER)
     value, error = (retrieved[f"backscatter{end}"].to_numpy() for end in ("", "_standard_error"))
-    assert negative[:, between(100.0, 350.0)].all()
+    assert negative[:, between(100.0, 500.0)].all()
     # Everything nearer is flagged, and nothing is as low that is not.
     assert not (np.diff(negative.astype(int), axis=1) > 0).any()
     runs = np.lib.stride_tricks.sliding_window_view(value < -4.0 * error, 4, axis=1).all(axis=2)
     assert not (runs & ~negative[:, 3:]).any()
+
+
+FULL = 1000.0
+OVERLAPS = {
+    "sine": np.sin(0.5 * np.pi * np.clip(distance / FULL, 0.0, 1.0)) ** 2,
+    "linear": np.clip(distance / FULL, 0.0, 1.0),
+    "late": np.clip((distance - 0.4 * FULL) / (0.6 * FULL), 0.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", OVERLAPS)
+def test_an_overlap_that_is_not_stated_is_no_cloud(name):
+    overlap = OVERLAPS[name]
+    retrieved = solved(counted(truth() * overlap, 10, exposure=30 * EXPOSURE))
+    assert not has(retrieved, ElasticQuality.CLOUD).any()
+    assert np.isnan(retrieved["cloud_base_range"]).all()
+    assert has(retrieved, Quality.INCOMPLETE_OVERLAP)[:, overlap < 0.98].all()
+    assert not has(retrieved, Quality.INCOMPLETE_OVERLAP)[:, distance > 1.1 * FULL].any()
+    # The signal cannot show where the overlap becomes full: nearer than the reference, no value
+    # is without a flag.
+    nearer = distance < float(retrieved["reference_bottom"].min())
+    assert has(retrieved, ElasticQuality.UNKNOWN_OVERLAP)[:, nearer & (distance > 1.1 * FULL)].all()
+    assert not (retrieved["quality_flag"].to_numpy()[:, nearer] == 0).any()
+    # Where it is full, values hold their errors.
+    score = (retrieved["backscatter"] - particles(STATION + distance)).to_numpy()
+    score /= np.hypot(
+        retrieved["backscatter_error_noise"], retrieved["backscatter_error_background"]
+    )
+    assert np.sqrt(np.mean(score[:, between(1.1 * FULL, 4500.0)] ** 2)) < 1.3
+
+
+def test_a_cloud_over_an_overlap_that_is_not_stated_is_found():
+    signal = light(distance, backscatter=cloud(8000.0 + STATION, 2e-5)) * OVERLAPS["late"]
+    window = Reference(5000.0, 7500.0, 1000.0, 1.0, 0.0)
+    retrieved = solved(counted(signal, 10, exposure=100 * EXPOSURE), reference=window)
+    base = retrieved["cloud_base_range"].to_numpy()
+    assert np.all((base > 7700.0) & (base < 8000.0))
+    assert not has(retrieved, ElasticQuality.CLOUD)[:, distance < 7700.0].any()
+
+
+def test_a_thick_cloud_across_the_search_range_is_no_overlap():
+    def thick(z):
+        return particles(z) + np.where((z > 4000.0) & (z < 6500.0), 8e-6, 0.0)
+
+    signal = light(distance, backscatter=thick, ratio=20.0)
+    retrieved = solved(counted(signal, 20, exposure=0.1 * EXPOSURE))
+    assert np.isfinite(retrieved["cloud_base_range"]).all()
+    assert not has(retrieved, ElasticQuality.UNKNOWN_OVERLAP).any()
+
+
+def test_a_cloud_at_the_end_of_a_profile_is_no_overlap():
+    """Air below it is clean; nothing beyond it shows its top."""
+    near = distance < 8100.0
+    signal = light(distance, backscatter=cloud(8000.0 + STATION, 2e-5, 200.0))[near]
+    data = counted(signal, 10, r=distance[near], exposure=100 * EXPOSURE)
+    retrieved = solved(data, reference=Reference(5000.0, 7300.0, 1000.0, 1.0, 0.0))
+    assert has(retrieved, ElasticQuality.CLOUD)[:, distance[near] > 7950.0].all()
+    assert not has(retrieved, ElasticQuality.UNKNOWN_OVERLAP).any()
+    assert not has(retrieved, Quality.INCOMPLETE_OVERLAP).any()
 
 
 def test_noise_is_no_negative_backscatter():
@@ -651,7 +710,8 @@ def test_every_bit_of_the_product_occurs():
     )
     outlying = counted(light(distance))
     outlying["power"][:, 300] *= 2.0
-    for data in (outlying, counted(truth() * not_full(), 20)):
+    overlapping = [counted(truth() * seen, 20) for seen in (not_full(), OVERLAPS["late"])]
+    for data in (outlying, *overlapping):
         bits |= np.bitwise_or.reduce(solved(data)["quality_flag"].to_numpy(), axis=None)
     assert FLAGS.raised(int(bits)) == FLAGS.bits
 

@@ -212,6 +212,7 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "lidar_ratio_standard_error": ("range", np.full(bins, 10.0)),
             "reference_bottom": ("time", window),
             "reference_top": ("time", window + 50.0),
+            "reference_detection_limit": ("time", np.where(np.isnan(window), np.nan, 0.1)),
             "reference_rejections": ("time", np.zeros(profiles, np.int32)),
             "cloud_base_range": ("time", np.where(np.arange(profiles) == 0, 40.0, np.nan)),
             "background": ("time", rng.uniform(0.1, 2.0, profiles)),
