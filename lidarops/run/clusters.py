@@ -9,12 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import dask.config
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from lidarops.campaign.yaml_errors import duplicate_keys
 from lidarops.errors import LidarOpsError
@@ -68,12 +78,42 @@ class Local(_Model):
     )
 
 
-class Scheduler(_Model):
+class _Reached(_Model):
+    """A scheduler that runs already."""
+
+    # Before the address, whose check reads it.
+    unencrypted: bool = Field(
+        default=False, description="whether tcp:// is admitted for a scheduler of another machine"
+    )
+    address: str
+    tls: Tls | None = Field(default=None, description="default: the settings of dask")
+
+    @field_validator("address")
+    @classmethod
+    def _refuse_plain_tcp(cls, address: str, others: ValidationInfo) -> str:
+        place = urlsplit(address)
+        plain = place.scheme == "tcp" and not _is_loopback(place.hostname)
+        if plain and not others.data.get("unencrypted", False):
+            raise ValueError(
+                f"{address} is another machine without encryption: whoever answers there gets the"
+                " scenes, and can run code here; in a network that you trust, set unencrypted: true"
+                " in a cluster file"
+            )
+        return address
+
+
+def _is_loopback(host: str | None) -> bool:
+    try:
+        return host == "localhost" or ip_address(host or "").is_loopback
+    except ValueError:
+        return False
+
+
+class Scheduler(_Reached):
     """A running dask scheduler with its own workers."""
 
     kind: Literal["scheduler"] = "scheduler"
     address: str = Field(pattern=r"^(tcp|tls)://[^/\s]+:\d+$")
-    tls: Tls | None = Field(default=None, description="default: the settings of dask")
     wait: Seconds = Field(default=60.0, description="s to wait for the first worker")
 
 
@@ -100,7 +140,7 @@ class Slurm(_Model):
     wait: Seconds = Field(default=3600.0, description="s to wait for the first worker in the queue")
 
 
-class Kubernetes(_Model):
+class Kubernetes(_Reached):
     """The scheduler and the workers of ``deploy/kubernetes``, scaled up for the time of the run."""
 
     kind: Literal["kubernetes"] = "kubernetes"
@@ -109,7 +149,6 @@ class Kubernetes(_Model):
     namespace: Name = "lidarops"
     deployment: Name = "lidarops-worker"
     api: str = Field(default="https://kubernetes.default.svc", pattern=r"^https?://[^/\s]+$")
-    tls: Tls | None = Field(default=None, description="default: the settings of dask")
     wait: Seconds = Field(
         default=600.0, description="s to wait for the first worker, e.g. while nodes start"
     )
@@ -206,7 +245,8 @@ def _validate(settings: dict[str, Any], file: str | None) -> Cluster:
         return _ADAPTER.validate_python(settings)
     except ValidationError as error:
         problems = [
-            f"{'.'.join(str(key) for key in problem['loc'][1:]) or 'kind'}: {problem['msg']}"
+            f"{'.'.join(str(key) for key in problem['loc'][1:]) or 'kind'}:"
+            f" {problem['msg'].removeprefix('Value error, ')}"
             for problem in error.errors(include_url=False)
         ]
         in_address = any("address" in problem["loc"] for problem in error.errors())

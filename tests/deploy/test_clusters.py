@@ -71,6 +71,10 @@ def test_a_wrong_description_is_reported_with_file_and_field(
         ({"scheduler": "tcp://head:8786", "workers": 2}, "has its own workers"),
         ({"cluster": "no-such.yaml"}, "cannot be read"),
         ({"scheduler": "nowhere"}, "such as tls://head:8786"),
+        ({"scheduler": "tcp://head:8786"}, "without encryption.*unencrypted: true"),
+        ({"scheduler": "tcp://192.0.2.7:8786"}, "without encryption"),
+        ({"scheduler": "tcp://127.0.0.1.example.org:8786"}, "without encryption"),
+        ({"scheduler": "tcp://[2001:db8::1]:8786"}, "without encryption"),
         ({"scheduler": "tls://head:8786", "memory": "2GiB"}, "memory_limit: .*of this machine"),
         ({"cluster": "slurm", "memory": "2GiB"}, "memory_limit: .*of this machine"),
     ],
@@ -79,6 +83,19 @@ def test_a_contradictory_choice_is_wrong_use(choice: dict[str, Any], message: st
     with pytest.raises(clusters.ClusterError, match=message) as caught:
         clusters.choose_cluster(**choice)
     assert caught.value.wrong_use
+
+
+def test_a_scheduler_without_encryption_is_used_on_this_machine_or_by_name(tmp_path: Path) -> None:
+    for host in ("127.0.0.1", "localhost", "[::1]"):
+        assert clusters.choose_cluster(scheduler=f"tcp://{host}:8786").kind == "scheduler"
+    described = tmp_path / "cluster.yaml"
+    for kind in ("scheduler", "kubernetes"):
+        text = f'kind: {kind}\naddress: "tcp://head:8786"\n'
+        described.write_text(text)
+        with pytest.raises(clusters.ClusterError, match=r"address: .*without encryption"):
+            clusters.choose_cluster(cluster=str(described))
+        described.write_text(f"{text}unencrypted: true\n")
+        assert clusters.choose_cluster(cluster=str(described)).kind == kind
 
 
 def test_a_memory_limit_applies_to_local_workers(tmp_path: Path) -> None:

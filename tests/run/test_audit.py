@@ -127,7 +127,8 @@ def test_commands_that_read_the_ledger_create_none(command: str, archive: Archiv
         (["--cluster", "luck"], 2, "kubernetes"),
         (["--scheduler", "luck"], 2, "tls://head:8786"),
         (["--cluster", "slurm", "--memory-limit", "2GiB"], 2, "memory_limit"),
-        (["--scheduler", "tcp://head:8786", "--memory-limit", "2GiB"], 2, "memory_limit"),
+        (["--scheduler", "tls://head:8786", "--memory-limit", "2GiB"], 2, "memory_limit"),
+        (["--scheduler", "tcp://head:8786"], 2, "unencrypted: true"),
     ],
 )
 def test_wrong_use_names_the_choices(
