@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import logging
 import re
 import secrets
 import sys
@@ -30,6 +31,9 @@ _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
+_NAMES_SHOWN: Final = 3
+
+_LOG = logging.getLogger(__name__)
 
 # Exceptions of drivers besides OSError and EOFError; only loaded drivers can raise them.
 _DRIVER_ERRORS: Final = (
@@ -121,6 +125,9 @@ class RemoteStore:
     def files(self) -> Iterator[Stored]:
         """List all objects below the URL, sorted by path.
 
+        Names that lead out of the URL are listed too, and a warning tells of them. None of them can
+        be read.
+
         Raises
         ------
         CatalogError
@@ -136,6 +143,15 @@ class RemoteStore:
                 for name, info in listing.items()
                 if info.get("size") is None and is_confined(self._path(name))
             }
+        outside = sorted(path for path in map(self._path, listing) if not is_confined(path))
+        if outside:
+            named = ", ".join(map(repr, outside[:_NAMES_SHOWN]))
+            _LOG.warning(
+                "%s lists %d names that lead out of it, which are not read, such as %s",
+                self.url,
+                len(outside),
+                named,
+            )
         for name in sorted(listing):
             info = listing[name]
             yield Stored(self._path(name), int(info["size"] or 0), _stamp(info))

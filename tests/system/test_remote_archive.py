@@ -7,6 +7,7 @@ import http.server
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support import factories
@@ -100,33 +101,90 @@ def test_a_denied_file_is_refused_but_a_lost_connection_ends_the_scan(
 
 ESCAPES = ["../../x", "%2e%2e/x", "coast/../../x", "..%5Cx", "coast//x"]
 """Links of an index that lead out of its folder, or to a file of another name in it."""
+ELSEWHERE = ["/x", "//elsewhere.example/x", "http://elsewhere.example/x"]
+"""Paths of a root, and links to another host."""
+
+
+def _campaign_of_everything(campaign: Campaign, archive: str) -> Campaign:
+    ((name, instrument),) = campaign.instruments.items()
+    everything = instrument.model_copy(update={"files": ["*", "**/*"]})
+    return campaign.model_copy(update={"archive": archive, "instruments": {name: everything}})
 
 
 def test_a_link_that_leads_out_of_the_archive_is_refused(
-    campaign: Campaign, tmp_path: Path
+    campaign: Campaign, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     index = tmp_path / "raw" / "index.html"
-    index.write_text("".join(f'<a href="{link}">x</a>' for link in [*ESCAPES, "coast/h0"]))
-    ((name, instrument),) = campaign.instruments.items()
-    everything = instrument.model_copy(update={"files": ["*", "**/*"]})
-    campaign = campaign.model_copy(update={"instruments": {name: everything}})
+    links = [*ESCAPES, *ELSEWHERE, "coast/h0"]
+    index.write_text("".join(f'<a href="{link}">x</a>' for link in links))
+    everything = _campaign_of_everything(campaign, campaign.archive)
     with Store(campaign.catalog_url, campaign.name) as store:
-        scan_archive(campaign, store)
+        scan_archive(everything, store)
         granules = {granule.path: granule for granule in store.granules()}
-    # The driver lists links that resolve to one address once, under any of their names.
+    # The driver lists links that resolve to one address once, under any of their names, and links
+    # to other folders and hosts not at all.
     assert len(granules) > 1
     assert granules.pop("coast/h0").status is Status.GOOD
     for granule in granules.values():
         assert granule.status is Status.REFUSED
         assert "leads out of the archive" in granule.reason
+    assert f"lists {len(granules)} names that lead out of it" in caplog.text
 
 
-@pytest.mark.parametrize("path", [*ESCAPES, "/x"])
-def test_nothing_is_copied_outside_the_folder(
-    campaign: Campaign, tmp_path: Path, path: str
-) -> None:
+@pytest.fixture(params=["http", "s3", "memory", "file"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> RemoteStore:
+    """A store of each kind with the raw file ``coast/h0``."""
+    if request.param == "http":
+        return RemoteStore(request.getfixturevalue("campaign").archive)
+    urls = {"memory": f"memory://{tmp_path.name}", "file": f"file://{tmp_path}/store"}
+    if request.param == "s3":
+        urls["s3"] = f"{request.getfixturevalue('s3')}/{tmp_path.name}"
+    filled = RemoteStore(urls[request.param])
+    filled._fs.makedirs(filled._name("coast"), exist_ok=True)
+    filled._fs.pipe_file(filled._name("coast/h0"), raw_archives.content(0))
+    return filled
+
+
+@pytest.mark.parametrize("path", [*ESCAPES, *ELSEWHERE])
+def test_no_name_of_a_store_leads_out_of_it(store: RemoteStore, tmp_path: Path, path: str) -> None:
     folder = tmp_path / "one" / "two"
     with pytest.raises(OSError, match="leads out"):
-        RemoteStore(campaign.archive).fetch(["coast/h0", path], folder)
+        store.fetch(["coast/h0", path], folder)
     assert not folder.exists()
     assert not list(tmp_path.rglob("x"))
+    with pytest.raises(OSError, match="leads out"):
+        store.head(path, 9)
+    with pytest.raises(OSError, match="leads out"):
+        store.digest(path)
+
+
+def test_names_of_a_listing_that_lead_out_of_the_store_are_reported(
+    store: RemoteStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    find = RemoteStore._find
+
+    def hostile(store: RemoteStore) -> dict[str, Any]:
+        info = {"size": 9, "mtime": 0.0}
+        return find(store) | {store._name(path): info for path in [*ESCAPES, *ELSEWHERE]}
+
+    monkeypatch.setattr(RemoteStore, "_find", hostile)
+    campaign = factories.campaign().model_copy(update={"output": str(tmp_path / "out")})
+    for patterns in (["coast/*"], ["**/*"]):
+        ((name, instrument),) = campaign.instruments.items()
+        claims = instrument.model_copy(update={"files": patterns})
+        scanned = campaign.model_copy(
+            update={"archive": store.url, "instruments": {name: claims}, "name": "c"}
+        )
+        caplog.clear()
+        with Store(campaign.catalog_url, "c") as catalog:
+            scan_archive(scanned, catalog)
+            granules = {granule.path: granule for granule in catalog.granules()}
+        # Whether or not an instrument claims them.
+        assert f"lists {len(ESCAPES) + len(ELSEWHERE)} names that lead out of it" in caplog.text
+        assert granules["coast/h0"].status is Status.GOOD
+    refused = [granule for granule in granules.values() if granule.status is Status.REFUSED]
+    assert len(refused) == len(ESCAPES) + len(ELSEWHERE)
+    assert all("leads out" in granule.reason for granule in refused)
