@@ -383,6 +383,16 @@ class Ledger(Granules):
         with self.stream(query) as rows:
             yield (_made_from(row) for row in rows)
 
+    def made_by_any_campaign(self, paths: Collection[str]) -> set[str]:
+        """Return those of some paths that are products of any campaign of the database."""
+        made: set[str] = set()
+        ordered = sorted(paths)
+        with self.transaction() as connection:
+            for first in range(0, len(ordered), BATCH):
+                batch = ordered[first : first + BATCH]
+                made.update(connection.scalars(sa.select(_P.path).where(_P.path.in_(batch))))
+        return made
+
     def scenes_with_product(
         self, owner: str, kind: str, channel: str, *, without: Collection[str]
     ) -> Iterator[str]:

@@ -1,16 +1,22 @@
-"""Compare products and inputs with the digests that the ledger recorded."""
+"""Compare products and inputs with the digests that the ledger recorded, and find others."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog.lock import Lock
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.records import Role
 from lidarops.system.files import sha256_of
+
+_UNLISTED: Final = (
+    "is not in the ledger: a run makes it again if it is requested; else move it away"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +24,7 @@ class CheckedFile:
     """A file that was read and compared with the ledger."""
 
     what: str
-    """``product``, ``superseded`` or the role of an input."""
+    """``product``, ``superseded``, ``unlisted`` or the role of an input."""
     path: str
     problem: str
     """Empty if it is as recorded."""
@@ -29,6 +35,9 @@ def verify_archive(
 ) -> Iterator[CheckedFile]:
     """Read every product and input, and yield them, with the problem of those that differ.
 
+    Product files that the ledger does not know are yielded too, unless a run is active, which may
+    yet enter them.
+
     Parameters
     ----------
     campaign : Campaign
@@ -36,16 +45,34 @@ def verify_archive(
     inputs : bool
         Whether to read also the inputs: raw, dark, molecular and overlap files.
     """
+    # Listed first: what a run writes from now on may be in the ledger only later.
+    unlisted = _product_files(campaign.products_root)
     read = _digests_below(campaign.products_root)
     with store.all_products() as rows:
         for made in rows:
+            unlisted.discard(made.path)
             yield CheckedFile("product", made.path, _problem(read, made.path, made.sha256))
+    yield from _check_unlisted(store, unlisted)
     read = _digests_below(Path(campaign.output))
     for old in store.superseded():
         if old.kept:
             yield CheckedFile("superseded", old.kept, _problem(read, old.kept, old.sha256))
     if inputs:
         yield from _check_inputs(campaign, store)
+
+
+def _product_files(root: Path) -> set[str]:
+    """Return the product files below a folder, without hidden ones, which writing leaves."""
+    paths = (path.relative_to(root).as_posix() for path in root.rglob("*.nc"))
+    return {path for path in paths if not path.rpartition("/")[2].startswith(".")}
+
+
+def _check_unlisted(store: Store, unlisted: set[str]) -> Iterator[CheckedFile]:
+    """Yield files that no campaign of the database has made."""
+    holder = Lock(store).holder()
+    if unlisted and (holder is None or holder.dead):
+        for path in sorted(unlisted - store.made_by_any_campaign(unlisted)):
+            yield CheckedFile("unlisted", path, _UNLISTED)
 
 
 def _check_inputs(campaign: Campaign, store: Store) -> Iterator[CheckedFile]:

@@ -50,6 +50,31 @@ def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> No
     assert _mismatches(archive) == changed | {("signal", "poor/h11")}
 
 
+def test_verify_names_products_that_the_ledger_does_not_know(archive: Archive) -> None:
+    """Such as those of a run that could not enter them."""
+    products = archive.folder / "out/products"
+    product = next(products.rglob("*.nc"))
+    shutil.copy(product, product.with_name("stray.nc"))
+    # What a killed process leaves is swept by the next run.
+    shutil.copy(product, product.with_name(".stray.nc.1.tmp.nc"))
+    stray = str(product.with_name("stray.nc").relative_to(products))
+    assert _mismatches(archive) == {("unlisted", stray)}
+    campaign = archive.write()
+    with Store(campaign.catalog_url, "other") as store, Lock(store) as lock:
+        lock.acquire()
+        assert _mismatches(archive) == {("unlisted", stray)}
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        # The run that holds the lock may yet enter it.
+        assert _mismatches(archive) == set()
+    # Another campaign of the same folder and database knows its own products.
+    archive.tree["name"] = "other"
+    archive.tree["instruments"]["rich"]["products"] = {}
+    archive.tree["instruments"]["poor"]["products"] = {}
+    other = {path for what, path in _mismatches(archive) if what == "unlisted"}
+    assert other == {stray}
+
+
 def test_the_command_line_shows_runs_and_mismatches(archive: Archive) -> None:
     runner, file = CliRunner(), str(archive.file)
     summary = runner.invoke(app, ["runs", file, "--json"])
