@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps
 
-.PHONY: demo test test-deployment lint bench golden lock clean
+.PHONY: demo test test-deployment lint bench docs golden lock clean
 
 # The demo's archive holds damaged files on purpose, for which the flow exits with 1.
 demo: .venv/.runtime
@@ -31,6 +31,10 @@ golden: .venv/.dev
 	$(BIN)/python docs/api_page.py
 	$(BIN)/python docs/architecture_picture.py
 
+# The documentation: docs/_build/html/index.html. Notebooks run again when code has changed.
+docs: .venv/.dev
+	$(BIN)/python -m sphinx --fail-on-warning --quiet -b html docs docs/_build/html
+
 # Error against run time of every retrieval, one page: bench/index.html.
 bench: .venv/.runtime
 	$(BIN)/lidarops bench accuracy --out bench
@@ -57,4 +61,4 @@ lock:
 		-o deploy/requirements.lock
 
 clean:
-	rm -rf .venv bench demo build *.egg-info
+	rm -rf .venv bench demo build docs/_build *.egg-info

@@ -1,0 +1,81 @@
+"""Settings of the documentation: ``make docs``."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+REPOSITORY = HERE.parent
+sys.path[:0] = [str(HERE / "_extensions"), str(REPOSITORY / "tests")]
+
+
+def _code_digest() -> str:
+    """Return a digest of all code, so that no notebook shows results of other code."""
+    digest = hashlib.sha256()
+    for path in sorted((REPOSITORY / "lidarops").rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+project = "lidarops"
+author = "The lidarops developers"
+project_copyright = author
+release = version = version_of("lidarops")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "mathml",
+]
+exclude_patterns = ["_build", "_extensions"]
+# Docstrings write code in single backticks.
+default_role = "code"
+nitpicky = False
+
+myst_enable_extensions = ["amsmath", "dollarmath", "colon_fence", "deflist"]
+myst_heading_anchors = 4
+myst_links_external_new_tab = False
+
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(HERE / "_build" / "notebooks" / _code_digest())
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+nb_execution_show_tb = True
+nb_merge_streams = True
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+
+html_theme = "pydata_sphinx_theme"
+html_title = "lidarops"
+html_math_renderer = "mathml"
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "navbar_end": ["theme-switcher"],
+    "secondary_sidebar_items": ["page-toc"],
+    "show_prev_next": False,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+
+
+def _link_to_page(_: object, __: str, source: list[str]) -> None:
+    """Let links to CONTRIBUTING.md, which lies above the pages, lead to the page of its text."""
+    source[0] = re.sub(r"\]\((\.\./)+CONTRIBUTING\.md", "](/contributing.md", source[0])
+
+
+def setup(app: Sphinx) -> None:
+    """Connect what no setting says."""
+    app.connect("source-read", _link_to_page)
