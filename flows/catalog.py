@@ -13,7 +13,7 @@ from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
 from flows.reprocess import Seconds, Workers
-from flows.usage import plain_errors
+from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
@@ -25,11 +25,11 @@ from lidarops.run.archive import update_catalog
 @flow(name="lidarops-catalog")
 def catalog(
     campaign: str,
-    archive: str | None = None,
+    archive: Location | None = None,
     out: str | None = None,
     wait: Seconds = 0.0,
     workers: Workers = 1,
-    catalog: str | None = None,
+    catalog: CatalogUrl | None = None,
 ) -> ScanSummary:
     """Scan the archive of a campaign, and publish a table of refused files as an artifact.
 
@@ -75,11 +75,12 @@ def main(
     """Update the catalog of a campaign as a Prefect flow."""
     # Check before the flow, which would start a server first and show tracebacks.
     with plain_errors():
-        catalog.validate_parameters({"campaign": campaign, "wait": wait})
+        stored_url = catalog_parameter(url)
+        catalog.validate_parameters({"campaign": campaign, "archive": archive, "wait": wait})
         settings = load_campaign(campaign, archive=archive, output=out, catalog=url)
         selection.check_archive_and_catalog(settings, archive=archive)
     with plain_errors():
-        summary = catalog(campaign, archive, out, wait, catalog=url)
+        summary = catalog(campaign, archive, out, wait, catalog=stored_url)
     raise typer.Exit(1 if summary.refused else 0)
 
 

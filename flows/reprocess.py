@@ -39,7 +39,7 @@ from prefect.utilities.annotations import quote
 from pydantic import AfterValidator, Field
 
 from flows import WITH_FAILURES
-from flows.usage import plain_errors
+from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
@@ -197,7 +197,7 @@ def _run_name() -> str:
 @flow(name="lidarops-reprocess", flow_run_name=_run_name)
 def reprocess(
     campaign: str,
-    archive: str | None = None,
+    archive: Location | None = None,
     out: str | None = None,
     workers: Workers | None = None,
     instruments: list[str] | None = None,
@@ -206,8 +206,8 @@ def reprocess(
     scheduler: str | None = None,
     cluster: str | None = None,
     wait: Seconds = 0.0,
-    publish: str | None = None,
-    catalog: str | None = None,
+    publish: Location | None = None,
+    catalog: CatalogUrl | None = None,
     stations: list[str] | None = None,
     products: list[KindName] | None = None,
     memory_limit: clusters.Memory | None = None,
@@ -398,7 +398,7 @@ def main(
         "campaign": campaign,
         "archive": archive,
         "out": out,
-        "catalog": catalog,
+        "catalog": catalog_parameter(catalog),
         "instruments": instrument,
         "stations": station,
         "products": product,

@@ -1,14 +1,24 @@
-"""Show errors of flows that are called from a command line."""
+"""What flows do with command lines and parameters: show errors, keep secrets from the server."""
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Annotated, Final
 
 import typer
 from prefect.exceptions import ParameterTypeError
+from pydantic import AfterValidator, Field
 
-from lidarops.errors import LidarOpsError
+from lidarops.campaign.model import CATALOG_VARIABLE
+from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.system.stores import is_url, refuse_keys
+
+_PASSWORD: Final = re.compile(r"://[^/:\s]*:\S*@")
+_NO_PASSWORD: Final = {"pattern": r"^(?!.*://[^/:]*:.*@)"}
+"""The server refuses other parameters before it stores them."""
 
 _WRONG_USE = 2
 _REFUSED = 1
@@ -23,3 +33,36 @@ def plain_errors() -> Iterator[None]:
         typer.echo(f"error: {error}", err=True)
         wrong_use = not isinstance(error, LidarOpsError) or error.wrong_use
         raise typer.Exit(_WRONG_USE if wrong_use else _REFUSED) from error
+
+
+def _without_keys(location: str) -> str:
+    if is_url(location):
+        refuse_keys(location)
+    return location
+
+
+def _without_password(url: str) -> str:
+    if _PASSWORD.search(url):
+        raise CatalogError(
+            "the URL holds a password, which the Prefect server would keep",
+            field="catalog",
+            remedy=f"set {CATALOG_VARIABLE} where the flow runs",
+            wrong_use=True,
+        )
+    return url
+
+
+Location = Annotated[str, AfterValidator(_without_keys), Field(json_schema_extra=_NO_PASSWORD)]
+"""A folder, or a URL without credentials."""
+CatalogUrl = Annotated[
+    str, AfterValidator(_without_password), Field(json_schema_extra=_NO_PASSWORD)
+]
+"""SQLAlchemy URL without password."""
+
+
+def catalog_parameter(url: str | None) -> str | None:
+    """Return the URL as a parameter of a flow; one with a password goes into the environment."""
+    if url is None or not _PASSWORD.search(url):
+        return url
+    os.environ[CATALOG_VARIABLE] = url
+    return None

@@ -43,6 +43,7 @@ from lidarops.settings import (
     nearest,
     quantity,
 )
+from lidarops.system.stores import refuse_keys
 
 __all__ = [
     "Campaign",
@@ -514,6 +515,8 @@ def load_campaign(
             "catalog": catalog or os.environ.get(CATALOG_VARIABLE) or campaign.catalog,
         }
     )
+    if "://" in loaded.archive:
+        refuse_keys(loaded.archive)
     loaded._folder = str(base)  # noqa: SLF001 - set once, here
     return loaded
 

@@ -188,7 +188,11 @@ def _parsed(url: str) -> sa.URL:
         return sa.make_url(url)
     except sa.exc.ArgumentError as error:
         raise CatalogError(
-            "is not a database URL", file=url, remedy=_URLS, wrong_use=True
+            "is not a database URL",
+            # A password may stand before the @.
+            file=url.rpartition("@")[2],
+            remedy=_URLS,
+            wrong_use=True,
         ) from error
 
 

@@ -2,7 +2,7 @@
 
 ``s3://``, ``gs://`` and all others that fsspec knows; ``http(s)://`` is read-only. The drivers find
 keys and endpoints in variables such as ``AWS_ACCESS_KEY_ID`` and ``FSSPEC_S3_ENDPOINT_URL``; this
-module stores none.
+module stores none, and refuses URLs that hold them.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 # A secret may hold slashes, so it is matched up to the last @. In Azure URLs the @ separates
 # container and account.
 _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
+# Signatures and tokens stand there.
+_QUERY: Final = re.compile(r"""(https?://[^\s?'"]*)\?[^\s'")]*""")
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
 _NAMES_SHOWN: Final = 3
@@ -77,8 +79,27 @@ def is_url(location: str) -> bool:
 
 
 def without_keys(text: str) -> str:
-    """Return a text without the credentials in its URLs (the part before the @)."""
-    return _KEYS.sub("", text)
+    """Return a text without the credentials in its URLs: what stands before the @, and queries."""
+    return _QUERY.sub(r"\1", _KEYS.sub("", text))
+
+
+def refuse_keys(url: str) -> None:
+    """Refuse a URL that holds credentials, which commands, logs and databases would keep.
+
+    Raises
+    ------
+    CatalogError
+    """
+    if without_keys(url) != url:
+        raise CatalogError(
+            "the URL holds a key, password or query, which others can read in commands, logs and"
+            " databases",
+            file=without_keys(url),
+            remedy="leave it out, and give keys to the driver: AWS_ACCESS_KEY_ID and"
+            " AWS_SECRET_ACCESS_KEY for s3://, GOOGLE_APPLICATION_CREDENTIALS for gs://, else"
+            " FSSPEC_SCHEME_OPTION, such as FSSPEC_SFTP_PASSWORD, or a file in ~/.config/fsspec",
+            wrong_use=True,
+        )
 
 
 def is_confined(path: str) -> bool:
@@ -99,14 +120,15 @@ class RemoteStore:
     Raises
     ------
     CatalogError
-        If fsspec does not know the URL or lacks its driver, or the store cannot be reached.
+        If the URL holds credentials, fsspec does not know it or lacks its driver, or the store
+        cannot be reached.
     """
 
     def __init__(self, url: str) -> None:
         import fsspec  # noqa: PLC0415 - most archives are local, and the import is slow
 
-        self.url = without_keys(url)
-        """The URL without credentials."""
+        refuse_keys(url)
+        self.url = url
         self._scheme = url.partition("://")[0]
         try:
             # Some drivers connect here.

@@ -24,6 +24,7 @@ from prefect import Flow, get_client, runtime
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
+from prefect.settings import get_current_settings
 from prefect.states import Completed, Failed, Pending, Running
 from prefect.utilities.callables import parameter_schema
 from support import factories
@@ -179,6 +180,62 @@ def test_places_that_are_none_are_wrong_use_of_every_flow(
     assert result.exit_code == 2
     assert result.output.startswith("error: ")
     assert said in result.output
+
+
+SECRET = "swordfish"
+
+
+@pytest.mark.parametrize(
+    ("flow", "name", "url"),
+    [
+        (reprocess, "publish", f"s3://key:{SECRET}@bucket"),
+        (reprocess, "archive", f"s3://key:{SECRET}@bucket"),
+        (reprocess, "catalog", f"postgresql+psycopg://user:{SECRET}@host/name"),
+        (catalog, "archive", f"s3://key:{SECRET}@bucket"),
+        (catalog, "catalog", f"postgresql+psycopg://user:{SECRET}@host/name"),
+    ],
+)
+def test_parameters_with_keys_are_refused_before_a_server_keeps_them(
+    flow: Flow, name: str, url: str
+) -> None:
+    parameters = {"campaign": "campaign.yaml", name: url}
+    with pytest.raises(CatalogError) as caught:
+        flow.validate_parameters(parameters)
+    assert SECRET not in str(caught.value)
+    schema = parameter_schema(flow).model_dump()
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(parameters, schema)
+    for allowed in ("/folder", "s3://bucket/a", "postgresql+psycopg://user@host/name"):
+        jsonschema.validate({"campaign": "campaign.yaml", name: allowed}, schema)
+
+
+@pytest.mark.parametrize("option", ["--archive", "--publish"])
+def test_a_store_with_a_key_is_wrong_use_of_the_flow(option: str, campaign_file: Path) -> None:
+    url = f"s3://key:{SECRET}@bucket"
+    result = called(flows.reprocess.main, str(campaign_file), option, url)
+    assert result.exit_code == 2
+    assert "AWS_ACCESS_KEY_ID" in result.output
+    assert SECRET not in result.output
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_the_password_of_a_catalog_is_not_stored_by_the_server(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So that what the command sets is gone afterwards.
+    monkeypatch.setenv("LIDAROPS_CATALOG", "")
+    url = f"postgresql+psycopg://user:{SECRET}@127.0.0.1:1/name"
+    for command in (flows.catalog.main, flows.reprocess.main):
+        result = called(command, str(campaign_file), "--catalog", url)
+        assert result.exit_code == 1
+        assert "the catalog cannot be used" in result.output
+        assert SECRET not in result.output
+    database = get_current_settings().server.database.connection_url
+    assert database is not None
+    file = Path(database.get_secret_value().partition(":///")[2])
+    written = b"".join(part.read_bytes() for part in file.parent.glob(f"{file.name}*"))
+    assert str(campaign_file).encode() in written
+    assert SECRET.encode() not in written
 
 
 @pytest.mark.parametrize("command", [flows.catalog.main, flows.reprocess.main])

@@ -1,29 +1,60 @@
-"""Passwords in URLs stay out of what a run writes and says."""
+"""Keys and passwords in URLs stay out of what a run writes and says."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import fsspec
+import pytest
+import yaml
 from support.archives.small_archive import Archive
+from typer.testing import CliRunner
 
-from lidarops.run.archive import bring_up_to_date, report_run
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.errors import CatalogError
 
-PASSWORD = "swordfish"
+SECRET = "swordfish"
+URL = f"memory://user:{SECRET}@bucket/raw"
 
 
-def test_a_password_in_the_url_of_the_archive_is_in_no_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["catalog", "plan", "reprocess", "verify"])
+@pytest.mark.parametrize("place", ["file", "option", "environment"])
+def test_an_archive_with_a_key_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, place: str
+) -> None:
     archive = Archive(tmp_path, days=1)
-    del archive.tree["instruments"]["rich"]
-    store, prefix = fsspec.core.url_to_fs(f"memory://user:{PASSWORD}@{tmp_path.name}/raw")
-    for path in (tmp_path / "raw" / "poor").iterdir():
-        store.pipe_file(f"{prefix}/poor/{path.name}", path.read_bytes())
-    archive.tree["archive"] = f"memory://user:{PASSWORD}@{tmp_path.name}/raw"
-    campaign = archive.write()
-    result = bring_up_to_date(campaign)
-    assert result.record is not None
-    assert not result.failures
-    report_run(campaign, result.record)
-    written = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
-    assert any(path.name == "run.json" for path in written)
-    assert not [path for path in written if PASSWORD.encode() in path.read_bytes()]
+    if place == "file":
+        archive.tree["archive"] = URL
+    if place == "environment":
+        monkeypatch.setenv("LIDAROPS_ARCHIVE", URL)
+    archive.file.write_text(yaml.safe_dump(archive.tree))
+    options = ["--archive", URL] if place == "option" else []
+    result = CliRunner().invoke(app, [command, str(archive.file), *options])
+    assert result.exit_code == 2
+    assert "memory://bucket/raw" in result.output
+    assert "AWS_ACCESS_KEY_ID" in result.output
+    assert SECRET not in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_store_with_a_key_is_refused_by_publish(tmp_path: Path) -> None:
+    archive = Archive(tmp_path, days=1)
+    archive.write()
+    CliRunner().invoke(app, ["catalog", str(archive.file)])
+    result = CliRunner().invoke(app, ["publish", str(archive.file), f"s3://key:{SECRET}@bucket"])
+    assert result.exit_code == 2
+    assert SECRET not in result.output
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"postgresql+psycopg//user:{SECRET}@host/name",
+        f"luck://user:{SECRET}@host/name",
+        f"postgresql+psycopg://user:{SECRET}@127.0.0.1:1/name",
+    ],
+)
+def test_errors_of_a_database_do_not_show_its_password(url: str) -> None:
+    with pytest.raises(CatalogError) as caught, Store(url, "campaign") as store:
+        store.granules()
+    assert SECRET not in str(caught.value)

@@ -196,12 +196,34 @@ def test_a_store_that_does_not_answer_is_reported(
         ("s3://key:secret@bucket/a", "s3://bucket/a"),
         ("s3://key:se/c@ret@bucket/a", "s3://bucket/a"),
         ("https://token@host:8080/a", "https://host:8080/a"),
+        (
+            "get https://host/a?sig=x%2By&t=1 and 'https://host/b?t=2'",
+            "get https://host/a and 'https://host/b'",
+        ),
         ("simplecache::s3://key:secret@bucket", "simplecache::s3://bucket"),
         ("s3://bucket/a@b", "s3://bucket/a@b"),
         ("file:///folder/a@b", "file:///folder/a@b"),
+        ("file:///folder/a?b", "file:///folder/a?b"),
         ("abfs://container@account.dfs.core.windows.net/a",) * 2,
         ("no address at all", "no address at all"),
     ],
 )
 def test_keys_are_left_out_of_messages(url: str, shown: str) -> None:
     assert without_keys(url) == shown
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "s3://key:swordfish@bucket/a",
+        "s3://key:sword/swordfish@bucket/a",
+        "https://swordfish@host/a",
+        "https://host/a?sig=swordfish",
+        "simplecache::s3://key:swordfish@bucket",
+    ],
+)
+def test_a_url_with_keys_is_refused_with_the_way_to_give_them(url: str) -> None:
+    with pytest.raises(CatalogError, match="AWS_ACCESS_KEY_ID") as caught:
+        RemoteStore(url)
+    assert caught.value.wrong_use
+    assert "swordfish" not in str(caught.value)
