@@ -217,10 +217,8 @@ def choose_reference(
         statistics,
     )
     rejections = _rejections(statistics, np.diff(edges)[:, 0])
-    level_error = np.broadcast_to(
-        inputs.real_array(background_standard_error, "background_standard_error"), leading
-    ).reshape(-1, 1)
-    level_error = level_error.astype(np.float64)
+    level_error = inputs.real_array(background_standard_error, "background_standard_error")
+    level_error = np.broadcast_to(level_error.astype(np.float64), leading).reshape(-1, 1)
     index, comparison_error = _pick(statistics, rejections, level_error)
     chosen = index >= 0
     profile = np.arange(index.size)

@@ -269,7 +269,7 @@ class _Means:
             for values in (power, np.where(np.isnan(power), 0.0, self.air.shape))
         )
         signal, air = means
-        return np.divide(signal, air, out=np.zeros_like(signal), where=air > 0.0)
+        return np.asarray(np.divide(signal, air, out=np.zeros_like(signal), where=air > 0.0))
 
     def find_clouds(self, power: Array) -> _layers.Layers:
         """Return the clouds of a signal without background."""
