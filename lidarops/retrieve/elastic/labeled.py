@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import uniform_filter1d
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window as _reference
@@ -260,16 +259,20 @@ class _Means:
         power = (self.raw - background[:, np.newaxis]) / self.overlap
         return np.where((self.quality & _WITHHELD) != 0, np.nan, power)
 
-    def ratio_to_air(self, power: Array) -> Array:
-        """Return the ratio of a signal to air in means over `Thresholds.overlap_length`."""
+    def ratio_to_air(self, power: Array) -> tuple[Array, Array]:
+        """Return the ratio of a signal to air and its error, in means over the bins before each."""
         step = float(np.median(np.diff(self.distance)))
         size = max(round(THRESHOLDS.overlap_length / step), 1)
-        means = (
-            uniform_filter1d(np.nan_to_num(values), size, axis=-1, mode="nearest")
-            for values in (power, np.where(np.isnan(power), 0.0, self.air.shape))
-        )
-        signal, air = means
-        return np.asarray(np.divide(signal, air, out=np.zeros_like(signal), where=air > 0.0))
+        known = np.isfinite(power)
+
+        def summed(values: Array) -> Array:
+            total = np.cumsum(np.where(known, values, 0.0), axis=-1)
+            total[:, size:] -= total[:, :-size].copy()
+            return total
+
+        air = summed(self.air.shape)
+        air[air <= 0.0] = np.nan
+        return summed(power) / air, np.sqrt(summed(self.variance)) / air
 
     def find_clouds(self, power: Array) -> _layers.Layers:
         """Return the clouds of a signal without background."""
@@ -286,14 +289,18 @@ def _signal_and_clouds(
     means: _Means, reference: Reference, *, known_shape: bool
 ) -> tuple[_Signal, _layers.Layers]:
     """Return signals without background, and their clouds, with incomplete overlap flagged."""
-    everywhere = np.ones_like(means.raw, bool)
-    signal = _subtract_background(means, everywhere, known_shape=known_shape)
-    clouds = means.find_clouds(signal.power)
+    signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
     partial = _overlap_bits(means, signal, clouds.mask, reference)
-    if partial.any():
-        means.quality = means.quality | partial
-        signal = _subtract_background(means, everywhere, known_shape=known_shape)
-        clouds = means.find_clouds(signal.power)
+    if not partial.any():
+        return signal, clouds
+    means.quality = means.quality | partial
+    return _signal_beyond_clouds(means, known_shape=known_shape)
+
+
+def _signal_beyond_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _layers.Layers]:
+    """Return signals without background, and their clouds."""
+    signal = _subtract_background(means, np.ones_like(means.raw, bool), known_shape=known_shape)
+    clouds = means.find_clouds(signal.power)
     if not known_shape or not clouds.cloudy.any():
         return signal, clouds
     # Only beyond the cloud does the signal have the shape of air: fit the background there.
@@ -310,21 +317,27 @@ def _signal_and_clouds(
 
 
 def _overlap_bits(means: _Means, signal: _Signal, layers: Mask, reference: Reference) -> Flags:
-    """Return the bits of overlap where the signal rises to that of clean air.
+    """Return the bits of overlap where the signal rises from less than clean air gives.
 
-    A layer that begins before the search range of the window, and in which a window passes as clean
-    air, is no cloud. The overlap is incomplete up to the largest ratio to air, and may be so
-    farther away, where particles decrease.
+    A layer that begins before the search range of the window is no cloud if the ratio to air below
+    it is less than in the window. The overlap is incomplete up to the largest ratio to air,
+    and may be so farther away, where particles decrease.
     """
     near = layers & _begin_before(layers, means.distance < reference.lowest)
     if not near.any():
         return np.zeros(layers.shape, np.int32)
     window = _window(signal, means, reference, layers & ~near)
-    bottom, top = (np.nan_to_num(edge)[:, np.newaxis] for edge in window.edges)
-    before = means.distance < bottom
-    has_rise = np.any(near & ~before & (means.distance <= top), axis=-1, keepdims=True)
-    ratio = np.where(before, means.ratio_to_air(signal.power), -np.inf)
-    partial = np.arange(means.distance.size) < ratio.argmax(axis=-1)[:, np.newaxis]
+    ratio, error = means.ratio_to_air(signal.power)
+    scale, scale_error = (
+        values[:, np.newaxis] for values in (window.scale, window.scale_standard_error)
+    )
+    deficit = scale - ratio > THRESHOLDS.negative * np.hypot(error, scale_error)
+    bases = np.diff(near.astype(np.int8), axis=-1, prepend=0) == 1
+    below = np.logical_or.accumulate(deficit, axis=-1)
+    has_rise = np.any(bases & below, axis=-1, keepdims=True)
+    before = means.distance < np.nan_to_num(window.bottom)[:, np.newaxis]
+    highest = np.where(before, np.nan_to_num(ratio, nan=-np.inf), -np.inf).argmax(axis=-1)
+    partial = np.arange(means.distance.size) < highest[:, np.newaxis]
     bits = np.where(partial, int(Quality.INCOMPLETE_OVERLAP), int(ElasticQuality.UNKNOWN_OVERLAP))
     return np.where(before & has_rise, bits, 0).astype(np.int32)
 

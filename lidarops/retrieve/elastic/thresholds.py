@@ -46,8 +46,8 @@ class Thresholds:
     """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
 
     # Overlap
-    overlap_length: float = 120.0
-    """m; in which the ratio to air is averaged where its largest value is sought. Assumed."""
+    overlap_length: float = 60.0
+    """m; in which the ratio to air is averaged below a base and where it is largest. Assumed."""
 
     # Inversion
     longest_gap: float = 150.0

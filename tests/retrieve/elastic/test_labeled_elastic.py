@@ -501,6 +501,19 @@ def test_an_overlap_that_is_not_stated_is_no_cloud(name):
     assert np.sqrt(np.mean(score[:, between(1.1 * FULL, 4500.0)] ** 2)) < 1.3
 
 
+def test_an_overlap_below_dense_aerosol_is_no_cloud():
+    """The signal falls back to its level near the lidar before the reference window."""
+
+    def dense(z):
+        return 3.0 * particles(z)
+
+    signal = light(distance, backscatter=dense) * np.clip(0.02 + distance / FULL, 0.0, 1.0)
+    retrieved = solved(counted(signal, 10, exposure=30 * EXPOSURE))
+    assert not has(retrieved, ElasticQuality.CLOUD).any()
+    assert has(retrieved, Quality.INCOMPLETE_OVERLAP)[:, distance < 400.0].all()
+    assert has(retrieved, ElasticQuality.UNKNOWN_OVERLAP)[:, between(1100.0, 4900.0)].all()
+
+
 def test_a_cloud_over_an_overlap_that_is_not_stated_is_found():
     signal = light(distance, backscatter=cloud(8000.0 + STATION, 2e-5)) * OVERLAPS["late"]
     window = Reference(5000.0, 7500.0, 1000.0, 1.0, 0.0)
