@@ -103,9 +103,11 @@ def campaign(archive: Path) -> Campaign:
 def true_attenuated_backscatter(result: SimulatedCampaign, row: int) -> tuple[Array, Array]:
     """Return the true attenuated backscatter, m-1 sr-1, and its range cells, m."""
     profile = result.truth.isel(profile_lidar=row, wavelength_lidar=0)
-    depth = profile["profile_optical_depth_lidar"].values
+    depth = profile["profile_path_optical_depth_lidar"].values
     cell = np.diff(depth, prepend=0.0)
-    attenuated = profile["profile_backscatter_lidar"].values * np.exp(-2.0 * (depth - cell / 2))
+    attenuated = profile["profile_total_backscatter_lidar"].values * np.exp(
+        -2.0 * (depth - cell / 2)
+    )
     return attenuated, result.truth["range_lidar"].values
 
 

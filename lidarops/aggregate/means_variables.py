@@ -88,7 +88,7 @@ def systematic(kind: str, name: str) -> str | None:
     Returns
     -------
     str or None
-        Such as ``extinction_model_error``; a variable of products or, for a quantity with an
+        Such as ``total_extinction_model_error``; a variable of products or, for a quantity with an
         interval (`Row.lower_end`), of means only.
     """
     table = layout_of(kind)

@@ -83,7 +83,7 @@ def open_products(
     Examples
     --------
     >>> data = lidarops.open_products("demo", kind="homogeneous", channel="analog_532o")
-    >>> data.extinction.resample(time="1D").mean()  # doctest: +SKIP
+    >>> data.total_extinction.resample(time="1D").mean()  # doctest: +SKIP
     """
     selection = parse_selection(kind, channel, station, instrument, since, until)
     root, all_products = _find(source, selection)

@@ -56,8 +56,12 @@ class Quantity:
     @property
     def label(self) -> str:
         """Name and unit."""
-        name = self.name.replace("_", " ")
-        return f"{name} ({self.units})" if self.units not in ("", "1") else name
+        return f"{self.words} ({self.units})" if self.units not in ("", "1") else self.words
+
+    @property
+    def words(self) -> str:
+        """Name as words."""
+        return self.name.replace("_", " ")
 
 
 def series_figures(
@@ -73,7 +77,7 @@ def series_figures(
             values = quantity.factor * finite([_usable(one, quantity.name) for one in few])
             beyond = np.count_nonzero((values < panel.y.low) | (values > panel.y.high))
             if beyond:
-                words.append(f"{counted(int(beyond), 'value')} of {quantity.name} beyond the axis")
+                words.append(f"{counted(int(beyond), 'value')} of {quantity.words} beyond the axis")
         yield Figure(f"{caption} against time", "; ".join(words), tuple(panels))
 
 

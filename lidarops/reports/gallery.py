@@ -180,7 +180,7 @@ def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
             raise ProductError("the file is missing")
         with xr.open_dataset(path, engine="netcdf4", decode_timedelta=False) as opened:
             truth = opened.load()
-        for name in ("path", "instrument", "time", "extinction"):
+        for name in ("path", "instrument", "time", "total_extinction"):
             if name not in truth.variables or truth[name].dims != ("granule",):
                 raise ProductError("is not a variable along granule", field=name)
     except UNREADABLE as error:

@@ -110,7 +110,7 @@ def simulate_campaign(
         - ``path``, ``instrument``, ``time`` (middle of the file, true UTC);
         - ``zenith_angle``, ``azimuth`` (degree), ``clock_error`` (s), ``energy`` (of the laser,
           relative);
-        - ``extinction`` (m-1; NaN if the path is not homogeneous, or channels differ),
+        - ``total_extinction`` (m-1; NaN if the path is not homogeneous, or channels differ),
           ``homogeneous`` (0 or 1);
         - ``damage`` (empty for good files), ``handling`` (correct handling of the damage),
           ``refused`` (1 if a correct reader must refuse the file);
@@ -119,9 +119,9 @@ def simulate_campaign(
           or mV m2) and for analog ``dark_offset_<channel>`` (mV): P* is the background if dark
           files were subtracted, else background plus dark offset. NaN if the instrument has no
           such channel or the path is not homogeneous;
-        - for paths that are not homogeneous ``profile_extinction_<key>``,
-          ``profile_backscatter_<key>`` and ``profile_optical_depth_<key>`` (profile, wavelength,
-          range), with their rows in ``profile_granule_<key>``.
+        - for paths that are not homogeneous ``profile_total_extinction_<key>``,
+          ``profile_total_backscatter_<key>`` and ``profile_path_optical_depth_<key>`` (profile,
+          wavelength, range), with their rows in ``profile_granule_<key>``.
 
     Raises
     ------

@@ -272,7 +272,7 @@ class Simulator:
             channels[name] = (
                 counts,
                 ChannelTruth(
-                    extinction=light.extinction,
+                    total_extinction=light.extinction,
                     background=unit * light.sky,
                     amplitude=unit * light.amplitude,
                     dark_offset=dark_offset,
@@ -428,7 +428,7 @@ class Simulator:
         self, conditions: _Conditions, channels: Sequence[ChannelTruth]
     ) -> ProfileTruth | None:
         planned, grid = conditions.planned, self.grid
-        homogeneous = all(math.isfinite(channel.extinction) for channel in channels)
+        homogeneous = all(math.isfinite(channel.total_extinction) for channel in channels)
         skipped = planned.role is Role.DARK or planned.index % grid.stride
         if skipped or homogeneous or grid.stops.size < 2:
             return None

@@ -31,7 +31,7 @@ _COARSE = 64
 class ChannelTruth:
     """True values of one channel of one file."""
 
-    extinction: float
+    total_extinction: float
     """m-1; NaN if the path is not homogeneous."""
     background: float
     """Sky light: MHz before dead time, or mV without the dark offset."""
@@ -45,11 +45,11 @@ class ChannelTruth:
 class ProfileTruth:
     """The air along the beam of one file, in coarse range cells."""
 
-    extinction: NDArray[np.float32]
+    total_extinction: NDArray[np.float32]
     """m-1, mean over each cell, shape (wavelengths, cells)."""
-    backscatter: NDArray[np.float32]
+    total_backscatter: NDArray[np.float32]
     """m-1 sr-1, mean over each cell."""
-    optical_depth: NDArray[np.float32]
+    path_optical_depth: NDArray[np.float32]
     """1, from the lidar to the far end of each cell."""
 
 
@@ -75,9 +75,9 @@ class FileTruth:
     profile: ProfileTruth | None = None
 
     @property
-    def extinction(self) -> float:
+    def total_extinction(self) -> float:
         """Extinction that all channels share, m-1; NaN if they do not share one."""
-        values = [channel.extinction for channel in self.channels.values()]
+        values = [channel.total_extinction for channel in self.channels.values()]
         first = values[0]
         alike = all(abs(value - first) <= _SAME * first for value in values)
         return first if alike else math.nan
@@ -192,7 +192,7 @@ class TruthTable:
     def dataset(self, campaign: str) -> xr.Dataset:
         """Return the truth as a dataset; see `lidarops.simulate.campaign.simulate_campaign`."""
         handling = {"": ""} | {kind.value: kind.handling.value for kind in DamageKind}
-        extinction = self._facts["extinction"]
+        extinction = self._facts["total_extinction"]
         handled = [handling[str(kind)] for kind in self._damage]
         truth = xr.Dataset(
             {
@@ -202,7 +202,7 @@ class TruthTable:
                 **{
                     name: _row(self._facts[name], *about)
                     for name, about in _FACTS.items()
-                    if name == "extinction" or np.isfinite(self._facts[name]).any()
+                    if name == "total_extinction" or np.isfinite(self._facts[name]).any()
                 },
                 "homogeneous": _row(
                     np.isfinite(extinction).astype(np.int8), "1 if the path is homogeneous", "1"
@@ -225,8 +225,8 @@ class TruthTable:
             attrs={
                 "title": f"Truth of the simulated campaign {campaign}",
                 "comment": "P = P* + B R^-2 exp(-2 sigma R) beyond full overlap, with sigma in"
-                " extinction and B in amplitude. P* is the background (sky light) if dark files"
-                " were subtracted, else background plus dark_offset. Photon counting: rates"
+                " total_extinction and B in amplitude. P* is the background (sky light) if dark"
+                " files were subtracted, else background plus dark_offset. Photon counting: rates"
                 " before dead time.",
             },
         )
@@ -243,7 +243,7 @@ class TruthTable:
 
 
 _FACTS = {
-    "extinction": ("extinction coefficient of the air on a homogeneous path", "m-1"),
+    "total_extinction": ("extinction coefficient of the air on a homogeneous path", "m-1"),
     "zenith_angle": ("zenith angle of the beam, 0 = up", "degree"),
     "azimuth": ("azimuth of the beam, clockwise from north", "degree"),
     "clock_error": ("clock of the instrument minus true time", "s"),
@@ -256,7 +256,10 @@ def _quantities(channel: str) -> dict[str, tuple[str, str]]:
     analog = mode == DetectionMode.ANALOG
     units = "mV" if analog else "MHz"
     quantities = {
-        "extinction": (f"extinction coefficient of the homogeneous path, {label}", "m-1"),
+        "total_extinction": (
+            f"extinction coefficient of the homogeneous path, {label}",
+            "m-1",
+        ),
         "background": (f"sky light, {mode} {label}", units),
         "amplitude": (f"amplitude B of the backscattered signal, {mode} {label}", f"{units} m2"),
     }
@@ -303,9 +306,9 @@ def _profiles(grid: TruthGrid, profiles: Mapping[int, ProfileTruth]) -> xr.Datas
 
 
 _PROFILES = {
-    "extinction": ("extinction coefficient of air, mean over a range cell", "m-1"),
-    "backscatter": ("backscatter coefficient of air, mean over a range cell", "m-1 sr-1"),
-    "optical_depth": ("optical depth of air from the lidar to the end of a range cell", "1"),
+    "total_extinction": ("extinction coefficient of air, mean over a range cell", "m-1"),
+    "total_backscatter": ("backscatter coefficient of air, mean over a range cell", "m-1 sr-1"),
+    "path_optical_depth": ("optical depth of air from the lidar to the end of a range cell", "1"),
 }
 
 

@@ -101,15 +101,15 @@ def test_a_profile_of_few_shots_has_little_weight(tmp_path: Path):
 
     def uneven(data: xr.Dataset) -> xr.Dataset:
         data["shots"] = ("time", shots)
-        data["extinction_standard_error"][-1] *= 10.0
+        data["total_extinction_standard_error"][-1] *= 10.0
         return data
 
     add_day(tmp_path, 0, change=uneven)
     data = open_products(tmp_path, usable=1).astype(np.float64).load()
-    weights = xr.DataArray(shots, dims="time").where(np.isfinite(data.extinction))
+    weights = xr.DataArray(shots, dims="time").where(np.isfinite(data.total_extinction))
     weights = weights / weights.sum("time")
-    expected = (weights * data.extinction).sum("time")
-    errors = ((weights * data.extinction_standard_error) ** 2).sum("time") ** 0.5
+    expected = (weights * data.total_extinction).sum("time")
+    errors = ((weights * data.total_extinction_standard_error) ** 2).sum("time") ** 0.5
     means = only(tmp_path, means_of(tmp_path))
     np.testing.assert_allclose(means.extinction[0], expected, rtol=1e-6)
     np.testing.assert_allclose(means.extinction_standard_error[0], errors, rtol=1e-6)
@@ -121,14 +121,14 @@ def test_a_profile_of_few_shots_has_little_weight(tmp_path: Path):
 
 def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
     def uneven(data: xr.Dataset) -> xr.Dataset:
-        data["extinction_standard_error"] *= xr.DataArray(np.arange(1.0, 6.0), dims="time")
+        data["total_extinction_standard_error"] *= xr.DataArray(np.arange(1.0, 6.0), dims="time")
         return data
 
     add_day(tmp_path, 0, change=uneven)
     means = only(tmp_path, means_of(tmp_path, weights=Weights.INVERSE_VARIANCE))
     data = open_products(tmp_path).astype(np.float64).load()
-    weights = 1.0 / data.extinction_standard_error**2
-    expected = (weights * data.extinction).sum("time") / weights.sum("time")
+    weights = 1.0 / data.total_extinction_standard_error**2
+    expected = (weights * data.total_extinction).sum("time") / weights.sum("time")
     np.testing.assert_allclose(means.extinction[0], expected, rtol=1e-6)
     np.testing.assert_allclose(
         means.extinction_standard_error[0], weights.sum("time") ** -0.5, rtol=1e-6
@@ -146,11 +146,11 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
 
     def random(factor):
         causes = ("noise", "background")
-        square = sum(data[f"backscatter_error_{cause}"] ** 2 for cause in causes)
+        square = sum(data[f"aerosol_backscatter_error_{cause}"] ** 2 for cause in causes)
         return (factor**2 * square).where(used)
 
     shared = sum(
-        (data[f"backscatter_error_{cause}"].where(used).sum("time") / count) ** 2
+        (data[f"aerosol_backscatter_error_{cause}"].where(used).sum("time") / count) ** 2
         for cause in ("reference", "lidar_ratio", "molecular", "dead_time")
     )
     expected = np.sqrt(random(1.0).sum("time") / count**2 + shared)
@@ -160,7 +160,7 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
     errors = means.backscatter_standard_error.to_numpy()
     np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
     for name, factor in (
-        ("extinction", data.lidar_ratio.isel(product=0)),
+        ("total_extinction", data.lidar_ratio.isel(product=0)),
         ("scattering_ratio", 1.0 / data.molecular_backscatter.isel(product=0)),
     ):
         total = data[f"{name}_standard_error"] ** 2
@@ -176,8 +176,11 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
 @pytest.mark.parametrize(
     ("kind", "names"),
     [
-        ("multiangle", ["optical_depth", "extinction", "layer_optical_depth"]),
-        ("visibility", ["extinction", "visibility_in_air"]),
+        (
+            "multiangle",
+            ["vertical_optical_depth", "total_extinction", "layer_vertical_optical_depth"],
+        ),
+        ("visibility", ["total_extinction", "visibility_in_air"]),
     ],
 )
 def test_fully_shared_errors_are_averaged(kind: str, names: list[str], tmp_path: Path):
@@ -224,14 +227,17 @@ def test_the_systematic_error_of_visibility_does_not_average_out(
     true, random, declared = 2e-4, 6e-6, 2e-5
 
     def off(data: xr.Dataset) -> xr.Dataset:
-        noise = np.random.default_rng(8).normal(0.0, random, data.extinction.shape)
+        noise = np.random.default_rng(8).normal(0.0, random, data.total_extinction.shape)
         # Replaces the extinction that `add_day` has scaled.
-        data["extinction"] = data.extinction.dims, true + declared + noise
-        data["extinction_standard_error"] = xr.full_like(data.extinction, random)
-        data["extinction_model_error"] = xr.full_like(data.extinction, declared)
+        data["total_extinction"] = data.total_extinction.dims, true + declared + noise
+        data["total_extinction_standard_error"] = xr.full_like(data.total_extinction, random)
+        data["total_extinction_model_error"] = xr.full_like(data.total_extinction, declared)
         data["quality_flag"] = xr.zeros_like(data.quality_flag)
         visibility = visibility_of_extinction(
-            data.extinction, data.extinction_standard_error, data.extinction_model_error, definition
+            data.total_extinction,
+            data.total_extinction_standard_error,
+            data.total_extinction_model_error,
+            definition,
         )
         return data.assign(visibility.data_vars)
 

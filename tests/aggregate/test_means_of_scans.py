@@ -14,12 +14,16 @@ from lidarops.retrieve.multiangle.vertical import smooth_profile
 CYCLES = 48
 
 
-@pytest.mark.parametrize("name", ["optical_depth", "extinction"])
+@pytest.mark.parametrize("name", ["vertical_optical_depth", "total_extinction"])
 def test_means_stay_within_their_errors(name: str):
     rng = np.random.default_rng(5)
     scene = clear(3000.0, aerosol=2.0)
     step = np.diff(scene.altitude, prepend=0.0)
-    truth = scene.truth if name == "optical_depth" else np.diff(scene.truth, prepend=0.0) / step
+    truth = (
+        scene.truth
+        if name == "vertical_optical_depth"
+        else np.diff(scene.truth, prepend=0.0) / step
+    )
     sums, shares = None, []
     for days in range(1, 6):
         depths = estimates(scene, CYCLES, rng, 0.6)

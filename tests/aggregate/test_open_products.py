@@ -30,16 +30,16 @@ def test_a_folder_opens_in_order_of_time_with_units_and_flags(archive: Path):
     data = open_products(archive, kind="homogeneous", usable=2)
     assert data.indexes["time"].is_monotonic_increasing
     assert data.sizes["time"] == 15
-    assert data.extinction.attrs["units"] == "m-1"
+    assert data.total_extinction.attrs["units"] == "m-1"
     assert data.quality_flag.attrs["flag_meanings"].split()[0] == "input_missing"
-    assert data.extinction.chunks == ((5, 5, 5), (3,))
+    assert data.total_extinction.chunks == ((5, 5, 5), (3,))
     assert {"altitude", "zenith_angle", "section_range"} <= set(data.coords)
     parts = []
     for facts in facts_of(archive):
         if facts.kind == "homogeneous":
             with xr.open_dataset(archive / facts.path) as product:
                 parts.append(product.load())
-    for name in ("extinction", "quality_flag", "time_bnds"):
+    for name in ("total_extinction", "quality_flag", "time_bnds"):
         expected = np.concatenate([part[name] for part in parts])
         np.testing.assert_array_equal(data[name], expected)
 

@@ -58,7 +58,7 @@ def test_two_hundred_products_have_the_mean_of_the_eager_ones(tmp_path: Path):
     view = view_of(tmp_path)
     assert view.products == 200
     virtual = open_view(tmp_path / view.path, usable=2)
-    values = eager(tmp_path, "extinction").astype(np.float64)
+    values = eager(tmp_path, "total_extinction").astype(np.float64)
     mean = float(virtual.extinction.astype(np.float64).mean())
     assert mean == pytest.approx(np.nanmean(values), rel=1e-6)
     # The dataset is lazy.

@@ -42,7 +42,7 @@ def test_the_python_lines_run(readme: str, demo_archive: Path) -> None:
     exec(code, names)
     fit = names["fit"]
     assert isinstance(fit, xr.Dataset)
-    assert fit["extinction"].sizes["time"] > 50
+    assert fit["total_extinction"].sizes["time"] > 50
 
 
 def test_every_command_exists(readme: str) -> None:

@@ -52,7 +52,10 @@ def _products(record: RunRecord, kind: str, instrument: str) -> xr.Dataset:
     ]
     assert parts
     return xr.concat(
-        [part[["extinction", "extinction_standard_error", "quality_flag"]] for part in parts],
+        [
+            part[["total_extinction", "total_extinction_standard_error", "quality_flag"]]
+            for part in parts
+        ],
         dim="time",
         coords="minimal",
         compat="override",
@@ -64,11 +67,11 @@ def test_extinction_agrees_with_the_truth(demo: tuple[Campaign, RunRecord]) -> N
     retrieved = _products(record, "homogeneous", "coast-horizontal")
     truth = xr.load_dataset(campaign.truth_path)
     truth = truth.isel(granule=(truth["instrument"] == "coast-horizontal").values)
-    truth = truth.swap_dims(granule="time").sortby("time")["extinction"]
+    truth = truth.swap_dims(granule="time").sortby("time")["total_extinction"]
     expected = truth.sel(time=retrieved["time"], method="nearest").values[:, np.newaxis]
     good = retrieved["quality_flag"].values == 0
-    score = (retrieved["extinction"].values - expected) / retrieved[
-        "extinction_standard_error"
+    score = (retrieved["total_extinction"].values - expected) / retrieved[
+        "total_extinction_standard_error"
     ].values
     assert good.mean() > 0.5
     assert (np.abs(score[good]) < 3).mean() >= 0.99

@@ -468,10 +468,15 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
         values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))
         read.append(outcome.bytes_read)
     assert read[0] < read[1]
-    for name in ("extinction", "extinction_standard_error", "reduced_chi2", "quality_flag"):
+    for name in (
+        "total_extinction",
+        "total_extinction_standard_error",
+        "reduced_chi2",
+        "quality_flag",
+    ):
         windowed, whole = (product[name].to_numpy() for product in values)
         np.testing.assert_array_equal(windowed, whole)
-    assert np.isfinite(values[0]["extinction"]).any()
+    assert np.isfinite(values[0]["total_extinction"]).any()
 
 
 def test_an_omitted_section_flags_profiles_without_shots(tmp_path, monkeypatch):
@@ -581,10 +586,10 @@ def _opened(record: RunRecord) -> dict[str, xr.Dataset]:
 
 
 _MAIN = {
-    "homogeneous": ("extinction", "extinction_standard_error"),
-    "elastic": ("backscatter", "backscatter_standard_error"),
-    "multiangle": ("extinction", "extinction_standard_error"),
-    "visibility": ("extinction", "extinction_standard_error"),
+    "homogeneous": ("total_extinction", "total_extinction_standard_error"),
+    "elastic": ("aerosol_backscatter", "aerosol_backscatter_standard_error"),
+    "multiangle": ("total_extinction", "total_extinction_standard_error"),
+    "visibility": ("total_extinction", "total_extinction_standard_error"),
 }
 
 

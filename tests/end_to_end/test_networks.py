@@ -42,8 +42,10 @@ def beams_of(outcome: SceneOutcome) -> list[str]:
 
 def scores(product: xr.Dataset, truth: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """(retrieved - true) / stated error of visibility, of unflagged values."""
-    whole = np.hypot(product["extinction_standard_error"], product["extinction_systematic_error"])
-    score = ((product["extinction"] - truth) / whole).values
+    whole = np.hypot(
+        product["total_extinction_standard_error"], product["total_extinction_systematic_error"]
+    )
+    score = ((product["total_extinction"] - truth) / whole).values
     return score[product["quality_flag"].values == 0]
 
 
@@ -57,7 +59,7 @@ def test_visibility_agrees_with_the_truth_within_its_errors(six_beams, tmp_path)
         true = made.truth_at(product, truth, beams_of(outcome))
         usable = product["usable"].values < 2
         assert usable.mean() > 0.95
-        error = (product["extinction"].values / true - 1.0)[usable]
+        error = (product["total_extinction"].values / true - 1.0)[usable]
         assert np.sqrt(np.mean(error**2)) < 0.08
         seen = -np.log(0.05) / true
         inside = (product["visibility_in_air_lower"] <= seen) & (
@@ -104,7 +106,11 @@ def test_the_range_window_does_not_change_the_product(tmp_path):
     full = opened(campaign, whole)
     assert windowed.bytes_read < whole.bytes_read
     np.testing.assert_array_equal(near["quality_flag"], full["quality_flag"])
-    for name in ("extinction", "extinction_standard_error", "extinction_systematic_error"):
+    for name in (
+        "total_extinction",
+        "total_extinction_standard_error",
+        "total_extinction_systematic_error",
+    ):
         # Sums over windows begin elsewhere, and are rounded differently.
         np.testing.assert_allclose(near[name], full[name], rtol=1e-6)
 
@@ -112,7 +118,7 @@ def test_the_range_window_does_not_change_the_product(tmp_path):
 def test_optically_thin_air_is_flagged(tmp_path):
     air = {
         "homogeneous": {
-            "extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
+            "total_extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
             "molecules_constant": True,
         }
     }
@@ -121,7 +127,7 @@ def test_optically_thin_air_is_flagged(tmp_path):
     product = opened(campaign, outcome)
     true = made.truth_at(product, truth, beams_of(outcome))
     usable = product["usable"].values < 2
-    wrong = np.abs(product["extinction"].values / true - 1.0) > 0.5
+    wrong = np.abs(product["total_extinction"].values / true - 1.0) > 0.5
     assert usable.mean() < 0.2
     assert not (usable & wrong).any()
 
@@ -172,9 +178,9 @@ def test_a_level_path_gives_visibility_too(tmp_path):
     assert usable.any()
     seen = product["visibility_in_air"].values
     np.testing.assert_allclose(
-        (seen * product["extinction"].values)[usable], -np.log(0.02), rtol=3e-4
+        (seen * product["total_extinction"].values)[usable], -np.log(0.02), rtol=3e-4
     )
-    true = -np.log(0.02) / float(truth["extinction"].mean())
+    true = -np.log(0.02) / float(truth["total_extinction"].mean())
     inside = (product["visibility_in_air_lower"] <= true) & (
         true <= product["visibility_in_air_upper"]
     )

@@ -66,9 +66,9 @@ def particles(truth: xr.Dataset) -> dict[str, Any]:
     fine = STEP * (np.arange(1000) + 0.5)
     found = {}
     for name in ("extinction", "backscatter"):
-        values = truth[f"profile_{name}_valley_raman"].values[:, 0].mean(axis=0)
+        values = truth[f"profile_total_{name}_valley_raman"].values[:, 0].mean(axis=0)
         values = values - getattr(air, name)(500.0 + r, 355e-9)
-        found[name] = np.interp(fine, r, values)
+        found[f"aerosol_{name}"] = np.interp(fine, r, values)
     return found
 
 
@@ -85,13 +85,13 @@ def test_a_simulated_night_agrees_with_the_truth(night):
     product, true = product_of(campaign, record), particles(truth)
     r = product["range"].values
     length = np.nan_to_num(product["vertical_resolution"].values, nan=60.0)
-    extinction = mean_over(true["extinction"], STEP, r, length)
-    backscatter = mean_over(true["backscatter"], STEP, r, np.full(r.size, 60.0))
-    ratio = extinction / np.maximum(mean_over(true["backscatter"], STEP, r, length), 1e-12)
+    extinction = mean_over(true["aerosol_extinction"], STEP, r, length)
+    backscatter = mean_over(true["aerosol_backscatter"], STEP, r, np.full(r.size, 60.0))
+    ratio = extinction / np.maximum(mean_over(true["aerosol_backscatter"], STEP, r, length), 1e-12)
     water = SURFACE * np.exp(-r / SCALE_HEIGHT)
     cases = (
-        ("extinction", extinction),
-        ("backscatter", backscatter),
+        ("aerosol_extinction", extinction),
+        ("aerosol_backscatter", backscatter),
         ("lidar_ratio", ratio),
         ("water_vapour_mixing_ratio", water),
     )
@@ -102,7 +102,7 @@ def test_a_simulated_night_agrees_with_the_truth(night):
         assert np.sqrt(np.mean(z**2)) < 1.2, name
     # Errors are not just large: the boundary layer is known to 15 %.
     layer = (r > 600.0) & (r < 1000.0)
-    error = product["extinction_standard_error"].values[:, layer]
+    error = product["aerosol_extinction_standard_error"].values[:, layer]
     assert np.all(error < 0.15 * extinction[:, layer])
 
 
@@ -176,8 +176,8 @@ def test_extinction_reaches_down_with_the_measured_overlap(repository, night, tm
     product = product_of(again, reprocess(again))
     r = product["range"].values
     near = (r > 180.0) & (r < 400.0)
-    true = mean_over(particles(truth)["extinction"], STEP, r, np.full(r.size, 60.0))
-    found = product["extinction"].values[:, near]
+    true = mean_over(particles(truth)["aerosol_extinction"], STEP, r, np.full(r.size, 60.0))
+    found = product["aerosol_extinction"].values[:, near]
     assert np.isfinite(found).all()
     assert np.abs(found.mean(axis=0) / true[near] - 1.0).max() < 0.25
 
@@ -186,7 +186,7 @@ def test_daylight_gives_an_empty_product_with_the_reason(repository, tmp_path):
     campaign, _ = simulated(repository, tmp_path, "2024-09-21T09:00:00+00:00", 0.5)
     record = reprocess(campaign)
     product = product_of(campaign, record)
-    assert np.isnan(product["extinction"].values).all()
+    assert np.isnan(product["aerosol_extinction"].values).all()
     assert np.all(product["quality_flag"].values & int(RamanQuality.WEAK_SIGNAL))
     (left,) = (left for left in record.scenes[0].plan.left_out if left.rule == "raman_dark")
     assert "no signal of photon_387o" in left.reason
@@ -281,11 +281,13 @@ def test_the_night_of_manaus_agrees_with_clean_air_and_the_elastic_inversion(man
     # up to 4 % a kilometre less than air explains, as it does where overlap is not complete.
     clean = usable & (r > 6000.0) & (r < 8500.0)
     assert clean.sum() > 30
-    z = (raman["extinction"].values / raman["extinction_standard_error"].values)[clean]
+    z = (raman["aerosol_extinction"].values / raman["aerosol_extinction_standard_error"].values)[
+        clean
+    ]
     assert np.mean(np.abs(z) < 1.96) > 0.85
     # Aerosol of the free atmosphere, by both methods.
     haze = usable & (r > 2600.0) & (r < 5000.0)
-    with_55 = np.interp(r, elastic["range"].values, elastic["backscatter"].values)
-    away = raman["backscatter"].values - with_55
-    error = raman["backscatter_standard_error"].values
+    with_55 = np.interp(r, elastic["range"].values, elastic["aerosol_backscatter"].values)
+    away = raman["aerosol_backscatter"].values - with_55
+    error = raman["aerosol_backscatter_standard_error"].values
     assert np.nanmean(np.abs(away[haze] / error[haze])) < 3.0

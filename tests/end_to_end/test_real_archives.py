@@ -154,21 +154,21 @@ def test_nothing_is_invented_where_photon_counting_is_paralysed(pilar: RunRecord
         assert (flags & bit).all()
         assert ((flags & flags_of("elastic").rejecting) != 0).all() or (flags != 0).all()
     glued = _open(pilar, "elastic", "glued_532p")
-    assert np.isnan(glued["backscatter"].values).all()
+    assert np.isnan(glued["aerosol_backscatter"].values).all()
 
 
 def test_pilar_has_aerosol_below_clean_air(pilar: RunRecord) -> None:
     product = _open(pilar, "elastic", "analog_532p")
-    values = product[["backscatter", "scattering_ratio"]]
+    values = product[["aerosol_backscatter", "scattering_ratio"]]
     good = values.where(product["quality_flag"] == 0)
-    assert float(good["backscatter"].count()) > 0.5 * product["backscatter"].size
+    assert float(good["aerosol_backscatter"].count()) > 0.5 * product["aerosol_backscatter"].size
     near = good["scattering_ratio"].sel(range=slice(800, 2000)).mean()
     far = good["scattering_ratio"].sel(range=slice(8000, 10_000)).mean()
     assert 1.2 < float(near) < 20.0
     assert abs(float(far) - 1.0) < 0.5
     assert product["profiles"].sum() == 120
     # The lidar ratio of the campaign determines the extinction.
-    ratio = product["extinction"] / product["backscatter"]
+    ratio = product["aerosol_extinction"] / product["aerosol_backscatter"]
     np.testing.assert_allclose(ratio.values[np.isfinite(ratio.values)], 60.0, rtol=1e-3)
 
 
@@ -194,15 +194,15 @@ def test_saopaulo_is_glued_with_the_lag_of_its_noise(saopaulo: RunRecord) -> Non
 
 def test_saopaulo_has_aerosol_in_its_mixed_layer(saopaulo: RunRecord) -> None:
     product = _open(saopaulo, "elastic", "glued_532o")
-    good = product["backscatter"].where(product["quality_flag"] == 0)
+    good = product["aerosol_backscatter"].where(product["quality_flag"] == 0)
     low = good.sel(range=slice(700, 1500)).mean("range")
     assert (low > 1e-6).all()
     assert (low < 2e-5).all()
     budget = [
-        product[f"backscatter_error_{cause}"]
+        product[f"aerosol_backscatter_error_{cause}"]
         for cause in ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
     ]
     total = np.sqrt(sum(part**2 for part in budget))
-    stated = product["backscatter_standard_error"]
+    stated = product["aerosol_backscatter_standard_error"]
     known = np.isfinite(stated.values)
     np.testing.assert_allclose(total.values[known], stated.values[known], rtol=0.01)

@@ -44,9 +44,9 @@ def test_optical_depths_agree_with_an_independent_estimate(channel, products):
     rows = [int(np.abs(product["altitude"].values - 220.0 - z).argmin()) for z in HEIGHTS]
     expected, scatter = (np.array(values) for values in REFERENCE[channel])
     part = product.isel(altitude=rows)
-    random = part["optical_depth_standard_error"]
-    total = np.sqrt(random**2 + part["optical_depth_gradient_error"] ** 2 + scatter**2)
-    deviation = (np.abs(part["optical_depth"] - expected) / total).values
+    random = part["vertical_optical_depth_standard_error"]
+    total = np.sqrt(random**2 + part["vertical_optical_depth_gradient_error"] ** 2 + scatter**2)
+    deviation = (np.abs(part["vertical_optical_depth"] - expected) / total).values
     # One of 20 values lies 2.2 standard errors off, at 300 m.
     assert np.all(deviation[:, 1:] < 1.0)
     assert np.all(deviation[:, 0] < 2.4)
@@ -57,8 +57,10 @@ def test_optical_depths_agree_with_an_independent_estimate(channel, products):
 
 def test_parallel_and_perpendicular_see_the_same_optical_depth(products):
     one, other = (products[channel].isel(altitude=slice(4, None)) for channel in REFERENCE)
-    difference = one["optical_depth"] - other["optical_depth"]
-    spread = np.hypot(one["optical_depth_standard_error"], other["optical_depth_standard_error"])
+    difference = one["vertical_optical_depth"] - other["vertical_optical_depth"]
+    spread = np.hypot(
+        one["vertical_optical_depth_standard_error"], other["vertical_optical_depth_standard_error"]
+    )
     assert np.sqrt(((difference / spread) ** 2).mean()) < 1.3
 
 
@@ -66,7 +68,7 @@ def test_parallel_and_perpendicular_see_the_same_optical_depth(products):
 def test_distorted_analog_signals_are_rejected(channel, products):
     product = products[channel]
     assert (product["usable"] == 2).all()
-    assert product["extinction"].isnull().all()
+    assert product["total_extinction"].isnull().all()
 
 
 def test_a_level_beam_above_the_background_of_the_far_range(data_root, tmp_path):
@@ -89,9 +91,13 @@ def test_a_level_beam_above_the_background_of_the_far_range(data_root, tmp_path)
             for product in sorted(scene.products, key=lambda product: product.channel)
         ]
     one, other = found["known_background"]
-    spread = np.hypot(one["extinction_standard_error"], other["extinction_standard_error"])
-    assert (np.abs(one["extinction"] - other["extinction"]) < 2.0 * spread).all()
-    assert (one["extinction"] == pytest.approx(1e-4, abs=2e-5)).all()
+    spread = np.hypot(
+        one["total_extinction_standard_error"], other["total_extinction_standard_error"]
+    )
+    assert (np.abs(one["total_extinction"] - other["total_extinction"]) < 2.0 * spread).all()
+    assert (one["total_extinction"] == pytest.approx(1e-4, abs=2e-5)).all()
     assert (np.abs(one["background"]) < 3.0 * one["background_standard_error"]).all()
     own = found["auto"][0]
-    assert (own["extinction_standard_error"] > 3.0 * one["extinction_standard_error"]).all()
+    assert (
+        own["total_extinction_standard_error"] > 3.0 * one["total_extinction_standard_error"]
+    ).all()

@@ -31,20 +31,21 @@ def scores(settings: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarra
     granule = truth["profile_granule_scanner"].values
     upward = truth["zenith_angle"].values[granule] < 1.0
     time = truth["time"].values[granule][upward]
-    depth = truth["profile_optical_depth_scanner"].values[upward, 0]
+    depth = truth["profile_path_optical_depth_scanner"].values[upward, 0]
     ends = np.append(0.0, truth["range_end_scanner"].values)
     found = []
     for path in paths:
         product = xr.load_dataset(settings.products_root / path)
         error = np.hypot(
-            product["optical_depth_standard_error"], product["optical_depth_gradient_error"]
+            product["vertical_optical_depth_standard_error"],
+            product["vertical_optical_depth_gradient_error"],
         ).values
         for cycle in range(product.sizes["time"]):
             nearest = np.argmin(np.abs(time - product["time"].values[cycle]))
             true = np.interp(
                 product["altitude"].values - ALTITUDE, ends, np.append(0.0, depth[nearest])
             )
-            score = (product["optical_depth"].values[cycle] - true) / error[cycle]
+            score = (product["vertical_optical_depth"].values[cycle] - true) / error[cycle]
             found.append(score[product["quality_flag"].values[cycle] == 0])
     return np.concatenate(found)
 

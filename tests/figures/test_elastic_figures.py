@@ -89,10 +89,10 @@ class TestClearestProfile:
         flag = product["quality_flag"].to_numpy()[4, shown]
         good = (flag & flags_of("elastic").rejecting) == 0
         assert np.isnan(profile.backscatter[~good]).all()
-        values = product["backscatter"].to_numpy()[4, shown]
+        values = product["aerosol_backscatter"].to_numpy()[4, shown]
         np.testing.assert_allclose(profile.backscatter[good], values[good])
         for cause in CAUSES:
-            errors = product[f"backscatter_error_{cause}"].to_numpy()[4, shown]
+            errors = product[f"aerosol_backscatter_error_{cause}"].to_numpy()[4, shown]
             np.testing.assert_allclose(profile.budget[cause][good], np.abs(errors[good]))
 
     def test_bins_to_use_with_care_are_marked(self, made, tmp_path):
@@ -111,7 +111,9 @@ class TestClearestProfile:
             made["quality_flag"][:] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
         assert clearest_profile(stored(tmp_path / "lost.nc", made)) is None
 
-    @pytest.mark.parametrize("name", ["backscatter", "backscatter_error_noise", "lidar_ratio"])
+    @pytest.mark.parametrize(
+        "name", ["aerosol_backscatter", "aerosol_backscatter_error_noise", "lidar_ratio"]
+    )
     def test_a_missing_variable_is_named(self, product, name):
         with pytest.raises(ProductError) as caught:
             clearest_profile(product.drop_vars(name))

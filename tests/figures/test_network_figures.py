@@ -34,7 +34,7 @@ def truth(made: xr.Dataset, extinction: float = EXTINCTION) -> xr.Dataset:
         {
             "instrument": ("granule", np.repeat(NAMES, 60)),
             "time": ("granule", np.tile(times, 3)),
-            "extinction": ("granule", np.full(180, extinction)),
+            "total_extinction": ("granule", np.full(180, extinction)),
         }
     )
 
@@ -44,17 +44,17 @@ def test_series_hold_values_errors_and_truth(made):
     assert [crossing.label for crossing in series] == ["crossing 0", "crossing 1", "crossing 2"]
     for v, crossing in enumerate(series):
         np.testing.assert_array_equal(
-            crossing.estimates["extinction"].value, made["extinction"].values[:, v]
+            crossing.estimates["total_extinction"].value, made["total_extinction"].values[:, v]
         )
         whole = np.hypot(
-            made["extinction_standard_error"], made["extinction_systematic_error"]
+            made["total_extinction_standard_error"], made["total_extinction_systematic_error"]
         ).values[:, v]
-        np.testing.assert_allclose(crossing.estimates["extinction"].standard_error, whole)
-        np.testing.assert_allclose(crossing.estimates["extinction"].truth, EXTINCTION)
+        np.testing.assert_allclose(crossing.estimates["total_extinction"].standard_error, whole)
+        np.testing.assert_allclose(crossing.estimates["total_extinction"].truth, EXTINCTION)
         np.testing.assert_allclose(
             crossing.estimates["visibility"].truth, -np.log(0.05) / EXTINCTION / 1e3, rtol=1e-6
         )
-        comparison = compare(crossing, "extinction")
+        comparison = compare(crossing, "total_extinction")
         assert comparison is not None
         assert comparison.within_3 == 1.0
         assert comparison.count == 12
@@ -62,24 +62,29 @@ def test_series_hold_values_errors_and_truth(made):
 
 def test_a_wrong_truth_gives_a_bias(made):
     (crossing, *_) = read_crossings(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
-    comparison = compare(crossing, "extinction")
+    comparison = compare(crossing, "total_extinction")
     assert comparison is not None
     assert comparison.bias < -3.0
 
 
 def test_truth_is_the_mean_over_the_beams_at_the_crossing(made):
-    known = truth(made).drop_vars("extinction")
-    known["extinction"] = ("granule", np.full(180, np.nan))
+    known = truth(made).drop_vars("total_extinction")
+    known["total_extinction"] = ("granule", np.full(180, np.nan))
     middle = np.arange(50.0, 5000.0, 100.0)
     for number, name in enumerate(NAMES):
         suffix = name.replace("-", "_")
         known[f"profile_granule_{suffix}"] = (f"p{number}", np.arange(60) + 60 * number)
         known[f"range_{suffix}"] = (f"r{number}", middle)
         field = np.broadcast_to(1e-4 + 1e-7 * middle, (60, 1, middle.size))
-        known[f"profile_extinction_{suffix}"] = ((f"p{number}", f"w{number}", f"r{number}"), field)
+        known[f"profile_total_extinction_{suffix}"] = (
+            (f"p{number}", f"w{number}", f"r{number}"),
+            field,
+        )
     for v, crossing in enumerate(read_crossings(made, known, instruments=NAMES)):
         expected = 1e-4 + 1e-7 * np.nanmean(made["beam_range"].values[:, v])
-        np.testing.assert_allclose(crossing.estimates["extinction"].truth, expected, rtol=1e-6)
+        np.testing.assert_allclose(
+            crossing.estimates["total_extinction"].truth, expected, rtol=1e-6
+        )
 
 
 def test_scenes_are_joined_in_time(made):
@@ -148,7 +153,7 @@ def test_series_are_drawn_with_errors_and_truth(made):
     view = views("visibility")["visibility"]
     (figure,) = view.draw([series])
     for panel, quantity, scale in zip(
-        figure.panels, ("visibility", "extinction"), (1.0, 1e3), strict=True
+        figure.panels, ("visibility", "total_extinction"), (1.0, 1e3), strict=True
     ):
         for line, crossing in zip(labelled(panel, "crossing"), series, strict=True):
             np.testing.assert_allclose(

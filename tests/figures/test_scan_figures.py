@@ -63,12 +63,12 @@ def multiangle(cycles=12, *, seed=0, tilt=0.02):
     dimensionless = {"units": "1"}
     return xr.Dataset(
         {
-            "optical_depth": (BOTH, depth, dimensionless),
-            "optical_depth_standard_error": (BOTH, depth_error, dimensionless),
-            "optical_depth_gradient_error": (BOTH, 0.5 * depth_error, dimensionless),
-            "extinction": (BOTH, extinction, per_m),
-            "extinction_standard_error": (BOTH, error, per_m),
-            "extinction_gradient_error": (BOTH, 2.0 * error, per_m),
+            "vertical_optical_depth": (BOTH, depth, dimensionless),
+            "vertical_optical_depth_standard_error": (BOTH, depth_error, dimensionless),
+            "vertical_optical_depth_gradient_error": (BOTH, 0.5 * depth_error, dimensionless),
+            "total_extinction": (BOTH, extinction, per_m),
+            "total_extinction_standard_error": (BOTH, error, per_m),
+            "total_extinction_gradient_error": (BOTH, 2.0 * error, per_m),
             "data_share": (BOTH, np.ones(shape)),
             "inhomogeneity": (BOTH, np.full(shape, 0.01)),
             "reach": ("time", np.full(cycles, REACH), {"units": "m"}),
@@ -111,11 +111,11 @@ def truth_of(product, *, instrument="plain-scanner", zenith=(60.0, 30.0, 45.0)):
             "instrument": ("granule", np.array(["other"] * other + [instrument] * time.size)),
             "time": ("granule", filled(time, time[0])),
             "zenith_angle": ("granule", filled(angle, 0.0)),
-            "extinction": ("granule", np.full(other + time.size, np.nan)),
+            "total_extinction": ("granule", np.full(other + time.size, np.nan)),
             f"profile_granule_{suffix}": (dims[0], other + np.arange(time.size)),
             f"range_end_{suffix}": (dims[2], end),
-            f"profile_extinction_{suffix}": (dims, np.stack([0 * cells, cells], axis=1)),
-            f"profile_optical_depth_{suffix}": (dims, np.stack([0 * depth, depth], axis=1)),
+            f"profile_total_extinction_{suffix}": (dims, np.stack([0 * cells, cells], axis=1)),
+            f"profile_path_optical_depth_{suffix}": (dims, np.stack([0 * depth, depth], axis=1)),
         },
         coords={
             f"wavelength_{suffix}": (dims[1], [355e-9, 532e-9]),
@@ -156,10 +156,10 @@ class TestClearestCycle:
     def test_where_all_are_rejected_the_cycle_with_most_values_is_shown(self):
         product = multiangle()
         product["quality_flag"][:] = int(MultiAngleQuality.POOR_STRATIFICATION)
-        product["optical_depth"][:9, :3] = np.nan
+        product["vertical_optical_depth"][:9, :3] = np.nan
         profile = figure_data.clearest_cycle(product)
         assert profile.time == product["time"].values[9]
-        assert np.isnan(profile.estimates["extinction"].value).all()
+        assert np.isnan(profile.estimates["total_extinction"].value).all()
         for panel in drawn(product).panels:
             (marks,) = labelled(panel, "do not use")
             assert ((marks.x >= panel.x.low) & (marks.x <= panel.x.high)).mean() > 0.9
@@ -168,7 +168,7 @@ class TestClearestCycle:
 
     def test_nothing_where_there_is_no_value(self):
         product = multiangle()
-        product["optical_depth"][:] = np.nan
+        product["vertical_optical_depth"][:] = np.nan
         assert figure_data.clearest_cycle(product) is None
         assert figure_data.clearest_cycle(multiangle().isel(time=slice(0))) is None
 
@@ -193,7 +193,7 @@ class TestClearestCycle:
         product["quality_flag"][:, 20] = np.nan
         profile = figure_data.clearest_cycle(product)
         assert profile.flag[20] == int(Quality.INPUT_MISSING)
-        assert np.isnan(profile.estimates["optical_depth"].value[20])
+        assert np.isnan(profile.estimates["vertical_optical_depth"].value[20])
 
 
 class TestTruth:
@@ -255,7 +255,8 @@ class TestTruth:
 
 class TestProfileFigure:
     @pytest.mark.parametrize(
-        ("place", "quantity", "scale"), [(0, "optical_depth", 1.0), (1, "extinction", 1e3)]
+        ("place", "quantity", "scale"),
+        [(0, "vertical_optical_depth", 1.0), (1, "total_extinction", 1e3)],
     )
     def test_lines_and_bands_hold_values_and_errors(self, place, quantity, scale):
         product = multiangle()
@@ -291,7 +292,7 @@ class TestProfileFigure:
 
     def test_a_rejected_value_far_off_does_not_set_the_axis(self):
         product = multiangle()
-        product["extinction"][:, 0] = 1.0
+        product["total_extinction"][:, 0] = 1.0
         assert drawn(product).panels[1].x.high < 1.0
 
     def test_the_reach_is_a_line_where_there_is_one(self):
@@ -315,7 +316,9 @@ class TestProfileFigure:
         product = multiangle()
         truth = truth_of(product)
         height = truth["range_plain_scanner"].values * np.cos(np.radians(30.0))
-        truth["profile_extinction_plain_scanner"].values[..., height > REACH - STATION + 60] = 0.1
+        truth["profile_total_extinction_plain_scanner"].values[
+            ..., height > REACH - STATION + 60
+        ] = 0.1
         panel = drawn(product, truth).panels[1]
         (cloud,) = labelled(panel, "truth")
         assert cloud.x[cloud.y < panel.y.high].max() == pytest.approx(100.0)
@@ -324,7 +327,7 @@ class TestProfileFigure:
     @pytest.mark.parametrize("error", [1.0, np.nan])
     def test_the_gradient_error_does_not_set_the_axis(self, error):
         product = multiangle()
-        product["extinction_gradient_error"][:] = error
+        product["total_extinction_gradient_error"][:] = error
         panel = drawn(product).panels[1]
         (line,) = labelled(panel, "retrieved")
         assert np.nanmax(line.x) - np.nanmin(line.x) > 0.2 * (panel.x.high - panel.x.low)
@@ -333,7 +336,7 @@ class TestProfileFigure:
 
     def test_extinction_withheld_where_the_optical_depth_is_known(self):
         product = multiangle()
-        product["extinction"][:] = np.nan
+        product["total_extinction"][:] = np.nan
         assert "Extinction no usable value" in drawn(product).words
 
     def test_the_description_lists_reach_and_flags(self):
@@ -492,7 +495,7 @@ class TestImage:
         (panel,) = figure.panels
         assert panel.y.label == "altitude (km)"
         assert panel.y.low == pytest.approx((ALTITUDE[0] - 25) / 1e3)
-        assert panel.bar.label == "extinction (km⁻¹)"
+        assert panel.bar.label == "total extinction (km⁻¹)"
         value = 1e3 * true_extinction(ALTITUDE)
         assert value.min() / 10 < panel.bar.low < panel.bar.high < 1.5 * value.max()
         assert "poor_stratification" in figure.words
@@ -503,7 +506,7 @@ class TestImage:
         raster = figure_data.read_extinction(product, profiles=20)
         assert raster.mean.shape == (3, ALTITUDE.size)
         np.testing.assert_allclose(
-            raster.mean[0, 10], 1e3 * product["extinction"].values[:20, 10].mean(), rtol=1e-6
+            raster.mean[0, 10], 1e3 * product["total_extinction"].values[:20, 10].mean(), rtol=1e-6
         )
         assert raster.units == "km-1"
 
@@ -529,7 +532,7 @@ NEEDED = {
         "altitude",
     ),
     "residuals": ("residual", "beam_zenith_angle", "quality_flag", "time", "altitude"),
-    "image": ("extinction", "extinction_standard_error", "quality_flag", "time"),
+    "image": ("total_extinction", "total_extinction_standard_error", "quality_flag", "time"),
 }
 
 
@@ -551,7 +554,7 @@ class TestRefusal:
     @pytest.mark.parametrize("reader", ["profile", "image"])
     def test_other_units_are_refused(self, reader):
         product = multiangle(cycles=2)
-        product["extinction"].attrs["units"] = "km-1"
+        product["total_extinction"].attrs["units"] = "km-1"
         with pytest.raises(ProductError, match="km-1"):
             READERS[reader](product)
 
@@ -581,10 +584,10 @@ class TestGallery:
         assert made.flags
 
     def test_an_unreadable_product_is_listed_once_and_the_next_is_drawn(self, tmp_path):
-        broken = multiangle().drop_vars(["optical_depth", "residual"])
+        broken = multiangle().drop_vars(["vertical_optical_depth", "residual"])
         made, _ = self.run(tmp_path, {"a.nc": broken, "b.nc": multiangle()})
         assert [problem.path for problem in made.problems] == ["a.nc"]
-        assert "optical_depth" in made.problems[0].reason
+        assert "vertical_optical_depth" in made.problems[0].reason
         assert len(made.pictures) == 3
 
     def test_figures_without_values_are_left_out(self, tmp_path):
@@ -592,7 +595,7 @@ class TestGallery:
         product["quality_flag"][:] = int(
             MultiAngleQuality.NO_LEVERAGE | MultiAngleQuality.NO_RESIDUAL
         )
-        product["optical_depth"][:] = np.nan
+        product["vertical_optical_depth"][:] = np.nan
         made, _ = self.run(tmp_path, {"a.nc": product})
         assert not made.problems
         assert [figure.file.partition("_")[0] for figure in made.pictures] == ["multiangle"]

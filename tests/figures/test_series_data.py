@@ -55,7 +55,7 @@ def test_sections_and_times_are_sorted_together():
             )
 
 
-@pytest.mark.parametrize("name", ["extinction", "background_standard_error", "quality_flag"])
+@pytest.mark.parametrize("name", ["total_extinction", "background_standard_error", "quality_flag"])
 def test_missing_variable_is_named(name):
     product = homogeneous(times(START, 4, 60.0)).drop_vars(name)
     with pytest.raises(ProductError, match=f"{name}: is missing"):
@@ -65,7 +65,9 @@ def test_missing_variable_is_named(name):
 def test_foreign_products_are_refused():
     product = homogeneous(times(START, 4, 60.0))
     with pytest.raises(ProductError, match="extinction: has the units 'km-1'"):
-        sections_of(product.assign(extinction=product["extinction"].assign_attrs(units="km-1")))
+        sections_of(
+            product.assign(total_extinction=product["total_extinction"].assign_attrs(units="km-1"))
+        )
     with pytest.raises(ProductError, match="dims"):
         sections_of(product.transpose("section", "time", "nv"))
     with pytest.raises(ProductError, match="section_bounds"):
@@ -92,7 +94,7 @@ class TestTruth:
         paths = [f"raw/h{i:05d}" for i in (3, 1, 29)]
         (section, _) = sections_of(homogeneous(time[[3, 1, 29]]), truth, paths=paths)
         np.testing.assert_allclose(
-            section.estimates["extinction"].truth, fab.true_extinction(time[[1, 3, 29]])
+            section.estimates["total_extinction"].truth, fab.true_extinction(time[[1, 3, 29]])
         )
 
     @pytest.mark.parametrize("offset", [0.0, -30.0, -29.0, 6.0])
@@ -102,21 +104,21 @@ class TestTruth:
         truth["time"] = truth["time"] + np.timedelta64(int(offset * 1e9), "ns")
         (section, _) = sections_of(homogeneous(time[5:9]), truth)
         np.testing.assert_allclose(
-            section.estimates["extinction"].truth, fab.true_extinction(time[5:9])
+            section.estimates["total_extinction"].truth, fab.true_extinction(time[5:9])
         )
 
     def test_is_absent_where_no_granule_is_near(self):
         time = times(START, 30, 60.0)
         far = times(START + timedelta(hours=3), 5, 60.0)
         (section, _) = sections_of(homogeneous(far), truth_of(time))
-        assert np.isnan(section.estimates["extinction"].truth).all()
-        assert compare(section, "extinction") is None
+        assert np.isnan(section.estimates["total_extinction"].truth).all()
+        assert compare(section, "total_extinction") is None
 
     def test_is_of_the_right_instrument(self):
         time = times(START, 30, 60.0)
         truth = truth_of(time, other=30)
         (section, _) = sections_of(homogeneous(time), truth, instrument="vertical")
-        assert np.isnan(section.estimates["extinction"].truth).all()
+        assert np.isnan(section.estimates["total_extinction"].truth).all()
         # Its background is 9 MHz at the first profile and unknown at the others.
         background = section.estimates["background"].truth
         assert background[0] == 9.0
@@ -137,7 +139,9 @@ class TestTruth:
         truth_of(time).to_netcdf(tmp_path / "truth.nc")
         with xr.open_dataset(tmp_path / "truth.nc") as opened:
             (section, _) = sections_of(homogeneous(time), opened)
-        np.testing.assert_allclose(section.estimates["extinction"].truth, fab.true_extinction(time))
+        np.testing.assert_allclose(
+            section.estimates["total_extinction"].truth, fab.true_extinction(time)
+        )
         assert np.isfinite(section.estimates["amplitude"].truth).all()
 
     def test_bytes_are_text_too(self):
@@ -145,21 +149,21 @@ class TestTruth:
         truth = truth_of(time)
         truth["instrument"] = truth["instrument"].astype("S20")
         (section, _) = sections_of(homogeneous(time), truth)
-        assert np.isfinite(section.estimates["extinction"].truth).all()
+        assert np.isfinite(section.estimates["total_extinction"].truth).all()
 
     def test_without_granules_is_no_truth(self):
         time = times(START, 3, 60.0)
         (section, _) = sections_of(homogeneous(time), truth_of(time).isel(granule=slice(0)))
-        assert np.isnan(section.estimates["extinction"].truth).all()
+        assert np.isnan(section.estimates["total_extinction"].truth).all()
 
 
 class TestCompare:
     def test_counts_unflagged_values_only(self):
         time = times(START, 2000, 30.0)
         for section in sections_of(homogeneous(time, flagged=0.2), truth_of(time)):
-            comparison = compare(section, "extinction")
+            comparison = compare(section, "total_extinction")
             assert comparison.count == int((section.flag == 0).sum())
-            estimate = section.estimates["extinction"]
+            estimate = section.estimates["total_extinction"]
             score = (estimate.value - estimate.truth) / estimate.standard_error
             score = score[section.flag == 0]
             assert comparison.within_1 == np.mean(np.abs(score) <= 1)
@@ -183,11 +187,11 @@ class TestCompare:
     def test_verdict_on_the_standard_errors(self, scale, shift, verdict):
         time = times(START, 500, 30.0)
         product = homogeneous(time, flagged=0.0, scale=scale)
-        product["extinction"] = (
-            product["extinction"] + shift * product["extinction_standard_error"]
+        product["total_extinction"] = (
+            product["total_extinction"] + shift * product["total_extinction_standard_error"]
         ).assign_attrs(units="m-1")
         (section, _) = sections_of(product, truth_of(time))
-        comparison = compare(section, "extinction")
+        comparison = compare(section, "total_extinction")
         assert comparison.verdict is verdict
         assert verdict.unsafe == (verdict in (Verdict.BEYOND, Verdict.UNDERSTATED))
 
@@ -195,20 +199,20 @@ class TestCompare:
     def test_values_without_a_standard_error_are_counted(self, error):
         time = times(START, 10, 30.0)
         product = homogeneous(time, flagged=0.0)
-        product["extinction_standard_error"][4, :] = error
+        product["total_extinction_standard_error"][4, :] = error
         (section, _) = sections_of(product, truth_of(time))
-        comparison = compare(section, "extinction")
+        comparison = compare(section, "total_extinction")
         assert (comparison.count, comparison.without_error) == (9, 1)
         assert comparison.verdict is Verdict.NO_ERROR
         assert comparison.verdict.unsafe
-        assert np.isnan(normalised_error(section, "extinction")[4])
+        assert np.isnan(normalised_error(section, "total_extinction")[4])
 
     def test_only_values_without_standard_error(self):
         time = times(START, 10, 30.0)
         product = homogeneous(time, flagged=0.0)
-        product["extinction_standard_error"][:] = np.nan
+        product["total_extinction_standard_error"][:] = np.nan
         (section, _) = sections_of(product, truth_of(time))
-        comparison = compare(section, "extinction")
+        comparison = compare(section, "total_extinction")
         assert (comparison.count, comparison.without_error) == (0, 10)
         assert comparison.verdict is Verdict.NO_ERROR
         assert comparison.verdict.unsafe
@@ -223,8 +227,10 @@ def test_join_sorts_in_time_and_separates_other_bounds():
     middle = joined[1]
     assert (np.diff(middle.time) > np.timedelta64(0)).all()
     np.testing.assert_array_equal(
-        middle.estimates["extinction"].value,
-        np.concatenate([early["extinction"].values[:, 0], late["extinction"].values[:, 0]]),
+        middle.estimates["total_extinction"].value,
+        np.concatenate(
+            [early["total_extinction"].values[:, 0], late["total_extinction"].values[:, 0]]
+        ),
     )
 
 
@@ -244,7 +250,7 @@ def test_thin_is_the_block_mean_of_unflagged_values(count, points, seed):
     blocks = [np.arange(i, min(i + size, count)) for i in range(0, count, size)]
     blocks = [block[good[block]] for block in blocks if good[block].any()]
     assert thinned.time.size == len(blocks)
-    for name in ("extinction", "background"):
+    for name in ("total_extinction", "background"):
         estimate, mean = section.estimates[name], thinned.estimates[name]
         error = [np.sqrt((estimate.standard_error[b] ** 2).sum()) / b.size for b in blocks]
         np.testing.assert_allclose(mean.value, [estimate.value[b].mean() for b in blocks])

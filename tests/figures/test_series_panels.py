@@ -40,9 +40,9 @@ def values(panel):
 def test_lines_hold_the_unflagged_values_in_km():
     product = homogeneous(times(START, 100, 300.0), flagged=0.2)
     ((upper, lower),) = (figure.panels for figure in drawn(product))
-    assert upper.y.label == "extinction (km⁻¹)"
+    assert upper.y.label == "total extinction (km⁻¹)"
     assert lower.y.label == "background (MHz)"
-    for panel, name, scale in ((upper, "extinction", 1e3), (lower, "background", 1.0)):
+    for panel, name, scale in ((upper, "total_extinction", 1e3), (lower, "background", 1.0)):
         assert len(values(panel)) == len(SECTIONS)
         for k, curve in enumerate(values(panel)):
             good = product["quality_flag"].values[:, k] == 0
@@ -55,7 +55,7 @@ def test_error_bars_are_one_standard_error():
     panel = drawn(product)[0].panels[0]
     (bars,) = (layer for layer in panel.layers if isinstance(layer, Band))
     assert bars.bars
-    expected = 1e3 * product["extinction_standard_error"].values[:, 0]
+    expected = 1e3 * product["total_extinction_standard_error"].values[:, 0]
     np.testing.assert_allclose((bars.high - bars.low) / 2, expected, rtol=1e-5)
 
 
@@ -82,21 +82,21 @@ def test_flagged_values_and_those_to_use_with_care_are_marked():
         (marks,) = labelled(panel, words)
         assert not marks.joined
         assert marks.label == f"{words}: {chosen.sum()}"
-        expected = 1e3 * product["extinction"].values.T[chosen.T]
+        expected = 1e3 * product["total_extinction"].values.T[chosen.T]
         np.testing.assert_allclose(marks.y, expected, rtol=1e-6)
 
 
 def test_flagged_values_do_not_set_the_axis():
     product = homogeneous(times(START, 40, 300.0), flagged=0.0)
     product["quality_flag"].values[5, 0] = int(HomogeneousQuality.AT_BOUND)
-    product["extinction"].values[5, 0] = 5.0
+    product["total_extinction"].values[5, 0] = 5.0
     assert drawn(product)[0].panels[0].y.high < 0.6
 
 
 def test_values_beyond_the_axis_are_counted():
     product = homogeneous(times(START, 1000, 60.0), flagged=0.0, sections=SECTIONS[:1])
-    product["extinction"].values[5, 0] = 5.0
-    assert "1 value of extinction beyond the axis" in drawn(product)[0].words
+    product["total_extinction"].values[5, 0] = 5.0
+    assert "1 value of total extinction beyond the axis" in drawn(product)[0].words
 
 
 def test_truth_is_drawn_and_named_once():
@@ -132,14 +132,14 @@ def test_one_profile_and_all_flagged_and_all_missing():
     product = homogeneous(times(START, 5, 60.0))
     product["quality_flag"][:] = int(HomogeneousQuality.POOR_FIT)
     assert "no usable value, 5 flagged values" in drawn(product)[0].words
-    for name in ("extinction", "background"):
+    for name in ("total_extinction", "background"):
         product[name][:] = np.nan
     assert drawn(product)
     assert not drawn(product.isel(time=slice(0)), homogeneous(times(START, 1, 60.0)))[1:]
 
 
 def test_a_foreign_product_is_refused():
-    with pytest.raises(ProductError, match="extinction"):
+    with pytest.raises(ProductError, match="total_extinction"):
         drawn(signal(times(START, 3, 60.0)))
 
 
@@ -151,8 +151,8 @@ def test_scores_are_normalised_errors_of_unflagged_values():
     marks = [layer for layer in figure.panels[0].layers if getattr(layer, "mark", None)]
     for k, curve in enumerate(marks):
         good = product["quality_flag"].values[:, k] == 0
-        score = (product["extinction"].values[:, k] - fab.true_extinction(time)) / product[
-            "extinction_standard_error"
+        score = (product["total_extinction"].values[:, k] - fab.true_extinction(time)) / product[
+            "total_extinction_standard_error"
         ].values[:, k]
         np.testing.assert_allclose(curve.y, score[good], rtol=1e-4, atol=1e-4)
         assert f"of {good.sum()} within 3" in curve.label
@@ -165,7 +165,7 @@ def test_scores_are_normalised_errors_of_unflagged_values():
 def test_far_off_scores_are_drawn_at_the_edge_and_counted():
     time = times(START, 20_000, 4.0)
     product = homogeneous(time, flagged=0.0, sections=SECTIONS[:1])
-    product["extinction"].values[777, 0] += 1.0
+    product["total_extinction"].values[777, 0] += 1.0
     figure = drawn(product, truth=truth_of(time), **INSTRUMENT)[1]
     (curve,) = (layer for layer in figure.panels[0].layers if getattr(layer, "mark", None))
     assert curve.y.max() == 10.0

@@ -144,14 +144,16 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: str):
         for listed in variable.attrs.get("coordinates", "").split():
             assert set(product[listed].dims) <= set(variable.dims), (name, listed)
         assert "station" not in variable.attrs.get("coordinates", "").split()
+    along_beam = {"altitude", "zenith_angle", "azimuth"}
     main, beam = {
-        "signal": ("signal", {"altitude", "zenith_angle", "azimuth"}),
+        "signal": ("signal", along_beam),
         "multiangle": ("residual", {"beam_zenith_angle", "beam_azimuth"}),
         "visibility": (
-            "extinction",
+            "total_extinction",
             {"latitude", "longitude", "altitude", "crossing_id"},
         ),
-    }.get(kind, ("extinction", {"altitude", "zenith_angle", "azimuth"}))
+        "homogeneous": ("total_extinction", along_beam),
+    }.get(kind, ("aerosol_extinction", along_beam))
     assert beam | {"wavelength"} <= set(product[main].attrs["coordinates"].split())
     assert not beam & set(product["shots"].attrs["coordinates"].split()) - {
         "zenith_angle",
@@ -362,10 +364,18 @@ def test_every_missing_variable_is_named(kind: str):
         (put("section_range", math.inf, (0,)), "section_range", "finite"),
         (put("section_range", 0.0, (0,)), "section_bounds", "enclose"),
         (put("section", 1.5, (0,)), "section", "whole numbers"),
-        (put("extinction", math.nan, (1, 1)), "extinction", "carry no quality bit"),
-        (put("extinction", 1e300, (1, 1)), "extinction", "carry no quality bit"),
-        (put("extinction_standard_error", math.inf, (1, 1)), "extinction_standard_error", "bit"),
-        (put("extinction_standard_error", -1.0, (1, 1)), "extinction_standard_error", "range"),
+        (put("total_extinction", math.nan, (1, 1)), "total_extinction", "carry no quality bit"),
+        (put("total_extinction", 1e300, (1, 1)), "total_extinction", "carry no quality bit"),
+        (
+            put("total_extinction_standard_error", math.inf, (1, 1)),
+            "total_extinction_standard_error",
+            "bit",
+        ),
+        (
+            put("total_extinction_standard_error", -1.0, (1, 1)),
+            "total_extinction_standard_error",
+            "range",
+        ),
         (put("reduced_chi2", -0.1, (1, 1)), "reduced_chi2", "valid range"),
         (put("quality_flag", 1 << 21 | 1 << 16, (0, 0)), "quality_flag", "not have: 16, 21"),
         (put("quality_flag", -1, (0, 0)), "quality_flag", "29, 30, 31"),
@@ -375,7 +385,7 @@ def test_every_missing_variable_is_named(kind: str):
         (put("shots", -1, (0,)), "shots", "valid range"),
         (lambda data: data.isel(section=0, drop=True), "section", "missing"),
         (lambda data: data.rename(section="level"), "section", "missing"),
-        (lambda data: data.assign(shots=data["extinction"]), "shots", "dimensions"),
+        (lambda data: data.assign(shots=data["total_extinction"]), "shots", "dimensions"),
         (lambda data: data.assign(shots=data["shots"].astype(str)), "shots", "not numbers"),
         (lambda data: data.assign(extra=data["shots"]), "extra", "not a variable"),
         (lambda data: data.chunk(), "time_bnds", "dask"),
@@ -419,9 +429,13 @@ def test_bad_signals_are_refused(change, field, problem):
         (put("beam_zenith_angle", -30.0, (1,)), "beam_zenith_angle", "valid range"),
         (put("beam_zenith_angle", math.nan, (1,)), "beam_zenith_angle", "finite"),
         (put("beam", 0.5, (0,)), "beam", "whole numbers"),
-        (put("optical_depth", math.nan, (2, 2)), None, ""),
+        (put("vertical_optical_depth", math.nan, (2, 2)), None, ""),
         (put("quality_flag", int(ElasticQuality.CLOUD), (0, 0)), "quality_flag", ": 17"),
-        (put("extinction_gradient_error", -1.0, (1, 1)), "extinction_gradient_error", "range"),
+        (
+            put("total_extinction_gradient_error", -1.0, (1, 1)),
+            "total_extinction_gradient_error",
+            "range",
+        ),
         (lambda data: data.assign_coords(zenith_angle=0.0), None, ""),
     ],
 )
@@ -440,7 +454,7 @@ def test_a_missing_optical_depth_without_a_bit_is_refused():
     data = multiangle()
     data["quality_flag"][2] = 0
     with pytest.raises(ProductError, match="carry no quality bit"):
-        build_product(put("optical_depth", math.nan, (2, 2))(data), context("multiangle"))
+        build_product(put("vertical_optical_depth", math.nan, (2, 2))(data), context("multiangle"))
 
 
 def test_layers_of_a_scan_reach_from_the_station_upwards():

@@ -52,15 +52,16 @@ def test_a_product_of_missing_values_only_complies(kind: str, tmp_path: Path):
     write_product(build_product(data, of), path)
     assert findings(path) == (set(), permitted(kind, data))
     with xr.open_dataset(path) as product:
-        main = "signal" if kind == "signal" else "extinction"
-        assert np.isnan(product[main]).all()
+        of_aerosol = kind in ("elastic", "raman")
+        main = "aerosol_extinction" if of_aerosol else "total_extinction"
+        assert np.isnan(product["signal" if kind == "signal" else main]).all()
         assert "wavelength" not in product
 
 
 def test_the_checker_detects_an_error(tmp_path: Path):
     product = build_product(homogeneous(), context())
-    product["extinction"].attrs["units"] = "kg"
-    product["extinction"].attrs["standard_name"] = "altitude"
+    product["total_extinction"].attrs["units"] = "kg"
+    product["total_extinction"].attrs["standard_name"] = "altitude"
     path = tmp_path / "product.nc"
     write_product(product, path)
-    assert any("extinction" in said for said in findings(path)[0])
+    assert any("total_extinction" in said for said in findings(path)[0])

@@ -75,7 +75,7 @@ def test_bins_of_slant_beams_have_their_own_position(kind: str):
     assert product["bin_latitude"].attrs["standard_name"] == "latitude"
     assert product.attrs["geospatial_lon_max"] == float(bins.max())
     assert product.attrs["geospatial_bounds"].startswith("POLYGON ((")
-    main = "signal" if kind == "signal" else "extinction"
+    main = "signal" if kind == "signal" else "total_extinction"
     # CDO 2.1 would skip the variable, or read garbage where the beam moves.
     assert "bin_latitude" not in product[main].attrs["coordinates"].split()
 

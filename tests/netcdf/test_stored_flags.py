@@ -82,7 +82,7 @@ def test_means_of_older_products_are_those_of_products_of_now(tmp_path: Path):
         (written,) = write_means(tmp_path, [read_facts(tmp_path, f"{name}.nc")], Period.DAY).files
         means.append(xr.load_dataset(tmp_path / written.path))
     assert means[0].quality_flag.values.any()
-    for name in ("quality_flag", "usable", "usable_share", "extinction"):
+    for name in ("quality_flag", "usable", "usable_share", "total_extinction"):
         xr.testing.assert_identical(means[0][name].variable, means[1][name].variable)
     groups = {read_facts(tmp_path, f"{name}.nc").group for name in ("now", "older")}
     assert len(groups) == 2, "views over both would mix bits"

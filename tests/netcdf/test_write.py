@@ -45,7 +45,7 @@ def product() -> xr.Dataset:
 def truth() -> xr.Dataset:
     return xr.Dataset(
         {
-            "extinction": (("scene", "level"), np.array([[1e-5, np.nan], [2e-5, 3e-5]])),
+            "total_extinction": (("scene", "level"), np.array([[1e-5, np.nan], [2e-5, 3e-5]])),
             "label": ("scene", np.array(["hazy", "чисто"])),
             "weather": "fair",
             "good": ("scene", np.array([True, False])),
@@ -455,10 +455,10 @@ def test_products_follow_the_umask_of_the_user(product: xr.Dataset, tmp_path: Pa
 
 @pytest.mark.parametrize("function", [write_product, write_plain])
 def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
-    lazy = product.assign(extinction=product["extinction"].chunk())
+    lazy = product.assign(total_extinction=product["total_extinction"].chunk())
     with pytest.raises(ProductError, match="load the dataset") as caught:
         function(lazy, tmp_path / "product.nc")
-    assert caught.value.field == "extinction"
+    assert caught.value.field == "total_extinction"
     assert list(tmp_path.iterdir()) == []
 
 

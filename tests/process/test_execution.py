@@ -193,8 +193,8 @@ def elastic_products():
 
 def deviation(product, inside):
     """Return the deviation of unflagged values from the truth, in standard errors."""
-    score = (product["backscatter"] - particles(STATION + distance)) / product[
-        "backscatter_standard_error"
+    score = (product["aerosol_backscatter"] - particles(STATION + distance)) / product[
+        "aerosol_backscatter_standard_error"
     ]
     return score.where(product["quality_flag"] == 0).to_numpy()[:, inside]
 
@@ -297,11 +297,11 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "notes": (),
     }
     product = build_product(retrieved, Context(**settings))
-    assert product["backscatter"].dims == ("time", "range")
-    stored = product["backscatter"].to_numpy()
+    assert product["aerosol_backscatter"].dims == ("time", "range")
+    stored = product["aerosol_backscatter"].to_numpy()
     np.testing.assert_allclose(
-        stored[np.isfinite(retrieved["backscatter"])],
-        retrieved["backscatter"].to_numpy()[np.isfinite(retrieved["backscatter"])],
+        stored[np.isfinite(retrieved["aerosol_backscatter"])],
+        retrieved["aerosol_backscatter"].to_numpy()[np.isfinite(retrieved["aerosol_backscatter"])],
         rtol=2e-4,
     )
     np.testing.assert_allclose(product["altitude"][..., 100], STATION + distance[100], rtol=1e-6)
@@ -321,7 +321,9 @@ def test_a_slant_beam_recovers_the_same_truth() -> None:
     product = carry_out(products, raw, zenith_angle=30.0)["elastic"]
     altitude = STATION + np.cos(np.deg2rad(30.0)) * distance
     assert float(product["zenith_angle"]) == 30.0
-    score = (product["backscatter"] - particles(altitude)) / product["backscatter_standard_error"]
+    score = (product["aerosol_backscatter"] - particles(altitude)) / product[
+        "aerosol_backscatter_standard_error"
+    ]
     inside = score.to_numpy()[:, between(800, 3000)]
     assert np.sqrt(np.nanmean(inside**2)) < 1.4
     assert float(product["reference_bottom"][0]) >= 3000.0 / np.cos(np.deg2rad(30.0)) - 1e-6
@@ -339,7 +341,7 @@ def test_missing_profiles_give_flags_and_no_error() -> None:
     for channel in ("photon_532o", "glued_532o"):
         for kind, product in carry_out(products, raw, channel=channel).items():
             flag = product["quality_flag"].to_numpy()
-            name = "backscatter" if kind == "elastic" else "signal"
+            name = "aerosol_backscatter" if kind == "elastic" else "signal"
             assert (flag[np.isnan(product[name].to_numpy())] != 0).all()
             assert np.isnan(product[name].to_numpy()[-1]).all()
             assert np.isfinite(product[name].to_numpy()[0]).mean() > 0.9
@@ -428,7 +430,10 @@ class TestOverlap:
         product = carry_out(
             {"homogeneous": sections}, archive(level * SEEN), ancillaries=files, **settings
         )["homogeneous"]
-        right = np.abs(product["extinction"] - 3e-4) < 5 * product["extinction_standard_error"]
+        right = (
+            np.abs(product["total_extinction"] - 3e-4)
+            < 5 * product["total_extinction_standard_error"]
+        )
         assert (right | (product["quality_flag"] != 0)).all()
 
 
@@ -468,7 +473,9 @@ def test_means_of_many_profiles_keep_the_error_of_the_dark_signal() -> None:
         product = carry_out(products, raw, channel="analog_532o", dark=dark)["elastic"]
         assert product.sizes["time"] == 1
         inside = between(2000, 3000)
-        errors[name] = np.nanmedian(product["backscatter_error_noise"].to_numpy()[0, inside])
+        errors[name] = np.nanmedian(
+            product["aerosol_backscatter_error_noise"].to_numpy()[0, inside]
+        )
     # 120 profiles average down, 3 dark files do not: sqrt((1/120 + 1/3) / (1/120)).
     assert errors["with"] / errors["without"] == pytest.approx(np.sqrt(41.0), rel=0.25)
 
@@ -564,7 +571,7 @@ def test_bins_nearer_than_full_overlap_are_flagged_and_excluded() -> None:
         for kind, data in retrieved.items():
             hit = (data["quality_flag"].to_numpy() & int(Quality.INCOMPLETE_OVERLAP)) != 0
             np.testing.assert_array_equal(hit, np.broadcast_to(near, hit.shape), err_msg=kind)
-        elastic = retrieved["elastic"]["backscatter"].to_numpy()
+        elastic = retrieved["elastic"]["aerosol_backscatter"].to_numpy()
         assert np.isnan(elastic[:, near]).all()
         assert np.isfinite(elastic[:, between(900, 3000)]).all()
 

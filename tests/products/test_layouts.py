@@ -98,7 +98,7 @@ def test_variables_without_standard_name():
             *gluing,
         },
         "elastic": {
-            *(f"backscatter_error_{cause}" for cause in _CAUSES),
+            *(f"aerosol_backscatter_error_{cause}" for cause in _CAUSES),
             "molecular_backscatter",
             "molecular_extinction",
             "reference_bottom",
@@ -112,14 +112,14 @@ def test_variables_without_standard_name():
             *gluing,
         },
         "raman": {
-            *(f"extinction_error_{cause}" for cause in EXTINCTION_CAUSES),
-            *(f"backscatter_error_{cause}" for cause in BACKSCATTER_CAUSES),
+            *(f"aerosol_extinction_error_{cause}" for cause in EXTINCTION_CAUSES),
+            *(f"aerosol_backscatter_error_{cause}" for cause in BACKSCATTER_CAUSES),
             *(
                 f"{quantity}_error_{kind}"
                 for quantity in ("lidar_ratio", "water_vapour_mixing_ratio")
                 for kind in ("random", "systematic")
             ),
-            "extinction_smoothing_error",
+            "aerosol_extinction_smoothing_error",
             "vertical_resolution",
             "overlap",
             "overlap_standard_error",
@@ -133,15 +133,15 @@ def test_variables_without_standard_name():
             *(
                 f"{quantity}{error}"
                 for quantity in (
-                    "optical_depth",
-                    "extinction",
-                    "layer_optical_depth",
-                    "plane_optical_depth",
-                    "plane_extinction",
+                    "vertical_optical_depth",
+                    "total_extinction",
+                    "layer_vertical_optical_depth",
+                    "plane_vertical_optical_depth",
+                    "plane_total_extinction",
                 )
                 for error in ("", "_standard_error", "_gradient_error")
             ),
-            "monotone_optical_depth",
+            "monotone_vertical_optical_depth",
             "reduced_chi2",
             "log_intercept",
             "log_intercept_standard_error",
@@ -156,11 +156,11 @@ def test_variables_without_standard_name():
         "visibility": {
             "visibility_in_air_lower",
             "visibility_in_air_upper",
-            "extinction",
-            "extinction_standard_error",
-            "extinction_systematic_error",
+            "total_extinction",
+            "total_extinction_standard_error",
+            "total_extinction_systematic_error",
             "condition",
-            "optical_depth",
+            "path_optical_depth",
             "reduced_chi2",
             "degrees_of_freedom",
             "prior_deviation",
@@ -169,9 +169,9 @@ def test_variables_without_standard_name():
         "homogeneous": {
             "visibility_in_air_lower",
             "visibility_in_air_upper",
-            "extinction",
-            "extinction_standard_error",
-            "extinction_model_error",
+            "total_extinction",
+            "total_extinction_standard_error",
+            "total_extinction_model_error",
             "amplitude",
             "amplitude_standard_error",
             "background",
@@ -180,6 +180,20 @@ def test_variables_without_standard_name():
             "reduced_chi2",
         },
     }
+
+
+def test_one_name_is_one_quantity_in_all_kinds():
+    meanings: dict[str, set[tuple[str | None, str | None]]] = {}
+    words: dict[str, set[str | None]] = {}
+    for kind in kinds():
+        for row in layout_of(kind).variables:
+            meanings.setdefault(row.name, set()).add((row.units, row.standard_name))
+            if "extinction" in row.name:
+                words.setdefault(row.name, set()).add(row.long_name)
+    assert {name for name, various in meanings.items() if len(various) > 1} == set()
+    assert all(len(words[f"{whose}_extinction"]) == 1 for whose in ("aerosol", "total"))
+    # Which extinction, and along which path, is part of the name.
+    assert not {"extinction", "backscatter", "optical_depth"} & set(meanings)
 
 
 def test_no_standard_name_means_total_extinction_in_air(standard_names: dict[str, str | None]):

@@ -12,30 +12,39 @@ from lidarops.errors import ProductError
 
 def test_layers_have_their_errors():
     product = build_product(multiangle(), context("multiangle"))
-    layer = product["layer_optical_depth"]
+    layer = product["layer_vertical_optical_depth"]
     assert layer.dims == ("time", "layer")
     np.testing.assert_allclose(layer[1:], 0.1, rtol=1e-3)
     ancillaries = set(layer.attrs["ancillary_variables"].split())
-    assert {f"layer_optical_depth_{kind}_error" for kind in ("standard", "gradient")} == ancillaries
-    assert product["layer_optical_depth_gradient_error"].attrs["error_kind"] == "systematic"
+    assert {
+        f"layer_vertical_optical_depth_{kind}_error" for kind in ("standard", "gradient")
+    } == ancillaries
+    assert (
+        product["layer_vertical_optical_depth_gradient_error"].attrs["error_kind"] == "systematic"
+    )
 
 
 def test_layers_need_their_errors_and_altitudes():
     plain = build_product(multiangle(layers=False), context("multiangle"))
     assert not [name for name in plain.variables if str(name).startswith("layer")]
     whole = multiangle()
-    named = ("layer_optical_depth_standard_error", "layer_optical_depth_gradient_error")
+    named = (
+        "layer_vertical_optical_depth_standard_error",
+        "layer_vertical_optical_depth_gradient_error",
+    )
     for name in (*named, "layer_altitude", "layer_bnds"):
         with pytest.raises(ProductError) as caught:
             build_product(whole.drop_vars(name), context("multiangle"))
         assert caught.value.field == name
-    bad = whole.assign(layer_optical_depth_standard_error=-whole["layer_optical_depth"])
+    bad = whole.assign(
+        layer_vertical_optical_depth_standard_error=-whole["layer_vertical_optical_depth"]
+    )
     with pytest.raises(ProductError, match="valid range"):
         build_product(bad, context("multiangle"))
 
 
 def test_each_optional_row_may_be_left_out():
-    for name in ("monotone_optical_depth", "reduced_chi2"):
+    for name in ("monotone_vertical_optical_depth", "reduced_chi2"):
         product = build_product(multiangle().drop_vars(name), context("multiangle"))
         assert name not in product
         assert name in build_product(multiangle(), context("multiangle"))

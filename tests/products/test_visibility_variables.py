@@ -70,7 +70,7 @@ def test_each_crossing_is_a_time_series(data: xr.Dataset, tmp_path: Path):
 
 def test_a_value_may_not_be_missing_without_a_reason(data: xr.Dataset):
     silent = data.copy(deep=True)
-    silent["extinction"][0, 0] = np.nan
+    silent["total_extinction"][0, 0] = np.nan
     with pytest.raises(ProductError, match="no quality bit"):
         build_product(silent, context(KIND))
 

@@ -145,8 +145,8 @@ class TestSimulatedRun:
         with xr.open_dataset(root / "h/extinction.nc") as product:
             product.load()
         time = product["time"].values
-        score = (product["extinction"].values - fab.true_extinction(time)[:, None]) / product[
-            "extinction_standard_error"
+        score = (product["total_extinction"].values - fab.true_extinction(time)[:, None]) / product[
+            "total_extinction_standard_error"
         ].values
         good = product["quality_flag"].values == 0
         size_of = np.abs(score[good])

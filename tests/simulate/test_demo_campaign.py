@@ -71,7 +71,7 @@ def test_the_homogeneous_path_is_retrievable(demo, section, channel):
         distance = (np.arange(dataset.bins) + 0.5) * dataset.bin_width
         inside = (distance >= section[0]) & (distance <= section[1])
         known = [float(truth[f"{q}_{channel}"][index]) for q in ("background", "amplitude")]
-        sigma = float(truth["extinction"][index])
+        sigma = float(truth["total_extinction"][index])
         model = known[0] + known[1] * np.exp(-2 * sigma * distance) / distance**2
         exposure = dataset.shots * 0.05
         if channel.startswith("photon"):
@@ -126,4 +126,4 @@ def test_the_vertical_path_is_clearly_not_homogeneous(demo):
             rest = rest - design @ np.linalg.lstsq(design, rest, rcond=None)[0]
             best = min(best, (rest**2).sum() / (r.size - 3))
         assert best > 5
-        assert np.isnan(truth["extinction"].values[index])
+        assert np.isnan(truth["total_extinction"].values[index])

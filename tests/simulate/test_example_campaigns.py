@@ -37,13 +37,15 @@ def test_a_scan_crosses_the_zenith(repository, tmp_path):
     # The level beam has one extinction.
     level = result.truth["zenith_angle"].values == 90
     np.testing.assert_array_equal(result.truth["homogeneous"].values == 1, level)
-    assert np.isfinite(result.truth["extinction"].values[level]).all()
+    assert np.isfinite(result.truth["total_extinction"].values[level]).all()
 
 
 def test_both_sides_of_a_layered_sky_are_alike(repository, tmp_path):
     result = simulate_campaign(_short(repository, tmp_path, "scan", duration=17 * 60))
     truth = result.truth
-    depth = truth["profile_optical_depth_plain_scanner"].isel(wavelength_plain_scanner=0).values
+    depth = (
+        truth["profile_path_optical_depth_plain_scanner"].isel(wavelength_plain_scanner=0).values
+    )
     rows = truth["profile_granule_plain_scanner"].values
     zenith, azimuth = truth["zenith_angle"].values[rows], truth["azimuth"].values[rows]
     far = truth["range_end_plain_scanner"].values
@@ -73,7 +75,7 @@ def test_a_network_shares_one_atmosphere(repository, tmp_path):
         assert float(opened["latitude"]) == pytest.approx(station.latitude, abs=1e-6)
 
     def extinction(name):
-        return truth[f"profile_extinction_{name}_lidar"].isel({f"wavelength_{name}_lidar": 0})
+        return truth[f"profile_total_extinction_{name}_lidar"].isel({f"wavelength_{name}_lidar": 0})
 
     # Each beam crosses the two others; there both lidars measure the same air.
     names = list(directions)

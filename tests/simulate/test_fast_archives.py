@@ -35,7 +35,7 @@ def test_fast_files_agree_with_the_truth_within_their_noise(small):
     scores = {"photon_532o": [], "analog_532o": []}
     for row in range(8):  # before the dead time changes
         values = _values(result, row)
-        sigma = float(truth["extinction"][row])
+        sigma = float(truth["total_extinction"][row])
         shape = np.exp(-2 * sigma * distance) / distance**2
         rate = float(truth["background_photon_532o"][row])
         rate = rate + float(truth["amplitude_photon_532o"][row]) * shape
@@ -63,16 +63,16 @@ def test_the_truth_of_a_fast_simulation_fits_its_signals(small):
 
     result = simulate_campaign(small(fast))
     truth = result.truth
-    profiles = truth["profile_extinction_hill_lidar"].values[:, 0]
+    profiles = truth["profile_total_extinction_hill_lidar"].values[:, 0]
     # The air changes every ten minutes, and the truth with it.
     changes = np.flatnonzero(np.any(profiles[1:] != profiles[:-1], axis=1)) + 1
     np.testing.assert_array_equal(changes, [10, 20, 30, 40, 50])
     for row in (5, 55):
         signal = _values(result, row)["analog_1064o"] - 3.0
         distance = truth["range_hill_lidar"].values
-        depth = truth["profile_optical_depth_hill_lidar"].values[row, 0]
+        depth = truth["profile_path_optical_depth_hill_lidar"].values[row, 0]
         middle = depth - 0.5 * np.diff(depth, prepend=0)
-        backscatter = truth["profile_backscatter_hill_lidar"].values[row, 0]
+        backscatter = truth["profile_total_backscatter_hill_lidar"].values[row, 0]
         shape = backscatter * np.exp(-2 * middle) / distance**2 * 30e12 * 0.05
         sky = float(truth["background_analog_1064o"][row])
         noise = np.sqrt(0.2**2 / 600 + 1.2 * 0.05 * (shape + sky) / 30)
@@ -97,11 +97,11 @@ def test_a_thin_layer_is_not_missed_by_coarse_truth(small):
     for name, result in (("coarse", coarse), ("fine", fine)):
         truth = result.truth.isel(wavelength_hill_lidar=0, profile_hill_lidar=0)
         end = truth["range_end_hill_lidar"].values
-        depth = truth["profile_optical_depth_hill_lidar"].values
+        depth = truth["profile_path_optical_depth_hill_lidar"].values
         assert depth[-1] == pytest.approx(0.3, abs=0.15)
         # Extinction is the mean over a cell, so that it adds up to the optical depth.
         width = np.diff(end, prepend=0)
-        total = np.cumsum(truth["profile_extinction_hill_lidar"].values * width)
+        total = np.cumsum(truth["profile_total_extinction_hill_lidar"].values * width)
         np.testing.assert_allclose(total, depth, rtol=1e-5)
         depths[name] = dict(zip(end, depth, strict=True))
     for end, depth in depths["coarse"].items():

@@ -114,7 +114,7 @@ def test_the_schema_of_the_truth(small):
     assert set(truth["instrument"].values) == {"coast-lidar", "hill-lidar"}
     assert truth["time"].values[0] == np.datetime64("2024-12-31T23:50:30")
     coast = truth["instrument"].values == "coast-lidar"
-    assert np.all(np.isfinite(truth["extinction"].values) == coast)
+    assert np.all(np.isfinite(truth["total_extinction"].values) == coast)
     np.testing.assert_array_equal(truth["homogeneous"].values, coast.astype(int))
     for quantity in ("background", "amplitude"):
         assert truth[f"{quantity}_photon_532o"].attrs["units"].startswith("MHz")
@@ -131,7 +131,7 @@ def test_the_schema_of_the_truth(small):
 
 def _expected(truth, index, channel, distance):
     """Return P* + B R^-2 exp(-2 sigma R) with the values of the truth."""
-    sigma = float(truth["extinction"][index])
+    sigma = float(truth["total_extinction"][index])
     background = float(truth[f"background_{channel}"][index])
     amplitude = float(truth[f"amplitude_{channel}"][index])
     return background + amplitude * distance**-2.0 * np.exp(-2 * sigma * distance)

@@ -56,7 +56,7 @@ LAYOUT = replace(
     OTHER,
     data=tuple(
         replace(row, budget=ErrorBudget(comment="All is shared."))
-        if row.name == "extinction"
+        if row.name == "total_extinction"
         else replace(row, flags=row.flags and FLAGS)
         for row in OTHER.data
     ),
@@ -181,8 +181,8 @@ def test_means_follow_its_budget(
     (products,) = groups(facts_of(tmp_path)).values()
     (file,) = write_means(tmp_path, products, Period.DAY).files
     with xr.open_dataset(path) as data, xr.open_dataset(tmp_path / file.path) as means:
-        error = data.extinction_standard_error.where(data.usable < 2).astype(float)
+        error = data.total_extinction_standard_error.where(data.usable < 2).astype(float)
         np.testing.assert_allclose(
-            means.extinction_standard_error[0], error.mean("time"), rtol=1e-5
+            means.total_extinction_standard_error[0], error.mean("time"), rtol=1e-5
         )
-        assert means.extinction.attrs["comment"].endswith("All is shared.")
+        assert means.total_extinction.attrs["comment"].endswith("All is shared.")

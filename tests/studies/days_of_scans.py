@@ -41,7 +41,7 @@ def day_of_scores(folder: Path, seed: int) -> tuple[np.ndarray, np.ndarray]:
     granule = truth["profile_granule_scanner"].values
     upward = truth["zenith_angle"].values[granule] < 1.0
     time = truth["time"].values[granule][upward]
-    depth = truth["profile_optical_depth_scanner"].values[upward, 0]
+    depth = truth["profile_path_optical_depth_scanner"].values[upward, 0]
     ends = np.append(0.0, truth["range_end_scanner"].values)
     scores, flags = [], []
     for path in sorted(campaign.products_root.rglob("*.nc")):
@@ -50,9 +50,10 @@ def day_of_scores(folder: Path, seed: int) -> tuple[np.ndarray, np.ndarray]:
         height = product["altitude"].values - ALTITUDE
         true = np.array([np.interp(height, ends, np.append(0.0, depth[k])) for k in nearest])
         error = np.hypot(
-            product["optical_depth_standard_error"], product["optical_depth_gradient_error"]
+            product["vertical_optical_depth_standard_error"],
+            product["vertical_optical_depth_gradient_error"],
         ).values
-        scores.append(((product["optical_depth"].values - true) / error).ravel())
+        scores.append(((product["vertical_optical_depth"].values - true) / error).ravel())
         flags.append(product["quality_flag"].values.ravel())
     return np.concatenate(scores), np.concatenate(flags)
 

@@ -235,13 +235,11 @@ def _campaign_counts(inputs: list[Any]) -> Iterator[tuple[str, int, dict[str, fl
     for number, (arguments, truth) in enumerate(inputs):
         product = labeled.retrieve_network(*arguments)
         stated = np.hypot(
-            product["extinction_standard_error"], product["extinction_systematic_error"]
+            product["total_extinction_standard_error"], product["total_extinction_systematic_error"]
         )
         flagged = (product["quality_flag"].to_numpy() & REJECTING) != 0
-        yield (
-            CAMPAIGNS, number,
-            _count(product["extinction"].to_numpy() - truth, stated.to_numpy(), flagged, truth),
-        )  # fmt: skip
+        away = product["total_extinction"].to_numpy() - truth
+        yield CAMPAIGNS, number, _count(away, stated.to_numpy(), flagged, truth)
 
 
 def _of(classes: list[str]) -> Callable[..., Any]:

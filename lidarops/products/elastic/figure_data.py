@@ -19,10 +19,10 @@ CAUSES: Final = ("noise", "background", "reference", "lidar_ratio", "molecular",
 
 _ALONG_TIME: Final = ("time", "reference_bottom", "reference_top")
 _ALONG_BOTH: Final = (
-    "backscatter",
-    "backscatter_standard_error",
+    "aerosol_backscatter",
+    "aerosol_backscatter_standard_error",
     "quality_flag",
-    *(f"backscatter_error_{cause}" for cause in CAUSES),
+    *(f"aerosol_backscatter_error_{cause}" for cause in CAUSES),
 )
 PROFILE_VARIABLES: Final = (
     *_ALONG_TIME,
@@ -103,9 +103,9 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
     return Profile(
         time=product["time"].values.astype("datetime64[ns]")[index],
         range=r[shown],
-        backscatter=values("backscatter"),
-        standard_error=values("backscatter_standard_error"),
-        budget={cause: np.abs(values(f"backscatter_error_{cause}")) for cause in CAUSES},
+        backscatter=values("aerosol_backscatter"),
+        standard_error=values("aerosol_backscatter_standard_error"),
+        budget={cause: np.abs(values(f"aerosol_backscatter_error_{cause}")) for cause in CAUSES},
         molecular=profile["molecular_backscatter"].values.astype(np.float64),
         with_care=(bits & _WITH_CARE) != 0,
         reference=(float(profile["reference_bottom"]), float(top[index])),

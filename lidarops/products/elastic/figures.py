@@ -120,5 +120,5 @@ FIGURES: Final = KindFigures(
             first=True,
         ),
     ),
-    preferred="backscatter",
+    preferred="aerosol_backscatter",
 )

@@ -68,7 +68,7 @@ def _error_budget() -> Iterator[Row]:
     """Yield the rows of the error budget of backscatter."""
     for source, (words, kind, comment) in _BUDGET.items():
         yield Row(
-            name=f"backscatter_error_{source}",
+            name=f"aerosol_backscatter_error_{source}",
             dims=_BINS,
             dtype="f4",
             units="m-1 sr-1",
@@ -76,20 +76,20 @@ def _error_budget() -> Iterator[Row]:
             coverage=Coverage.QUALITY,
             significant_bits=8,
             error_kind=kind,
-            comment=f"{comment} backscatter_standard_error is the root of the sum of squares of"
-            f" the error budget. {NO_STANDARD_NAME}",
+            comment=f"{comment} aerosol_backscatter_standard_error is the root of the sum of"
+            f" squares of the error budget. {NO_STANDARD_NAME}",
         )
 
 
-_BUDGET_TERMS: Final = tuple(f"backscatter_error_{source}" for source in _BUDGET)
+_BUDGET_TERMS: Final = tuple(f"aerosol_backscatter_error_{source}" for source in _BUDGET)
 _MEANS: Final = ErrorBudget(
-    random=("backscatter_error_noise", "backscatter_error_background"),
+    random=("aerosol_backscatter_error_noise", "aerosol_backscatter_error_background"),
     comment="Errors from noise and background are independent between profiles. Errors from"
     " reference, lidar ratio, molecules and dead time are assumed to be shared by all profiles, so"
     " that they are averaged and do not decrease with the number of profiles.",
 )
 _SHARED: Final = tuple(
-    f"backscatter_error_{source}"
+    f"aerosol_backscatter_error_{source}"
     for source in ("reference", "lidar_ratio", "molecular", "dead_time")
 )
 
@@ -107,11 +107,11 @@ LAYOUT: Final = Layout(
         "Fernald, F. G. (1984), Appl. Opt. 23, 652-653.",
         "Sasano, Y. et al. (1985), Appl. Opt. 24, 3929-3932.",
     ),
-    comment="extinction is backscatter times the assumed lidar ratio, not an independent"
-    " measurement. Profiles are means over time; range is along the beam. Particles in the"
-    " reference window that decrease with height nearly as molecules do look like aerosol-free air,"
-    " and no test of the signal detects them: only the error of the scattering ratio declared in"
-    " the settings covers them. Declare a larger error where the air is hazy at all heights. An"
+    comment="aerosol_extinction is aerosol_backscatter times the assumed lidar ratio, not an"
+    " independent measurement. Profiles are means over time; range is along the beam. Particles in"
+    " the reference window that decrease with height nearly as molecules do look like aerosol-free"
+    " air, and no test of the signal detects them: only the error of the scattering ratio declared"
+    " in the settings covers them. Declare a larger error where the air is hazy at all heights. An"
     " elastic signal does not determine the lidar ratio either; its declared error has to cover"
     " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
     " bin deviates from theirs by more than noise explains.",
@@ -119,7 +119,7 @@ LAYOUT: Final = Layout(
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(
-            name="backscatter",
+            name="aerosol_backscatter",
             dims=_BINS,
             dtype="f4",
             units="m-1 sr-1",
@@ -136,7 +136,7 @@ LAYOUT: Final = Layout(
         ),
         *_error_budget(),
         Row(
-            name="extinction",
+            name="aerosol_extinction",
             dims=_BINS,
             dtype="f4",
             units="m-1",
@@ -157,7 +157,7 @@ LAYOUT: Final = Layout(
             uncertain=True,
             error_kind=ErrorKind.BOTH,
             budget=replace(_MEANS, times="lidar_ratio"),
-            comment="backscatter times lidar_ratio.",
+            comment="aerosol_backscatter times lidar_ratio.",
         ),
         Row(
             name="scattering_ratio",

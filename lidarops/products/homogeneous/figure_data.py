@@ -22,7 +22,7 @@ from lidarops.products.homogeneous.flags import FLAGS
 
 Floats = NDArray[np.float64]
 
-QUANTITIES: Final = ("extinction", "background", "amplitude")
+QUANTITIES: Final = ("total_extinction", "background", "amplitude")
 """Retrieved quantities, as the names of their variables."""
 _ALONG_BOTH: Final = (
     *QUANTITIES,
@@ -99,16 +99,16 @@ def _check(product: xr.Dataset) -> None:
     require(product, {"time": ("time",)} | dict.fromkeys(_ALONG_BOTH, ("time", "section")))
     if "section_bounds" not in product or product["section_bounds"].shape[1:] != (2,):
         raise ProductError("has no section bounds", field="section_bounds")
-    units = product["extinction"].attrs.get("units")
+    units = product["total_extinction"].attrs.get("units")
     if units != "m-1":
-        raise ProductError(f"has the units {units!r}, not 'm-1'", field="extinction")
+        raise ProductError(f"has the units {units!r}, not 'm-1'", field="total_extinction")
 
 
 def _true_variables(channel: str, *, dark_subtracted: bool) -> Mapping[str, Sequence[str]]:
     """Return for each quantity the variables of the truth that add up to its true value."""
     offset = () if dark_subtracted else (f"dark_offset_{channel}",)
     return {
-        "extinction": ("extinction",),
+        "total_extinction": ("total_extinction",),
         "background": (f"background_{channel}", *offset),
         "amplitude": (f"amplitude_{channel}",),
     }

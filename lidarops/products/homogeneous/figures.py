@@ -39,7 +39,10 @@ def _sections(contents: Sequence[list[Section]]) -> list[Section]:
 def _draw(contents: Sequence[list[Section]]) -> Iterator[Figure]:
     sections = _sections(contents)
     background = units(sections[0].estimates["background"].units)
-    quantities = (Quantity("extinction", 1e3, "km⁻¹"), Quantity("background", 1.0, background))
+    quantities = (
+        Quantity("total_extinction", 1e3, "km⁻¹"),
+        Quantity("background", 1.0, background),
+    )
     yield from series_figures(sections, quantities, "Extinction and background of range sections")
     yield from score_figures(sections, QUANTITIES)
 
@@ -50,5 +53,5 @@ def _compare(contents: Sequence[list[Section]]) -> Iterator[Comparison | None]:
 
 
 FIGURES: Final = KindFigures(
-    (View("homogeneous", SECTION_VARIABLES, _read, _draw, _compare),), preferred="extinction"
+    (View("homogeneous", SECTION_VARIABLES, _read, _draw, _compare),), preferred="total_extinction"
 )

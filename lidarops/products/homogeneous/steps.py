@@ -366,9 +366,9 @@ def _in_order(
 
 def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:
     visibility = labeled_visibility.visibility_of_extinction(
-        sections["extinction"],
-        sections["extinction_standard_error"],
-        sections["extinction_model_error"],
+        sections["total_extinction"],
+        sections["total_extinction_standard_error"],
+        sections["total_extinction_model_error"],
         definition,
     )
     return sections.assign(visibility.data_vars).assign_attrs(steps=definition.words)

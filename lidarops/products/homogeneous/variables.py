@@ -22,7 +22,7 @@ from lidarops.products.homogeneous.flags import FLAGS
 
 _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
-_OF_EXTINCTION = ("extinction_model_error", *_OF_FIT)
+_OF_EXTINCTION = ("total_extinction_model_error", *_OF_FIT)
 
 _CURVED_SIGNAL = (
     "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
@@ -50,14 +50,14 @@ LAYOUT: Final = Layout(
         "Potapova, I. A. et al. (2021), Izv. Vuzov. Priborostroenie 64, 384-391.",
         "Golub, G. H. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432.",
     ),
-    comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 extinction r), with"
-    " range r. altitude, geospatial_vertical_min and geospatial_vertical_max refer to the midpoint"
-    " of a section; altitude_bnds holds its ends where the beam is fixed.",
+    comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 total_extinction r),"
+    " with range r. altitude, geospatial_vertical_min and geospatial_vertical_max refer to the"
+    " midpoint of a section; altitude_bnds holds its ends where the beam is fixed.",
     sampled="section",
     coordinates=coordinates((SECTION, SECTION_RANGE), altitude("section", "altitude_bnds")),
     data=(
         Row(
-            name="extinction",
+            name="total_extinction",
             dims=_SECTIONS,
             dtype="f4",
             units="m-1",
@@ -69,7 +69,7 @@ LAYOUT: Final = Layout(
             comment=f"At the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="extinction_model_error",
+            name="total_extinction_model_error",
             dims=_SECTIONS,
             dtype="f4",
             units="m-1",
@@ -77,11 +77,11 @@ LAYOUT: Final = Layout(
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Separate from the random error in extinction_standard_error. Root of the sum"
-            " of squares of 5 percent of (extinction + 1 / mean range), and of the extinction error"
-            f" caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED} 7 percent with backscatter that"
-            " changes exponentially along the section with a scale of 1 to 100 km, 10 percent with"
-            " a plume, 8 percent where the top of the signal is clipped, 2.5 percent where"
+            comment="Separate from the random error in total_extinction_standard_error. Root of the"
+            " sum of squares of 5 percent of (extinction + 1 / mean range), and of the extinction"
+            f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED} 7 percent with backscatter"
+            " that changes exponentially along the section with a scale of 1 to 100 km, 10 percent"
+            " with a plume, 8 percent where the top of the signal is clipped, 2.5 percent where"
             f" backscatter is curved, at most 0.5 percent otherwise. {NO_STANDARD_NAME}",
         ),
         *visibility_rows(

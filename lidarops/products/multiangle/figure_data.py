@@ -20,7 +20,7 @@ from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-QUANTITIES: Final = ("optical_depth", "extinction")
+QUANTITIES: Final = ("vertical_optical_depth", "total_extinction")
 """Retrieved quantities of a profile, as the names of their variables."""
 
 _ERRORS: Final = ("", "_standard_error", "_gradient_error")
@@ -44,7 +44,7 @@ RESIDUAL_VARIABLES: Final = (
 """Variables that `read_residuals` needs."""
 _REJECTED: Final = flags_of("multiangle").rejecting
 _WITH_CARE: Final = flags_of("multiangle").caring
-_UNITS: Final = {"optical_depth": "1", "extinction": "m-1"}
+_UNITS: Final = {"vertical_optical_depth": "1", "total_extinction": "m-1"}
 _BEYOND: Final = 1.15
 """A profile is shown to this many times the height of its reach above the lowest altitude."""
 _LOWEST_BEAM: Final = 80.0
@@ -167,7 +167,7 @@ def clearest_cycle(
     """
     _check_profiles(product)
     flag = quality_bits(product["quality_flag"])
-    known = np.isfinite(product["optical_depth"].values.astype(np.float64))
+    known = np.isfinite(product["vertical_optical_depth"].values.astype(np.float64))
     clear = (known & (flag == 0)).sum(axis=1)
     usable = (known & ((flag & _REJECTED) == 0)).sum(axis=1)
     if not known.any():
@@ -253,7 +253,8 @@ def true_profile(
         the product, or the altitude of the station is unknown.
     """
     suffix = instrument.replace("-", "_")
-    variables = {name: f"profile_{name}_{suffix}" for name in ("granule", *QUANTITIES)}
+    names = ("granule", "total_extinction", "path_optical_depth")
+    variables = {name: f"profile_{name}_{suffix}" for name in names}
     needed = [*variables.values(), f"range_{suffix}", f"range_end_{suffix}", "zenith_angle", "time"]
     column = _wavelength_index(product, truth, suffix)
     if "station_altitude" not in product.variables or column is None:
@@ -269,16 +270,16 @@ def true_profile(
     cosine = float(np.cos(np.radians(zenith[row])))
     end = truth[f"range_end_{suffix}"].values.astype(np.float64)
     start = 2.0 * truth[f"range_{suffix}"].values.astype(np.float64)[:1] - end[:1]
-    true_values = {
-        name: truth[variables[name]].values[row, column].astype(np.float64) for name in QUANTITIES
-    }
+    extinction, depth = (
+        truth[variables[name]].values[row, column].astype(np.float64) for name in names[1:]
+    )
     at_start = 0.0 if abs(float(start[0])) <= 1e-6 * float(end[0]) else np.nan
     return TrueProfile(
         time=time[row],
         zenith_angle=float(zenith[row]),
         edges=float(product["station_altitude"]) + np.concatenate([start, end]) * cosine,
-        extinction=true_values["extinction"],
-        optical_depth=np.append(at_start, true_values["optical_depth"]) * cosine,
+        extinction=extinction,
+        optical_depth=np.append(at_start, depth) * cosine,
     )
 
 
@@ -472,12 +473,12 @@ def read_extinction(product: xr.Dataset, *, profiles: int = 0) -> Raster:
     """
     _check_profiles(product)
     unknown = ("time", np.full(product.sizes["time"], np.nan))
-    extinction = product[["extinction", "extinction_standard_error"]] * 1e3
+    extinction = product[["total_extinction", "total_extinction_standard_error"]] * 1e3
     drawn = (
         extinction.assign(quality_flag=product["quality_flag"])
         .drop_vars([name for name in extinction.coords if name not in ("time", "altitude")])
         .rename(altitude="range")
         .assign(background=unknown, background_standard_error=unknown)
     )
-    drawn["extinction"].attrs["units"] = "km-1"
-    return read_raster(drawn, quantity="extinction", kind="multiangle", profiles=profiles)
+    drawn["total_extinction"].attrs["units"] = "km-1"
+    return read_raster(drawn, quantity="total_extinction", kind="multiangle", profiles=profiles)

@@ -49,8 +49,8 @@ from lidarops.products.multiangle.scan_images import (
 Floats = NDArray[np.float64]
 
 _SCALES: Final = {
-    "optical_depth": (1.0, "optical depth from the lidar"),
-    "extinction": (1e3, "extinction (km⁻¹)"),
+    "vertical_optical_depth": (1.0, "vertical optical depth from the lidar"),
+    "total_extinction": (1e3, "total extinction (km⁻¹)"),
 }
 _HEIGHT: Final = 366
 _MARKS: Final = 30
@@ -75,7 +75,7 @@ def _read_residuals(product: xr.Dataset, _: ProductSource) -> ScanResiduals | No
 def _draw_cycle(profiles: Sequence[ScanProfile]) -> list[Figure]:
     """Return optical depth and extinction of one scan cycle against altitude."""
     profile = profiles[0]
-    extinction = span_in_words(1e3 * profile.estimates["extinction"].value, "km⁻¹")
+    extinction = span_in_words(1e3 * profile.estimates["total_extinction"].value, "km⁻¹")
     bits = flags_of("multiangle").raised(int(np.bitwise_or.reduce(profile.flag)))
     names = f" ({', '.join(bit.word for bit in bits)})" if bits else ""
     flagged = int((profile.flag != 0).sum())
@@ -129,7 +129,7 @@ def _truth(profile: ScanProfile, quantity: str, scale: float) -> Curve:
         return Curve(np.array([]), np.array([]))
     late = float((truth.time - profile.time) / np.timedelta64(1, "m"))
     label = f"truth at zenith angle {truth.zenith_angle:.3g}°, {late:+.0f} min"
-    if quantity == "optical_depth":
+    if quantity == "vertical_optical_depth":
         return Curve(scale * truth.optical_depth, truth.edges / 1e3, "ink d1", label=label)
     edges = np.repeat(truth.edges / 1e3, 2)[1:-1]
     return Curve(scale * np.repeat(truth.extinction, 2), edges, "ink d1", label=label)
@@ -233,10 +233,12 @@ def _beam_label(residuals: ScanResiduals) -> str:
 
 FIGURES: Final = KindFigures(
     (
-        image_view("multiangle", EXTINCTION_VARIABLES, read_extinction, "extinction", "altitude"),
+        image_view(
+            "multiangle", EXTINCTION_VARIABLES, read_extinction, "total extinction", "altitude"
+        ),
         View("scan-profile", CYCLE_VARIABLES, _read_cycle, _draw_cycle, first=True),
         View("scan-image", VARIABLES, read_scan_image, draw_scan_images, first=True),
         View("scan-residuals", RESIDUAL_VARIABLES, _read_residuals, _draw_residuals, first=True),
     ),
-    preferred="optical_depth",
+    preferred="vertical_optical_depth",
 )

@@ -89,6 +89,7 @@ def _plane_azimuth() -> Row:
 def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
     """Return the rows of a quantity that is retrieved from the beams of each vertical plane."""
     dims = ("time", "plane", "altitude")
+    method = "mean" if quantity == "total_extinction" else "point"
     value = Row(
         name=f"plane_{quantity}",
         dims=dims,
@@ -96,7 +97,7 @@ def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
         units=units,
         long_name=f"{words}, from the beams of a vertical plane",
         coverage=Coverage.PHYSICAL,
-        cell_methods=f"time: mean altitude: {'mean' if quantity == 'extinction' else 'point'}",
+        cell_methods=f"time: mean altitude: {method}",
         ancillaries=(f"plane_{quantity}_gradient_error",),
         significant_bits=_BITS,
         uncertain=True,
@@ -166,7 +167,7 @@ LAYOUT: Final = Layout(
     ),
     data=(
         Row(
-            name="optical_depth",
+            name="vertical_optical_depth",
             dims=_LEVELS,
             dtype="f4",
             units="1",
@@ -174,7 +175,7 @@ LAYOUT: Final = Layout(
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: point",
             ancillaries=(
-                "optical_depth_gradient_error",
+                "vertical_optical_depth_gradient_error",
                 "data_share",
                 "inhomogeneity",
                 "quality_flag",
@@ -187,23 +188,25 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.BOTH,
             comment=f"Along the vertical, at the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
-        _gradient_error("optical_depth", "optical depth", "1"),
+        _gradient_error("vertical_optical_depth", "optical depth", "1"),
         Row(
-            name="monotone_optical_depth",
+            name="monotone_vertical_optical_depth",
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="profile nearest to optical_depth that nowhere decreases with altitude",
+            long_name="profile nearest to vertical_optical_depth that nowhere decreases with"
+            " altitude",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: point",
             ancillaries=("quality_flag",),
             significant_bits=_BITS,
             optional=True,
             comment="For figures of single profiles. Where the signal is weak, its means over many"
-            f" profiles are biased high: average optical_depth instead. {NO_STANDARD_NAME}",
+            " profiles are biased high: average vertical_optical_depth instead."
+            f" {NO_STANDARD_NAME}",
         ),
         Row(
-            name="extinction",
+            name="total_extinction",
             dims=_LEVELS,
             dtype="f4",
             units="m-1",
@@ -211,7 +214,7 @@ LAYOUT: Final = Layout(
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: mean",
             ancillaries=(
-                "extinction_gradient_error",
+                "total_extinction_gradient_error",
                 "data_share",
                 "inhomogeneity",
                 "quality_flag",
@@ -225,7 +228,7 @@ LAYOUT: Final = Layout(
             comment="Mean over the layer in altitude_bnds, at the wavelength of the channel."
             f" {NO_STANDARD_NAME}",
         ),
-        _gradient_error("extinction", "extinction", "m-1"),
+        _gradient_error("total_extinction", "extinction", "m-1"),
         Row(
             name="log_intercept",
             dims=_LEVELS,
@@ -276,14 +279,14 @@ LAYOUT: Final = Layout(
             f" noise is overstated. Missing where no beam is redundant. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="layer_optical_depth",
+            name="layer_vertical_optical_depth",
             dims=("time", "layer"),
             dtype="f4",
             units="1",
             long_name="optical depth of molecules and particles between the bounds of the layer",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
-            ancillaries=("layer_optical_depth_gradient_error",),
+            ancillaries=("layer_vertical_optical_depth_gradient_error",),
             significant_bits=_BITS,
             uncertain=True,
             # Noise, and smoothing error that profiles share, are not stated separately.
@@ -293,12 +296,12 @@ LAYOUT: Final = Layout(
             f" quality_flag rejects the value at a bound of the layer. {NO_STANDARD_NAME}",
         ),
         replace(
-            _gradient_error("layer_optical_depth", "the optical depth of the layer", "1"),
+            _gradient_error("layer_vertical_optical_depth", "the optical depth of the layer", "1"),
             dims=("time", "layer"),
             optional=True,
         ),
-        *_of_planes("optical_depth", "optical depth of molecules and particles", "1"),
-        *_of_planes("extinction", "extinction coefficient of molecules and particles", "m-1"),
+        *_of_planes("vertical_optical_depth", "optical depth of molecules and particles", "1"),
+        *_of_planes("total_extinction", "extinction coefficient of molecules and particles", "m-1"),
         Row(
             name="beam_signal",
             dims=("time", "beam", "altitude"),

@@ -30,10 +30,10 @@ Floats = NDArray[np.float64]
 
 _MEGA: Final = 1e6
 _HEIGHT: Final = 366
-_QUANTITY: Final = "extinction"
+_QUANTITY: Final = "aerosol_extinction"
 _SHOWN: Final = (
-    ("extinction", "extinction (Mm⁻¹)", _MEGA),
-    ("backscatter", "backscatter (Mm⁻¹ sr⁻¹)", _MEGA),
+    ("aerosol_extinction", "aerosol extinction (Mm⁻¹)", _MEGA),
+    ("aerosol_backscatter", "aerosol backscatter (Mm⁻¹ sr⁻¹)", _MEGA),
     ("lidar_ratio", "lidar ratio (sr)", 1.0),
 )
 """Variable, axis and scale of each panel."""
@@ -97,7 +97,7 @@ def _draw(profiles: Sequence[_Profile]) -> list[Figure]:
         for name, label, scale in _SHOWN
         if np.isfinite(profile.values[name][0]).any()
     )
-    reach = span_in_words(_MEGA * profile.values["extinction"][0], "Mm⁻¹")
+    reach = span_in_words(_MEGA * profile.values["aerosol_extinction"][0], "Mm⁻¹")
     resolution = span_in_words(profile.resolution, "m")
     words = (
         f"Particle extinction {reach} with a vertical resolution of {resolution}; bands are"
@@ -121,9 +121,9 @@ FIGURES: Final = KindFigures(
             "raman",
             raster_variables(_QUANTITY),
             partial(read_raster, quantity=_QUANTITY, kind="raman"),
-            "extinction",
+            "aerosol extinction",
         ),
         View("profile", ("time", "range", *_ALONG_BOTH), _read, _draw, first=True),
     ),
-    preferred="extinction",
+    preferred="aerosol_extinction",
 )

@@ -26,9 +26,9 @@ from lidarops.steps.dependence import is_product
 Floats = NDArray[np.float64]
 
 _EXTINCTION: Final = (
-    "extinction",
-    "extinction_standard_error",
-    "extinction_systematic_error",
+    "total_extinction",
+    "total_extinction_standard_error",
+    "total_extinction_systematic_error",
 )
 _VISIBILITY: Final = ("visibility_in_air", "visibility_in_air_lower", "visibility_in_air_upper")
 _ANGLES: Final = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
@@ -126,7 +126,7 @@ def read_crossings(
             flag=flags[:, v],
             rejecting=flags_of("visibility").rejecting,
             estimates={
-                "extinction": SeriesEstimate(
+                "total_extinction": SeriesEstimate(
                     value[:, v], np.hypot(random, systematic)[:, v], true_extinction[:, v], "m-1"
                 ),
                 "visibility": SeriesEstimate(
@@ -221,7 +221,7 @@ def _contrast_constant(extinction: Floats, visibility: Floats) -> float:
 
 
 def _truth(product: xr.Dataset, truth: xr.Dataset | None, instruments: Sequence[str]) -> Floats:
-    shape = product["extinction"].shape
+    shape = product["total_extinction"].shape
     if truth is None or len(instruments) != product.sizes["beam"]:
         return np.full(shape, np.nan)
     bounds = product["time_bnds"].values.astype("datetime64[ns]")
@@ -247,11 +247,13 @@ def _along(
     names = np.asarray(truth["instrument"].values, dtype=np.str_)
     if f"profile_granule_{suffix}" not in truth:
         rows = np.flatnonzero(names == instrument)
-        true_values = float_values(truth, "extinction")[rows]
+        true_values = float_values(truth, "total_extinction")[rows]
     else:
         rows = truth[f"profile_granule_{suffix}"].values.astype(np.intp)
         middle = float_values(truth, f"range_{suffix}")
-        field = np.asarray(truth[f"profile_extinction_{suffix}"].values[:, 0], dtype=np.float64)
+        field = np.asarray(
+            truth[f"profile_total_extinction_{suffix}"].values[:, 0], dtype=np.float64
+        )
         true_values = np.array([np.interp(distance, middle, row) for row in field])
     times = truth["time"].values.astype("datetime64[ns]")[rows]
     if "zenith_angle" in truth:

@@ -40,7 +40,7 @@ _ROOM: Final = 0.08
 """Margin on each side, relative to the extent."""
 _LEAST: Final = 0.05
 """km, smallest span of an axis."""
-_QUANTITIES: Final = (Quantity("visibility", 1.0, "km"), Quantity("extinction", 1e3, "km⁻¹"))
+_QUANTITIES: Final = (Quantity("visibility", 1.0, "km"), Quantity("total_extinction", 1e3, "km⁻¹"))
 
 
 def _read_crossings(product: xr.Dataset, source: ProductSource) -> list[NumberedSeries] | None:
@@ -62,7 +62,7 @@ def _draw_crossings(contents: Sequence[list[NumberedSeries]]) -> Iterator[Figure
 
 
 def _compare(contents: Sequence[list[NumberedSeries]]) -> Iterator[Comparison | None]:
-    return (compare(crossing, "extinction") for crossing in _crossings(contents))
+    return (compare(crossing, "total_extinction") for crossing in _crossings(contents))
 
 
 def _draw_map(contents: Sequence[NetworkMap]) -> list[Figure]:

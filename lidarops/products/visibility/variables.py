@@ -24,7 +24,7 @@ _SERIES: Final = ("time", "crossing")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
 
-_OF_VALUE: Final = ("condition", "quality_flag", "optical_depth", "reduced_chi2", "shots")
+_OF_VALUE: Final = ("condition", "quality_flag", "path_optical_depth", "reduced_chi2", "shots")
 
 
 def _place(name: str) -> Row:
@@ -121,9 +121,10 @@ LAYOUT: Final = Layout(
     " crossing, both beams see the same extinction. Signals were averaged before the retrieval."
     " beam_latitude, beam_longitude and beam_altitude are the positions of the lidars. A gradient"
     " over the whole network mimics attenuation where the air is optically thin or the noise is"
-    " high, and no test detects it there: extinction_standard_error allows for twice the typical"
-    " gradient. More profiles in a block and more beams constrain the field better. The error that"
-    " the prior leaves is common to all profiles, so that a mean over time does not reduce it.",
+    " high, and no test detects it there: total_extinction_standard_error allows for twice the"
+    " typical gradient. More profiles in a block and more beams constrain the field better. The"
+    " error that the prior leaves is common to all profiles, so that a mean over time does not"
+    " reduce it.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=(
@@ -149,26 +150,26 @@ LAYOUT: Final = Layout(
             for row in visibility_rows(
                 _SERIES,
                 place="at the crossing of beams",
-                ancillaries=("extinction_systematic_error", *_OF_VALUE),
+                ancillaries=("total_extinction_systematic_error", *_OF_VALUE),
                 optional=False,
             )
         ),
         Row(
-            name="extinction",
+            name="total_extinction",
             dims=_SERIES,
             dtype="f4",
             units="m-1",
             long_name="extinction coefficient of molecules and particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
-            ancillaries=("extinction_systematic_error", *_OF_VALUE),
+            ancillaries=("total_extinction_systematic_error", *_OF_VALUE),
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
             comment=f"At the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="extinction_systematic_error",
+            name="total_extinction_systematic_error",
             dims=_SERIES,
             dtype="f4",
             units="m-1",
@@ -177,9 +178,9 @@ LAYOUT: Final = Layout(
             valid_min=0.0,
             significant_bits=8,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Separate from extinction_standard_error, which covers noise and prior. Effect"
-            " of the errors of exponent, lidar ratio and overlap declared in the settings, and of"
-            f" signal that may remain in the background. {NO_STANDARD_NAME}",
+            comment="Separate from total_extinction_standard_error, which covers noise and prior."
+            " Effect of the errors of exponent, lidar ratio and overlap declared in the settings,"
+            f" and of signal that may remain in the background. {NO_STANDARD_NAME}",
         ),
         Row(
             name="condition",
@@ -209,7 +210,7 @@ LAYOUT: Final = Layout(
             " error. The value is valid.",
         ),
         _time_series(
-            "optical_depth",
+            "path_optical_depth",
             "optical depth along the longest beam section between crossings",
             "From the mean extinction at the crossings.",
         ),

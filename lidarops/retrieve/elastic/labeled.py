@@ -448,10 +448,10 @@ def _with_beyond(mask: Mask, distance: Array, window: _reference.ReferenceWindow
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
     budget: Any = solution.budget
     return {
-        "backscatter": solution.backscatter,
-        "backscatter_standard_error": budget.total,
+        "aerosol_backscatter": solution.backscatter,
+        "aerosol_backscatter_standard_error": budget.total,
         **{
-            f"backscatter_error_{cause}": getattr(budget, cause)
+            f"aerosol_backscatter_error_{cause}": getattr(budget, cause)
             for cause in (
                 "noise",
                 "background",
@@ -461,8 +461,8 @@ def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
                 "dead_time",
             )
         },
-        "extinction": solution.extinction,
-        "extinction_standard_error": solution.extinction_budget.total,
+        "aerosol_extinction": solution.extinction,
+        "aerosol_extinction_standard_error": solution.extinction_budget.total,
         "scattering_ratio": solution.scattering_ratio,
         "scattering_ratio_standard_error": solution.scattering_ratio_budget.total,
         "attenuated_backscatter": solution.attenuated_backscatter,

@@ -27,9 +27,9 @@ _VALUES: Final = {
     "background_model_error": "{}",
     "amplitude": "{} m2",
     "amplitude_standard_error": "{} m2",
-    "extinction": "m-1",
-    "extinction_standard_error": "m-1",
-    "extinction_model_error": "m-1",
+    "total_extinction": "m-1",
+    "total_extinction_standard_error": "m-1",
+    "total_extinction_model_error": "m-1",
     "reduced_chi2": "1",
 }
 """Variables and their units, in terms of the unit of the power."""
@@ -86,10 +86,11 @@ def fit_homogeneous_path(
     Returns
     -------
     xr.Dataset, (..., section)
-        ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
-        ``background_model_error``, ``extinction_model_error``, ``reduced_chi2``, ``valid_bins``
-        and ``quality_flag``, with the coordinates ``section``, ``section_range`` (its middle)
-        and ``section_bounds``. As lazy as the input, with the same bits for any chunking.
+        ``background``, ``amplitude``, ``total_extinction``, each with ``_standard_error``,
+        ``background_model_error``, ``total_extinction_model_error``, ``reduced_chi2``,
+        ``valid_bins`` and ``quality_flag``, with the coordinates ``section``, ``section_range``
+        (its middle) and ``section_bounds``. As lazy as the input, with the same bits for any
+        chunking.
 
     Raises
     ------
@@ -342,7 +343,7 @@ def _solve_section(
         background_standard_error=error,
         extinction=prior,
     )
-    values = tuple(getattr(fit, name) for name in _VALUES)
+    values = tuple(getattr(fit, name.removeprefix("total_")) for name in _VALUES)
     bits = fit.quality | carried
     return (*values, fit.valid_bins, bits if doubt is None else bits | doubt)
 

@@ -130,9 +130,11 @@ def retrieve_optical_depth(
     retrieval = _solve_all(signals, zenith_angle, altitude, levels, layers=layers, **settings)
     signal = signals.signal
     sampled = np.isfinite(signal).any(axis=-1)
-    values = {name: (("time", "altitude"), getattr(retrieval, name)) for name in _PER_ALTITUDE}
-    values["reduced_chi2"] = values.pop("reduced_chi_square")
-    values["monotone_optical_depth"] = (("time", "altitude"), monotone(retrieval.optical_depth))
+    values = {
+        _variable(name): (("time", "altitude"), getattr(retrieval, name)) for name in _PER_ALTITUDE
+    }
+    depth = monotone(retrieval.optical_depth)
+    values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
     quality = _quality(retrieval, beams["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
     product = xr.Dataset(
         {
@@ -152,6 +154,15 @@ def retrieve_optical_depth(
     if not layers:
         return product
     return product.assign(_layer_variables(retrieval, quality, levels, bounds))
+
+
+def _variable(field: str) -> str:
+    """Return the variable of a field of `MultiAngleResult`, whose package says which quantity."""
+    return (
+        field.replace("optical_depth", "vertical_optical_depth")
+        .replace("extinction", "total_extinction")
+        .replace("reduced_chi_square", "reduced_chi2")
+    )
 
 
 def _agreed_signals(
@@ -202,7 +213,7 @@ def _plane_variables(
         "plane": xr.Variable("plane", np.arange(len(planes), dtype=np.int32)),
         "plane_azimuth": xr.Variable("plane", np.array(azimuths)),
         **{
-            f"plane_{name}": xr.Variable(cube, np.stack(values, axis=1))
+            f"plane_{_variable(name)}": xr.Variable(cube, np.stack(values, axis=1))
             for name, values in pieces.items()
         },
     }
@@ -234,7 +245,9 @@ def _layer_variables(
     rejected = np.hstack([np.zeros((len(quality), 1), dtype=np.bool_), rejected])
     hidden = rejected[:, levels].any(axis=2)
     variables = {
-        name: xr.Variable(("time", "layer"), np.where(hidden, np.nan, getattr(retrieval, name)))
+        _variable(name): xr.Variable(
+            ("time", "layer"), np.where(hidden, np.nan, getattr(retrieval, name))
+        )
         for name in _PER_LAYER
     }
     middle = xr.Variable("layer", bounds.mean(axis=1))

@@ -157,12 +157,12 @@ def retrieve_network(
     return xr.Dataset(
         {
             **visibility.data_vars,
-            "extinction": (dimensions, extinction),
-            "extinction_standard_error": (dimensions, random),
-            "extinction_systematic_error": (dimensions, systematic),
+            "total_extinction": (dimensions, extinction),
+            "total_extinction_standard_error": (dimensions, random),
+            "total_extinction_systematic_error": (dimensions, systematic),
             "condition": (dimensions, errors.condition[:, near]),
             "quality_flag": (dimensions, flags),
-            "optical_depth": ("time", _optical_depth(extinction, network)),
+            "path_optical_depth": ("time", _optical_depth(extinction, network)),
             "reduced_chi2": ("time", result.reduced_chi_square),
             "degrees_of_freedom": (
                 "time",

@@ -330,13 +330,13 @@ def _variables(
 ) -> dict[str, Any]:
     both = ("time", "range")
     profiles: dict[str, Array] = {
-        "extinction": result.extinction,
-        "extinction_standard_error": result.extinction_standard_error,
-        **_budget("extinction", result.extinction_budget),
-        "extinction_smoothing_error": result.extinction_smoothing_error,
-        "backscatter": result.backscatter,
-        "backscatter_standard_error": result.backscatter_standard_error,
-        **_budget("backscatter", result.backscatter_budget),
+        "aerosol_extinction": result.extinction,
+        "aerosol_extinction_standard_error": result.extinction_standard_error,
+        **_budget("aerosol_extinction", result.extinction_budget),
+        "aerosol_extinction_smoothing_error": result.extinction_smoothing_error,
+        "aerosol_backscatter": result.backscatter,
+        "aerosol_backscatter_standard_error": result.backscatter_standard_error,
+        **_budget("aerosol_backscatter", result.backscatter_budget),
         "lidar_ratio": result.lidar_ratio,
         "lidar_ratio_standard_error": result.lidar_ratio_standard_error,
         "lidar_ratio_error_random": result.lidar_ratio_random,

@@ -211,7 +211,9 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
         molecular_relative_error=0.01,
         reference=labeled.Reference(**dict(reference)),
     )
-    score = (result["backscatter"].values - true) / result["backscatter_standard_error"].values
+    score = (result["aerosol_backscatter"].values - true) / result[
+        "aerosol_backscatter_standard_error"
+    ].values
     used = (result["quality_flag"].values == 0) & compared
     assert np.count_nonzero(np.abs(score[used]) > 4.0) <= 1e-3 * np.count_nonzero(used)
     # At 1064 nm air is too faint for a reference in one file.
@@ -227,10 +229,12 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
 def mean_of_files(result):
     """Return mean backscatter and its error; random errors decrease with the number of files."""
     errors = {
-        source: np.abs(result[f"backscatter_error_{source}"].values)
+        source: np.abs(result[f"aerosol_backscatter_error_{source}"].values)
         for source in ("noise", "background", "reference", "lidar_ratio", "molecular")
     }
     random = sum(np.nansum(errors.pop(source) ** 2, axis=0) for source in ("noise", "background"))
-    files = np.isfinite(result["backscatter"].values).sum(axis=0)
+    files = np.isfinite(result["aerosol_backscatter"].values).sum(axis=0)
     shared = sum(np.nanmean(error, axis=0) ** 2 for error in errors.values())
-    return np.nanmean(result["backscatter"].values, axis=0), np.sqrt(random / files**2 + shared)
+    return np.nanmean(result["aerosol_backscatter"].values, axis=0), np.sqrt(
+        random / files**2 + shared
+    )

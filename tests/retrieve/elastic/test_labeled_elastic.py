@@ -123,7 +123,7 @@ def test_noise_free_profiles_give_the_truth():
     inside = between(200.0, 4500.0)
     true = particles(STATION + distance)
     np.testing.assert_allclose(
-        retrieved["backscatter"].to_numpy()[0, inside], true[inside], atol=2e-3 * true.max()
+        retrieved["aerosol_backscatter"].to_numpy()[0, inside], true[inside], atol=2e-3 * true.max()
     )
     assert float(retrieved["background"][0]) == pytest.approx(SKY, abs=1e-6)
     assert not retrieved["quality_flag"].to_numpy()[0, inside].any()
@@ -142,8 +142,8 @@ def test_noise_free_profiles_give_the_truth():
 @pytest.mark.parametrize(
     ("name", "true"),
     [
-        ("backscatter", particles),
-        ("extinction", lambda z: LIDAR_RATIO * particles(z)),
+        ("aerosol_backscatter", particles),
+        ("aerosol_extinction", lambda z: LIDAR_RATIO * particles(z)),
         ("scattering_ratio", lambda z: 1.0 + particles(z) / AIR.backscatter(z, GREEN)),
     ],
 )
@@ -161,9 +161,10 @@ def test_noisy_profiles_scatter_as_stated(name, true, edges):
 def from_noise(retrieved):
     """Deviation of the backscatter from the truth in standard errors of noise and background."""
     error = np.hypot(
-        retrieved["backscatter_error_noise"], retrieved["backscatter_error_background"]
+        retrieved["aerosol_backscatter_error_noise"],
+        retrieved["aerosol_backscatter_error_background"],
     )
-    score = (retrieved["backscatter"] - particles(STATION + distance)) / error
+    score = (retrieved["aerosol_backscatter"] - particles(STATION + distance)) / error
     return score.where(retrieved["quality_flag"] == 0).to_numpy()
 
 
@@ -171,7 +172,8 @@ def test_the_error_of_the_background_moves_the_far_range():
     retrieved = many()
     at = int(np.searchsorted(distance, 10_000.0))
     error = (
-        retrieved["backscatter_error_background"][:, at] / retrieved["molecular_backscatter"][at]
+        retrieved["aerosol_backscatter_error_background"][:, at]
+        / retrieved["molecular_backscatter"][at]
     )
     expected = retrieved["background_standard_error"] / truth()[at]
     # Minus its effect on the calibration, where the signal is five times as large.
@@ -179,7 +181,7 @@ def test_the_error_of_the_background_moves_the_far_range():
 
 
 def test_the_reference_error_covers_particles_hidden_by_noise():
-    error = np.abs(many()["backscatter_error_reference"].to_numpy())[:, between(300, 1000)]
+    error = np.abs(many()["aerosol_backscatter_error_reference"].to_numpy())[:, between(300, 1000)]
     assert (error > 0).all()
 
 
@@ -201,17 +203,17 @@ def test_the_background_scatters_as_stated():
 def test_derived_quantities_follow_from_the_backscatter():
     retrieved = many().isel(time=slice(5)).where(lambda f: f["quality_flag"] == 0)
     np.testing.assert_allclose(
-        retrieved["extinction"], LIDAR_RATIO * retrieved["backscatter"], rtol=1e-12
+        retrieved["aerosol_extinction"], LIDAR_RATIO * retrieved["aerosol_backscatter"], rtol=1e-12
     )
     np.testing.assert_allclose(
         retrieved["scattering_ratio"],
-        1.0 + retrieved["backscatter"] / retrieved["molecular_backscatter"],
+        1.0 + retrieved["aerosol_backscatter"] / retrieved["molecular_backscatter"],
         rtol=1e-12,
     )
     causes = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
-    squares = sum(retrieved[f"backscatter_error_{cause}"] ** 2 for cause in causes)
+    squares = sum(retrieved[f"aerosol_backscatter_error_{cause}"] ** 2 for cause in causes)
     np.testing.assert_allclose(
-        retrieved["backscatter_standard_error"], np.sqrt(squares), rtol=1e-12
+        retrieved["aerosol_backscatter_standard_error"], np.sqrt(squares), rtol=1e-12
     )
 
 
@@ -235,8 +237,8 @@ def test_each_error_of_the_budget_is_the_effect_of_its_cause():
         "dead_time": solved(longer),
     }
     for cause, other in changed.items():
-        moved = (other["backscatter"] - stated["backscatter"]).to_numpy()[0, inside]
-        error = stated[f"backscatter_error_{cause}"].to_numpy()[0, inside]
+        moved = (other["aerosol_backscatter"] - stated["aerosol_backscatter"]).to_numpy()[0, inside]
+        error = stated[f"aerosol_backscatter_error_{cause}"].to_numpy()[0, inside]
         np.testing.assert_allclose(moved, error, rtol=0.06, atol=2e-10, err_msg=cause)
 
 
@@ -248,8 +250,8 @@ def test_a_slant_beam_gives_the_profile_of_a_vertical_one():
     tilted = solved(noiseless(light(slanted, zenith=30.0), slanted, zenith=30.0), reference=window)
     inside = between(200.0, 4500.0)
     np.testing.assert_allclose(
-        tilted["backscatter"].to_numpy()[0, inside],
-        vertical["backscatter"].to_numpy()[0, inside],
+        tilted["aerosol_backscatter"].to_numpy()[0, inside],
+        vertical["aerosol_backscatter"].to_numpy()[0, inside],
         atol=5e-9,
     )
     np.testing.assert_allclose(
@@ -297,7 +299,7 @@ def test_a_cloud_above_the_reference_flags_the_bins_beyond_it():
     assert not flagged[:, distance < 7700.0].any()
     inside = between(300.0, 2000.0)
     true = particles(STATION + distance)[inside]
-    deviation = (retrieved["backscatter"].to_numpy()[:, inside] - true).mean(axis=0)
+    deviation = (retrieved["aerosol_backscatter"].to_numpy()[:, inside] - true).mean(axis=0)
     assert np.abs(deviation).max() < 0.05 * true.max()
 
 
@@ -334,7 +336,7 @@ def test_a_profile_beside_a_cloudy_one_is_retrieved_as_alone():
     both = xr.concat(data, dim="time", data_vars="minimal", coords="minimal")
     together = solved(both, reference=window)
     for place, alone in enumerate(solved(each, reference=window) for each in data):
-        for name in ("background", "backscatter", "quality_flag"):
+        for name in ("background", "aerosol_backscatter", "quality_flag"):
             np.testing.assert_array_equal(
                 together[name].isel(time=[place]).to_numpy(), alone[name].to_numpy()
             )
@@ -403,12 +405,14 @@ def test_a_lidar_ratio_that_changes_with_altitude():
 
     def worst(given):
         found = solved(signal, lidar_ratio=given)
-        return np.abs(found["backscatter"].to_numpy()[0, inside] - true).max() / true.max(), found
+        return np.abs(
+            found["aerosol_backscatter"].to_numpy()[0, inside] - true
+        ).max() / true.max(), found
 
     deviation, found = worst(ratio)
     assert deviation < 2e-3
     np.testing.assert_allclose(
-        found["extinction"].to_numpy()[0, inside],
+        found["aerosol_extinction"].to_numpy()[0, inside],
         (ratio(STATION + distance)[0][inside] * true),
         atol=3e-3 * 70.0 * true.max(),
     )
@@ -553,7 +557,7 @@ def test_an_opaque_cloud_leaves_no_reference():
     retrieved = solved(counted(signal, 10))
     assert has(retrieved, ElasticQuality.NO_REFERENCE).all()
     assert has(retrieved, ElasticQuality.CLOUD)[:, between(2500.0, 12_000.0)].all()
-    assert np.isnan(retrieved["backscatter"]).all()
+    assert np.isnan(retrieved["aerosol_backscatter"]).all()
     for end in ("reference_bottom", "reference_top"):
         assert np.isnan(retrieved[end]).all()
 
@@ -579,8 +583,8 @@ class TestTailMean:
 
     def test_biased_values_are_flagged(self):
         retrieved = solved(counted(truth(), 100, seed=4), known_shape=False)
-        score = (retrieved["backscatter"] - particles(STATION + distance)) / retrieved[
-            "backscatter_standard_error"
+        score = (retrieved["aerosol_backscatter"] - particles(STATION + distance)) / retrieved[
+            "aerosol_backscatter_standard_error"
         ]
         unflagged = score.where(retrieved["quality_flag"] == 0).to_numpy()[
             :, between(300.0, 2000.0)
@@ -599,16 +603,16 @@ class TestOverlap:
         plain = solved(data)
         true, inside = particles(STATION + distance), between(160.0, 700.0)
         np.testing.assert_allclose(
-            corrected["backscatter"].to_numpy()[0, inside], true[inside], rtol=4e-3
+            corrected["aerosol_backscatter"].to_numpy()[0, inside], true[inside], rtol=4e-3
         )
-        bias = np.abs(plain["backscatter"].to_numpy()[0, inside] / true[inside] - 1.0)
+        bias = np.abs(plain["aerosol_backscatter"].to_numpy()[0, inside] / true[inside] - 1.0)
         assert not (bias < 0.1).any()
 
     def test_bins_without_overlap_are_flagged_and_withheld(self):
         retrieved = solved(noiseless(truth() * self.seen), overlap=self.at)
         near = distance < 150.0
         np.testing.assert_array_equal(has(retrieved, Quality.INCOMPLETE_OVERLAP)[0], near)
-        assert np.isnan(retrieved["backscatter"].to_numpy()[0, near]).all()
+        assert np.isnan(retrieved["aerosol_backscatter"].to_numpy()[0, near]).all()
 
     def test_noise_grows_as_the_signal_is_divided(self):
         # The overlap is so small that the noise of a bin exceeds that of the reference.
@@ -626,16 +630,21 @@ class TestOverlap:
         retrieved = solved(averages(power, variance, longer), overlap=at)
         expected = solved(whole, overlap=self.at)
         np.testing.assert_array_equal(retrieved["range"], distance)
-        np.testing.assert_array_equal(retrieved["backscatter"], expected["backscatter"])
+        np.testing.assert_array_equal(
+            retrieved["aerosol_backscatter"], expected["aerosol_backscatter"]
+        )
 
 
 BINS = [
-    "backscatter",
-    "backscatter_standard_error",
-    *(f"backscatter_error_{c}" for c in ("noise", "background", "reference", "lidar_ratio")),
-    "backscatter_error_molecular",
-    "extinction",
-    "extinction_standard_error",
+    "aerosol_backscatter",
+    "aerosol_backscatter_standard_error",
+    *(
+        f"aerosol_backscatter_error_{c}"
+        for c in ("noise", "background", "reference", "lidar_ratio")
+    ),
+    "aerosol_backscatter_error_molecular",
+    "aerosol_extinction",
+    "aerosol_extinction_standard_error",
     "scattering_ratio",
     "scattering_ratio_standard_error",
     "attenuated_backscatter",
@@ -650,7 +659,7 @@ def assert_missing_is_flagged(retrieved):
         assert not np.isinf(values).any(), name
         assert (flags[np.isnan(values)] != 0).all(), name
     rejected = (flags & int(ElasticQuality.NO_REFERENCE | labeled._WITHHELD)) != 0
-    assert np.isnan(retrieved["backscatter"].to_numpy()[rejected]).all()
+    assert np.isnan(retrieved["aerosol_backscatter"].to_numpy()[rejected]).all()
     assert not (flags & ~np.int32(sum(FLAGS))).any()
 
 
@@ -691,11 +700,11 @@ def test_every_missing_value_carries_a_bit(known_shape, seed):
     assert has(retrieved, Quality.SATURATED)[1, :40].all()
     assert not has(retrieved, ElasticQuality.UNSTABLE_INVERSION)[1, :40].any()
     # The integration continues over a gap of 75 m, and ends at one of 300 m.
-    assert np.isfinite(retrieved["backscatter"][5, 100:290]).all()
-    assert np.isnan(retrieved["backscatter"][6, :300]).all()
+    assert np.isfinite(retrieved["aerosol_backscatter"][5, 100:290]).all()
+    assert np.isnan(retrieved["aerosol_backscatter"][6, :300]).all()
     assert has(retrieved, ElasticQuality.UNSTABLE_INVERSION)[6, :300].all()
     # Without the last tenth of the bins, only the fit of a shape gives a background.
-    assert np.isfinite(retrieved["backscatter"][7, 100:1000]).all() == known_shape
+    assert np.isfinite(retrieved["aerosol_backscatter"][7, 100:1000]).all() == known_shape
 
 
 def test_a_scene_of_missing_profiles_is_no_error():
@@ -706,7 +715,7 @@ def test_a_scene_of_missing_profiles_is_no_error():
     for known_shape in (True, False):
         retrieved = solved(data, known_shape=known_shape)
         assert_missing_is_flagged(retrieved)
-        assert np.isnan(retrieved["backscatter"]).all()
+        assert np.isnan(retrieved["aerosol_backscatter"]).all()
         assert np.isnan(retrieved["background"]).all()
         assert np.isnan(retrieved["cloud_base_range"]).all()
 
@@ -779,11 +788,12 @@ def test_an_outlying_bin_is_bridged_and_flagged():
         error = clean["background_standard_error"].to_numpy()
         moved = np.abs(bridged[name].to_numpy() - clean[name].to_numpy())
         assert np.all(moved <= (2.0 * error if name == "background" else 0.0))
-    solved_bins = np.isfinite(clean["backscatter"].to_numpy())
-    assert np.array_equal(np.isfinite(bridged["backscatter"].to_numpy()), solved_bins)
-    deviation = bridged["backscatter"] - particles(STATION + distance)
+    solved_bins = np.isfinite(clean["aerosol_backscatter"].to_numpy())
+    assert np.array_equal(np.isfinite(bridged["aerosol_backscatter"].to_numpy()), solved_bins)
+    deviation = bridged["aerosol_backscatter"] - particles(STATION + distance)
     beyond_four_errors = (
-        np.abs(deviation / bridged["backscatter_standard_error"]).to_numpy()[solved_bins] > 4.0
+        np.abs(deviation / bridged["aerosol_backscatter_standard_error"]).to_numpy()[solved_bins]
+        > 4.0
     )
     assert beyond_four_errors.mean() < 1e-3
 
@@ -797,6 +807,6 @@ def test_a_background_of_bins_that_were_saturated_in_some_profiles_is_withheld(k
     data = averages(rate, rate / EXPOSURE, quality=saturated[np.newaxis])
     retrieved = solved(data, known_shape=known_shape)
     assert np.isnan(retrieved["background"].to_numpy()).all()
-    for name in ("backscatter", "attenuated_backscatter"):
+    for name in ("aerosol_backscatter", "attenuated_backscatter"):
         assert np.isnan(retrieved[name].to_numpy()).all()
     assert ((retrieved["quality_flag"].to_numpy() & FLAGS.rejecting) != 0).all()

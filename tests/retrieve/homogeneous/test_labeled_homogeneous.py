@@ -21,8 +21,8 @@ VALUES = [
     "background_standard_error",
     "amplitude",
     "amplitude_standard_error",
-    "extinction",
-    "extinction_standard_error",
+    "total_extinction",
+    "total_extinction_standard_error",
     "reduced_chi2",
     "valid_bins",
 ]
@@ -53,13 +53,14 @@ def in_section(array, near, far):
 
 def test_result_is_that_of_numpy_for_each_section(power):
     fit = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=1.0)
-    assert fit["extinction"].dims == ("channel", "time", "section")
+    assert fit["total_extinction"].dims == ("channel", "time", "section")
     for k, edges in enumerate(SECTIONS):
         expected = path_fit.fit_homogeneous_path(*in_section(power, *edges), variance=1.0)
         for name in VALUES:
-            np.testing.assert_array_equal(fit[name][..., k], getattr(expected, name))
+            same = getattr(expected, name.removeprefix("total_"))
+            np.testing.assert_array_equal(fit[name][..., k], same)
         np.testing.assert_array_equal(fit["quality_flag"][..., k], expected.quality)
-    np.testing.assert_allclose(fit["extinction"].median("time")[:, 0], 5e-5, rtol=0.02)
+    np.testing.assert_allclose(fit["total_extinction"].median("time")[:, 0], 5e-5, rtol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -115,15 +116,17 @@ def test_bad_bins_are_excluded_and_their_bits_carried(power):
 
     masked = np.where((quality & labeled.EXCLUDED) != 0, np.nan, power)
     expected = path_fit.fit_homogeneous_path(*in_section(masked, *SECTIONS[0]), variance=1.0)
-    np.testing.assert_array_equal(fit["extinction"][..., 0], expected.extinction)
+    np.testing.assert_array_equal(fit["total_extinction"][..., 0], expected.extinction)
     carried = fit["quality_flag"][0, :, 0] & labeled.CARRIED
     assert carried[0] == Quality.SATURATED
     assert carried[1] == Quality.INCOMPLETE_OVERLAP
     assert carried[2] == 0
     assert carried[4] == Quality.PILE_UP
-    assert fit["extinction"][0, 4, 0] == clean["extinction"][0, 4, 0]
+    assert fit["total_extinction"][0, 4, 0] == clean["total_extinction"][0, 4, 0]
     # The second section begins beyond the spoiled bins.
-    np.testing.assert_array_equal(fit["extinction"][..., 1], clean["extinction"][..., 1])
+    np.testing.assert_array_equal(
+        fit["total_extinction"][..., 1], clean["total_extinction"][..., 1]
+    )
     assert not np.any(fit["quality_flag"][0, :3, 1] & labeled.CARRIED)
 
 
@@ -136,7 +139,7 @@ def test_variance_may_lack_dimensions(power, dims):
     expected = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=full)
     fit = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=variance)
     # A variance common to all profiles uses another solver, with the same result.
-    for name in ("background", "amplitude", "extinction"):
+    for name in ("background", "amplitude", "total_extinction"):
         apart = abs(fit[name] - expected[name])
         error = expected[f"{name}_standard_error"]
         assert (apart < 0.01 * error).where(error.notnull(), other=True).all()
@@ -155,7 +158,7 @@ def test_coordinates_and_units_describe_the_sections(power):
     units = {name: fit[name].attrs["units"] for name in VALUES[:-1]}
     assert units["background"] == units["background_standard_error"] == "mV"
     assert units["amplitude"] == "mV m2"
-    assert units["extinction_standard_error"] == "m-1"
+    assert units["total_extinction_standard_error"] == "m-1"
     assert {"time", "channel"} <= set(fit.coords)
     plain = power.copy()
     plain.attrs = {}
@@ -167,9 +170,9 @@ def test_coordinates_and_units_describe_the_sections(power):
 def test_single_profile_and_descending_range(power):
     one = power.isel(channel=0, time=0)
     fit = labeled.fit_homogeneous_path(one, sections=SECTIONS, variance=1.0)
-    assert fit["extinction"].dims == ("section",)
+    assert fit["total_extinction"].dims == ("section",)
     turned = labeled.fit_homogeneous_path(one[::-1], sections=SECTIONS, variance=1.0)
-    np.testing.assert_array_equal(fit["extinction"], turned["extinction"])
+    np.testing.assert_array_equal(fit["total_extinction"], turned["total_extinction"])
 
 
 def test_near_is_inside_and_far_is_not(power):
@@ -278,10 +281,10 @@ def test_the_background_of_the_far_range_makes_extinction_more_certain(extinctio
     far = labeled.fit_homogeneous_path(
         power, **options, method="known_background", background_range=(27_000.0, 30_000.0)
     )
-    off = (far["extinction"] - extinction) / far["extinction_standard_error"]
+    off = (far["total_extinction"] - extinction) / far["total_extinction_standard_error"]
     assert np.sqrt((off**2).mean()) == pytest.approx(1.0, abs=0.12)
     assert (np.abs(off) < 4.0).all()
-    ratio = far["extinction_standard_error"] / own["extinction_standard_error"]
+    ratio = far["total_extinction_standard_error"] / own["total_extinction_standard_error"]
     # At 5e-5 m-1, signal reaches 27 km.
     assert ratio.median() < (0.5 if extinction == 2e-4 else 1.2)
     assert not (far["quality_flag"] & int(Quality.BACKGROUND_UNCERTAIN)).any()
@@ -297,7 +300,7 @@ def test_signal_left_in_a_near_tail_is_part_of_the_error():
         method="known_background",
         background_range=(4050.0, 4500.0),
     )
-    off = (far["extinction"] - 2e-5) / far["extinction_standard_error"]
+    off = (far["total_extinction"] - 2e-5) / far["total_extinction_standard_error"]
     assert np.isfinite(off).all()
     assert (np.abs(off) < 4.0).all()
     assert far["background_standard_error"].median() > 0.2

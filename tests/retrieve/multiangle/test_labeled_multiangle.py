@@ -125,7 +125,9 @@ FAR = {"molecules": AIR, "wavelength": 532e-9}
 def errors(product: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Return errors over standard errors, and where nothing is flagged."""
     truth = optical_depth(ALTITUDE - STATION)
-    off = (product["optical_depth"] - truth) / product["optical_depth_standard_error"]
+    off = (product["vertical_optical_depth"] - truth) / product[
+        "vertical_optical_depth_standard_error"
+    ]
     plain = product["quality_flag"].to_numpy() == 0
     return off.to_numpy(), plain
 
@@ -174,10 +176,12 @@ def test_extinction_is_that_of_the_layers():
     product = solve(*scan(32), method="joint", **FAR)
     tops = np.append(0.0, ALTITUDE - STATION)
     truth = np.diff(optical_depth(tops)) / np.diff(tops)
-    off = ((product["extinction"] - truth) / product["extinction_standard_error"]).to_numpy()
+    off = (
+        (product["total_extinction"] - truth) / product["total_extinction_standard_error"]
+    ).to_numpy()
     good = ~has(product, flags_of("multiangle").rejecting)
     assert np.mean(np.abs(off[good]) < 3) >= 0.98
-    assert float(product["extinction_standard_error"].median()) < 3e-5
+    assert float(product["total_extinction_standard_error"].median()) < 3e-5
 
 
 @pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
@@ -191,27 +195,30 @@ def test_optical_depths_of_layers_lie_within_their_errors(method):
         np.testing.assert_allclose(product["layer_altitude"], STATION + np.array([300, 1050]))
         truth = np.diff(optical_depth(bounds - STATION), axis=1)[:, 0]
         error = np.hypot(
-            product["layer_optical_depth_standard_error"],
-            product["layer_optical_depth_gradient_error"],
+            product["layer_vertical_optical_depth_standard_error"],
+            product["layer_vertical_optical_depth_gradient_error"],
         )
-        off.append(((product["layer_optical_depth"] - truth) / error).to_numpy())
+        off.append(((product["layer_vertical_optical_depth"] - truth) / error).to_numpy())
         reject = has(product, flags_of("multiangle").rejecting)
         hidden = np.stack([reject[:, 5], reject[:, 5] | reject[:, 20]], axis=1)
-        np.testing.assert_array_equal(np.isnan(product["layer_optical_depth"]), hidden)
+        np.testing.assert_array_equal(np.isnan(product["layer_vertical_optical_depth"]), hidden)
         # Equal to the difference of the optical depths but for rounding.
-        depth = product["optical_depth"].to_numpy()
+        depth = product["vertical_optical_depth"].to_numpy()
         layer = np.where(hidden[:, 1], np.nan, depth[:, 20] - depth[:, 5])
-        np.testing.assert_allclose(product["layer_optical_depth"][:, 1], layer, atol=1e-12)
+        np.testing.assert_allclose(product["layer_vertical_optical_depth"][:, 1], layer, atol=1e-12)
     size = np.abs(np.concatenate(off))
     size = size[np.isfinite(size)]
     assert size.size > 100
     assert np.mean(size < 3) >= 0.97
-    assert "layer_optical_depth" not in solve(*scan(3), method=method)
+    assert "layer_vertical_optical_depth" not in solve(*scan(3), method=method)
 
 
 def test_product_has_monotone_profiles_and_chi_square():
     product = solve(*scan(16), **FAR)
-    depth, risen = product["optical_depth"].to_numpy(), product["monotone_optical_depth"].to_numpy()
+    depth, risen = (
+        product["vertical_optical_depth"].to_numpy(),
+        product["monotone_vertical_optical_depth"].to_numpy(),
+    )
     np.testing.assert_array_equal(np.isnan(depth), np.isnan(risen))
     for rising_row, row in zip(risen, depth, strict=True):
         steps = np.diff(rising_row[np.isfinite(rising_row)])
@@ -247,8 +254,12 @@ def test_extinction_stays_withheld_if_single_altitudes_replace_joint():
     product = labeled.retrieve_optical_depth(beams, station_altitude=0.0)
     assert "left out joint" in product.attrs["steps"]
     assert has(product, MultiAngleQuality.POOR_STRATIFICATION).all()
-    assert np.isfinite(product["optical_depth"]).any()
-    for name in ("extinction", "extinction_standard_error", "extinction_gradient_error"):
+    assert np.isfinite(product["vertical_optical_depth"]).any()
+    for name in (
+        "total_extinction",
+        "total_extinction_standard_error",
+        "total_extinction_gradient_error",
+    ):
         assert np.isnan(product[name]).all()
 
 
@@ -304,11 +315,13 @@ def test_incomplete_cycles_are_used_as_far_as_possible():
     assert product["beams"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
     # Two beams to one side, of a scan to both sides: a gradient does not cancel.
     two, full = product.isel(time=2), product.isel(time=1)
-    known = np.isfinite(two["optical_depth"])
-    assert (two["optical_depth_gradient_error"] > 0.0).to_numpy()[known].all()
-    wider = two["optical_depth_standard_error"] > full["optical_depth_standard_error"]
-    assert wider.to_numpy()[np.isfinite(two["optical_depth"])].all()
-    assert np.isnan(product["optical_depth"][4]).all()
+    known = np.isfinite(two["vertical_optical_depth"])
+    assert (two["vertical_optical_depth_gradient_error"] > 0.0).to_numpy()[known].all()
+    wider = (
+        two["vertical_optical_depth_standard_error"] > full["vertical_optical_depth_standard_error"]
+    )
+    assert wider.to_numpy()[np.isfinite(two["vertical_optical_depth"])].all()
+    assert np.isnan(product["vertical_optical_depth"][4]).all()
     assert np.isnan(product["reach"][4])
     assert has(product, MultiAngleQuality.NO_LEVERAGE)[4].all()
     assert_explained(product)
@@ -334,11 +347,15 @@ def test_an_angle_to_one_side_has_a_systematic_error():
     one_sided, two_sided = (
         solve(*scan(4, zenith), method="kano_hamilton") for zenith in (ONE_SIDE, TWO_SIDED)
     )
-    ratio = one_sided["optical_depth_gradient_error"] / two_sided["optical_depth_gradient_error"]
+    ratio = (
+        one_sided["vertical_optical_depth_gradient_error"]
+        / two_sided["vertical_optical_depth_gradient_error"]
+    )
     assert float(ratio[:, 5:50].median()) > 100
     half = solve(*scan(4, ONE_SIDE), method="kano_hamilton", largest_gradient=2.5e-5)
     np.testing.assert_allclose(
-        2.0 * half["optical_depth_gradient_error"], one_sided["optical_depth_gradient_error"]
+        2.0 * half["vertical_optical_depth_gradient_error"],
+        one_sided["vertical_optical_depth_gradient_error"],
     )
 
 
@@ -371,14 +388,19 @@ def test_a_plume_in_one_plane_of_a_volume_does_not_widen_the_errors_of_another()
     rough = solve(conditioned.assign(power=conditioned["power"] * plume), pointing)
     np.testing.assert_allclose(calm["plane_azimuth"], [20.0, 80.0])
     ratio = (
-        (rough["plane_optical_depth_standard_error"] / calm["plane_optical_depth_standard_error"])
+        (
+            rough["plane_vertical_optical_depth_standard_error"]
+            / calm["plane_vertical_optical_depth_standard_error"]
+        )
         .isel(altitude=slice(5, 30))
         .median(("time", "altitude"))
     )
     assert ratio[0] == pytest.approx(1.0, abs=0.1)
     assert ratio[1] > 3.0
     truth = optical_depth(ALTITUDE - STATION)
-    off = (calm["plane_optical_depth"] - truth) / calm["plane_optical_depth_standard_error"]
+    off = (calm["plane_vertical_optical_depth"] - truth) / calm[
+        "plane_vertical_optical_depth_standard_error"
+    ]
     assert np.sqrt((off**2).mean()) < 1.3
 
 
@@ -495,7 +517,7 @@ def test_all_is_uncertain_if_the_signal_left_in_the_tail_is_unknown():
         quality=conditioned["quality"] | before.astype(np.int32) * np.int32(Quality.SATURATED)
     )
     product = solve(hidden, pointing, method="kano_hamilton")
-    stands = np.isfinite(product["optical_depth"].to_numpy())
+    stands = np.isfinite(product["vertical_optical_depth"].to_numpy())
     assert stands.any()
     assert has(product, Quality.BACKGROUND_UNCERTAIN)[stands].all()
     assert_explained(product)

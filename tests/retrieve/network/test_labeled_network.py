@@ -27,14 +27,16 @@ def solved(beams, **changes):
 
 def test_homogeneous_air_is_within_the_errors():
     result = product(intervals=40)
-    whole = np.hypot(result["extinction_standard_error"], result["extinction_systematic_error"])
-    score = (result["extinction"] - EXTINCTION) / whole
+    whole = np.hypot(
+        result["total_extinction_standard_error"], result["total_extinction_systematic_error"]
+    )
+    score = (result["total_extinction"] - EXTINCTION) / whole
     assert result.sizes == {"time": 40, "crossing": 3, "nv": 2, "beam": 3}
     assert (result["quality_flag"] == 0).all()
     assert (abs(score) < 3).mean() > 0.97
-    assert float(abs(result["extinction"] / EXTINCTION - 1).mean()) < 0.02
+    assert float(abs(result["total_extinction"] / EXTINCTION - 1).mean()) < 0.02
     np.testing.assert_allclose(
-        result["visibility_in_air"], -np.log(0.05) / result["extinction"], rtol=1e-12
+        result["visibility_in_air"], -np.log(0.05) / result["total_extinction"], rtol=1e-12
     )
     assert (result["visibility_in_air_lower"] < result["visibility_in_air"]).all()
     assert (result["visibility_in_air_upper"] > result["visibility_in_air"]).all()
@@ -42,10 +44,12 @@ def test_homogeneous_air_is_within_the_errors():
 
 def test_the_interval_of_visibility_follows_from_all_errors_of_extinction():
     result = product()
-    whole = np.hypot(result["extinction_standard_error"], result["extinction_systematic_error"])
+    whole = np.hypot(
+        result["total_extinction_standard_error"], result["total_extinction_systematic_error"]
+    )
     for end, value in (
-        ("lower", result["extinction"] + whole),
-        ("upper", result["extinction"] - whole),
+        ("lower", result["total_extinction"] + whole),
+        ("upper", result["total_extinction"] - whole),
     ):
         np.testing.assert_allclose(
             result[f"visibility_in_air_{end}"], -np.log(0.05) / value, rtol=1e-9
@@ -59,10 +63,12 @@ def test_the_interval_of_visibility_follows_from_all_errors_of_extinction():
 def test_a_larger_declared_error_gives_a_larger_systematic_error(setting):
     beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
     less, more = (solved(beams, **{setting: value}) for value in (0.0, 0.05))
-    assert (more["extinction_systematic_error"] > less["extinction_systematic_error"]).mean() > 0.9
-    np.testing.assert_array_equal(more["extinction"], less["extinction"])
+    assert (
+        more["total_extinction_systematic_error"] > less["total_extinction_systematic_error"]
+    ).mean() > 0.9
+    np.testing.assert_array_equal(more["total_extinction"], less["total_extinction"])
     np.testing.assert_array_equal(
-        more["extinction_standard_error"], less["extinction_standard_error"]
+        more["total_extinction_standard_error"], less["total_extinction_standard_error"]
     )
 
 
@@ -71,9 +77,11 @@ def test_an_exponent_at_its_bound_has_an_error_too(exponent):
     beams = [beam(number, noise=0.001, exponent=exponent) for number in range(3)]
     declared = {"overlap_relative_error": 0.0, "lidar_ratio_relative_error": 0.0}
     less, more = (solved(beams, exponent_relative_error=error, **declared) for error in (0.0, 0.1))
-    known = np.isfinite(more["extinction"]).to_numpy()
+    known = np.isfinite(more["total_extinction"]).to_numpy()
     assert known.any()
-    changes = (more["extinction_systematic_error"] - less["extinction_systematic_error"]).to_numpy()
+    changes = (
+        more["total_extinction_systematic_error"] - less["total_extinction_systematic_error"]
+    ).to_numpy()
     assert (changes[known] > 0.0).all()
 
 
@@ -87,9 +95,9 @@ def test_the_declared_error_covers_an_error_of_the_overlap():
     )
     net = beams[0].averages["power"] - 0.1
     wrong = replace(beams[0], averages=beams[0].averages.assign(power=net * error + 0.1))
-    shift = abs(solved([wrong, *beams[1:]])["extinction"] - plain["extinction"])
+    shift = abs(solved([wrong, *beams[1:]])["total_extinction"] - plain["total_extinction"])
     assert float(shift.max()) > 0.5 * declared * EXTINCTION
-    assert (shift <= 1.1 * plain["extinction_systematic_error"]).all()
+    assert (shift <= 1.1 * plain["total_extinction_systematic_error"]).all()
 
 
 def test_signal_left_in_the_background_is_flagged():
@@ -102,14 +110,16 @@ def test_signal_left_in_the_background_is_flagged():
     result = solved(beams)
     assert short.sizes["range"] == 560
     assert (result["quality_flag"] & int(Quality.BACKGROUND_UNCERTAIN)).all()
-    whole = np.hypot(result["extinction_standard_error"], result["extinction_systematic_error"])
-    assert (abs(result["extinction"] - EXTINCTION) < 3 * whole).mean() > 0.9
+    whole = np.hypot(
+        result["total_extinction_standard_error"], result["total_extinction_systematic_error"]
+    )
+    assert (abs(result["total_extinction"] - EXTINCTION) < 3 * whole).mean() > 0.9
 
 
 def test_a_missing_beam_gives_a_reason():
     beams = [beam(number) for number in range(3)]
     result = solved([without(beams[0], slice(2, 4)), *beams[1:]])
-    missing = np.isnan(result["extinction"].values)
+    missing = np.isnan(result["total_extinction"].values)
     bits = result["quality_flag"].values
     on_beam = np.isfinite(result["beam_range"].values[0])
     assert (bits[2:4, on_beam] & flags_of("visibility").rejecting).all()
@@ -145,7 +155,7 @@ def test_pile_up_is_kept_where_the_signal_is_used():
 def test_visibility_follows_the_definition():
     koschmieder = product(visibility=VisibilityDefinition(wavelength=532e-9, contrast=0.02))
     np.testing.assert_allclose(
-        koschmieder["visibility_in_air"] * koschmieder["extinction"], -np.log(0.02)
+        koschmieder["visibility_in_air"] * koschmieder["total_extinction"], -np.log(0.02)
     )
     angstrom = product(
         visibility=VisibilityDefinition(
@@ -154,13 +164,13 @@ def test_visibility_follows_the_definition():
     )
     factor = (1064 / 550) ** 1.3
     np.testing.assert_allclose(
-        angstrom["visibility_in_air"] * angstrom["extinction"] * factor, -np.log(0.05)
+        angstrom["visibility_in_air"] * angstrom["total_extinction"] * factor, -np.log(0.05)
     )
     assert "angstrom" in angstrom.attrs["steps"]
     # The error of the law widens the interval, not the random error.
     ratio = angstrom["visibility_in_air_standard_error"] / angstrom["visibility_in_air"]
     np.testing.assert_allclose(
-        ratio, angstrom["extinction_standard_error"] / angstrom["extinction"]
+        ratio, angstrom["total_extinction_standard_error"] / angstrom["total_extinction"]
     )
     width = angstrom["visibility_in_air_upper"] / angstrom["visibility_in_air_lower"]
     assert (width > 1 + 2 * 0.2 * np.log(1064 / 550)).all()

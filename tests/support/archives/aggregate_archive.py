@@ -33,7 +33,7 @@ def add_day(
     data = MAKERS[kind](**{"zenith": 0.0, **maker})
     shift = np.timedelta64(day, "D")
     data = data.assign_coords(time=data.time + shift, time_bnds=data.time_bnds + shift)
-    for name in ("extinction", "signal"):
+    for name in ("total_extinction", "signal"):
         if name in data:
             data[name] = data[name] * np.random.default_rng(1000 + day).uniform(0.5, 2.0)
     data = change(data)

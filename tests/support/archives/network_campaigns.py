@@ -148,17 +148,17 @@ def truth_at(product: xr.Dataset, truth: xr.Dataset, instruments: list[str]) -> 
         Of each beam.
     """
     bounds = product["time_bnds"].values
-    if np.isfinite(truth["extinction"].values).all():
+    if np.isfinite(truth["total_extinction"].values).all():
         # Homogeneous: one number a file.
-        return np.full(product["extinction"].shape, float(truth["extinction"].mean()))
-    found = np.full((product.sizes["beam"], *product["extinction"].shape), np.nan)
+        return np.full(product["total_extinction"].shape, float(truth["total_extinction"].mean()))
+    found = np.full((product.sizes["beam"], *product["total_extinction"].shape), np.nan)
     for beam, name in enumerate(instruments):
         suffix = name.replace("-", "_")
         granule = truth[f"profile_granule_{suffix}"].values
         when = truth["time"].values[granule]
         zenith = truth["zenith_angle"].values[granule]
         mine = np.abs(zenith - float(product["beam_zenith_angle"][beam])) < 0.2
-        field = truth[f"profile_extinction_{suffix}"].values[:, 0]
+        field = truth[f"profile_total_extinction_{suffix}"].values[:, 0]
         middle = truth[f"range_{suffix}"].values
         for crossing, distance in enumerate(product["beam_range"].values[beam]):
             if not np.isfinite(distance):

@@ -54,11 +54,11 @@ def homogeneous(
     random = np.random.default_rng(seed)
     shape = (time.size, len(sections))
     truth = {
-        "extinction": true_extinction(time)[:, None],
+        "total_extinction": true_extinction(time)[:, None],
         "background": true_background(time)[:, None],
         "amplitude": np.full((time.size, 1), 2.0e7),
     }
-    errors = {"extinction": 4e-6, "background": 4e-3, "amplitude": 3e5}
+    errors = {"total_extinction": 4e-6, "background": 4e-3, "amplitude": 3e5}
     flag = np.zeros(shape, dtype=np.int32)
     bad = random.random(shape) < flagged
     flag[bad] = random.choice(
@@ -71,7 +71,7 @@ def homogeneous(
     if flagged > 0:
         flag[random.random(shape) < flagged / 4] |= int(Quality.OUTLIER)
     data = {}
-    units = {"extinction": "m-1", "background": "MHz", "amplitude": "MHz m2"}
+    units = {"total_extinction": "m-1", "background": "MHz", "amplitude": "MHz m2"}
     for name, value in truth.items():
         error = errors[name] * (0.7 + 0.6 * random.random(shape)) * (1 + np.arange(len(sections)))
         values = value + scale * error * random.standard_normal(shape)
@@ -167,7 +167,7 @@ def truth_of(time: np.ndarray, *, instrument: str = "horizontal", other: int = 3
                 np.array([instrument] * time.size + ["vertical"] * other, dtype=object),
             ),
             "time": ("granule", all_times),
-            "extinction": ("granule", extinction, {"units": "m-1"}),
+            "total_extinction": ("granule", extinction, {"units": "m-1"}),
             f"background_{CHANNEL}": (
                 "granule",
                 np.concatenate([true_background(time), np.full(other, 9.0)]),

@@ -123,9 +123,9 @@ def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset
     extinction[0, 0] = np.nan
     return xr.Dataset(
         {
-            "extinction": (dims, extinction),
-            "extinction_standard_error": (dims, np.abs(extinction) * 0.05),
-            "extinction_model_error": (dims, np.abs(extinction) * 0.05 + 1e-5),
+            "total_extinction": (dims, extinction),
+            "total_extinction_standard_error": (dims, np.abs(extinction) * 0.05),
+            "total_extinction_model_error": (dims, np.abs(extinction) * 0.05 + 1e-5),
             "amplitude": (dims, rng.uniform(1e7, 1e12, shape)),
             "amplitude_standard_error": (dims, rng.uniform(1e5, 1e9, shape)),
             "background": (dims, rng.uniform(0.1, 2.0, shape)),
@@ -181,8 +181,8 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     flags[0, 5:] |= np.int32(ElasticQuality.CLOUD)
     missing = (flags & int(Quality.INCOMPLETE_OVERLAP | ElasticQuality.NO_REFERENCE)) != 0
     scales = {
-        "backscatter": 1e-6,
-        "extinction": 5e-5,
+        "aerosol_backscatter": 1e-6,
+        "aerosol_extinction": 5e-5,
         "scattering_ratio": 2.0,
         "attenuated_backscatter": 2e-6,
     }
@@ -198,7 +198,7 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
         "molecular",
         "dead_time",
     ):
-        retrieved[f"backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
+        retrieved[f"aerosol_backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
     window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
     return xr.Dataset(
         {
@@ -239,14 +239,14 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     flags[-1] |= np.int32(RamanQuality.WEAK_SIGNAL | RamanQuality.NO_LIDAR_RATIO)
     flags[0, 5:] |= np.int32(RamanQuality.NO_REFERENCE | RamanQuality.NO_LIDAR_RATIO)
     scales = {
-        "extinction": 5e-5,
-        "backscatter": 1e-6,
+        "aerosol_extinction": 5e-5,
+        "aerosol_backscatter": 1e-6,
         "lidar_ratio": 50.0,
         "water_vapour_mixing_ratio": 5e-3,
     }
     causes = {
-        "extinction": EXTINCTION_CAUSES,
-        "backscatter": BACKSCATTER_CAUSES,
+        "aerosol_extinction": EXTINCTION_CAUSES,
+        "aerosol_backscatter": BACKSCATTER_CAUSES,
         "lidar_ratio": ("random", "systematic"),
         "water_vapour_mixing_ratio": ("random", "systematic"),
     }
@@ -258,7 +258,7 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             share = 0.1 * scale / np.sqrt(len(causes[name]))
             values[f"{name}_error_{cause}"] = np.full(shape, share)
     values |= {
-        "extinction_smoothing_error": np.full(shape, 5e-6),
+        "aerosol_extinction_smoothing_error": np.full(shape, 5e-6),
         "vertical_resolution": np.full(shape, 300.0),
     }
     values = {name: np.where(flags != 0, np.nan, array) for name, array in values.items()}
@@ -299,17 +299,17 @@ def multiangle(
     flags[0, 2 * levels // 3 :] = MultiAngleQuality.EXTRAPOLATED
     flags[-1, 0] |= np.int32(MultiAngleQuality.INTERPOLATED | MultiAngleQuality.POOR_STRATIFICATION)
     scales = {
-        "optical_depth": 0.3,
-        "optical_depth_standard_error": 0.01,
-        "optical_depth_gradient_error": 0.005,
-        "extinction": 1e-4,
-        "extinction_standard_error": 1e-5,
-        "extinction_gradient_error": 5e-6,
+        "vertical_optical_depth": 0.3,
+        "vertical_optical_depth_standard_error": 0.01,
+        "vertical_optical_depth_gradient_error": 0.005,
+        "total_extinction": 1e-4,
+        "total_extinction_standard_error": 1e-5,
+        "total_extinction_gradient_error": 5e-6,
         "log_intercept": 14.0,
         "log_intercept_standard_error": 0.02,
         "data_share": 0.99,
         "inhomogeneity": 0.03,
-        "monotone_optical_depth": 0.3,
+        "monotone_vertical_optical_depth": 0.3,
         "reduced_chi2": 1.0,
     }
     missing = (flags & int(MultiAngleQuality.EXTRAPOLATED)) != 0
@@ -349,7 +349,7 @@ def multiangle(
 
 def with_planes(data: xr.Dataset) -> xr.Dataset:
     """Return data with profiles of two vertical planes."""
-    names = ("optical_depth", "extinction")
+    names = ("vertical_optical_depth", "total_extinction")
     return data.assign(
         {
             f"plane_{name}{ending}": data[name + ending].expand_dims(plane=2, axis=1).copy()
@@ -371,7 +371,7 @@ def with_layers(data: xr.Dataset) -> xr.Dataset:
     scales = {"": 0.1, "_standard_error": 0.01, "_gradient_error": 0.005}
     return data.assign(
         {
-            f"layer_optical_depth{error}": (dims, np.where(missing, np.nan, scale))
+            f"layer_vertical_optical_depth{error}": (dims, np.where(missing, np.nan, scale))
             for error, scale in scales.items()
         }
     ).assign_coords(
@@ -400,12 +400,12 @@ def visibility(
         "visibility_in_air_standard_error": law * error / extinction**2,
         "visibility_in_air_lower": law / (extinction + both),
         "visibility_in_air_upper": law / (extinction - both),
-        "extinction": extinction,
-        "extinction_standard_error": error,
-        "extinction_systematic_error": systematic,
+        "total_extinction": extinction,
+        "total_extinction_standard_error": error,
+        "total_extinction_systematic_error": systematic,
         "condition": rng.uniform(1.0, 3.0, shape),
     }
-    scalars = {"optical_depth": 0.8, "reduced_chi2": 1.1, "degrees_of_freedom": 1.0}
+    scalars = {"path_optical_depth": 0.8, "reduced_chi2": 1.1, "degrees_of_freedom": 1.0}
     distance = np.full((beams, crossings), np.nan)
     for crossing in range(crossings):
         meeting = [crossing % beams, (crossing + 1) % beams]
