@@ -420,6 +420,8 @@ class Study:
     date: str
     chapters: Sequence[Chapter]
     works: Sequence[Work] = ()
+    missed: Sequence[str] = ()
+    """Targets that are missed; the command fails where there is one."""
     machine: Machine = field(default_factory=machine)
 
     def figures(self, title: str) -> dict[tuple[str, str, str], Row]:

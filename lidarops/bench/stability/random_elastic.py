@@ -336,12 +336,11 @@ def _scored(
         behind_cloud = (window.top > clouds.cloud_base_range)[:, np.newaxis]
     bits |= np.where(behind_cloud, np.int32(ElasticQuality.CLOUD), np.int32(0))
     budget = solved.budget
-    systematic: Any = np.sqrt(
-        budget.reference**2 + budget.lidar_ratio**2 + budget.molecular**2 + budget.background**2
-    )
+    random = np.hypot(budget.noise, budget.background)
+    systematic: Any = np.sqrt(budget.reference**2 + budget.lidar_ratio**2 + budget.molecular**2)
     error = (solved.backscatter - sky.particles)[:, inside]
     return ScoredValues(
-        failure, "backscatter", error, budget.noise[:, inside], systematic[:, inside],
+        failure, "backscatter", error, random[:, inside], systematic[:, inside],
         bits[:, inside], ElasticQuality,
         uncertain=(bits[:, inside] & int(ElasticQuality.CLOUD)) != 0,
         hidden=None if hidden is None else np.broadcast_to(hidden[:, np.newaxis], error.shape),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,9 +16,11 @@ from lidarops.bench.stability import (
     random_signals,
 )
 from lidarops.bench.stability.random_scenes import (
-    ALL,
+    BROKEN,
+    COVERED,
     FALSE,
     FINE,
+    HELD,
     SATISFIED,
     VIOLATED,
     VISIBLE,
@@ -72,34 +74,44 @@ def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Study
         clusters = draw.quick if effort.quick else draw.clusters
         tally = collect(draw.score_cluster, clusters, effort.progress)
         chapters.append(_chapter(draw.retrieval, tally.rates(draw.needless)))
-    return Study("Stability: false values without a flag", effort.date, chapters)
+    return Study(
+        "Stability: false values without a flag",
+        effort.date,
+        chapters,
+        missed=missed_targets(chapters),
+    )
 
 
 _NOTE: Final = (
     "In brackets: Monte Carlo standard error in the last digits, from independently drawn "
     "geometries. Not rejected: no flag rejects the value. Not uncertain: no flag marks the stated "
-    "error as uncertain. Undetectable: the misfit of the violation is below "
-    f"{VISIBLE:g} standard deviations of the noise. Even the best test that knows the shape of the "
-    "violation, but not its sign, misses 7 % or more of these at our rate of false alarms (half at "
-    "3.5 deviations). The target applies to the rest, as a share of all. Share of the detectable: "
-    "false values among those whose violation is detectable but raised no flag. Target, undecided: "
-    "the share exceeds it by less than 2 Monte Carlo errors. Rejected but accurate: differs by "
+    f"error as uncertain. Within {COVERED:g}: values that are not rejected and within this number "
+    "of stated random errors; 95 % for correct errors where the model holds. The target applies to "
+    "everything drawn: to random errors alone where the model holds, else to values that are not "
+    "uncertain, with the stated systematic errors. Undecided: the share exceeds it by less than "
+    "2 Monte Carlo errors. Missed as declared: the share exceeds the target, but not the one that "
+    "docs/stability.md declares. Undetectable, which explains but does not excuse: the misfit of "
+    f"the violation is below {VISIBLE:g} standard deviations of the noise. Even the best test that "
+    "knows the shape of the violation, but not its sign, misses 7 % or more of these at our rate "
+    "of false alarms (half at 3.5 deviations). Share of the detectable: false values among those "
+    "whose violation is detectable but raised no flag. Rejected but accurate: differs by "
     f"less than {FINE:g} errors. Needlessly flagged: flagged although the value can be determined."
 )
 
 
 def _chapter(name: str, scores: Scores) -> Chapter:
     scenes = max(
-        int(str(score["scenes"])) for (_, failure), score in scores.items() if failure == ALL
+        int(str(score["scenes"]))
+        for (_, failure), score in scores.items()
+        if failure in {HELD, BROKEN}
     )
     return Chapter(
         f"False values: {name}",
         f"{counted(scenes, 'random scene')}. A value is false if it differs from the "
         f"truth by more than {FALSE:g} stated standard errors. Targets for values that no "
         f"flag rejects: {share_text(SATISFIED)} where the model holds, by random errors alone; "
-        f"{share_text(VIOLATED)} elsewhere, with the stated systematic errors, excluding "
-        "values that flags mark as uncertain and violations that no test can reliably "
-        f"detect. {targets(scores)}",
+        f"{share_text(VIOLATED)} of everything drawn elsewhere, with the stated systematic errors, "
+        f"excluding values that flags mark as uncertain. {targets(scores)}",
         [
             Results(
                 f"Values that differ by more than {FALSE:g} stated errors: {name}",
@@ -115,12 +127,27 @@ def _chapter(name: str, scores: Scores) -> Chapter:
 def targets(scores: Scores) -> str:
     """Return which classes miss their targets, and for which that is undecided."""
     sentences = []
-    for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNDECIDED, "Undecided")):
+    for verdict, words in (
+        (Verdict.MISSED, "Missed"),
+        (Verdict.DECLARED, "Missed as declared"),
+        (Verdict.UNDECIDED, "Undecided"),
+    ):
         names = [
             f"{failure} ({quantity})"
             for (quantity, failure), score in scores.items()
-            if failure != ALL and verdict in str(score["target"])
+            if verdict in str(score["target"])
         ]
         if names:
             sentences.append(f"{words}: {', '.join(names)}.")
     return " ".join(sentences) or "All targets are met."
+
+
+def missed_targets(chapters: Sequence[Chapter]) -> list[str]:
+    """Return the classes whose share of false or needlessly flagged values is above the target."""
+    return [
+        f"{results.title}: {row.method} ({row.case}), target {row.value}"
+        for chapter in chapters
+        for results in chapter.results
+        for row in results.rows
+        if row.quantity == "target" and Verdict.MISSED in str(row.value)
+    ]
