@@ -232,7 +232,7 @@ def _works(backgrounds: Scores, inversions: Scores, costs: Sequence[Row]) -> lis
                         Figure(error.value, error.error),
                         coverage,
                         cpu_time(spent),
-                        ours=method != elastic_cases.TAIL_MEAN,
+                        ours=method not in {elastic_cases.TAIL_MEAN, elastic_cases.LINEAR},
                         informed=method == elastic_cases.KNOWN_CLEAN_RANGE,
                     )
                 )
@@ -478,6 +478,7 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
                 elastic_cases.TAIL_MEAN,
                 elastic_cases.KNOWN_SHAPE,
                 elastic_cases.KNOWN_CLEAN_RANGE,
+                elastic_cases.LINEAR,
             )
         },
         "layers.screen": lambda few: elastic_cases.find_clouds(power[:few], noise[:few], sky),
@@ -486,7 +487,6 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
         ALL_STEPS: everything,
     }
     peers: dict[str, _Step] = {
-        "background, numpy lstsq": lambda few: elastic_cases.lstsq_backgrounds(counts[:few], sky),
         "Klett, numpy": lambda few: elastic_cases.klett_numpy(whole[:few], sky),
     }
     return ours, peers
@@ -498,8 +498,8 @@ def elastic_cost_chapter(costs: Sequence[Row]) -> Chapter:
         "elastic-time",
         f"Profiles of {elastic_cases.RANGE.size} bins, float64, one thread, least CPU time of "
         "interleaved repeats. Steps of lidarops compute all errors and flags; all steps: "
-        "background, clouds, reference window and inversion with its error budget. The peers give "
-        "values without errors: a weighted numpy.linalg.lstsq and a Klett inversion in numpy for "
-        "each profile.",
+        "background, clouds, reference window and inversion with its error budget. The peer "
+        f"{elastic_cases.LINEAR} gives values and errors without flags, the Klett inversion in "
+        "numpy for each profile values alone.",
         costs,
     )

@@ -187,6 +187,8 @@ KNOWN_SHAPE: Final = "known_shape"
 KNOWN_CLEAN_RANGE: Final = "known_shape, from 6 km"
 TAIL_MEAN: Final = "tail_mean"
 HOMOGENEOUS: Final = "homogeneous"
+LINEAR: Final = "least squares {1, shape}"
+"""The peer: the range from 6 km is given, and the weights are those of the mean profile."""
 
 
 def background_methods() -> dict[str, BackgroundMethod]:
@@ -199,6 +201,7 @@ def background_methods() -> dict[str, BackgroundMethod]:
         KNOWN_SHAPE: _known_shape,
         KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
         TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
+        LINEAR: linear_backgrounds,
         HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
     }
@@ -373,17 +376,21 @@ def invert(
 # Peers ----------------------------------------------------------------------------------------
 
 
-def lstsq_backgrounds(counts: Array, sky: SimulatedSky) -> Array:
-    """Return backgrounds by `numpy.linalg.lstsq`, one weighted fit above 6 km per profile."""
-    far = sky.range >= CLEAN_FROM
-    shape = sky.shape[far] / sky.shape[far][0]
+def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    """Return backgrounds by linear least squares with a constant and the shape of air."""
+    first = int(np.searchsorted(sky.range, CLEAN_FROM))
+    shape = sky.shape[first:] / sky.shape[first]
     slopes = np.stack([np.ones_like(shape), shape], axis=1)
-    backgrounds = np.empty(len(counts))
-    for row, profile in enumerate(counts[:, far]):
-        weight = np.sqrt(SHOTS / np.maximum(profile, 1.0 / SHOTS))
-        solution = np.linalg.lstsq(slopes * weight[:, np.newaxis], profile * weight, rcond=None)
-        backgrounds[row] = solution[0][0]
-    return backgrounds
+    weighted = slopes * count_weight(counts[:, first:])[:, np.newaxis]
+    covariance = np.linalg.inv(weighted.T @ slopes)
+    background = counts[:, first:] @ (weighted @ covariance[:, 0])
+    error = np.full(len(counts), np.sqrt(covariance[0, 0]))
+    return BackgroundEstimates(background, error, np.zeros(len(counts), dtype=np.bool_))
+
+
+def count_weight(counts: Array) -> Array:
+    """Return inverse variances of mean counts, (range,), from the mean of the profiles."""
+    return np.asarray(SHOTS / np.maximum(counts.mean(axis=0), 1.0 / SHOTS))
 
 
 def klett_numpy(power: Array, sky: SimulatedSky) -> Array:

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
+from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import lsq_linear
 
 from lidarops.bench.harness.rows import Array
@@ -31,6 +32,8 @@ _OUTLIERS: Final = (0.3, 1.0)
 _STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
 _LEAST_SNR: Final = 3.0
 _FEWEST_BEAMS: Final = 3
+_FEWEST_KNOTS: Final = 5
+_LEAST_SCATTER: Final = 1e-20
 
 AUTO: Final = "auto"
 TWO_ANGLE: Final = "two_angle"
@@ -38,7 +41,8 @@ KANO_HAMILTON: Final = "kano_hamilton"
 JOINT: Final = "joint"
 MLD: Final = "mld"
 MLD_PRIOR: Final = "mld_prior"
-LSTSQ: Final = "numpy lstsq"
+LINES: Final = "straight lines, numpy"
+SPLINE: Final = "straight lines, GCV spline"
 TIKHONOV: Final = "Tikhonov, L-curve"
 BOUNDED: Final = "scipy lsq_linear"
 
@@ -361,37 +365,61 @@ def with_prior(scan: Scan, prior: Array) -> Array:
 
 
 def scan_peers() -> Mapping[str, ScanSolver]:
-    """Return methods written directly with numpy and scipy, which solve each altitude on its own.
+    """Return methods written directly with numpy and scipy.
 
-    They know the true scatter, and use samples of more than 3 times their noise.
+    They know the true scatter, and use samples of more than 3 times their noise. All but the
+    spline solve each altitude on its own.
     """
-    return {LSTSQ: lstsq, TIKHONOV: tikhonov, BOUNDED: bounded}
+    return {LINES: lines, SPLINE: spline, TIKHONOV: tikhonov, BOUNDED: bounded}
 
 
+SLOW: Final = frozenset({TIKHONOV, BOUNDED})
+"""Peers that loop over altitudes."""
 _Line = tuple[Array, Array, Array]
 """Slant path, logarithm and weight (the reciprocal standard error) of each beam."""
 
 
-def lstsq(scan: Scan) -> ScanEstimates:
-    """Fit straight lines by `numpy.linalg.lstsq`."""
+def lines(scan: Scan) -> ScanEstimates:
+    """Fit straight lines to all altitudes at once: Kano-Hamilton in closed form."""
+    x = scan.scene.path[:, np.newaxis]
+    used = scan.signal > _LEAST_SNR * np.sqrt(scan.variance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scatter = scan.variance / scan.signal**2 + scan.scene.inhomogeneity**2
+        # Without scatter and noise, all beams have the same weight.
+        weight = np.where(used, 1.0 / np.maximum(scatter, _LEAST_SCATTER), 0.0)
+        y = np.where(used, np.log(np.where(used, scan.signal, 1.0)), 0.0)
+        total = weight.sum(axis=1, keepdims=True)
+        away = x - (weight * x).sum(axis=1, keepdims=True) / total
+        information = (weight * away**2).sum(axis=1)
+        depth = -0.5 * (weight * away * y).sum(axis=1) / information
+        error = 0.5 / np.sqrt(information)
+    solvable = used.sum(axis=1) >= _FEWEST_BEAMS
+    return ScanEstimates(np.where(solvable, depth, np.nan), np.where(solvable, error, np.nan))
 
-    def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
-        design = np.stack([root, -2.0 * x * root], axis=1)
-        solution = np.linalg.lstsq(design, y * root, rcond=None)[0]
-        return float(solution[1]), float(np.sqrt(np.linalg.inv(design.T @ design)[1, 1]))
 
-    return _solve_lines(scan, fit, stated=True)
+def spline(scan: Scan) -> ScanEstimates:
+    """Smooth the optical depths of `lines` by a cubic spline, its strength by cross validation."""
+    found = lines(scan)
+    error = np.asarray(found.standard_error)
+    smooth = np.full(found.optical_depth.shape, np.nan)
+    for t, depth in enumerate(found.optical_depth):
+        known = np.isfinite(depth)
+        if known.sum() >= _FEWEST_KNOTS:
+            height = scan.scene.altitude[known]
+            curve = make_smoothing_spline(height, depth[known], w=1.0 / error[t, known] ** 2)
+            smooth[t, known] = curve(height)
+    return ScanEstimates(smooth)
 
 
 def bounded(scan: Scan) -> ScanEstimates:
     """Fit straight lines with the optical depth constrained to be non-negative."""
 
-    def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
+    def fit(x: Array, y: Array, root: Array) -> float:
         design = np.stack([root, -2.0 * x * root], axis=1)
         least = ([-np.inf, 0.0], [np.inf, np.inf])
-        return float(lsq_linear(design, y * root, bounds=least).x[1]), np.nan
+        return float(lsq_linear(design, y * root, bounds=least).x[1])
 
-    return _solve_lines(scan, fit, stated=False)
+    return _solve_lines(scan, fit)
 
 
 def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
@@ -404,7 +432,7 @@ def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
         Ascending; one strength is taken as it is.
     """
 
-    def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
+    def fit(x: Array, y: Array, root: Array) -> float:
         order = np.argsort(x)
         x, y, root = x[order], y[order], root[order]
         width = np.diff(x) / (x[-1] - x[0])
@@ -417,9 +445,9 @@ def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
         size = np.sqrt(np.sum((kept * data / values) ** 2, axis=1))
         misfit = np.sqrt(np.sum(((1.0 - kept) * data) ** 2, axis=1))
         slope = right.T @ (kept[_corner(misfit, size)] * data / values)
-        return float(-0.5 * np.sum(np.sqrt(width) * slope) / (x[-1] - x[0])), np.nan
+        return float(-0.5 * np.sum(np.sqrt(width) * slope) / (x[-1] - x[0]))
 
-    return _solve_lines(scan, fit, stated=False)
+    return _solve_lines(scan, fit)
 
 
 def _corner(misfit: Array, size: Array) -> int:
@@ -434,17 +462,15 @@ def _corner(misfit: Array, size: Array) -> int:
     return int(np.argmax(np.where(np.isfinite(bend), bend, -np.inf)))
 
 
-def _solve_lines(
-    scan: Scan, fit: Callable[[Array, Array, Array], tuple[float, float]], *, stated: bool
-) -> ScanEstimates:
+def _solve_lines(scan: Scan, fit: Callable[[Array, Array, Array], float]) -> ScanEstimates:
     profiles, _, bins = scan.signal.shape
-    depth, error = np.full((profiles, bins), np.nan), np.full((profiles, bins), np.nan)
+    depth = np.full((profiles, bins), np.nan)
     for t in range(profiles):
         for k in range(bins):
             line = _line(scan, t, k)
             if line[0].size >= _FEWEST_BEAMS:
-                depth[t, k], error[t, k] = fit(*line)
-    return ScanEstimates(depth, error if stated else None)
+                depth[t, k] = fit(*line)
+    return ScanEstimates(depth)
 
 
 def _line(scan: Scan, t: int, k: int) -> _Line:

@@ -492,7 +492,9 @@ def compare_with_scipy(profiles: int) -> Scores:
 
 
 def _clipped_rms(errors: Array, kept: Mask) -> Figure:
-    return share(float(np.sqrt(np.mean(np.clip(errors[kept], -CLIPPED, CLIPPED) ** 2))))
+    """Return the root mean square of kept errors; profiles are independent but for their field."""
+    rmse = root_by_block(np.clip(errors, -CLIPPED, CLIPPED), kept, 1)
+    return share(math.nan) if rmse is None else share(rmse)
 
 
 def _peers_chapter(comparisons: Scores) -> Chapter:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.optimize import curve_fit
 
-from lidarops.bench.accuracy import levenberg_marquardt
+from lidarops.bench.accuracy import levenberg_marquardt, variable_projection
 from lidarops.bench.accuracy.homogeneous_cases import (
     WRONG_PRIOR,
     Estimates,
@@ -24,12 +24,14 @@ from lidarops.bench.harness.rows import Array
 
 KILOMETRE: Final = 1e3
 JIT: Final = "LM, numba"
+PROJECTION: Final = "variable projection, numba"
 
 
 def iterative_peers() -> dict[str, PathSolver]:
     """Return the iterative solvers by name."""
     return {
         JIT: compiled,
+        PROJECTION: _by_projection,
         "scipy curve_fit": _by_scipy,
     }
 
@@ -47,6 +49,17 @@ def compiled(power: Any, scenario: Scenario) -> Estimates:
     covariance = np.empty((len(power), levenberg_marquardt.UNKNOWNS, levenberg_marquardt.UNKNOWNS))
     levenberg_marquardt.fit_levenberg_marquardt(
         power, ratio, depth, start(scenario), unknowns, covariance
+    )
+    return _estimates(unknowns, covariance, scenario)
+
+
+def _by_projection(power: Any, scenario: Scenario) -> Estimates:
+    """Solve by the fit of `lidarops.bench.accuracy.variable_projection`."""
+    ratio, depth = _geometry(scenario)
+    unknowns = np.empty((len(power), variable_projection.UNKNOWNS))
+    covariance = np.empty((*unknowns.shape, variable_projection.UNKNOWNS))
+    variable_projection.fit_variable_projection(
+        power, ratio, depth, float(start(scenario)[2]), unknowns, covariance
     )
     return _estimates(unknowns, covariance, scenario)
 
