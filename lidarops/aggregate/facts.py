@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
+from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.system.files import sha256_of, within
@@ -274,12 +275,13 @@ def opened(file: Path) -> Iterator[xr.Dataset]:
         If the file cannot be read, or lacks what every product has.
     """
     try:
+        check_sizes(file)
         with xr.open_dataset(file, engine="netcdf4", decode_cf=False, cache=False) as product:
             yield product
     except KeyError as error:
         raise ProductError(f"is not a product of lidarops: it has no {error}", file=file) from error
     # Reading a damaged file raises OSError or RuntimeError.
-    except (OSError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError, MemoryError) as error:
         raise ProductError(f"cannot be read: {error}", file=file) from error
 
 

@@ -18,6 +18,7 @@ from uuid import NAMESPACE_URL, uuid5
 import xarray as xr
 
 from lidarops.errors import NO_FILE, ProductError
+from lidarops.netcdf.sizes import check_sizes
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 RELEASE_DATE: Final = date(2026, 11, 21)
@@ -180,6 +181,7 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
         If the file cannot be read or holds no provenance.
     """
     try:
+        check_sizes(path)
         with xr.open_dataset(path, engine="netcdf4", decode_times=False) as product:
             if "provenance" not in product:
                 raise ProductError(

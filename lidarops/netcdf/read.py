@@ -23,6 +23,7 @@ from xarray.core import indexing
 
 from lidarops.errors import ProductError
 from lidarops.netcdf._deflate import inflate_chunk
+from lidarops.netcdf.sizes import is_bare_dimension
 from lidarops.netcdf.stored_flags import Recoding, recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.netcdf.write import OTHER_DIMENSION
@@ -39,7 +40,6 @@ _ATTRIBUTES: Final = (
     "dtype",
 )
 """Attributes needed to decode values. Reading all attributes takes longer than the values."""
-_NO_VARIABLE: Final = b"This is a netCDF dimension but not a netCDF variable"
 LAZY_BYTES: Final = 1 << 14
 """Smallest variable that is not read at once."""
 _FILTERS: Final = [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
@@ -152,7 +152,7 @@ class _File:
             return None
         # Faster than indexing the file object.
         dataset = h5py.Dataset(h5py.h5d.open(self._file.id, inside.encode()))
-        if _is_bare_dimension(dataset):
+        if is_bare_dimension(dataset.id):
             return None
         dims, attributes = _dimensions(dataset, name), _attributes(dataset)
         fill = _own_fill(dataset.dtype, attributes)
@@ -290,12 +290,6 @@ def _has_time_units(attributes: Mapping[str, Any]) -> bool:
 
 def _count(size: int, step: int) -> int:
     return -(-size // step)
-
-
-def _is_bare_dimension(dataset: h5py.Dataset) -> bool:
-    if not h5py.h5ds.is_scale(dataset.id):
-        return False
-    return bool(h5py.h5ds.get_scale_name(dataset.id).startswith(_NO_VARIABLE))
 
 
 def _dimensions(dataset: h5py.Dataset, name: str) -> tuple[str, ...]:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -15,13 +17,15 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
-from lidarops.netcdf.stored_flags import count_bits, stored_bits
+from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
 from lidarops.records import Role
@@ -43,6 +47,8 @@ _UNITS: Final = {
 """Units of what raw headers hold."""
 _HEADER: Final = "source"
 """Key of the header as written."""
+_READ_VALUES: Final = 4_000_000
+"""Values in memory at a time."""
 _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
@@ -165,6 +171,7 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
 
 def _product(file: Path) -> dict[str, Any]:
     try:
+        check_sizes(file)
         dataset = xr.open_dataset(file, decode_times=False)
     except (OSError, ValueError, RuntimeError) as error:
         raise ProductError(f"cannot be opened: {error}", file=file) from error
@@ -190,30 +197,49 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
     }
     if variable.dtype.kind not in "fiu" or variable.size == 0:
         return properties
-    values = variable.to_numpy().astype(np.float64)
-    finite = values[np.isfinite(values)]
-    properties["missing"] = values.size - finite.size
-    if finite.size:
-        properties |= {"minimum": float(finite.min()), "maximum": float(finite.max())}
+    missing, ends = 0, []
+    for values in _blocks(variable):
+        finite = values[np.isfinite(values)]
+        missing += values.size - finite.size
+        ends += [float(finite.min()), float(finite.max())] if finite.size else []
+    properties["missing"] = missing
+    if ends:
+        properties |= {"minimum": min(ends), "maximum": max(ends)}
     return properties
+
+
+def _blocks(variable: xr.DataArray) -> Iterator[NDArray[Any]]:
+    """Yield the values of a variable, some rows at a time."""
+    if not variable.dims:
+        yield variable.to_numpy()
+        return
+    first, rows = next(iter(variable.sizes.items()))
+    step = max(1, _READ_VALUES * rows // variable.size)
+    for start in range(0, rows, step):
+        yield variable.isel({first: slice(start, start + step)}).to_numpy()
 
 
 def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     """Count values by verdict and by quality bit; empty for files without quality flags."""
     if "quality_flag" not in dataset.variables:
         return []
-    flags = dataset["quality_flag"].to_numpy().astype(np.int64)
+    size = dataset["quality_flag"].size
     bits = stored_bits(dataset["quality_flag"].attrs, dataset.attrs.get("lidarops_kind"))
     rows = []
-    if "usable" in dataset.variables:
-        usable = dataset["usable"].to_numpy()
+    if "usable" in dataset.variables and dataset["usable"].size:
+        verdicts: Counter[int] = Counter()
+        for usable in _blocks(dataset["usable"]):
+            verdicts.update({v: int(np.count_nonzero(usable == v)) for v in range(len(_VERDICTS))})
         rows = [
-            _counted(name, "verdict", int(np.count_nonzero(usable == value)), flags.size, "")
+            _counted(name, "verdict", verdicts[value], size, "")
             for value, name in enumerate(_VERDICTS)
         ]
-    for bit, count in count_bits(flags, bits).items():
+    counts: Counter[StoredBit] = Counter()
+    for flags in _blocks(dataset["quality_flag"]) if size else ():
+        counts.update(count_bits(flags.astype(np.int64), bits))
+    for bit in (bit for bit in bits if counts[bit]):
         severity = "unknown" if bit.severity is None else bit.severity.name.lower()
-        rows.append(_counted(bit.word, severity, count, flags.size, bit.description))
+        rows.append(_counted(bit.word, severity, counts[bit], size, bit.description))
     return rows
 
 

@@ -16,6 +16,7 @@ from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.netcdf.provenance import NETCDF_MAGIC
 from lidarops.netcdf.read import open_product
+from lidarops.netcdf.sizes import check_sizes
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
 
@@ -65,6 +66,7 @@ def _of_product(path: Path) -> Iterator[Figure]:
 
 def _kind(path: Path) -> str:
     try:
+        check_sizes(path)
         with xr.open_dataset(path, decode_times=False) as opened:
             return str(opened.attrs.get("lidarops_kind", ""))
     except (OSError, ValueError, RuntimeError) as error:

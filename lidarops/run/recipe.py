@@ -62,10 +62,10 @@ class Recipe:
         except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise _insufficient(file, repr(error)) from error
         for record in recipe.inputs:
-            # Copies are written under this path, which a forged product could choose freely.
-            if record.role in RAW and not stays_inside(record.path):
+            # It is read, and copies are written under it: a forged product could choose it freely.
+            if not stays_inside(record.path):
                 raise ProductError(
-                    f"names a raw file outside its archive: {record.path}",
+                    f"names an input outside its archive: {record.path}",
                     file=file,
                     field="provenance",
                     remedy="lidarops does not write such products: do not trust this one",

@@ -208,15 +208,18 @@ def _folder(
     """Return the nearest folder above the product, or subfolder of one, that holds any input.
 
     If there is none, the folder or URL of the last run in the catalog, if it may hold an input. A
-    folder whose files only bear the names of inputs, with other content, is taken last.
+    folder whose files only bear the names of inputs, with other content, is taken last, and none
+    of those that every machine has: a product could name any file of them.
     """
     digests = {record.path: record.sha256 for record in records}
     moved = {name: digests[old] for old, name in _moved(recipe, records, catalog).items()}
     last = _last_run(recipe, catalog)
     known = "" if last is None else last.archive if option == "--archive" else last.folder
-    local = [*_folders_above(recipe.file), *([Path(known)] if known and not is_url(known) else [])]
-    for holds in (_holds_content, _holds_name):
-        for folder in local:
+    last_read = [Path(known)] if known and not is_url(known) else []
+    local = [*_folders_above(recipe.file), *last_read]
+    own = [folder for folder in local if folder.parent != folder.parent.parent] + last_read
+    for holds, folders in ((_holds_content, local), (_holds_name, own)):
+        for folder in folders:
             if holds(folder, digests) or holds(folder, moved):
                 return str(folder)
         if is_url(known):

@@ -25,6 +25,7 @@ from lidarops.figures import any_kind, svg
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.kinds import kinds
+from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.reports.reading import UNREADABLE
@@ -46,7 +47,7 @@ _FORMAT: Final = "lidarops site"
 _EMPTY: Final = "no figure of the product"
 _OURS: Final = ("product", "station")
 """Folders that only the site writes to."""
-_UNREADABLE: Final = (*UNREADABLE, TypeError, ArithmeticError)
+_UNREADABLE: Final = (*UNREADABLE, TypeError, ArithmeticError, MemoryError)
 """Exceptions observed when damaged or foreign files are read and drawn."""
 
 
@@ -198,6 +199,7 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
 
 
 def _make(task: _Task, file: Path, sha256: str) -> Entry:
+    check_sizes(file)
     with xr.open_dataset(file, engine="netcdf4", decode_timedelta=False) as opened:
         quality = product_contents.count_quality(opened)
         origin = product_contents.origin(opened)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import stat
 import tempfile
 from pathlib import Path, PurePosixPath
 
@@ -16,9 +18,12 @@ def sha256_of(path: Path) -> str:
     Raises
     ------
     OSError
-        If it cannot be read.
+        If it cannot be read, or is no regular file.
     """
-    with path.open("rb") as stream:
+    # Opening a pipe would block for ever, and a device may have no end.
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as stream:
+        if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "is no regular file")
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -317,19 +319,54 @@ def test_the_exit_code_states_the_result(campaign: Campaign, moved: Campaign):
     assert output["differences"][0]["name"] == f"coast/{gone.name}"
 
 
+def _forge(monkeypatch: pytest.MonkeyPatch, product: Path, renamed: dict[str, str]) -> None:
+    """Let the provenance of a product name other paths."""
+    document = read_provenance(product)
+    for entity in document["entity"].values():
+        path = entity.get("lidarops:path")
+        if path in renamed:
+            entity["lidarops:path"] = renamed.pop(path)
+    assert not renamed
+    monkeypatch.setattr("lidarops.run.recipe.read_provenance", lambda _: document)
+
+
 @pytest.mark.parametrize("escape", ["{outside}", "../outside"])
-def test_a_product_that_names_raw_files_elsewhere_is_refused(
-    escape: str, campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["raw", "overlap.csv", "air.csv"])
+def test_a_product_that_names_inputs_elsewhere_is_refused(
+    escape: str, name: str, campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     outside = tmp_path / "outside"
     outside.write_bytes(b"of somebody else")
-    product = of_kind(campaign, "homogeneous")
-    document = read_provenance(product)
-    raw = next(
-        each for each in document["entity"].values() if "/h" in each.get("lidarops:path", "")
-    )
-    raw["lidarops:path"] = escape.format(outside=outside)
-    monkeypatch.setattr("lidarops.run.recipe.read_provenance", lambda _: document)
+    product = of_kind(campaign, "elastic" if name != "raw" else "homogeneous")
+    entities = read_provenance(product)["entity"].values()
+    paths = [entity["lidarops:path"] for entity in entities if "lidarops:path" in entity]
+    path = next(path for path in paths if path == name or (name == "raw" and "/h" in path))
+    _forge(monkeypatch, product, {path: escape.format(outside=outside)})
     with pytest.raises(ProductError, match="outside its archive"):
         reproduce_product(product, archive=campaign.archive, catalog=campaign.catalog_url)
     assert outside.read_bytes() == b"of somebody else"
+
+
+def test_a_product_cannot_name_a_file_that_every_machine_has(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A system file was hashed, and its digest shown: any folder at the root was searched."""
+    product = Path(shutil.copy(of_kind(campaign, "elastic"), tmp_path))
+    names = {"air.csv": "group", "overlap.csv": "passwd", "ratio.csv": "hosts"}
+    _forge(monkeypatch, product, names)
+    with pytest.raises(ProductError, match="in no folder above"):
+        reproduce_product(product, archive=campaign.archive)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_pipes_and_devices_are_no_inputs(
+    make: Callable[[Path], None], campaign: Campaign, tmp_path: Path
+):
+    """The first blocks whoever opens it, the second has no end."""
+    for name in ("air.csv", "ratio.csv"):
+        shutil.copy(Path(campaign.folder) / name, tmp_path)
+    make(tmp_path / "overlap.csv")
+    product = of_kind(campaign, "elastic")
+    result = reproduce_product(product, archive=campaign.archive, ancillary=tmp_path)
+    assert names(result, "input") == ["overlap.csv"]
+    assert "no regular file" in result.differences[0].problem
