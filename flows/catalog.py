@@ -13,6 +13,7 @@ from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
 from flows.reprocess import Seconds, Workers
+from flows.temporary_server import tie_to_this_process
 from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.scan import ScanSummary
@@ -50,6 +51,7 @@ def catalog(
     -------
     ScanSummary
     """
+    tie_to_this_process()
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
@@ -79,6 +81,7 @@ def main(
         catalog.validate_parameters({"campaign": campaign, "archive": archive, "wait": wait})
         settings = load_campaign(campaign, archive=archive, output=out, catalog=url)
         selection.check_archive_and_catalog(settings, archive=archive)
+    tie_to_this_process()
     with plain_errors():
         summary = catalog(campaign, archive, out, wait, catalog=stored_url)
     raise typer.Exit(1 if summary.refused else 0)

@@ -39,6 +39,7 @@ from prefect.utilities.annotations import quote
 from pydantic import AfterValidator, Field
 
 from flows import WITH_FAILURES
+from flows.temporary_server import tie_to_this_process
 from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.ledger import RunStatus
@@ -250,6 +251,7 @@ def reprocess(
     If anything is refused or failed, the flow ends in the state `flows.WITH_FAILURES`, and the
     results are the data of this state; callers of the flow get the data.
     """
+    tie_to_this_process()
     chosen = clusters.choose_cluster(
         workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
     )
@@ -422,6 +424,7 @@ def main(
             workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
         )
         check_archive_and_catalog(settings, archive=archive)
+    tie_to_this_process()
     with plain_errors():
         result, built = reprocess(**parameters)
     if result.record is None:

@@ -40,6 +40,7 @@ from lidarops.site.paths import (
 )
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.system.files import sha256_of, within, write_atomically
+from lidarops.system.processes import end_with_parent
 
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
@@ -158,7 +159,8 @@ def _outcomes(tasks: Sequence[_Task], workers: int) -> Iterator[_Outcome]:
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent)
 
 
 def _alone(task: _Task) -> _Outcome:

@@ -40,6 +40,8 @@ _LIBRARY_VARIABLES: Final = frozenset(
 )
 """Variables that dask, when it starts workers, and netCDF4 also set in this process."""
 
+_ENDS_WITH_PARENT: Final = "lidarops.system.ends_with_parent"
+
 _NO_MORE: Final[Any] = object()
 
 Kept = TypeVar("Kept")
@@ -56,7 +58,9 @@ def preload_modules(modules: Collection[str]) -> None:
     """
     if not sys.platform.startswith("linux") or os.getpid() in _LOADED:
         return
-    multiprocessing.set_forkserver_preload(list(modules))
+    # The kernel takes the thread that starts a process for its parent; only the main one stays.
+    in_main = threading.current_thread() is threading.main_thread()
+    multiprocessing.set_forkserver_preload([*([_ENDS_WITH_PARENT] if in_main else []), *modules])
     unset = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
     os.environ.update(unset)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -241,13 +245,20 @@ _KEPT: list[Any] = []
 def _prepare(kept: object) -> None:
     # Ctrl-C reaches all processes of a terminal, but the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     keep_memory()
     _KEPT[:] = [kept]
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent is killed and can no longer do so."""
+def end_with_parent() -> None:
+    """Let this process of `multiprocessing` end when its parent is killed.
+
+    A process of a pool would wait for tasks for ever.
+    """
+    threading.Thread(target=_await_parent, daemon=True).start()
+
+
+def _await_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -92,6 +94,39 @@ def test_a_configured_server_gets_no_password_of_a_temporary_one() -> None:
         [sys.executable, "-c", code], env=configured, capture_output=True, text=True, check=True
     )
     assert process.stdout.strip() == "None"
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="needs pidfd of Linux")
+def test_a_temporary_server_ends_with_its_flow_however_that_ends(
+    campaign_file: Path, tmp_path: Path
+) -> None:
+    environment = os.environ | {"PREFECT_HOME": str(tmp_path / "prefect")}
+    for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING", "PREFECT_SERVER_API_AUTH_STRING"):
+        environment.pop(name, None)
+    flow_run = subprocess.Popen(
+        [sys.executable, "-m", "flows.catalog", str(campaign_file)],
+        env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    children: dict[str, int] = {}
+    while not {"uvicorn", "watch.py"} <= children.keys():
+        assert flow_run.poll() is None
+        time.sleep(0.05)
+        children = _children(flow_run.pid)
+    ended = os.pidfd_open(children["uvicorn"])
+    flow_run.kill()
+    flow_run.wait()
+    assert select.select([ended], [], [], 30)[0]
+    os.close(ended)
+
+
+def _children(process: int) -> dict[str, int]:
+    """Return word of the command line -> number, of the children of a process."""
+    return {
+        Path(word).name: int(child)
+        for listing in Path(f"/proc/{process}/task").glob("*/children")
+        for child in listing.read_text().split()
+        for word in Path(f"/proc/{child}/cmdline").read_text().split("\0")
+    }
 
 
 @pytest.mark.parametrize("flow", [catalog, reprocess])

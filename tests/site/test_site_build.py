@@ -6,6 +6,10 @@ import json
 import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -375,3 +379,35 @@ def test_paths_that_lead_out_are_refused(tmp_path: Path, path: str) -> None:
 )
 def test_grades_cover_every_share(share: float | None, grade: Grade) -> None:
     assert Grade.of(share) is grade
+
+
+_KILLED = """
+import multiprocessing, os, signal, sys
+from pathlib import Path
+from lidarops.site.build import build_site
+
+def kill(done):
+    numbers = [str(child.pid) for child in multiprocessing.active_children()]
+    Path(sys.argv[2]).write_text(" ".join(numbers))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+if __name__ == "__main__":
+    build_site(sys.argv[1], workers=2, progress=kill)
+"""
+
+
+def test_processes_end_with_a_killed_build(tmp_path: Path) -> None:
+    for name in ("a.nc", "b.nc", "c.nc"):
+        (tmp_path / "out/products").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "out/products" / name).write_bytes(b"no product")
+    script = tmp_path / "killed.py"
+    script.write_text(_KILLED)
+    numbers = tmp_path / "numbers"
+    command = [sys.executable, str(script), str(tmp_path / "out"), str(numbers)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    processes = [int(number) for number in numbers.read_text().split()]
+    assert len(processes) == 2
+    give_up = time.monotonic() + 20
+    while any(Path(f"/proc/{process}").exists() for process in processes):
+        assert time.monotonic() < give_up
+        time.sleep(0.05)

@@ -191,6 +191,17 @@ if __name__ == "__main__":
         os.kill(os.getpid(), signal.SIGKILL)
 """
 
+LOADING = """
+import os, signal
+from multiprocessing import forkserver
+from lidarops.system.processes import preload_modules
+
+if __name__ == "__main__":
+    preload_modules(["loads_for_a_minute"])
+    print(forkserver._forkserver._forkserver_pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
 WORKERS = """
 import os
 from lidarops.run.executor import local_client
@@ -248,6 +259,18 @@ class TestPreloadModules:
             capture_output=True, text=True, env=environment, timeout=60, check=False,
         )  # fmt: skip
         assert done.returncode == -signal.SIGKILL, done.stderr
+        assert _ends(int(done.stdout))
+
+    def test_the_server_ends_with_its_parent_also_while_it_loads(self, tmp_path: Path) -> None:
+        (tmp_path / "loads_for_a_minute.py").write_text("import time; time.sleep(60)")
+        script = tmp_path / "loading.py"
+        script.write_text(LOADING)
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        # Its standard error stays open as long as the server.
+        done = subprocess.run(
+            [sys.executable, str(script)], stdout=subprocess.PIPE, env=environment, check=False
+        )
+        assert done.returncode == -signal.SIGKILL
         assert _ends(int(done.stdout))
 
     def test_serves_workers_and_later_processes(self, tmp_path: Path) -> None:
