@@ -23,12 +23,9 @@ lint: .venv/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The products and pages that tests compare with; look at the difference before you commit it.
+# The products and the picture that tests compare with; look at the difference before you commit it.
 golden: .venv/.dev
 	PYTHONPATH=tests $(BIN)/python -m golden.regenerate
-	$(BIN)/python docs/products_table.py
-	PYTHONPATH=tests $(BIN)/python docs/stiff_cases_table.py
-	$(BIN)/python docs/api_page.py
 	$(BIN)/python docs/architecture_picture.py
 
 # The documentation: docs/_build/html/index.html. Notebooks run again when code has changed.

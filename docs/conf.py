@@ -9,6 +9,8 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jupyter_client.manager import KernelManager
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
@@ -34,12 +36,14 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "generated",
     "mathml",
 ]
 exclude_patterns = ["_build", "_extensions"]
 # Docstrings write code in single backticks.
 default_role = "code"
-nitpicky = False
+# Names in types of docstrings that several classes have as an attribute.
+suppress_warnings = ["ref.python"]
 
 myst_enable_extensions = ["amsmath", "dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4
@@ -51,6 +55,8 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 120
 nb_execution_show_tb = True
 nb_merge_streams = True
+# Sockets of kernels listen on the loopback interface, where others must not read along.
+KernelManager.transport_encryption.default_value = "required"
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import warnings
 from dataclasses import replace
-from importlib.util import module_from_spec, spec_from_file_location
 
 import mpmath
 import numpy as np
@@ -49,13 +48,6 @@ CARE = int(Quality.OUTLIER)
 )
 def test_case_meets_its_expectations(case):
     assert not failure(case)
-
-
-def test_the_page_lists_the_cases(repository):
-    script = spec_from_file_location("table", repository / "docs/stiff_cases_table.py")
-    table = module_from_spec(script)
-    script.loader.exec_module(table)
-    assert table.PAGE.read_text(encoding="utf-8") == table.page(), "run: make golden"
 
 
 def test_no_two_cases_of_a_retrieval_share_a_name():

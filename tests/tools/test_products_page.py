@@ -1,4 +1,4 @@
-"""The tables and examples of docs/products.md."""
+"""The examples of docs/products.md."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import netCDF4
 import pytest
-
-from lidarops.netcdf.variables import layout_of
 
 TEXT = (Path(__file__).parents[2] / "docs/products.md").read_text(encoding="utf-8")
 PYTHON = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
@@ -29,19 +26,6 @@ def files(made: Callable[[str, str], Path], tmp_path: Path) -> dict[str, str]:
         for name in ("time", "time_bnds"):
             file[name][:] = file[name][:] + 86400.0
     return {"PRODUCT": str(product), "LATER": str(later)}
-
-
-def test_the_tables_match_the_code(repository: Path):
-    spec = spec_from_file_location("products_table", repository / "docs/products_table.py")
-    assert spec
-    assert spec.loader
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    _, found, rest = TEXT.partition(module.BEGIN)
-    assert found + rest == module.tables(), "run python docs/products_table.py"
-    for layout in map(layout_of, module._own_kinds()):
-        for row in (*layout.coordinates, *layout.variables):
-            assert f"| `{row.name}` |" in rest
 
 
 @pytest.mark.parametrize("code", PYTHON, ids=lambda code: code.split()[1].rstrip(","))

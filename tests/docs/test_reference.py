@@ -1,0 +1,118 @@
+"""The generated parts of the reference are complete."""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from types import ModuleType
+
+import campaign_keys
+import command_line
+import product_variables
+import pytest
+import python_api
+import stiff_cases
+import typer
+from support.stiff import CASES
+
+import flows
+import lidarops
+from lidarops.campaign.model import load_campaign
+from lidarops.cli import app
+from lidarops.kinds import flags_of
+from lidarops.netcdf.variables import layout_of
+
+# Made of the settings of all kinds of product, and listed among the keys of a campaign file.
+ASSEMBLED = {"Products", "Network"}
+OWN_KINDS = ("elastic", "homogeneous", "multiangle", "raman", "signal", "visibility")
+
+
+def _first_cells(page: str) -> set[str]:
+    return set(re.findall(r"^\| `([^`]+)`", page, re.MULTILINE))
+
+
+def _modules(package: ModuleType) -> Iterator[ModuleType]:
+    yield package
+    for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        if not found.name.rpartition(".")[2].startswith("_"):
+            yield import_module(found.name)
+
+
+@pytest.mark.parametrize("package", [lidarops, flows], ids=lambda package: package.__name__)
+def test_every_public_function_and_class_is_listed_under_its_module(package: ModuleType) -> None:
+    sections = python_api.every_function().split("\n### ")
+    listed = {text.partition("`\n")[0].strip("`"): _first_cells(text) for text in sections}
+    for module in _modules(package):
+        own = {
+            name
+            for name, value in vars(module).items()
+            if (inspect.isfunction(value) or inspect.isclass(value))
+            and value.__module__ == module.__name__
+            and value.__name__ == name
+            and not name.startswith("_")
+        }
+        assert own - ASSEMBLED <= listed.get(module.__name__, set()), module.__name__
+
+
+def test_modules_for_users_have_a_page_with_all_their_public_names(tmp_path) -> None:
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made/old.md").touch()
+    python_api.write_pages(tmp_path / "made")
+    pages = {path.stem: path.read_text() for path in (tmp_path / "made").iterdir()}
+    assert pages.keys() == set(python_api.MODULES)
+    assert ".. autofunction:: lidarops.open_archive" in pages["lidarops"]
+    assert ".. autoclass:: lidarops.raw.licel.Header\n   :members:" in pages["lidarops.raw.licel"]
+    offered = python_api.offered()
+    for name in python_api.MODULES:
+        assert f"[{name}](made/{name}.md)" in offered
+
+
+def test_every_command_is_listed_with_its_options() -> None:
+    page = command_line.page()
+    for name, command in typer.main.get_command(app).commands.items():
+        section = page.partition(f"## `{name}`\n")[2].partition("\n## ")[0]
+        assert f"lidarops {name} " in section
+        for parameter in command.params:
+            for option in parameter.opts if parameter.param_type_name == "option" else ():
+                assert f"`{option}`" in section, (name, option)
+
+
+def test_every_key_is_listed_with_unit_bounds_and_default(repository) -> None:
+    page = campaign_keys.page()
+    (dead_time,) = re.findall(r"^\| `dead_time` \|.*\|$", page, re.MULTILINE)
+    assert "number in s, ≥ 1e-10, ≤ 2e-07" in dead_time
+    assert "| `latitude` | number in degree, ≥ -90, ≤ 90 | required |" in page
+    assert "| `superseded` | `keep`, `remove` | `remove` |" in page
+    keys = _first_cells(page)
+    for path in sorted((repository / "catalogs").glob("*.yaml")):
+        load_campaign(path)
+        # Names that the writer chooses, and the channels, are no keys.
+        written = set(re.findall(r"^ *([a-z_]+): ", path.read_text(), re.MULTILINE))
+        assert len(written & keys) > 10
+    sections = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
+    links = set(re.findall(r"\]\(#(\w+)\)", page))
+    assert links <= {section.lower() for section in sections}
+    # A kind of another package has its own documentation.
+    assert "integrated" not in keys
+
+
+def test_every_variable_and_flag_is_listed() -> None:
+    page = product_variables.page()
+    for kind in OWN_KINDS:
+        section = page.partition(f"## Variables of `{kind}`")[2].partition("\n## ")[0]
+        layout = layout_of(kind)
+        names = {row.name for row in (*layout.coordinates, *layout.variables)}
+        assert names == _first_cells(section)
+    bits = page.partition("## Bits of")[2]
+    for kind in OWN_KINDS:
+        for bit in flags_of(kind):
+            assert f"| `{bit.word}` | {int(bit)} |" in bits
+
+
+def test_every_stiff_case_is_listed() -> None:
+    page = stiff_cases.page()
+    for case in CASES:
+        assert f"| {case.name.replace('|', chr(92) + '|')} |" in page
