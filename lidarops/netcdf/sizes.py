@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import h5py
 
@@ -80,11 +80,12 @@ def _stated_bytes(opened: h5py.File, name: str, file: Path) -> int:
     """Return the bytes of a variable in memory; at least one chunk is read of it."""
     place = name.encode()
     hard = opened.id.links.get_info(place).type == h5py.h5l.TYPE_HARD
-    stored = h5py.h5o.open(opened.id, place) if hard else None
+    # Untyped: the types of h5py differ between its releases.
+    stored: Any = h5py.h5o.open(opened.id, place) if hard else None
     if isinstance(stored, h5py.h5g.GroupID):
         return 0
     # Faster than the attributes of a dataset.
-    layout = stored.get_create_plist() if isinstance(stored, h5py.h5d.DatasetID) else None
+    layout: Any = stored.get_create_plist() if isinstance(stored, h5py.h5d.DatasetID) else None
     if layout is None or layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
         raise ProductError(
             "takes its values from elsewhere, which could be any file of this machine",
