@@ -115,8 +115,9 @@ def test_the_index_keeps_every_fact(archive: tuple[Path, list[Facts]]):
         assert UUID(row.id) == UUID(facts.id)
         assert row.sha256_prefix == facts.sha256[:32]
         assert (row.start, row.stop) == (facts.start, facts.stop)
-        for name in ("kind", "mode", "size", "usable", "unflagged", "wavelength", "grid"):
+        for name in ("kind", "mode", "size", "wavelength", "grid"):
             assert getattr(row, name) == getattr(facts, name)
+        assert (row.good, row.care, row.reject) == facts.verdicts
         assert row.flag_cloud == facts.flagged.get("CLOUD", 0)
         assert row.flag_saturated == 0
 

@@ -76,20 +76,23 @@ def test_daily_means_of_the_usable_values(tmp_path: Path):
         usable = values.usable < 2
         count = usable.sum("time")
         assert count.to_numpy().tolist() == [5, 6]
-        np.testing.assert_array_equal(mean.extinction_observations, count)
+        np.testing.assert_array_equal(mean.total_extinction_observations, count)
         np.testing.assert_allclose(mean.usable_share, count / 6)
-        x = values.extinction.astype(float)
-        np.testing.assert_allclose(mean.extinction, x.mean("time"), rtol=1e-6)
+        x = values.total_extinction.astype(float)
+        np.testing.assert_allclose(mean.total_extinction, x.mean("time"), rtol=1e-6)
         np.testing.assert_allclose(
-            mean.extinction_standard_error,
-            np.sqrt((values.extinction_standard_error.astype(float) ** 2).sum("time")) / count,
+            mean.total_extinction_standard_error,
+            np.sqrt((values.total_extinction_standard_error.astype(float) ** 2).sum("time"))
+            / count,
             rtol=1e-6,
         )
         np.testing.assert_allclose(
-            mean.extinction_standard_deviation, x.std("time", ddof=1), rtol=1e-6
+            mean.total_extinction_standard_deviation, x.std("time", ddof=1), rtol=1e-6
         )
         np.testing.assert_allclose(
-            mean.extinction_model_error, values.extinction_model_error.mean("time"), rtol=1e-6
+            mean.total_extinction_model_error,
+            values.total_extinction_model_error.mean("time"),
+            rtol=1e-6,
         )
         assert mean.shots == 3600
     assert (means.quality_flag == 0).all()
@@ -111,12 +114,15 @@ def test_a_profile_of_few_shots_has_little_weight(tmp_path: Path):
     expected = (weights * data.total_extinction).sum("time")
     errors = ((weights * data.total_extinction_standard_error) ** 2).sum("time") ** 0.5
     means = only(tmp_path, means_of(tmp_path))
-    np.testing.assert_allclose(means.extinction[0], expected, rtol=1e-6)
-    np.testing.assert_allclose(means.extinction_standard_error[0], errors, rtol=1e-6)
+    np.testing.assert_allclose(means.total_extinction[0], expected, rtol=1e-6)
+    np.testing.assert_allclose(means.total_extinction_standard_error[0], errors, rtol=1e-6)
     assert means.attrs["lidarops_weights"] == "shots"
     equal = only(tmp_path, means_of(tmp_path, weights=Weights.PLAIN))
     # In the first section, all values are usable.
-    assert equal.extinction_standard_error[0, 0] > 4.0 * means.extinction_standard_error[0, 0]
+    assert (
+        equal.total_extinction_standard_error[0, 0]
+        > 4.0 * means.total_extinction_standard_error[0, 0]
+    )
 
 
 def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
@@ -129,19 +135,19 @@ def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
     data = open_products(tmp_path).astype(np.float64).load()
     weights = 1.0 / data.total_extinction_standard_error**2
     expected = (weights * data.total_extinction).sum("time") / weights.sum("time")
-    np.testing.assert_allclose(means.extinction[0], expected, rtol=1e-6)
+    np.testing.assert_allclose(means.total_extinction[0], expected, rtol=1e-6)
     np.testing.assert_allclose(
-        means.extinction_standard_error[0], weights.sum("time") ** -0.5, rtol=1e-6
+        means.total_extinction_standard_error[0], weights.sum("time") ** -0.5, rtol=1e-6
     )
     assert means.attrs["lidarops_weights"] == "inverse-variance"
-    assert "1 / standard_error^2" in means.extinction.attrs["comment"]
+    assert "1 / standard_error^2" in means.total_extinction.attrs["comment"]
 
 
 def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Path):
     add_day(tmp_path, 0, "elastic", profiles=9)
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
     data = open_products(tmp_path).astype(np.float64).load()
-    used = np.isfinite(data.backscatter)
+    used = np.isfinite(data.aerosol_backscatter)
     count = used.sum("time")
 
     def random(factor):
@@ -157,10 +163,10 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
     some = count.to_numpy() > 0
     assert some.any()
     assert not some.all()
-    errors = means.backscatter_standard_error.to_numpy()
+    errors = means.aerosol_backscatter_standard_error.to_numpy()
     np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
     for name, factor in (
-        ("total_extinction", data.lidar_ratio.isel(product=0)),
+        ("aerosol_extinction", data.lidar_ratio.isel(product=0)),
         ("scattering_ratio", 1.0 / data.molecular_backscatter.isel(product=0)),
     ):
         total = data[f"{name}_standard_error"] ** 2
@@ -168,7 +174,7 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
         expected = np.sqrt(random(factor).sum("time") / count**2 + rest**2)
         errors = means[f"{name}_standard_error"].to_numpy()
         np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
-    assert np.isnan(means.backscatter.to_numpy()[~some]).all()
+    assert np.isnan(means.aerosol_backscatter.to_numpy()[~some]).all()
     assert (means.quality_flag.to_numpy()[~some] & flags_of("elastic").rejecting != 0).all()
     assert (means.usable.to_numpy()[~some] == 2).all()
 
@@ -268,7 +274,7 @@ def test_a_month_has_all_its_days_and_each_year_its_file(tmp_path: Path):
             means.time_bnds,
             np.array([["2026-02-01", "2026-03-01"], ["2026-03-01", "2026-04-01"]], "datetime64"),
         )
-        np.testing.assert_array_equal(means.extinction_observations[:, 1], [5, 10])
+        np.testing.assert_array_equal(means.total_extinction_observations[:, 1], [5, 10])
 
 
 def test_a_profile_belongs_to_the_day_of_its_middle(tmp_path: Path):

@@ -53,11 +53,11 @@ def test_unusable_values_are_missing(level: int, archive: Path):
     np.testing.assert_array_equal(data.usable, worst)
     assert set(np.unique(worst)) == {0, 1, 2}
     np.testing.assert_array_equal(
-        data.backscatter, np.where(worst <= level, everything.backscatter, np.nan)
+        data.aerosol_backscatter, np.where(worst <= level, everything.aerosol_backscatter, np.nan)
     )
     np.testing.assert_array_equal(data.quality_flag, flags)
     np.testing.assert_array_equal(data.background, everything.background)
-    assert data.backscatter.attrs == everything.backscatter.attrs
+    assert data.aerosol_backscatter.attrs == everything.aerosol_backscatter.attrs
 
 
 def test_variables_of_a_whole_product_have_the_dimension_product(tmp_path: Path):

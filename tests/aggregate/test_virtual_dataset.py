@@ -59,11 +59,11 @@ def test_two_hundred_products_have_the_mean_of_the_eager_ones(tmp_path: Path):
     assert view.products == 200
     virtual = open_view(tmp_path / view.path, usable=2)
     values = eager(tmp_path, "total_extinction").astype(np.float64)
-    mean = float(virtual.extinction.astype(np.float64).mean())
+    mean = float(virtual.total_extinction.astype(np.float64).mean())
     assert mean == pytest.approx(np.nanmean(values), rel=1e-6)
     # The dataset is lazy.
-    assert virtual.extinction.chunks is not None
-    assert len(virtual.extinction.chunks[0]) == 200
+    assert virtual.total_extinction.chunks is not None
+    assert len(virtual.total_extinction.chunks[0]) == 200
 
 
 def test_products_of_unequal_length_are_joined_in_order_of_time(tmp_path: Path):
@@ -115,9 +115,11 @@ def test_the_archive_can_move(tmp_path: Path):
     assert "/" not in json.loads((tmp_path / "here" / view.path).read_text())["templates"][
         "u"
     ].replace("../..", "")
-    before = open_view(tmp_path / "here" / view.path).extinction.to_numpy()
+    before = open_view(tmp_path / "here" / view.path).total_extinction.to_numpy()
     shutil.move(tmp_path / "here", tmp_path / "there")
-    np.testing.assert_array_equal(open_view(tmp_path / "there" / view.path).extinction, before)
+    np.testing.assert_array_equal(
+        open_view(tmp_path / "there" / view.path).total_extinction, before
+    )
 
 
 def test_a_view_is_read_by_zarr_without_lidarops(tmp_path: Path):

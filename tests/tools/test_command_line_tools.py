@@ -111,7 +111,7 @@ def test_cdo_reads_every_number_and_names_skipped_text(product: Path, for_cdo: P
 def test_cdo_joins_days_and_keeps_bits(product: Path, for_cdo: Path, tmp_path: Path):
     one, later = tmp_path / "one.nc", tmp_path / "later.nc"
     # Without positions, CDO takes the beams of a network for series.
-    chosen = ["-selname,extinction,quality_flag"] if for_cdo != product else []
+    chosen = ["-selname,total_extinction,quality_flag"] if for_cdo != product else []
     call("cdo", "-s", "copy", *chosen, for_cdo, one)
     call("cdo", "-s", "shifttime,1day", one, later)
     call("cdo", "-s", "mergetime", one, later, tmp_path / "both.nc")
