@@ -50,7 +50,14 @@ from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import run_page
 from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
-from lidarops.run.archive import Options, Result, Selection, bring_up_to_date, report_run
+from lidarops.run.archive import (
+    Options,
+    Result,
+    Selection,
+    bring_up_to_date,
+    report_earlier_runs,
+    report_run,
+)
 from lidarops.run.options import missing_report
 from lidarops.run.publication import publish_products
 from lidarops.run.selection import check_archive_and_catalog, check_selection, selects_no_scene
@@ -134,7 +141,13 @@ def process_task(
 ) -> Result:
     """Bring catalog and products up to date."""
     progress = _Progress(campaign.name)
-    options = Options(force=full, wait=wait, progress=progress.advance, expect=progress.expect)
+    options = Options(
+        force=full,
+        wait=wait,
+        journal=True,
+        progress=progress.advance,
+        expect=progress.expect,
+    )
     if isinstance(cluster, clusters.Local):
         options = replace(options, workers=cluster.workers, memory=cluster.memory)
     else:
@@ -268,13 +281,16 @@ def reprocess(
         no_scene = selects_no_scene(settings, selection)
         reason = "the selection contains no scene of the archive" if no_scene else "nothing to do"
         get_run_logger().info("campaign %s: %s", settings.name, reason)
-        if report_note := missing_report(settings):
-            get_run_logger().warning("campaign %s: %s", settings.name, report_note)
     else:
         local = chosen.workers if isinstance(chosen, clusters.Local) else 1
         built = report_task(_opaque(settings), _opaque(result.record), local)
         scenes = len(result.record.scenes)
         get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
+    made = "" if result.record is None else result.record.id
+    for page in report_earlier_runs(settings, without=made):
+        get_run_logger().info("campaign %s: report of an earlier run, %s", settings.name, page)
+    if report_note := missing_report(settings):
+        get_run_logger().warning("campaign %s: %s", settings.name, report_note)
     if not result.has_failures:
         return result, built
     # Prefect uses a returned state as that of the flow, and gives its data to callers.

@@ -448,12 +448,14 @@ class RunRecord:
     """Scene -> why it can give no product; the first of those that the run examined."""
     more_empty_scenes: int = 0
     """Number of further scenes without product."""
+    cut_short: bool = False
+    """Whether the run was killed or met a full disk: it names only scenes that ended before."""
 
     @property
     def failed(self) -> bool:
         """Whether a file was refused, a scene failed or is unusable, or the findings failed."""
         return (
-            bool(self.refused or self.empty_scenes)
+            bool(self.refused or self.empty_scenes or self.cut_short)
             or self.findings.failed
             or any(scene.error or scene.refused or scene.unusable for scene in self.scenes)
         )

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sqlite3
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, Self
@@ -12,13 +16,13 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, LidarOpsError
 
 BATCH = 1000
 """Largest number of values in the list of one statement."""
 _MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all products again"
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
-_BROKEN: Final = ("malformed", "not a database")
+_BROKEN: Final = ("malformed", "not a database", "decode")
 """Words in the messages of SQLite about a damaged file."""
 
 
@@ -50,7 +54,8 @@ class Database:
             if not create and not Path(self._url.database).exists():
                 raise self._absent()
             _make_folder(Path(self._url.database).parent)
-        self._engine = _engine(self._url)
+        self._copied = ExitStack()
+        self._engine = _engine(self._url if create else self._readable())
         if self._sqlite:
             sa.event.listen(self._engine, "connect", _tune_sqlite)
         with self.transaction() as connection:
@@ -70,12 +75,13 @@ class Database:
     def close(self) -> None:
         """Close the database connections."""
         self._engine.dispose()
+        self._copied.close()
 
     @contextmanager
     def transaction(self) -> Iterator[sa.Connection]:
         """Yield a connection; commit all its changes at the end, or none if an error is raised."""
         try:
-            with self._engine.begin() as connection:
+            with self.decoded(), self._engine.begin() as connection:
                 yield connection
         except sa.exc.SQLAlchemyError as error:
             raise self._catalog_error(error) from error
@@ -89,6 +95,20 @@ class Database:
                 yield iter(connection.execution_options(**options).execute(query))
         except sa.exc.SQLAlchemyError as error:
             raise self._catalog_error(error) from error
+
+    @contextmanager
+    def decoded(self) -> Iterator[None]:
+        """Raise a CatalogError where a stored value is not what lidarops stores."""
+        try:
+            yield
+        except LidarOpsError:
+            raise
+        except (ValueError, KeyError) as error:
+            raise CatalogError(
+                f"the catalog cannot be used: it holds {error!r}",
+                file=self.place,
+                remedy=_MOVE_AWAY,
+            ) from error
 
     def insert(self, table: sa.Table) -> Any:
         """Return an insert statement that can handle rows that already exist."""
@@ -107,6 +127,33 @@ class Database:
         if self._sqlite:
             return sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Float())
         return sa.literal_column("extract(epoch from clock_timestamp())::float8", sa.Float())
+
+    def copy_to(self, file: Path) -> None:
+        """Copy this SQLite database to a file."""
+        try:
+            with (
+                closing(self._engine.raw_connection()) as source,
+                closing(sqlite3.connect(file)) as target,
+            ):
+                own: sqlite3.Connection = source.driver_connection  # type: ignore[assignment]
+                own.backup(target)
+        except sqlite3.Error as error:
+            raise CatalogError(f"cannot be copied: {error}", file=self.place) from error
+
+    def _readable(self) -> sa.URL:
+        """Return a URL that can be read also where the folder of the database cannot be written."""
+        file = Path(self._url.database or "")
+        if not self._sqlite or not self._url.database or os.access(file.parent, os.W_OK):
+            return self._url
+        journal = Path(f"{file}-wal")
+        if not journal.exists() or not journal.stat().st_size:
+            # SQLite would make files beside it.
+            query = {"uri": "true", "immutable": "1"}
+            return self._url.set(database=file.absolute().as_uri(), query=query)
+        folder = self._copied.enter_context(tempfile.TemporaryDirectory(prefix="lidarops-"))
+        for part in (file, journal):
+            shutil.copy(part, folder)
+        return self._url.set(database=str(Path(folder, file.name)))
 
     def _settle_schema(self, connection: sa.Connection) -> None:
         inspector = sa.inspect(connection)

@@ -147,7 +147,7 @@ class Granules(Database):
                 row.hash: _layout_from(row.channels)
                 for row in connection.execute(sa.select(LAYOUT))
             }
-        with self.stream(query) as rows:
+        with self.decoded(), self.stream(query) as rows:
             return [_granule_from(row, layouts) for row in rows]
 
     def refused(self) -> list[Granule]:

@@ -192,11 +192,7 @@ class Ledger(Granules):
         """Enter a starting run, and close runs whose process died."""
         with self.transaction() as connection:
             self._hold(connection, token)
-            connection.execute(
-                sa.update(RUN)
-                .where(RUN.c.campaign == self.campaign, RUN.c.status == RunStatus.RUNNING.value)
-                .values(status=RunStatus.DIED.value)
-            )
+            connection.execute(self._closing())
             values = asdict(run) | {
                 "campaign": self.campaign,
                 "started": naive(run.started),
@@ -204,6 +200,24 @@ class Ledger(Granules):
             }
             del values["seconds"]
             connection.execute(sa.insert(RUN), values)
+
+    def _closing(self) -> sa.Update:
+        return sa.update(RUN).where(*self._open_runs()).values(status=RunStatus.DIED.value)
+
+    def _open_runs(self) -> tuple[sa.ColumnElement[bool], ...]:
+        return RUN.c.campaign == self.campaign, RUN.c.status == RunStatus.RUNNING.value
+
+    def has_open_run(self) -> bool:
+        """Return whether a run has begun and not ended."""
+        with self.transaction() as connection:
+            query = sa.select(RUN.c.id).where(*self._open_runs()).limit(1)
+            return connection.execute(query).first() is not None
+
+    def close_runs(self, token: str) -> None:
+        """Close runs whose process died."""
+        with self.transaction() as connection:
+            self._hold(connection, token)
+            connection.execute(self._closing())
 
     def end_run(self, run: str, status: RunStatus, *, refused: int, token: str) -> None:
         """Enter the end of a run."""

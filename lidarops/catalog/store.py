@@ -32,8 +32,16 @@ class Store(Ledger):
         A run that is marked as running has died if no living process holds the lock.
         """
         runs = super().runs(limit=limit)
-        holder = Lock(self).holder()
-        if holder is not None and not holder.dead:
+        if self.in_use():
             return runs
         died = {RunStatus.RUNNING: RunStatus.DIED}
         return [replace(run, status=died.get(run.status, run.status)) for run in runs]
+
+    def in_use(self) -> bool:
+        """Return whether a living process holds the lock."""
+        holder = Lock(self).holder()
+        return holder is not None and not holder.dead
+
+    def has_dead_run(self) -> bool:
+        """Return whether the process of a run that did not end has died."""
+        return self.has_open_run() and not self.in_use()

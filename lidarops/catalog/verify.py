@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.lock import Lock
+from lidarops.catalog import versions
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.records import Role
@@ -17,6 +17,7 @@ from lidarops.system.files import sha256_of
 _UNLISTED: Final = (
     "is not in the ledger: a run makes it again if it is requested; else move it away"
 )
+LEFT_OVER: Final = "left by a killed process; the next run that makes a product removes it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class CheckedFile:
     """A file that was read and compared with the ledger."""
 
     what: str
-    """``product``, ``superseded``, ``unlisted`` or the role of an input."""
+    """``product``, ``superseded``, ``unlisted``, ``temporary`` or the role of an input."""
     path: str
     problem: str
     """Empty if it is as recorded."""
@@ -45,6 +46,10 @@ def verify_archive(
     inputs : bool
         Whether to read also the inputs: raw, dark, molecular and overlap files.
     """
+    if not store.in_use():
+        for path in versions.temporary_files(Path(campaign.output)):
+            name = path.relative_to(campaign.output).as_posix()
+            yield CheckedFile("temporary", name, LEFT_OVER)
     # Listed first: what a run writes from now on may be in the ledger only later.
     unlisted = _product_files(campaign.products_root)
     read = _digests_below(campaign.products_root)
@@ -69,8 +74,7 @@ def _product_files(root: Path) -> set[str]:
 
 def _check_unlisted(store: Store, unlisted: set[str]) -> Iterator[CheckedFile]:
     """Yield files that no campaign of the database has made."""
-    holder = Lock(store).holder()
-    if unlisted and (holder is None or holder.dead):
+    if unlisted and not store.in_use():
         for path in sorted(unlisted - store.made_by_any_campaign(unlisted)):
             yield CheckedFile("unlisted", path, _UNLISTED)
 

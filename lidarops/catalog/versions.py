@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -85,11 +86,17 @@ def sweep(output: Path) -> list[str]:
         Paths of the removed files.
     """
     swept = []
+    for path in temporary_files(output):
+        with suppress(OSError):
+            path.unlink()
+            swept.append(str(path))
+    return swept
+
+
+def temporary_files(output: Path) -> Iterator[Path]:
+    """Yield the hidden temporary files among products and reports."""
     for kept in ("products", FOLDER, "report"):
         for folder, _, names in os.walk(output / kept):
             for name in names:
                 if name.startswith(".") and name.endswith(".tmp"):
-                    with suppress(OSError):
-                        Path(folder, name).unlink()
-                        swept.append(str(Path(folder, name)))
-    return swept
+                    yield Path(folder, name)

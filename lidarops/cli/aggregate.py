@@ -15,9 +15,11 @@ from lidarops.cli.app import (
     command,
     exit_with_status,
     progress_bar,
+    say,
     show_rows,
     utc,
 )
+from lidarops.figures.wording import visible
 
 if TYPE_CHECKING:
     from lidarops.aggregate.aggregates import AggregateResult
@@ -95,9 +97,9 @@ def _tell(made: AggregateResult) -> None:
     refused = ((product.path, product.reason) for product in made.refused)
     show_rows("Refused", ("file", "reason"), refused)
     for sentence in made.notes:
-        typer.echo(f"note: {sentence}")
+        say(f"note: {sentence}")
     for sentence in made.failed:
-        typer.secho(f"failed: {sentence}", fg="red", err=True)
+        typer.secho(visible(f"failed: {sentence}"), fg="red", err=True)
     for name, path in (("index", made.index), ("stac", made.stac)):
         if path is not None:
-            typer.echo(f"{name}: {made.root / path}")
+            say(f"{name}: {made.root / path}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, ParamSpec
 import typer
 
 from lidarops.errors import LidarOpsError
+from lidarops.figures.wording import visible
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -79,7 +82,12 @@ REFUSED = 1
 
 def show_error(error: LidarOpsError) -> None:
     """Show an error on standard error."""
-    typer.secho(f"error: {error}", fg="red", err=True)
+    typer.secho(visible(f"error: {error}"), fg="red", err=True)
+
+
+def say(text: object) -> None:
+    """Print a text; control characters, which a file name may hold, are shown as escapes."""
+    typer.echo(visible(str(text)))
 
 
 def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
@@ -93,10 +101,24 @@ def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[
             except LidarOpsError as error:
                 show_error(error)
                 raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
+            except OSError as error:
+                # Typer ends quietly where the reader of a pipe has gone.
+                if error.errno == errno.EPIPE:
+                    raise
+                show_error(_of_system(error))
+                raise typer.Exit(REFUSED) from error
 
         return app.command(name)(wrapped)
 
     return registered
+
+
+def _of_system(error: OSError) -> LidarOpsError:
+    return LidarOpsError(
+        error.strerror or repr(error),
+        file=None if error.filename is None else os.fsdecode(error.filename),
+        remedy="check permissions, space and connection, then run the command again",
+    )
 
 
 def _print_version(requested: bool) -> None:  # noqa: FBT001 - typer calls it so
@@ -204,9 +226,10 @@ def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]])
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
-        # Text, because rich would read brackets in a path or reason as markup.
-        table.add_row(*(Text(str(cell)) for cell in row))
+        # Text, because rich would read brackets in a path or reason as markup. A file name may hold
+        # what moves the cursor of a terminal.
+        table.add_row(*(Text(visible(str(cell))) for cell in row))
     if table.row_count:
         # As the title of the table it would fold at the width of the table.
-        typer.echo(title)
+        say(title)
         show(table)

@@ -25,6 +25,7 @@ from lidarops.cli.app import (
     command,
     exit_with_status,
     progress_bar,
+    say,
     show_error,
     show_rows,
 )
@@ -102,7 +103,7 @@ def catalog(
     else:
         _show_refused(refused)
         show_findings(findings)
-        typer.echo(
+        say(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
             f" {summary.refused} refused"
@@ -195,20 +196,21 @@ def reprocess(
             cluster=connect,
             wait=wait,
             profiles_per_chunk=profiles_per_chunk,
+            journal=True,
             progress=lambda outcome: bar.advance(outcome.granules),
             expect=bar.grow,
         )
         result = pipeline.bring_up_to_date(settings, selection=selection, options=options)
     no_scene = result.record is None and selects_no_scene(settings, selection)
-    report_note = missing_report(settings) if result.record is None else ""
     if not as_json:
         _print_result(settings, result, no_scene=no_scene, removing=remove_orphans)
-        if report_note:
-            typer.echo(report_note)
-    page, removed = None, None
+    page, removed, report_note = None, None, ""
+    earlier: list[Path] = []
     try:
         if result.record is not None:
             page = _page(settings, result.record, options.workers)
+        earlier = _earlier_pages(settings, result.record, options.workers)
+        report_note = missing_report(settings) if result.record is None else ""
         if remove_orphans:
             removed = pipeline.remove_orphans(settings, result, wait=wait)
     finally:
@@ -216,9 +218,14 @@ def reprocess(
         if as_json:
             summary = _run_summary(settings, result, page)
             summary |= {"no_scene_selected": no_scene, "removed": removed or 0}
+            summary |= {"earlier_reports": [str(made) for made in earlier]}
             typer.echo(json.dumps({**summary, "unreported": report_note}, indent=2))
         else:
             _print_places(result, page)
+            for made in earlier:
+                say(f"report of an earlier run: {made}")
+            if report_note:
+                typer.echo(report_note)
     if removed is not None and not as_json:
         _show_orphans(result, removed)
     if result.signal:
@@ -236,6 +243,21 @@ def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
     except LidarOpsError as error:
         show_error(error)
         return None
+
+
+def _earlier_pages(campaign: Campaign, run: RunRecord | None, workers: int) -> list[Path]:
+    """Build the missing pages of earlier runs; if that fails, show the error."""
+    from lidarops.run.archive import report_earlier_runs
+
+    pages: list[Path] = []
+    try:
+        for page in report_earlier_runs(
+            campaign, without="" if run is None else run.id, workers=workers
+        ):
+            pages.append(page)  # noqa: PERF402 - those before an error count
+    except LidarOpsError as error:
+        show_error(error)
+    return pages
 
 
 def _cluster(
@@ -301,12 +323,12 @@ def _print_places(result: Result, page: Path | None) -> None:
     from lidarops.figures.wording import counted
 
     if page is not None:
-        typer.echo(f"report:   {page}")
+        say(f"report:   {page}")
     if result.internal:
         on_page = page is not None and set(result.internal) <= _processed_scenes(result)
         scenes = counted(len(result.internal), "scene")
         place = page if on_page else "the output of the same command with --json"
-        typer.echo(
+        say(
             f"{scenes} ended with an internal error: please report it,"
             f" with the traceback in {place}"
         )
@@ -341,12 +363,12 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         typer.echo(NO_SCENE)
     elif result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
-        typer.echo(f"products: {campaign.products_root}{ended}{never_made(result.findings)}")
+        say(f"products: {campaign.products_root}{ended}{never_made(result.findings)}")
     else:
         state = "the archive is not what the campaign states, see above"
         if not result.findings.failed:
             state = "every requested product is fresh or cannot be made"
-        typer.echo(f"nothing to do: {state}{never_made(result.findings)}")
+        say(f"nothing to do: {state}{never_made(result.findings)}")
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:

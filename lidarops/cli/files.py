@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import JsonOption, command, exit_with_status, show
+from lidarops.cli.app import JsonOption, command, exit_with_status, say, show
 
 
 @command()
@@ -26,9 +26,7 @@ def report(
     from lidarops.reports import run_page, run_record
 
     folder = run if run.is_dir() else run.parent
-    typer.echo(
-        str(run_page.build_report(run_record.load_run_record(run), folder, workers=workers).page)
-    )
+    say(str(run_page.build_report(run_record.load_run_record(run), folder, workers=workers).page))
 
 
 @command()
@@ -80,7 +78,7 @@ def plot(
             out / f"{file.name.removesuffix('.nc')}{'' if len(figures) == 1 else f'_{number}'}.svg"
         )
         write_atomically(target, svg.file(figure))
-        typer.echo(f"{target}: {figure.caption}")
+        say(f"{target}: {figure.caption}")
 
 
 @command()

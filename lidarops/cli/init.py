@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from lidarops.cli.app import command, no_url
+from lidarops.cli.app import command, no_url, say
 
 _SCHEMA: Final = "campaign.schema.json"
 
@@ -51,4 +51,4 @@ def init(
     (base / _SCHEMA).write_text(json.dumps(campaign_schema(), indent=2) + "\n", encoding="utf-8")
     campaign.write_text(text, encoding="utf-8")
     questions = sum("# ?" in line or "; ?" in line for line in text.splitlines())
-    typer.echo(f"{campaign}: {questions} lines have a question; next: lidarops plan {campaign}")
+    say(f"{campaign}: {questions} lines have a question; next: lidarops plan {campaign}")

@@ -18,6 +18,7 @@ from lidarops.cli.app import (
     command,
     exit_with_status,
     progress_bar,
+    say,
     show_rows,
 )
 
@@ -98,7 +99,7 @@ def verify(
     else:
         rows = ((file.what, file.path, file.problem) for file in mismatches)
         show_rows("Not as recorded", ("what", "file", "problem"), rows)
-        typer.echo(f"{checked} files read, {len(mismatches)} not as recorded")
+        say(f"{checked} files read, {len(mismatches)} not as recorded")
     exit_with_status(failed=bool(mismatches))
 
 
@@ -127,4 +128,4 @@ def publish(
         return
     others = f", {published.others} other files left alone" if published.others else ""
     counts = f"{len(published.uploaded)} sent, {published.unchanged} unchanged{others}"
-    typer.echo(f"{without_keys(url)}: {counts}")
+    say(f"{without_keys(url)}: {counts}")

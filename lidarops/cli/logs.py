@@ -11,6 +11,7 @@ from typing import Annotated, Final
 import typer
 
 from lidarops.errors import CatalogError
+from lidarops.figures.wording import visible
 
 LogLevelOption = Annotated[
     str, typer.Option("--log-level", help="debug, info, warning or error.", metavar="LEVEL")
@@ -46,6 +47,14 @@ class JsonLines(logging.Formatter):
         return json.dumps(fields, default=str)
 
 
+class TextLines(logging.Formatter):
+    """Formats a log record as text, with control characters, as of file names, as escapes."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the text."""
+        return visible(super().format(record))
+
+
 def set_up(level: str, *, as_json: bool, file: Path | None) -> None:
     """Send the log of the package to a file or to standard error.
 
@@ -67,7 +76,7 @@ def set_up(level: str, *, as_json: bool, file: Path | None) -> None:
         raise CatalogError(
             f"cannot be written: {error.strerror}", file=file, remedy="choose another --log-file"
         ) from error
-    text = logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S")
+    text = TextLines("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S")
     handler.setFormatter(JsonLines() if as_json else text)
     for previous in list(logger.handlers):
         logger.removeHandler(previous)

@@ -29,9 +29,11 @@ from lidarops.cli.findings import findings_document, show_findings
 from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
 
 if TYPE_CHECKING:
+    from lidarops.campaign.model import Campaign
     from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import LeftOut, Plan, PlannedStep
     from lidarops.run.archive import EarlierProblems
+    from lidarops.run.selection import Selection
     from lidarops.run.staleness import Judgement
 
 
@@ -55,19 +57,30 @@ def show_plan(
 ) -> None:
     """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
 
+    Makes no folder: without an output folder the catalog is made for the moment.
+
     Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
     code 1 if a scene cannot be planned, failed before or gave no usable value, a pattern or channel
     is in no file, or headers contradict a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
+    from lidarops.catalog.scratch import without_writing
+
+    settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
+    selection = selection_of(instrument, station, product, since, until)
+    with without_writing(settings) as planned:
+        _plan(planned, selection, stale=stale, wait=wait, as_json=as_json)
+
+
+def _plan(
+    settings: Campaign, selection: Selection, *, stale: bool, wait: float, as_json: bool
+) -> None:
     from lidarops.plan.cost_estimate import RunTime
     from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
 
-    settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
-    selection = selection_of(instrument, station, product, since, until)
     findings = survey(settings, selection=selection, wait=wait)
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
     making, everything = RunTime(), RunTime()

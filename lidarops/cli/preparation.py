@@ -13,6 +13,7 @@ from lidarops.cli.app import (
     OutOption,
     command,
     progress_bar,
+    say,
 )
 
 
@@ -40,7 +41,7 @@ def simulate(
     with progress_bar("simulate", len(planned.paths)) as bar, cluster as client:
         simulated = write_simulation(planned, client=client, progress=bar.advance)
     write_plain(simulated.truth, settings.truth_path)
-    typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
+    say(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
 
 
 @command()
@@ -62,4 +63,4 @@ def compile_code() -> None:
     """
     from lidarops.run.compilation import compile_retrievals
 
-    typer.echo(f"compiled code is kept in {compile_retrievals()}")
+    say(f"compiled code is kept in {compile_retrievals()}")

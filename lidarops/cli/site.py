@@ -14,6 +14,7 @@ from lidarops.cli.app import (
     command,
     exit_with_status,
     progress_bar,
+    say,
     show_rows,
 )
 
@@ -42,5 +43,5 @@ def site(
     else:
         rows = ((problem.path, problem.reason) for problem in made.problems)
         show_rows("Cannot be shown completely", ("file", "reason"), rows)
-        typer.echo(f"{made.products} products, {made.made} pages made\nsite: {made.index}")
+        say(f"{made.products} products, {made.made} pages made\nsite: {made.index}")
     exit_with_status(failed=bool(made.problems))

@@ -23,6 +23,7 @@ from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
+from lidarops.figures.wording import visible
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
@@ -307,4 +308,4 @@ def _table(title: str, *columns: str) -> Table:
 
 def _row(table: Table, *cells: Any) -> None:
     # As Text, because rich would interpret brackets in a header as markup.
-    table.add_row(*(Text(str(cell)) for cell in cells))
+    table.add_row(*(Text(visible(str(cell))) for cell in cells))

@@ -3,39 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
-import types
-import typing
-from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
-from datetime import datetime
-from enum import StrEnum
-from functools import cache
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final
 
 from lidarops.errors import NO_FILE, CatalogError
 from lidarops.records import RunRecord
+from lidarops.reports import run_journal
+from lidarops.reports.json_records import MismatchError, from_plain, plain
 from lidarops.system.files import write_atomically
 
 FILE_NAME: Final = "run.json"
 """Name of the record inside a run's report folder."""
 
 _FORMAT: Final = "lidarops run record"
-_VERSION: Final = 3
-_T = TypeVar("_T")
+_VERSION: Final = 4
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
-# JSON has no such numbers, and only Python reads Python's spelling of them.
-_NOT_FINITE: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
-
-
-class _MismatchError(Exception):
-    """A value of the wrong type; carries its place and what was expected there."""
-
-    def __init__(self, place: str, expected: str) -> None:
-        self.place = place
-        self.expected = expected
-        super().__init__(place, expected)
 
 
 def save_run_record(record: RunRecord, folder: Path) -> Path:
@@ -59,7 +41,7 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
         If the folder cannot be written, or a setting is not a plain JSON type.
     """
     target = Path(folder) / FILE_NAME
-    document = {"format": _FORMAT, "version": _VERSION, "record": _plain(record)}
+    document = {"format": _FORMAT, "version": _VERSION, "record": plain(record)}
     try:
         text = json.dumps(document, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -76,9 +58,16 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
         raise CatalogError(
             f"cannot be written: {error}",
             file=target,
-            remedy="make space or choose a folder you can write to, then reprocess with --force",
+            remedy="make space, then run again, which makes the report; or lidarops report"
+            f" {target.parent}",
         ) from error
+    (target.parent / run_journal.FILE_NAME).unlink(missing_ok=True)
     return target
+
+
+def exists(folder: Path) -> bool:
+    """Return whether a report folder holds the record of a run, or its journal."""
+    return any((folder / name).exists() for name in (FILE_NAME, run_journal.FILE_NAME))
 
 
 def load_run_record(path: str | Path) -> RunRecord:
@@ -92,7 +81,7 @@ def load_run_record(path: str | Path) -> RunRecord:
     Returns
     -------
     RunRecord
-        Equal to the saved record.
+        Equal to the saved record; if there is none, as far as the journal of the run reaches.
 
     Raises
     ------
@@ -101,7 +90,10 @@ def load_run_record(path: str | Path) -> RunRecord:
         or a missing field). States the file, the field and what was expected.
     """
     path = Path(path)
+    journal = (path if path.is_dir() else path.parent) / run_journal.FILE_NAME
     path = path / FILE_NAME if path.is_dir() else path
+    if journal.exists() and not path.exists():
+        return run_journal.load_journal(journal)
     try:
         document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
     except OSError as error:
@@ -121,125 +113,13 @@ def load_run_record(path: str | Path) -> RunRecord:
             remedy="use the lidarops version that wrote it, or run the campaign again",
         )
     try:
-        record = _dataclass(RunRecord, document.get("record"), "record")
-    except _MismatchError as error:
+        record = from_plain(RunRecord, document.get("record"), "record")
+    except MismatchError as error:
         raise CatalogError(
             f"expected {error.expected}", file=path, field=error.place, remedy=_REMEDY
         ) from error
     return record
 
 
-def _plain(value: object) -> object:
-    if is_dataclass(value) and not isinstance(value, type):
-        return {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
-    if isinstance(value, float) and not math.isfinite(value):
-        return next(name for name, number in _NOT_FINITE.items() if repr(number) == repr(value))
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, datetime):
-        return value.isoformat()
-    # Settings are plain already. `save_run_record` refuses non-finite numbers in them: text in
-    # their place could not be distinguished from text when it is read.
-    return dict(value) if isinstance(value, Mapping) else value
-
-
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not JSON")
-
-
-@cache
-def _hints(kind: type) -> dict[str, object]:
-    return typing.get_type_hints(kind)
-
-
-def _typed(expected: object, value: object, place: str) -> object:
-    """Return a JSON `value` as the type `expected` of a field."""
-    origin, arguments = typing.get_origin(expected), typing.get_args(expected)
-    if origin is types.UnionType:
-        (kind,) = (argument for argument in arguments if argument is not type(None))
-        return None if value is None else _typed(kind, value, place)
-    if origin is tuple:
-        items = _checked(value, list, "a list", place)
-        return tuple(_typed(arguments[0], item, f"{place}[{i}]") for i, item in enumerate(items))
-    if origin is Mapping:
-        pairs = _checked(value, dict, "a mapping", place)
-        return {key: _typed(arguments[1], item, f"{place}.{key}") for key, item in pairs.items()}
-    if isinstance(expected, type) and is_dataclass(expected):
-        return _dataclass(expected, value, place)
-    if isinstance(expected, type) and issubclass(expected, StrEnum):
-        return _enum(expected, value, place)
-    return _SCALARS[expected](value, place)
-
-
-def _dataclass(kind: type[_T], value: object, place: str) -> _T:
-    items = _checked(value, dict, f"the fields of {kind.__name__}", place)
-    hints = _hints(kind)  # type: ignore[arg-type]  # mypy checks the __hash__ of instances
-    for name in sorted(set(hints) ^ set(items)):
-        missing = "this field, which is missing"
-        raise _MismatchError(
-            f"{place}.{name}", missing if name in hints else f"no such field of {kind.__name__}"
-        )
-    return kind(**{name: _typed(hints[name], items[name], f"{place}.{name}") for name in hints})
-
-
-def _enum(kind: type[StrEnum], value: object, place: str) -> StrEnum:
-    for member in kind:
-        if member.value == value:
-            return member
-    choices = ", ".join(member.value for member in kind)
-    raise _MismatchError(place, f"one of {choices}, not {value!r:.80}")
-
-
-def _checked(value: object, kind: type[_T], words: str, place: str) -> _T:
-    # In Python, booleans are integers.
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise _MismatchError(place, f"{words}, not {value!r:.80}")
-    return value
-
-
-def _text(value: object, place: str) -> str:
-    return _checked(value, str, "text", place)
-
-
-def _integer(value: object, place: str) -> int:
-    return _checked(value, int, "a whole number", place)
-
-
-def _boolean(value: object, place: str) -> bool:
-    if not isinstance(value, bool):
-        raise _MismatchError(place, f"true or false, not {value!r:.80}")
-    return value
-
-
-def _float(value: object, place: str) -> float:
-    if isinstance(value, str) and value in _NOT_FINITE:
-        return _NOT_FINITE[value]
-    if isinstance(value, float):
-        return value
-    integer = _checked(value, int, "a number", place)
-    try:
-        return float(integer)
-    except OverflowError as error:
-        raise _MismatchError(place, f"a number below 1e308, not {integer!r:.80}") from error
-
-
-def _datetime(value: object, place: str) -> datetime:
-    text = _checked(value, str, "an ISO 8601 date and time", place)
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError as error:
-        raise _MismatchError(place, f"an ISO 8601 date and time, not {text!r:.80}") from error
-
-
-def _anything(value: object, _: str) -> object:
-    return value
-
-
-_SCALARS: Final[Mapping[object, Callable[[object, str], object]]] = {
-    str: _text,
-    bool: _boolean,
-    int: _integer,
-    float: _float,
-    datetime: _datetime,
-    Any: _anything,
-}

@@ -170,6 +170,8 @@ def outcome_class(record: RunRecord) -> str:
 
 def _problems(record: RunRecord) -> Iterator[str]:
     """Yield what makes a run fail."""
+    if record.cut_short:
+        yield "the run was killed or met a full disk, so that only scenes that ended are listed"
     failed, internal = len(failed_scenes(record)), len(internal_errors(record))
     if internal:
         yield f"{counted(internal, 'scene')} ended with an internal error"

@@ -12,11 +12,13 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from dask.utils import parse_bytes
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog import versions
 from lidarops.catalog.ledger import RunStatus, Verdict
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
@@ -51,6 +53,7 @@ __all__ = [
     "assess",
     "bring_up_to_date",
     "remove_orphans",
+    "report_earlier_runs",
     "report_run",
     "reprocess",
     "survey",
@@ -63,6 +66,9 @@ MOST_FAILURES_IN_A_ROW = 5
 MOST_DAYS_JUDGED_AGAIN: Final = 30
 """Unchanged days that are judged again to name their unused files and scenes; the unused ones of
 other days are only counted."""
+
+MOST_RUNS_REPORTED: Final = 20
+"""Last runs whose missing reports are made; older ones are left to ``lidarops report``."""
 
 _WORKER_MODULES: Final = ("distributed.nanny", "lidarops.run.executor", "lidarops.reports.gallery")
 """Modules that workers need, for scenes and then for the report."""
@@ -303,6 +309,7 @@ class _Pass:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
+        self._clear_up()
         orphans = {orphan.path for orphan in self.gathered.orphans}
         findings = find(self.judge, self.store, self.selection, summary.idle_patterns, orphans)
         record = self._conclude(status, findings)
@@ -470,7 +477,10 @@ class _Pass:
     def _running(self) -> Session:
         if self.session is None:
             _acquire(self.lock)
-            self.session = Session(self.campaign, self.store, self.lock, self.judge)
+            journal = self.options.journal
+            self.session = Session(
+                self.campaign, self.store, self.lock, self.judge, journal=journal
+            )
             self.session.begin()
         return self.session
 
@@ -509,6 +519,14 @@ class _Pass:
         """Return whether every product that was stale on a day is now fresh."""
         done = self.session.settled if self.session else set()
         return self.gathered.open[day] <= done
+
+    def _clear_up(self) -> None:
+        """Remove what a killed run left, if this one has not; another run may be at work."""
+        if self.session is None and self.store.has_dead_run():
+            _acquire(self.lock)
+            for path in versions.sweep(Path(self.campaign.output)):
+                _LOG.warning("removed %s, left by a killed process", path)
+            self.store.close_runs(self.lock.token)
 
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:
@@ -611,3 +629,25 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_p
     folder = campaign.report_root / run.id
     run_record.save_run_record(run, folder)
     return run_page.build_report(run, folder, workers=workers)
+
+
+def report_earlier_runs(
+    campaign: Campaign, *, without: str = "", workers: int = 1
+) -> Iterator[Path]:
+    """Build the missing report pages of runs that were killed or met a full disk; yield them.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        A catalog must exist.
+    without : str, optional
+        Id of a run that is left out.
+    workers : int, optional
+    """
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        runs = store.runs(limit=MOST_RUNS_REPORTED)
+    for run in runs:
+        folder = campaign.report_root / run.id
+        unreported = run_record.exists(folder) and not (folder / run_page.INDEX).exists()
+        if unreported and run.id != without and run.status is not RunStatus.RUNNING:
+            yield report_run(campaign, run_record.load_run_record(folder), workers=workers).page

@@ -37,6 +37,8 @@ class Options:
     wait: float = 0.0
     """s to wait for another run on the same catalog."""
     profiles_per_chunk: int | None = None
+    journal: bool = False
+    """Note each scene in the report folder as it ends, for the report of a run that is killed."""
     progress: Progress | None = None
     """Called with the outcome of each scene as it ends."""
     expect: Callable[[int], None] | None = None
@@ -123,9 +125,10 @@ def missing_report(campaign: Campaign) -> str:
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
         for last in store.runs(limit=1):
             folder = campaign.report_root / last.id
-            if folder.is_dir() and not (folder / run_page.INDEX).exists():
-                problem = "the report page of the last run is missing"
-                if (folder / run_record.FILE_NAME).exists():
-                    return f"{problem}; make it with: lidarops report {folder}"
-                return f"{problem}, and so is its record; lidarops reprocess --force makes new ones"
+            if not folder.is_dir() or (folder / run_page.INDEX).exists():
+                return ""
+            problem = "the report page of the last run is missing"
+            if run_record.exists(folder):
+                return f"{problem}; make it with: lidarops report {folder}"
+            return f"{problem}, and so is its record; lidarops reprocess --force makes new ones"
     return ""

@@ -26,6 +26,7 @@ from lidarops.records import (
     Scene,
     SceneOutcome,
 )
+from lidarops.reports.run_journal import Journal
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps.dependence import ProductKey
 from lidarops.system.code_version import joint_code_version
@@ -49,6 +50,8 @@ class Session:
     lock : Lock
         Must be held when the session begins.
     judge : Judge
+    journal : bool, optional
+        Whether to keep a journal, for the report of a run that is killed.
     """
 
     def __init__(
@@ -57,6 +60,8 @@ class Session:
         store: Store,
         lock: Lock,
         judge: Judge,
+        *,
+        journal: bool = False,
     ) -> None:
         self._campaign = campaign
         self._store = store
@@ -71,11 +76,11 @@ class Session:
         """Scenes whose products are all fresh now."""
         self.started = datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+        self._journal = Journal(campaign.report_root / self.id) if journal else None
 
     def begin(self) -> None:
         """Enter the run in the ledger, and remove temporary files of killed runs."""
-        for path in versions.sweep(self._output):
-            _LOG.warning("removed %s, left by a killed run", path)
+        self._sweep()
         run = Run(
             id=self.id,
             started=self.started,
@@ -88,6 +93,12 @@ class Session:
             folder=str(self._campaign.folder),
         )
         self._store.begin_run(run, self._lock.token)
+        if self._journal:
+            self._journal.begin(self._record((), Findings()))
+
+    def _sweep(self) -> None:
+        for path in versions.sweep(self._output):
+            _LOG.warning("removed %s, left by a killed process", path)
 
     def take(self, judged: Judgement, *, note: bool) -> None:
         """Prepare for a scene that is about to start: keep replaced versions.
@@ -127,16 +138,18 @@ class Session:
             products=tuple(new),
             digests=_unknown_digests(judged.scene, outcome),
         )
-        self._store.record(entry, self.id, self._lock.token)
-        self._settle(judged, outcome, new)
         outcome = replace(outcome, left_out=self._beyond(judged, outcome))
-        self._settle_versions(judged, outcome)
-        self._log(outcome)
         self._named += outcome.granules
         # A million file names would fill memory, and the page shows few.
-        self._outcomes.append(
-            outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
-        )
+        brief = outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
+        # First, so that whatever the ledger knows is in the report, also of a run that is killed.
+        if self._journal:
+            self._journal.add(brief)
+        self._store.record(entry, self.id, self._lock.token)
+        self._settle(judged, outcome, new)
+        self._settle_versions(judged, outcome)
+        self._log(outcome)
+        self._outcomes.append(brief)
         return outcome
 
     def _settle(self, judged: Judgement, outcome: SceneOutcome, new: Sequence[NewProduct]) -> None:
@@ -172,9 +185,21 @@ class Session:
         empty_scenes : mapping of str to str, optional
             Scene -> why it can give no product.
         """
+        # A worker may have been killed, too.
+        self._sweep()
         refused = (*self._store.refused(), *set_aside)
         self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
         _LOG.info("run %s %s: %d scenes", self.id, status.value, len(self._outcomes))
+        listed = dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES))
+        return replace(
+            self._record(refused, findings),
+            scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
+            empty_scenes=listed,
+            more_empty_scenes=len(empty_scenes or {}) - len(listed),
+        )
+
+    def _record(self, refused: tuple[Granule, ...], findings: Findings) -> RunRecord:
+        """Return the record of the run without its scenes."""
         return RunRecord(
             id=self.id,
             campaign=self._campaign.name,
@@ -184,12 +209,10 @@ class Session:
             version=__version__,
             archive=without_keys(self._campaign.archive),
             products=str(self._campaign.products_root),
-            scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
+            scenes=(),
             refused=refused,
             truth=_truth(self._campaign),
             findings=findings,
-            empty_scenes=dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES)),
-            more_empty_scenes=max(len(empty_scenes or {}) - MOST_EMPTY_SCENES, 0),
         )
 
     def _beyond(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:

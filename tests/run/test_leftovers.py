@@ -19,7 +19,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.reports import gallery, run_record
+from lidarops.reports import gallery, run_journal, run_record
 from lidarops.run import archive as pipeline
 from lidarops.run import session
 from lidarops.run.archive import (
@@ -30,6 +30,7 @@ from lidarops.run.archive import (
     report_run,
     reprocess,
 )
+from lidarops.run.session import Session
 from lidarops.steps.dependence import plan_closure, planned_products
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
@@ -447,18 +448,36 @@ def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
         assert "poor_20260302T000000" in failed.stdout
         assert "report:" not in failed.stdout
     shown = CliRunner().invoke(app, command)
+    page = str(folder / "index.html")
     if as_json:
-        assert json.loads(shown.stdout)["unreported"].endswith(f": lidarops report {folder}")
+        assert json.loads(shown.stdout)["earlier_reports"] == [page]
     else:
-        assert f"lidarops report {folder}" in shown.stdout
-    assert CliRunner().invoke(app, ["report", str(folder)]).exit_code == 0
-    shown = CliRunner().invoke(app, command)
-    assert str(folder) not in shown.stdout
+        assert f"report of an earlier run: {page}" in shown.stdout
+    assert "poor_20260301T000000" in (folder / "index.html").read_text()
+    assert str(folder) not in CliRunner().invoke(app, command).stdout
 
 
-def test_a_run_whose_record_could_not_be_saved_says_how_to_get_another(
+def test_a_report_that_fails_again_can_be_made_by_hand(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    archive.write()
+    command = ["reprocess", str(archive.file), "--json"]
+    with monkeypatch.context() as patch:
+        patch.setattr(gallery, "fill", _full)
+        CliRunner().invoke(app, command)
+        shown = CliRunner().invoke(app, command)
+    (folder,) = (archive.folder / "out/report").glob("*")
+    assert json.loads(shown.stdout)["unreported"].endswith(f": lidarops report {folder}")
+    assert CliRunner().invoke(app, ["report", str(folder)]).exit_code == 0
+    assert json.loads(CliRunner().invoke(app, command).stdout)["unreported"] == ""
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_a_run_whose_record_could_not_be_saved_is_reported_without_making_it_again(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, *, by_hand: bool
+) -> None:
+    """Its disk was full, or it was killed, after its last product."""
     archive.raw("poor/h09", 630, seed=9)
     archive.write()
     command = ["reprocess", str(archive.file)]
@@ -467,11 +486,99 @@ def test_a_run_whose_record_could_not_be_saved_says_how_to_get_another(
         failed = CliRunner().invoke(app, command)
     assert failed.exit_code == 1
     assert "poor_20260301T000000" in failed.stdout
-    assert "--force" in failed.stderr
-    assert "--force" in CliRunner().invoke(app, command).stdout
-    assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
-    shown = CliRunner().invoke(app, command)
-    assert (shown.exit_code, "--force" in shown.stdout) == (0, False)
+    (folder,) = (archive.folder / "out/report").glob("*")
+    assert f"lidarops report {folder}" in failed.stderr
+    before = archive.contents("out/products")
+    shown = CliRunner().invoke(app, ["report", str(folder)] if by_hand else command)
+    assert shown.exit_code == 0
+    assert str(folder / "index.html") in shown.stdout
+    page = (folder / "index.html").read_text()
+    assert "was killed or met a full disk" in page
+    assert "poor_20260301T000000" in page
+    assert archive.contents("out/products") == before
+    if not by_hand:
+        record = run_record.load_run_record(folder)
+        assert [scene.scene for scene in record.scenes] == ["poor_20260301T000000"]
+        assert record.scenes[0].products
+        assert not (folder / run_journal.FILE_NAME).exists()
+    assert "index.html" not in CliRunner().invoke(app, command).stdout
+
+
+def test_a_journal_that_is_cut_gives_the_scenes_before(archive: Archive) -> None:
+    for day in range(3):
+        archive.raw(f"poor/h{day}9", day * DAY + 630, seed=9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_record, "write_atomically", _full)
+        CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    (folder,) = (archive.folder / "out/report").glob("*")
+    journal = folder / run_journal.FILE_NAME
+    os.truncate(journal, journal.stat().st_size - 10)
+    assert len(run_record.load_run_record(folder).scenes) == 2
+    journal.write_text("{}\n")
+    with pytest.raises(CatalogError, match=r"scenes\.jsonl: cannot be read"):
+        run_record.load_run_record(folder)
+
+
+def test_a_full_disk_for_the_journal_does_not_stop_the_run(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    monkeypatch.setattr(run_journal, "plain", _full)
+    options = Options(journal=True)
+    assert not bring_up_to_date(archive.write(), options=options).has_failures
+
+
+def _killed(archive: Archive) -> None:
+    """Leave the ledger as a killed run does."""
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        started = FIRST.replace(year=2030)
+        run = Run("killed", started, None, RunStatus.RUNNING, "me", "0", "0", "", "")
+        store.begin_run(run, lock.token)
+
+
+def test_a_killed_run_is_reported_by_the_next_one(archive: Archive) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Session, "finish", _stopped)
+        with pytest.raises(KeyboardInterrupt):
+            bring_up_to_date(archive.write(), options=Options(journal=True))
+    assert not list((archive.folder / "out/report").glob("*/index.html"))
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    assert shown.exit_code == 0
+    (page,) = (archive.folder / "out/report").glob("*/index.html")
+    assert f"report of an earlier run: {page}" in shown.stdout
+    assert "poor_20260301T000000" in page.read_text()
+
+
+def test_temporary_files_of_a_killed_run_are_named_by_verify_and_removed_by_the_next_run(
+    archive: Archive,
+) -> None:
+    left = archive.folder / "out/products/.half.nc.0123.tmp"
+    left.write_bytes(b"half of a product")
+    command = ["verify", str(archive.file), "--json"]
+    _killed(archive)
+    found = json.loads(CliRunner().invoke(app, command).stdout)["mismatches"]
+    assert [(file["what"], file["path"]) for file in found] == [
+        ("temporary", "products/.half.nc.0123.tmp")
+    ]
+    assert reprocess(archive.write()) is None
+    assert not left.exists()
+    assert CliRunner().invoke(app, command).exit_code == 0
+
+
+def test_temporary_files_of_a_run_at_work_are_left_alone(archive: Archive) -> None:
+    campaign = archive.write()
+    left = archive.folder / "out/products/.half.nc.0123.tmp"
+    left.write_bytes(b"half of a product")
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        run = Run("works", FIRST, None, RunStatus.RUNNING, "me", "0", "0", "", "")
+        store.begin_run(run, lock.token)
+        assert reprocess(campaign) is None
+        assert CliRunner().invoke(app, ["verify", str(archive.file)]).exit_code == 0
+    assert left.exists()
 
 
 def test_a_failed_removal_does_not_hide_the_products(archive: Archive) -> None:
