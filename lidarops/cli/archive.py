@@ -77,11 +77,20 @@ def catalog(
     catalog: CatalogOption = None,
     workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
     wait: WaitOption = 0.0,
+    rebuild: Annotated[
+        bool,
+        typer.Option(
+            "--rebuild",
+            help="Also enter products that the ledger lacks, from their own provenance.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Create or update the catalog of the archive; list refused files, notes on files, and why.
 
     Example: lidarops catalog catalogs/demo.yaml
+
+    Example: lidarops catalog catalogs/demo.yaml --rebuild
     """
     from lidarops.catalog.store import Store
     from lidarops.records import Findings
@@ -90,6 +99,11 @@ def catalog(
     settings = loaded_campaign(campaign, archive, out, catalog)
     with progress_bar("catalog", None) as bar:
         summary = update_catalog(settings, progress=bar.advance, wait=wait, workers=workers)
+        rebuilt = None
+        if rebuild:
+            from lidarops.run.rebuild import rebuild_ledger
+
+            rebuilt = rebuild_ledger(settings, wait=wait, progress=bar.advance)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
         notes = store.file_notes(settings.instruments)
@@ -99,6 +113,8 @@ def catalog(
         numbers = asdict(summary)
         del numbers["idle_patterns"]
         document = {**numbers, "refused_files": reasons, **findings_document(findings)}
+        if rebuilt is not None:
+            document["rebuilt"] = asdict(rebuilt)
         typer.echo(json.dumps(document, indent=2))
     else:
         _show_refused(refused)
@@ -108,7 +124,14 @@ def catalog(
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
             f" {summary.refused} refused"
         )
-    exit_with_status(failed=bool(refused) or findings.failed)
+        if rebuilt is not None:
+            show_rows("Not entered in the ledger", ("file", "reason"), rebuilt.problems.items())
+            say(
+                f"{rebuilt.entered} products entered in the ledger, {rebuilt.without_scene} of them"
+                f" without raw files; {rebuilt.known} known before"
+            )
+    failed = bool(refused) or findings.failed or bool(rebuilt and rebuilt.problems)
+    exit_with_status(failed=failed)
 
 
 @command()

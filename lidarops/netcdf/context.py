@@ -56,15 +56,30 @@ def product_path(context: Context) -> str:
     ProductError
         If a name cannot be part of a file name.
     """
+    names = (context.station_key, context.instrument_key, context.kind, context.channel)
+    return path_of_product(names, context.scene, context.start)
+
+
+def path_of_product(names: tuple[str, str, str, str], scene: str, start: datetime) -> str:
+    """Return the path of a product's file; see `product_path`.
+
+    Parameters
+    ----------
+    names : (str, str, str, str)
+        Keys of station and instrument, kind and channel.
+    scene : str
+        Id of its scene.
+    start : datetime
+        Start of the scene.
+    """
     # The id of a scene without its instrument: start time, and key of the grid where there are two.
-    when = context.scene.removeprefix(f"{context.instrument_key}_")
-    parts = (context.station_key, context.instrument_key, context.kind, context.channel, when)
+    parts = (*names, scene.removeprefix(f"{names[1]}_"))
     for part in parts:
         if not _SAFE.fullmatch(part):
             raise ProductError(
                 f"{part!r} cannot be part of a file name",
-                field=context.scene,
+                field=scene,
                 remedy="use letters, digits, '.', '_' and '-' in names of the campaign file",
             )
-    folder = "/".join((*parts[:3], f"{context.start.astimezone(UTC):%Y}"))
+    folder = "/".join((*parts[:3], f"{start.astimezone(UTC):%Y}"))
     return f"{folder}/{'_'.join(parts)}.nc"

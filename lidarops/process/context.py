@@ -66,14 +66,7 @@ def product_context(
             channel=channel.name,
             inputs=dependence.product_inputs(closure, inputs),
             plan=closure,
-            settings={
-                **_campaign_settings(job, closure, kind, channel.name),
-                "metadata": as_settings(campaign.metadata),
-                "keys": {"station": scene.station, "instrument": scene.instrument},
-                "campaign": {"title": campaign.title, "summary": campaign.summary},
-                "window": [scene.start.isoformat(), scene.stop.isoformat()],
-                "notes": list(notes),
-            },
+            settings=recorded_settings(job, scene, closure, (kind, channel.name)),
             versions=provenance.package_versions(),
             code_version=code_version(kind),
         ),
@@ -81,6 +74,32 @@ def product_context(
             sorted({raw_format(granule.format).title for granule in (*scene.granules, *scene.dark)})
         ),
     )
+
+
+def recorded_settings(
+    job: Job, scene: Scene, plan: Plan, product: dependence.ProductKey
+) -> dict[str, Any]:
+    """Return what a product states of the campaign: all that is needed to make it again.
+
+    Parameters
+    ----------
+    job : Job
+    scene : Scene
+        With usable granules only.
+    plan : Plan
+        Plan of the product, from `plan_closure`.
+    product : (str, str)
+        Its kind and channel.
+    """
+    campaign = job.campaign
+    return {
+        **_campaign_settings(job, plan, *product),
+        "metadata": as_settings(campaign.metadata),
+        "keys": {"station": scene.station, "instrument": scene.instrument},
+        "campaign": {"title": campaign.title, "summary": campaign.summary},
+        "window": [scene.start.isoformat(), scene.stop.isoformat()],
+        "notes": list(dependence.product_notes(scene, plan, product[1])),
+    }
 
 
 def _campaign_settings(job: Job, plan: Plan, kind: str, channel: str) -> dict[str, Any]:
