@@ -205,7 +205,7 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.BOTH,
             budget=_of_two_parts("lidar_ratio"),
             comment="Measured: extinction over backscatter, which is smoothed as extinction is."
-            " Missing where backscatter exceeds zero by less than 3 standard errors.",
+            " Missing where backscatter exceeds zero by too few standard errors.",
         ),
         _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.RANDOM),
         _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.SYSTEMATIC),

@@ -73,8 +73,6 @@ class Backscatter:
     """Weight of each cell in the reference, 1 in total."""
     sensitivity: Array
     """Change of the logarithm of the ratio with the depth."""
-    scale: float
-    """K: total backscatter over the ratio."""
 
     def respond(self, relative: Array, depth: Array) -> Array:
         """Return the change of total backscatter, m-1 sr-1.
@@ -156,15 +154,24 @@ def cell_ratio(
 
 
 def calibrated(
-    ratio: Ratio, noise: SignalNoise, reference: Array, window: npt.NDArray[np.bool_]
+    ratio: Ratio,
+    noise: SignalNoise,
+    depth_noise: Array,
+    reference: Array,
+    window: npt.NDArray[np.bool_],
 ) -> Backscatter | None:
     """Return total backscatter from a ratio and the backscatter in the reference window.
+
+    The quotient of a cell and the noisy level of the window is too large by the relative variance
+    of the level, less its covariance with the cell; it is divided by that.
 
     Parameters
     ----------
     ratio : Ratio
     noise : SignalNoise
         Of the elastic signal: weights by the observed counts would prefer low ones.
+    depth_noise : (cell, noise of a cell) float
+        Response of the depth of the Raman signal to independent unit noise.
     reference : (cell,) float
         m-1 sr-1, total backscatter that is assumed in the window.
     window : (cell,) bool
@@ -191,14 +198,17 @@ def calibrated(
     if not level > 0.0:
         return None
     expected = weight * reference
-    scale = float(expected.sum()) / level
+    level_scale = float(expected.sum()) / level
     # The noise of the window relative to its level, by the expected variances.
     spread = float(np.sqrt((weight[used] ** 2 * variance[used]).sum())) / level
+    shares = expected / expected.sum()
+    of_cells = ratio.sensitivity[:, np.newaxis] * depth_noise
+    of_level = shares @ of_cells
+    scale = level_scale / (1.0 + spread**2 + of_level @ of_level - of_cells @ of_level)
     return Backscatter(
         total=scale * ratio.value,
         own=scale * np.sqrt(ratio.variance),
         reference=spread,
-        shares=expected / expected.sum(),
+        shares=shares,
         sensitivity=ratio.sensitivity,
-        scale=scale,
     )

@@ -25,7 +25,7 @@ class RamanQuality(FlagBit):
         FIRST_OWN + 2,
         Severity.CARE,
         (
-            "backscatter exceeds zero by less than 3 standard errors, so that the lidar ratio is"
+            "backscatter exceeds zero by too few standard errors for a lidar ratio, so that it is"
             " missing; other values are not concerned"
         ),
     )

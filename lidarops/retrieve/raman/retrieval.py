@@ -386,7 +386,9 @@ class _Solution:
         inside = (cells.range >= bottom) & (cells.range <= top)
         ratio = _ratio(profile, partial, settings.ratio)
         assumed = settings.scattering_ratio * molecular
-        calibrated = _backscatter.calibrated(ratio, profile.elastic.noise, assumed, inside)
+        calibrated = _backscatter.calibrated(
+            ratio, profile.elastic.noise, profile.fit.noise, assumed, inside
+        )
         effects = _Effects(profile, calibrated, air, cells, settings, partial)
         causes = list(effects.causes(molecular))
         extinction = profile.extinction
@@ -522,31 +524,47 @@ def _lidar_ratio(
     level = calibrated.reference * smoothed(calibrated.total)
     error = np.sqrt((of_smooth**2).sum(axis=1) + own + level**2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = extinction.value / smooth
+        uncertainty = (error / smooth) ** 2
+        inverse = _backscatter.inverse_mean(smooth, uncertainty)
+    ratio = extinction.value * inverse
 
-        def change(of_extinction: Array, of_backscatter: Array) -> Array:
-            scale, slanted = (
-                array.reshape(-1, *(1,) * (of_extinction.ndim - 1)) for array in (smooth, ratio)
-            )
-            return np.asarray((of_extinction - slanted * of_backscatter) / scale)
+    def change(of_extinction: Array, of_backscatter: Array) -> Array:
+        return np.asarray((of_extinction - ratio[:, np.newaxis] * of_backscatter) * column)
 
-        raman = change(extinction.noise, of_smooth)
-        random = (raman**2).sum(axis=1) + (own + level**2) * (ratio / smooth) ** 2
-        systematic = np.zeros(value.size)
-        for cause in causes:
-            square = change(cause.extinction, smoothed(cause.backscatter)) ** 2
-            if cause.name in RANDOM:
-                random += square
-            else:
-                systematic += square
-        # A denominator that is too high by noise makes the value and its error too low.
-        skewed = 1.0 / (1.0 - error / smooth)
-    certain = complete & (smooth > THRESHOLDS.least_ratio_certainty * error)
+    column = inverse[:, np.newaxis]
+    random = (change(extinction.noise, of_smooth) ** 2).sum(axis=1)
+    random += (own + level**2) * (ratio * inverse) ** 2
+    systematic = np.zeros(value.size)
+    for cause in causes:
+        effects = cause.extinction[:, np.newaxis], smoothed(cause.backscatter)[:, np.newaxis]
+        square = change(*effects)[:, 0] ** 2
+        if cause.name in RANDOM:
+            random += square
+        else:
+            systematic += square
+    # The variance of a reciprocal to the second order.
+    random *= 1.0 + 8.0 * uncertainty
+    likely = _likely(extinction, smooth, error)
+    total = smoothed(calibrated.total)
+    least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
+    certain = complete & (smooth > error) & (likely > least)
     return (
         np.where(certain, ratio, np.nan),
-        np.where(certain, skewed * np.sqrt(random), np.nan),
+        np.where(certain, np.sqrt(random), np.nan),
         np.where(certain, np.sqrt(systematic), np.nan),
     )
+
+
+def _likely(extinction: Extinction, backscatter: Array, error: Array) -> Array:
+    """Return the weighted mean of backscatter and of what extinction lets expect, m-1 sr-1.
+
+    Its noise and that of the lidar ratio are independent, so that it selects no lidar ratios by
+    their noise; backscatter alone would keep those whose backscatter is too high.
+    """
+    typical = THRESHOLDS.typical_lidar_ratio
+    other = np.hypot(extinction.noise_error, extinction.resolution_error) / typical
+    weight = error**2 / (error**2 + other**2)
+    return np.asarray(backscatter + weight * (extinction.value / typical - backscatter))
 
 
 def _joined(

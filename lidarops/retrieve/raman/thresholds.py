@@ -22,8 +22,12 @@ class Thresholds:
     """Expected standard error of the logarithm of the smoothed signal, beyond which first-order
     errors do not hold: a signal of less than 5 standard errors. Assumed."""
     least_ratio_certainty: float = 3.0
-    """Standard errors by which the smoothed backscatter must exceed zero for a lidar ratio. Below,
-    no error is symmetrical; with 5, none is left at 355 nm of the published simulations."""
+    """Standard errors by which backscatter must exceed zero for a lidar ratio. Below, no error is
+    symmetrical; with 5, none is left at 355 nm of the published simulations."""
+    typical_lidar_ratio: float = 50.0
+    """sr, by which extinction helps to decide whether backscatter is certain enough for a lidar
+    ratio. Decided by backscatter alone, lidar ratios of few counts are 21 % too small
+    (`tests/retrieve/raman/test_raman_coverage.py`)."""
     fewest_cells: int = 8
     """Cells with data of a profile that is fitted. Assumed."""
     many_counts: float = 1000.0

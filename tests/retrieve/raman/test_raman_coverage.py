@@ -8,7 +8,8 @@ from support.raman_signals import make_sky, mean_over
 
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.raman import retrieve_raman
-from lidarops.retrieve.raman.backscatter import inverse_mean, ratio_of_counts
+from lidarops.retrieve.raman.backscatter import Ratio, calibrated, inverse_mean, ratio_of_counts
+from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
 
 STEP = 30.0
@@ -88,3 +89,40 @@ def test_backscatter_of_few_counts_has_no_bias():
     away = (found.backscatter - sky.cells.mean(sky.backscatter))[:, inside]
     spread = np.nanstd(away, axis=0)
     assert np.all(np.abs(np.nanmean(away, axis=0)) < 4.0 * spread / np.sqrt(rows))
+
+
+def test_backscatter_from_a_reference_of_few_counts_has_no_bias():
+    # 30 counts of the window, and a Raman level there of 60 counts. The quotient of means is too
+    # large by the variance of the level, 5 %.
+    rng = np.random.default_rng(11)
+    truth = np.where(np.arange(30) < 10, 2.0, 1.0)
+    window = truth == 1.0
+    light = np.where(window, 1.5, 100.0)
+    noise = SignalNoise(1.0 / light, np.zeros(30))
+    levels = rng.poisson(60.0, 4000) / 60.0
+    response = np.where(window, -1.0 / np.sqrt(60.0), 0.0)[:, np.newaxis]
+    total = []
+    for level, counts in zip(levels, rng.poisson(truth * light, (4000, 30)), strict=True):
+        factor = np.where(window, inverse_mean(level, 1.0 / 60.0), 1.0)
+        signal = counts / light
+        ratio = Ratio(signal * factor, factor**2 * truth / light, np.ones(30), factor)
+        total.append(calibrated(ratio, noise, response, truth, window).total[:10].mean())
+    assert abs(np.mean(total) / 2.0 - 1.0) < 3.0 * np.std(total) / 2.0 / np.sqrt(len(total))
+
+
+@pytest.mark.parametrize("lidar_ratio", [25.0, 50.0])
+def test_lidar_ratios_of_few_counts_have_no_bias(lidar_ratio):
+    rows = 50
+    sky = make_sky(HAZE, STEP, 1000.0, lidar_ratio=lidar_ratio)
+    rng = np.random.default_rng(3)
+    raman, elastic = (
+        sky.signal(rng.poisson(mean, (rows, R.size)).astype(float))
+        for mean in (sky.raman, sky.elastic)
+    )
+    quality = np.repeat(sky.quality, rows, axis=0)
+    found = retrieve_raman(raman, elastic, sky.air, sky.cells, sky.settings, quality=quality)
+    known = np.isfinite(found.lidar_ratio)
+    assert known.sum() > 250
+    away = (found.lidar_ratio - lidar_ratio)[known]
+    assert abs(away.mean()) < 0.1 * lidar_ratio
+    assert np.mean(np.abs(away / found.lidar_ratio_standard_error[known]) < 1.96) > 0.9

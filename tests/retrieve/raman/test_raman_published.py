@@ -1,6 +1,7 @@
 """The retrieval on the published simulation of the EARLINET Raman intercomparison.
 
 `pappalardo2004`: 15 realisations of Poisson counts without background, overlap complete from 345 m.
+Other realisations of the same truth tell what is chance (`test_other_realisations_have_no_bias`).
 Particles end at 7.2 km. Above, one realisation has 338 (355 nm) and 535 (532 nm) elastic counts up
 to 15 km, so that its calibration alone leaves 7 and 5 % of total backscatter, and 24 and 10 % of
 that of particles at 1 km; the mean of 15 has a fourth of it.
@@ -31,10 +32,32 @@ STEP = 15.0
 RAMAN = {"355": ("387", 386.7e-9), "532": ("608", 607.4e-9)}
 
 
-def channel(counts):
+REALISATIONS = 15
+FIRST, SECOND, LAST = 350.0, 2000.0, 5000.0
+"""m: heights between which the intercomparison and the tables of the page take means."""
+# Percent, as in the table of `docs/algorithms/raman.md`.
+FIGURES = {
+    "355": {
+        "extinction": (0.2, -5.3),
+        "backscatter": (0.6, -2.7),
+        "lidar_ratio": (-2.6, 7.5),
+        "line": (2.9, -21.0),
+    },
+    "532": {
+        "extinction": (2.4, 0.0),
+        "backscatter": (-1.5, 0.1),
+        "lidar_ratio": (3.8, 1.1),
+        "line": (1.1, -10.5),
+    },
+}
+# Of other sets of 15, 13 to 17 % cover backscatter by less than 0.92.
+COVERED = {"355": (0.938, 0.967, 0.970), "532": (0.960, 0.918, 0.955)}
+
+
+def channel(counts, variance=None):
     """Return the signal of Poisson counts without background."""
     rows = len(counts)
-    variance = np.maximum(counts.mean(axis=0), 0.1)
+    variance = np.maximum(counts.mean(axis=0) if variance is None else variance, 0.1)
     none = np.zeros(rows)
     return ChannelSignal(
         counts, np.tile(variance, (rows, 1)), none, none, np.zeros((1, counts.shape[1])),
@@ -42,9 +65,29 @@ def channel(counts):
     )  # fmt: skip
 
 
+def simple_air(air):
+    """Return molecular backscatter by the power law that the signals were simulated with.
+
+    5.45e-32 m2 sr-1 at 550 nm (`collis1976`); extinction is 8 pi / 3 times that. See
+    `test_the_signals_follow_a_power_law_of_molecular_scattering`.
+    """
+    return lambda r, wavelength: air.number_density(r) * 5.45e-32 * (550e-9 / wavelength) ** 4
+
+
+def column_of(air, r, laser, raman, *, simple):
+    """Return clean air by the power law, or by the cross sections of lidarops."""
+    if simple:
+        backscatter = simple_air(air)
+        extinction = lambda r, x: 8.0 * np.pi / 3.0 * backscatter(r, x)  # noqa: E731
+    else:
+        backscatter, extinction = air.backscatter, air.extinction
+    depths = (along(extinction(r, x), STEP) for x in (laser, raman))
+    return AirColumn(r, backscatter(r, laser), *depths, air.number_density(r), np.ones(r.size))
+
+
 @pytest.fixture(scope="module", params=["355", "532"])
 def case(request, data_root):
-    """Return one wavelength of the set: signals, air, cells, truth."""
+    """Return one wavelength of the set: counts, air, cells, truth."""
     folder = data_root / "synthetic/pappalardo_raman"
     if not folder.exists():
         pytest.skip("no published Raman signals")
@@ -55,37 +98,55 @@ def case(request, data_root):
         xr.open_dataset(folder / "truth.nc") as truth,
     ):
         r = counts["rangebin"].values
-        one, other = (
-            channel(counts["phy"].sel(channel=f"{c}_1").values.astype(float)) for c in (raman, name)
+        of_raman, of_elastic = (
+            counts["phy"].sel(channel=f"{c}_1").values.astype(float) for c in (raman, name)
         )
         particles = {
             key: truth[key].sel(channel=f"{name}_1").values for key in ("extinction", "backscatter")
         }
+        colours = [truth["extinction"].sel(channel=f"{c}_1").values for c in ("355", "532")]
+    exponent = np.ones(r.size)
+    known = (colours[0] > 0.0) & (colours[1] > 0.0)
+    exponent[known] = np.log(colours[0][known] / colours[1][known]) / np.log(532.0 / 355.0)
     levels = np.loadtxt(folder / "pressure_temperature.txt", skiprows=1)
     air = MolecularProfile.from_profile(levels[:, 1], levels[:, 2], levels[:, 3] + 273.15)
     laser = float(name) * 1e-9
-    column = AirColumn(
-        r,
-        air.backscatter(r, laser),
-        *(along(air.extinction(r, x), STEP) for x in (laser, wavelength)),
-        air.number_density(r),
-        np.ones(r.size),
-    )
-    cells = make_cells(r, 15_000.0, 60.0)
     settings = RamanSettings(
         laser, wavelength, 1.0, 0.3, 7250.0, 15_000.0, 7000.0, 1.0, 0.0, 0.0
     )  # fmt: skip
     return SimpleNamespace(
-        raman=one, elastic=other, air=column, cells=cells, settings=settings, **particles
+        name=name,
+        raman=of_raman,
+        elastic=of_elastic,
+        air=column_of(air, r, laser, wavelength, simple=True),
+        own_air=column_of(air, r, laser, wavelength, simple=False),
+        exponent=exponent,
+        cells=make_cells(r, 15_000.0, 60.0),
+        settings=settings,
+        **particles,
     )
 
 
-def retrieved(case):
+def expected(case, air):
+    """Return mean counts of both channels, in proportion to all counts from 400 m to 20 km."""
+    ratio = (case.settings.wavelength / case.settings.raman_wavelength) ** case.exponent
+    depth, of_raman = along(case.extinction, STEP), along(case.extinction * ratio, STEP)
+    raman = air.raman_shape * np.exp(-depth - of_raman)
+    elastic = air.elastic_shape * (air.backscatter + case.backscatter) * np.exp(-2.0 * depth)
+    inside = (air.range > 400.0) & (air.range < 20_000.0)
+    pairs = ((raman, case.raman), (elastic, case.elastic))
+    return [
+        mean * counts[:, inside].mean(axis=0).sum() / mean[inside].sum() for mean, counts in pairs
+    ]
+
+
+def retrieved(case, raman=None, elastic=None, air=None):
     near = np.where(case.cells.range < 375.0, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    quality = np.tile(near, (15, 1))
-    return retrieve_raman(
-        case.raman, case.elastic, case.air, case.cells, case.settings, quality=quality
-    )
+    raman = channel(case.raman) if raman is None else raman
+    elastic = channel(case.elastic) if elastic is None else elastic
+    quality = np.tile(near, (len(raman.power), 1))
+    air = case.air if air is None else air
+    return retrieve_raman(raman, elastic, air, case.cells, case.settings, quality=quality)
 
 
 def resolved(case, profile, found):
@@ -94,56 +155,140 @@ def resolved(case, profile, found):
     return np.array([mean_over(profile, STEP, case.cells.range, row) for row in length])
 
 
-def test_extinction_agrees_with_the_truth_within_stated_errors(case):
-    found, r = retrieved(case), case.cells.range
-    truth = resolved(case, case.extinction, found)
-    for low, high, most in ((350.0, 2000.0, 0.05), (2000.0, 5000.0, 0.10)):
-        inside = (r > low) & (r < high)
-        away = (found.extinction - truth)[:, inside].mean() / truth[:, inside].mean()
-        assert abs(away) <= most
-    inside = (r > 350.0) & (r < 5000.0)
-    z = ((found.extinction - truth) / found.extinction_standard_error)[:, inside]
-    assert 0.9 < np.sqrt((z**2).mean()) < 1.15
-    assert 0.92 < np.mean(np.abs(z) < 1.96) < 0.98
+def true_ratio(case, found):
+    """Return the true lidar ratio at the resolution of each value, NaN where there is no value."""
+    known = np.isfinite(found.lidar_ratio) & (case.cells.range < LAST)
+    extinction = resolved(case, case.extinction, found)
+    known &= extinction > 2e-5
+    return np.where(known, extinction, np.nan) / np.where(
+        known, resolved(case, case.backscatter, found), 1.0
+    )
 
 
-def test_backscatter_agrees_with_the_truth_within_stated_errors(case):
-    found, r = retrieved(case), case.cells.range
-    inside = (r > 350.0) & (r < 5000.0)
-    away = found.backscatter[:, inside] - case.cells.mean(case.backscatter)[inside]
-    z = away / found.backscatter_standard_error[:, inside]
+def between(case):
+    """Return the cells below and above 2 km."""
+    r = case.cells.range
+    return [(r > low) & (r < high) for low, high in ((FIRST, SECOND), (SECOND, LAST))]
+
+
+def deviations(case, found):
+    """Return mean relative deviations below and above 2 km of each quantity, in percent."""
+    extinction = resolved(case, case.extinction, found)
+    backscatter = np.tile(case.cells.mean(case.backscatter), (len(extinction), 1))
+    result = {}
+    for name, values, truth in (
+        ("extinction", found.extinction, extinction),
+        ("backscatter", found.backscatter, backscatter),
+    ):
+        result[name] = [
+            100.0 * np.nanmean((values - truth)[:, part]) / truth[:, part].mean()
+            for part in between(case)
+        ]
+    away = found.lidar_ratio / true_ratio(case, found) - 1.0
+    parts = [away[:, part][np.isfinite(away[:, part])] for part in between(case)]
+    result["lidar_ratio"] = [100.0 * part.mean() if part.size else np.nan for part in parts]
+    return result
+
+
+def normalised(case, found):
+    """Return deviations over stated errors of each quantity."""
+    inside = between(case)[0] | between(case)[1]
+    truths = {
+        "extinction": resolved(case, case.extinction, found),
+        "backscatter": case.cells.mean(case.backscatter),
+        "lidar_ratio": true_ratio(case, found),
+    }
+    for name, truth in truths.items():
+        z = (getattr(found, name) - truth) / getattr(found, f"{name}_standard_error")
+        z = z[:, inside]
+        yield name, z[np.isfinite(z)]
+
+
+def lines(case):
+    """Return extinction by lines through 11 cells, 660 m."""
+    return np.array(
+        [
+            sliding_line(signal.value, signal.variance, case.cells.step, case.settings.ratio, 11)[0]
+            for signal in (
+                cell_signal(channel(case.raman), row, case.air.raman_shape, case.cells)
+                for row in range(REALISATIONS)
+            )
+        ]
+    )
+
+
+def test_the_signals_follow_a_power_law_of_molecular_scattering(case):
+    # Twice the logarithm of the likelihood ratio, nothing fitted. With an own factor of molecular
+    # extinction for 355 nm, the best is 0.962(6); the law has 0.953, and 0.970 at 387 nm.
+    inside = (case.air.range > 400.0) & (case.air.range < 20_000.0)
+    gain = 0.0
+    for simple, own, counts in zip(
+        expected(case, case.air),
+        expected(case, case.own_air),
+        (case.raman, case.elastic),
+        strict=True,
+    ):
+        total = counts.sum(axis=0)[inside]
+        gain += 2.0 * (total * np.log(simple[inside] / own[inside])).sum()
+    assert gain > {"355": 40.0, "532": 15.0}[case.name]
+
+
+def test_means_of_the_realisations_agree_with_the_truth(case):
+    found = deviations(case, retrieved(case))
+    limits = {"extinction": (5.0, 10.0), "backscatter": (3.0, 3.0), "lidar_ratio": (10.0, 10.0)}
+    for name, most in limits.items():
+        assert np.all(np.abs(found[name]) <= most), name
+        np.testing.assert_allclose(found[name], FIGURES[case.name][name], atol=0.06, err_msg=name)
+
+
+def test_single_realisations_are_right_within_their_errors(case):
+    found = retrieved(case)
     # At 532 nm no window of one realisation passes.
-    assert np.isfinite(z).all(axis=1).sum() >= 14
-    z = z[np.isfinite(z)]
-    assert 0.9 < np.sqrt((z**2).mean()) < 1.15
-    assert 0.90 < np.mean(np.abs(z) < 1.96) < 0.98
-    # Calibration by few counts: 5 and 3 % of backscatter are one error of the mean of 15.
-    assert abs(np.nanmean(away)) < 0.05 * case.backscatter[23:333].mean()
+    assert np.isfinite(found.backscatter).any(axis=1).sum() >= REALISATIONS - 1
+    assert np.isfinite(true_ratio(case, found)).sum() > 250
+    for (name, z), covered in zip(normalised(case, found), COVERED[case.name], strict=True):
+        assert 0.9 < np.sqrt((z**2).mean()) < 1.15, name
+        assert np.mean(np.abs(z) < 1.96) == pytest.approx(covered, abs=6e-4), name
 
 
-def test_lidar_ratio_agrees_with_the_truth_within_stated_errors(case):
-    found, r = retrieved(case), case.cells.range
-    known = np.isfinite(found.lidar_ratio) & (r < 5000.0)
-    truth = resolved(case, case.extinction, found)
-    truth /= np.where(known, resolved(case, case.backscatter, found), 1.0)
-    assert known.sum() > 150
-    z = ((found.lidar_ratio - truth) / found.lidar_ratio_standard_error)[known]
-    assert np.sqrt((z**2).mean()) < 1.15
-    assert np.mean(np.abs(z) < 1.96) > 0.92
+def test_cross_sections_of_lidarops_leave_their_difference(case):
+    found = deviations(case, retrieved(case, air=case.own_air))
+    name, away = {
+        "355": ("extinction", (-1.7, -9.1)), "532": ("backscatter", (-3.8, -2.2)),
+    }[case.name]  # fmt: skip
+    np.testing.assert_allclose(found[name], away, atol=0.06)
+
+
+@pytest.mark.slow
+def test_other_realisations_have_no_bias(case):
+    rng = np.random.default_rng(1)
+    signals = [
+        channel(rng.poisson(mean, (300, mean.size)).astype(float), mean)
+        for mean in expected(case, case.air)
+    ]
+    found = retrieved(case, *signals)
+    # 15 realisations scatter four times as much.
+    for name, most in (("extinction", 2.0), ("backscatter", 3.0)):
+        assert np.all(np.abs(deviations(case, found)[name]) < most), name
+    assert abs(deviations(case, found)["lidar_ratio"][0]) < 3.0
+    for name, z in normalised(case, found):
+        assert 0.91 < np.mean(np.abs(z) < 1.96) < 0.97, name
+    z = (found.backscatter - case.cells.mean(case.backscatter)) / found.backscatter_standard_error
+    z = z[:, between(case)[0] | between(case)[1]].reshape(20, REALISATIONS, -1)
+    covered = [np.mean(np.abs(one[np.isfinite(one)]) < 1.96) for one in z]
+    assert np.mean(np.array(covered) < 0.92) < 0.3
 
 
 def test_lines_of_a_fixed_length_scatter_more_for_the_same_structure(case):
-    found, r = retrieved(case), case.cells.range
-    inside = (r > 2000.0) & (r < 5000.0)
-    lines = [
-        sliding_line(signal.value, signal.variance, case.cells.step, case.settings.ratio, 11)[0]
-        for signal in (
-            cell_signal(case.raman, row, case.air.raman_shape, case.cells) for row in range(15)
-        )
-    ]
-    truth = case.cells.mean(case.extinction)[inside]
-    smooth, line = (
-        np.sqrt(np.mean((values[:, inside] - truth) ** 2))
-        for values in (found.extinction, np.array(lines))
+    found, line = retrieved(case), lines(case)
+    truth = case.cells.mean(case.extinction)
+    # Lines that begin beyond partial overlap.
+    whole = case.cells.range > 375.0 + 330.0
+    parts = [part & whole for part in between(case)]
+    away = [100.0 * (line[:, part] - truth[part]).mean() / truth[part].mean() for part in parts]
+    np.testing.assert_allclose(away, FIGURES[case.name]["line"], atol=0.06)
+    smooth, of_line = (
+        np.sqrt(np.mean((values[:, parts[1]] - truth[parts[1]]) ** 2))
+        for values in (found.extinction, line)
     )
-    assert smooth < 0.5 * line
+    assert of_line / smooth == pytest.approx({"355": 2.4, "532": 2.9}[case.name], abs=0.06)

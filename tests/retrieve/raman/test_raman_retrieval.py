@@ -41,7 +41,8 @@ def test_values_without_noise_are_exact(sky):
     found = retrieved(sky)
     near = (R > 600.0) & (R < 5000.0)
     np.testing.assert_allclose(found.backscatter[0, near], HAZE[near] / 50.0, rtol=1e-3)
-    np.testing.assert_allclose(found.lidar_ratio[0, near], 50.0, rtol=2e-3)
+    # The mean of the posterior of a reciprocal is less by its relative variance.
+    np.testing.assert_allclose(found.lidar_ratio[0, near], 50.0, rtol=3e-3)
     assert np.all(found.quality[0, near] == 0)
 
 
