@@ -25,6 +25,17 @@ def site(
         Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
     ],
     workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
+    products_at: Annotated[
+        str,
+        typer.Option(
+            help="Where downloads lead: an address, or a place relative to the site, such as .. for"
+            " a site that is published beside the products."
+        ),
+    ] = "../products",
+    copies: Annotated[
+        bool,
+        typer.Option("--copies", help="Copy the products into the site, to serve it alone."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a static site of all products: calendar, figures, flags, provenance, downloads.
@@ -33,11 +44,15 @@ def site(
     Exit code 1 if a product cannot be shown completely.
 
     Example: lidarops site demo --workers 2
+
+    Example: lidarops site demo --products-at https://example.org/lidar/products
     """
     from lidarops.site.build import build_site
 
     with progress_bar("site", None) as bar:
-        made = build_site(out, workers=workers, progress=bar.advance)
+        made = build_site(
+            out, workers=workers, products_at=products_at, copies=copies, progress=bar.advance
+        )
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:

@@ -64,7 +64,7 @@ def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None
         The first that varies with time of: the preferred variables of all kinds, variables with a
         standard error, floating-point variables. None without any.
     """
-    name = _main_name(product)
+    name = main_name(product)
     if name is None:
         return None
     step = max(1, -(-product[name].nbytes // _BULK))
@@ -92,7 +92,8 @@ def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None
     return MainVariable(name, str(variable.attrs.get("long_name", name)), series, table.shape[1])
 
 
-def _main_name(product: xr.Dataset) -> str | None:
+def main_name(product: xr.Dataset) -> str | None:
+    """Return the name of the main variable of a product; None without a variable over time."""
     if "time" not in product.variables or product["time"].dtype.kind != "M":
         return None
     over_time = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -33,28 +34,48 @@ _HEIGHT: Final = 306
 """Height of a panel in units of the figure, and of its image in pixels."""
 _BEYOND: Final = 1.2
 """A signal is shown to this many times its reach."""
+_HALF: Final = 0.5
+"""Share of the filled time that was measured, below which the words state it."""
+_NO_TIME: Final = np.timedelta64(0, "ns")
 _UPRIGHT: Final = 0.05
 """Change of altitude with range, below which altitude is no useful axis."""
 
 
-def image_figure(rasters: Sequence[Raster], what: str, along: str) -> Figure:
+@dataclass(frozen=True, slots=True)
+class ImageQuantity:
+    """A quantity as an image shows it."""
+
+    name: str
+    """In words."""
+    factor: float = 1.0
+    """From the unit of the product to the displayed unit."""
+    units: str = ""
+    """Displayed unit; empty for that of the product."""
+    limits: tuple[float, float] | None = None
+    """Ends of the colour scale in the displayed unit, the same in all products, so that their
+    images can be compared; None for those of the data, where a scale has no absolute meaning."""
+    background: bool = True
+    """Whether the background is drawn below."""
+
+
+def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str) -> Figure:
     """Return a quantity against time and `along`, ``range`` or ``altitude``.
 
     Parameters
     ----------
     rasters : sequence of Raster
         At least one, of one instrument and channel.
-    what : str
-        Name of the quantity.
+    quantity : ImageQuantity
     along : str
 
     Returns
     -------
     Figure
-        Block means on a logarithmic colour scale, up to the range where noise dominates. Rejected
-        bins are striped, gaps empty, triangles mark the lowest cloud bases.
+        Block means on a logarithmic colour scale, up to the range where noise dominates. Means at
+        or below zero are grey, rejected bins striped, times without measurement empty; triangles
+        mark the lowest cloud bases.
     """
-    axis = time_axis(np.unique(np.concatenate([raster.middle for raster in rasters])))
+    axis = _time_axis(rasters)
     x = time_panel_axis(axis)
     full = max(float(raster.edges[-1]) for raster in rasters)
     reach = max(raster.reach for raster in rasters)
@@ -62,12 +83,13 @@ def image_figure(rasters: Sequence[Raster], what: str, along: str) -> Figure:
     shown = [raster.shown_to(far) for raster in rasters]
     near = min(float(raster.edges[0]) for raster in shown)
     far = max(float(raster.edges[-1]) for raster in shown)
-    ends = colour_limits(np.concatenate([r.mean[~r.flagged] for r in shown], axis=None))
+    values = quantity.factor * np.concatenate([r.mean[~r.flagged] for r in shown], axis=None)
+    ends = quantity.limits or colour_limits(values)
     image = np.full((_HEIGHT, COLUMNS), pixels.BLANK, dtype=np.uint8)
     for raster in shown:
-        _fill(image, raster, axis, (near, far), ends)
+        _fill(image, raster, axis, (near, far), quantity.factor, ends)
     y = Axis(f"{along} (km)", near / 1e3, far / 1e3)
-    label = f"{what} ({units(rasters[0].units)})"
+    label = f"{quantity.name} ({quantity.units or units(rasters[0].units)})"
     main = Panel(
         x,
         y,
@@ -75,13 +97,23 @@ def image_figure(rasters: Sequence[Raster], what: str, along: str) -> Figure:
         height=_HEIGHT,
         right=_altitude(rasters, y),
         bar=Axis(label, *ends, log=True) if ends else None,
-        note="" if ends else "no usable value above zero",
+        note="" if (values > 0).any() else "no usable value above zero",
     )
-    lower = _background(rasters, x, axis)
+    lower = _background(rasters, x, axis) if quantity.background else ()
     below = ", with the background below" if lower else ""
-    caption = f"{what[:1].upper()}{what[1:]} against time and {along}{below}"
+    caption = f"{quantity.name[:1].upper()}{quantity.name[1:]} against time and {along}{below}"
     words = _in_words(rasters, shown, reach, ends, along)
     return Figure(caption, words, (main, *lower))
+
+
+def _time_axis(rasters: Sequence[Raster]) -> TimeAxis:
+    """Return the axis from the start of the first profile to the end of the last."""
+    start, stop = (
+        np.concatenate([getattr(raster, edge) for raster in rasters]) for edge in ("start", "stop")
+    )
+    order = np.argsort(start, kind="stable")
+    start, stop = start[order], stop[order]
+    return time_axis(start + (stop - start) / 2, (start, stop))
 
 
 def _fill(
@@ -89,32 +121,44 @@ def _fill(
     raster: Raster,
     axis: TimeAxis,
     span: tuple[float, float],
+    factor: float,
     ends: tuple[float, float] | None,
 ) -> None:
     """Fill the pixels that lie in a raster; the first row of the image is the farthest."""
     height, width = image.shape
-    first, last = axis.limits
-    x = first + (np.arange(width) + 0.5) / width * (last - first)
     along = span[1] - (np.arange(height) + 0.5) / height * (span[1] - span[0])
-    left, right = axis.x(raster.start), axis.x(raster.stop)
-    column = np.searchsorted(left, x, side="right") - 1
+    column = _columns(raster, axis, width)
     row = np.searchsorted(raster.edges, along, side="right") - 1
-    across = np.flatnonzero((column >= 0) & (x <= right[column]))
+    across = np.flatnonzero(column >= 0)
     up = np.flatnonzero((row >= 0) & (row < raster.edges.size - 1))
-    mean = raster.mean
+    mean = factor * raster.mean
     if ends is None:
         shares = np.full(mean.shape, np.nan)
     else:
-        # On the logarithmic scale, means at or below zero take the lowest colour.
         low, high = ends
         shares = np.log(np.clip(mean, low, high) / low) / np.log(high / low)
-    blocks = np.where(raster.flagged, pixels.REJECTED, pixels.steps(shares)).astype(np.uint8)
+    blocks = np.where(mean <= 0.0, pixels.NEGATIVE, pixels.steps(shares))
+    blocks = np.where(raster.flagged, pixels.REJECTED, blocks).astype(np.uint8)
     image[np.ix_(up, across)] = blocks[np.ix_(column[across], row[up])].T
+
+
+def _columns(raster: Raster, axis: TimeAxis, width: int) -> NDArray[np.intp]:
+    """Return the column of a raster at each pixel, -1 for none; a column has at least a pixel."""
+    first, last = axis.limits
+    left, right = (
+        np.rint((axis.x(edge) - first) / (last - first) * width).astype(np.intp)
+        for edge in (raster.start, raster.stop)
+    )
+    left = np.minimum(left, width - 1)
+    column = np.full(width, -1, dtype=np.intp)
+    for place, (start, stop) in enumerate(zip(left, np.maximum(right, left + 1), strict=True)):
+        column[start:stop] = place
+    return column
 
 
 def _clouds(rasters: Sequence[Raster], axis: TimeAxis) -> list[Curve]:
     base = np.concatenate([raster.clouds for raster in rasters]) / 1e3
-    time = np.concatenate([raster.middle for raster in rasters])
+    time = np.concatenate([raster.time for raster in rasters])
     if not np.isfinite(base).any():
         return []
     label = "base of the lowest cloud or dense layer"
@@ -131,7 +175,7 @@ def _altitude(rasters: Sequence[Raster], y: Axis) -> Axis | None:
 
 
 def _background(rasters: Sequence[Raster], x: Axis, axis: TimeAxis) -> tuple[Panel, ...]:
-    time = np.concatenate([raster.middle for raster in rasters])
+    time = np.concatenate([raster.time for raster in rasters])
     order = np.argsort(time, kind="stable")
     level = np.concatenate([raster.background for raster in rasters])[order]
     error = np.concatenate([raster.background_error for raster in rasters])[order]
@@ -153,7 +197,13 @@ def _in_words(
     if reach > 0:
         words.append(f"noise dominates beyond {reach / 1e3:.3g} km")
     if ends:
-        words.append(f"colour scale from {number(ends[0])} to {number(ends[1])}")
+        words.append(
+            f"colour scale from {number(ends[0])} to {number(ends[1])}, grey at or below 0"
+        )
+    measured = sum((raster.profiles.sum() * raster.length for raster in rasters), _NO_TIME)
+    drawn = sum(((raster.stop - raster.start).sum() for raster in rasters), _NO_TIME)
+    if measured < _HALF * drawn:
+        words.append(f"measured in {percent(float(measured / drawn))} of the time that is filled")
     bits = sorted({bit for raster in rasters for bit in raster.bits})
     names = {
         severity: ", ".join(

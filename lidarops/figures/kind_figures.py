@@ -13,10 +13,11 @@ from typing import Any, Generic, TypeVar
 
 import xarray as xr
 
-from lidarops.figures.image_panels import image_figure
+from lidarops.figures.image_panels import ImageQuantity, image_figure
 from lidarops.figures.panels import Figure
 from lidarops.figures.raster import Raster
 from lidarops.figures.series_data import Comparison
+from lidarops.figures.series_panels import Quantity
 from lidarops.kinds import kinds
 from lidarops.records import SceneOutcome
 
@@ -66,16 +67,19 @@ class KindFigures:
     """The first figure of the first view is the thumbnail of a product."""
     preferred: str
     """Variable for an overview of any product that has it."""
+    values: tuple[Quantity, ...] = ()
+    """Quantities of tables of values, in the units of the figures, the main one first; the main
+    variable where there are none."""
 
 
 def image_view(
     name: str,
     variables: tuple[str, ...],
     read: Callable[..., Raster],
-    what: str,
+    quantity: ImageQuantity,
     along: str = "range",
 ) -> View[Raster]:
-    """Return the view of a quantity, named `what`, against time and range or altitude.
+    """Return the view of a quantity against time and range or altitude.
 
     `read` is called with a product and ``profiles``, the profiles per column.
     """
@@ -83,7 +87,7 @@ def image_view(
         name,
         variables,
         partial(_read_raster, read),
-        lambda rasters: [image_figure(rasters, what, along)],
+        lambda rasters: [image_figure(rasters, quantity, along)],
         image=True,
     )
 

@@ -120,6 +120,8 @@ class Panel:
     title: str = ""
     note: str = ""
     """Why the panel is empty."""
+    to_scale: bool = False
+    """Whether both axes have one scale, so that the height follows the width."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,11 @@ BLANK: Final = 0
 """Pixel without data, transparent."""
 REJECTED: Final = 1
 """Dark stripes over rejected blocks; light stripes are the next value."""
-_COLOURS: Final = 253
+NEGATIVE: Final = 3
+"""A usable block at or below zero, which a logarithmic scale cannot show: grey."""
+_FIRST: Final = 4
+"""Pixel of the low end of the colour scale."""
+_COLOURS: Final = 252
 """Steps of the colour scale."""
 _STRIPE: Final = 5
 """Width of a stripe, pixels."""
@@ -34,13 +38,13 @@ _ANCHORS: Final = {
 def steps(shares: Floats) -> NDArray[np.uint8]:
     """Return the pixels of shares of the colour scale, 0 to 1; blank for NaN."""
     inside = np.clip(np.nan_to_num(shares), 0.0, 1.0)
-    level = 3 + np.rint(inside * (_COLOURS - 1)).astype(np.uint8)
+    level = _FIRST + np.rint(inside * (_COLOURS - 1)).astype(np.uint8)
     return np.where(np.isfinite(shares), level, BLANK).astype(np.uint8)
 
 
 def ramp() -> NDArray[np.uint8]:
     """Return the colour scale as an image, shape (row, 1)."""
-    return np.arange(_COLOURS + 2, 2, -1, dtype=np.uint8)[:, None]
+    return np.arange(_FIRST + _COLOURS - 1, _FIRST - 1, -1, dtype=np.uint8)[:, None]
 
 
 def striped(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -56,7 +60,7 @@ def png(pixels: NDArray[np.uint8], palette: Palette) -> bytes:
     Parameters
     ----------
     pixels : ndarray of uint8, shape (row, column)
-        `BLANK`, `REJECTED`, `REJECTED` + 1, or of `steps`.
+        `BLANK`, `REJECTED`, `REJECTED` + 1, `NEGATIVE`, or of `steps`.
     palette : Palette
     """
     height, width = pixels.shape
@@ -85,5 +89,5 @@ def _colours(palette: Palette) -> bytes:
     anchors = np.array([list(bytes.fromhex(word)) for word in _ANCHORS[palette].split()], float)
     places = np.linspace(0.0, len(anchors) - 1.0, _COLOURS)
     scale = [np.interp(places, np.arange(len(anchors)), anchors[:, c]) for c in range(3)]
-    special = np.array([[0, 0, 0], [20, 20, 20], [170, 174, 180]], dtype=np.uint8)
+    special = np.array([[0, 0, 0], [20, 20, 20], [170, 174, 180], [128, 128, 128]], dtype=np.uint8)
     return np.concatenate([special, np.rint(np.stack(scale, -1)).astype(np.uint8)]).tobytes()

@@ -28,12 +28,19 @@ COLUMNS: Final = 780
 ROWS: Final = 200
 """Most rows of an image."""
 _ALONG_TIME: Final = ("time", "background", "background_standard_error")
+TIME_BOUNDS: Final = "time_bnds"
+_TOUCHING: Final = 10.0
+"""Columns touch across a pause of at most this many of their profiles: one minute measured in ten
+is shown as one area, but not five seconds in an hour."""
 _READ_ROWS: Final = 4096
 """Most rows while reading, because the range to show is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
 """Most bytes of one variable in memory."""
 _VISIBLE: Final = 1.0
 """The reach of a signal ends where its median falls below this many standard errors."""
+_SOMETIMES: Final = 90.0, 3.0
+"""It also goes on where this percentile over time exceeds this many, as in a cloud that passes; of
+noise alone it is 1.3."""
 _DECADES: Final = 4.0
 """Most decades of a colour scale."""
 
@@ -49,6 +56,8 @@ class Raster:
     """(column,) Start of each column, UTC."""
     stop: Times
     """(column,) End of each column."""
+    time: Times
+    """(column,) Mean time of its profiles; columns that touch reach farther than their profiles."""
     edges: Floats
     """(row + 1,) Edges of the rows along range, m."""
     total: Sums
@@ -65,6 +74,8 @@ class Raster:
     """(row,) Number of bins along range in a row."""
     profiles: NDArray[np.int64]
     """(column,) Number of profiles in a column."""
+    length: np.timedelta64
+    """Usual length of a profile."""
     background: Floats
     """(column,) Mean background."""
     background_error: Floats
@@ -77,11 +88,6 @@ class Raster:
     """All bits that any bin carries."""
     altitude: tuple[float, float] | None
     """Altitude at range 0 in m, and its change per m of range; None if unknown."""
-
-    @property
-    def middle(self) -> Times:
-        """(column,) Middle of each column, UTC."""
-        return np.asarray(self.start + (self.stop - self.start) / 2)
 
     @property
     def mean(self) -> Floats:
@@ -101,9 +107,13 @@ class Raster:
             ratio = np.where(self.used > 0, self.total / np.sqrt(self.variance), 0.0)
         ratio = np.where(np.isfinite(ratio), ratio, 0.0)
         width = min(25, ratio.shape[1])
+        often, many = _SOMETIMES
         # Smoothed along range, so that a single noisy row does not count as signal.
-        smooth = np.convolve(np.median(ratio, axis=0), np.full(width, 1.0 / width), mode="same")
-        rows = np.flatnonzero(smooth > _VISIBLE)
+        usual, best = (
+            np.convolve(level, np.full(width, 1.0 / width), mode="same")
+            for level in np.percentile(ratio, [50.0, often], axis=0)
+        )
+        rows = np.flatnonzero((usual > _VISIBLE) | (best > many))
         return float(self.edges[rows[-1] + 1]) if rows.size else 0.0
 
     def shown_to(self, far: float) -> Raster:
@@ -127,7 +137,8 @@ class Raster:
 
 def raster_variables(quantity: str) -> tuple[str, ...]:
     """Return the variables that `read_raster` reads, including optional ones."""
-    return (*_ALONG_TIME, "range", *_along_both(quantity), "cloud_base_range", "altitude")
+    optional = (TIME_BOUNDS, "cloud_base_range", "altitude")
+    return (*_ALONG_TIME, "range", *_along_both(quantity), *optional)
 
 
 def _along_both(quantity: str) -> tuple[str, ...]:
@@ -171,10 +182,12 @@ def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int 
     flags = flags_of(kind)
     blocks = list(_reduced(product, quantity, flags, columns, rows))
     background, background_error = _background(product, columns)
-    start, stop = _column_edges(time, columns)
+    starts, stops = profile_bounds(product)
+    start, stop = column_edges(starts, stops, columns)
     return Raster(
         start=start,
         stop=stop,
+        time=_mean_time(starts + (stops - starts) / 2, columns),
         edges=bin_edges(ranges)[[*rows, ranges.size]],
         total=np.concatenate([block.total for block in blocks]),
         variance=np.concatenate([block.variance for block in blocks]),
@@ -183,6 +196,7 @@ def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int 
         with_care=sum(block.with_care for block in blocks),
         bins=np.diff([*rows, ranges.size]).astype(np.float64),
         profiles=np.diff([*columns, time.size]),
+        length=np.median(stops - starts),
         background=background,
         background_error=background_error,
         clouds=_clouds(product, columns),
@@ -255,6 +269,14 @@ def _sums(
     )
 
 
+def _mean_time(time: Times, columns: NDArray[np.intp]) -> Times:
+    since = (time - time[0]).astype("timedelta64[ns]").astype(np.int64)
+    count = np.diff([*columns, time.size])
+    return np.asarray(
+        time[0] + (np.add.reduceat(since, columns) // count).astype("timedelta64[ns]")
+    )
+
+
 def _background(product: xr.Dataset, columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
     value = product["background"].values.astype(np.float64)
     error = product["background_standard_error"].values.astype(np.float64)
@@ -275,17 +297,26 @@ def _clouds(product: xr.Dataset, columns: NDArray[np.intp]) -> Floats:
     return np.where(np.isfinite(lowest), lowest, np.nan)
 
 
-def _column_edges(time: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]:
-    """Return edges at which neighbouring columns touch; before a gap a column keeps its width."""
-    half = usual_step(time) / 2
-    last = np.append(columns[1:], time.size) - 1
-    start, stop = time[columns] - half, time[last] + half
-    touching = np.zeros(columns.size, dtype=bool)
-    touching[1:] = time[columns[1:]] - time[columns[1:] - 1] <= 5 * half
-    where = np.flatnonzero(touching)
-    middle = stop[where - 1] + (start[where] - stop[where - 1]) / 2
-    start[where], stop[where - 1] = middle, middle
-    return start, stop
+def profile_bounds(product: xr.Dataset) -> tuple[Times, Times]:
+    """Return start and end of each profile; without bounds half the usual step around its time."""
+    if TIME_BOUNDS in product.variables:
+        bounds = product[TIME_BOUNDS].values.astype("datetime64[ns]")
+        return bounds[:, 0], bounds[:, 1]
+    time = product["time"].values.astype("datetime64[ns]")
+    half = usual_step(np.sort(time)) / 2
+    return np.asarray(time - half), np.asarray(time + half)
+
+
+def column_edges(start: Times, stop: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]:
+    """Return the edges of columns; they touch where the pause between them is short."""
+    last = np.append(columns[1:], start.size) - 1
+    left, right = start[columns], stop[last]
+    length = np.median(stop - start)
+    pause = left[1:] - right[:-1]
+    touching = np.flatnonzero(np.abs(pause) <= _TOUCHING * length)
+    middle = right[touching] + pause[touching] / 2
+    left[touching + 1], right[touching] = middle, middle
+    return left, right
 
 
 def bin_edges(middles: Floats) -> Floats:
@@ -318,10 +349,20 @@ def share_with_care(rasters: Sequence[Raster]) -> float:
 
 
 def colour_limits(values: Floats) -> tuple[float, float] | None:
-    """Return the ends of a logarithmic colour scale for `values`; None if none is positive."""
+    """Return round ends of a logarithmic colour scale for `values`; None if none is positive."""
     positive = values[np.isfinite(values) & (values > 0)]
     if positive.size == 0:
         return None
     low, high = (float(level) for level in np.percentile(positive, [2.0, 99.8]))
-    low = max(low, high * 10.0**-_DECADES)
-    return low, max(high, 1.05 * low)
+    high = _round(max(high, 1.05 * low), up=True)
+    return _round(max(low, high * 10.0**-_DECADES), up=False), high
+
+
+def _round(value: float, *, up: bool) -> float:
+    """Return the next 1, 2 or 5 times a power of ten that is not below, or not above, a value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    rounded = [float(power * step) for step in (1.0, 2.0, 5.0, 10.0)]
+    # A value that is round already stays, also where its power is off by a rounding error.
+    if up:
+        return next(step for step in rounded if step >= value * (1.0 - 1e-9))
+    return next(step for step in rounded[::-1] if step <= value * (1.0 + 1e-9))

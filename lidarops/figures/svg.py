@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -37,6 +37,8 @@ Floats = NDArray[np.float64]
 
 WIDTH: Final = 960
 """Width of a figure in its own units."""
+NARROW: Final = 460
+"""Width of a figure for a telephone, whose letters are then of about the size of text."""
 THUMB: Final = (240, 84)
 """Width and height of a thumbnail."""
 _LEFT: Final = 74
@@ -50,6 +52,10 @@ _RIGHT: Final = 62
 """Space for an axis at the right."""
 _BETWEEN: Final = 72
 """Space between panels side by side, for the labels of an axis."""
+_LOWER: Final = 0.6
+"""Height of panels that are below each other in a narrow figure, but side by side in a wide one."""
+_TICK: Final = 16
+"""Least space between the labels of ticks along the horizontal axis of a narrow figure."""
 _FEW: Final = 150
 """Most points of a curve in a thumbnail."""
 
@@ -115,19 +121,25 @@ class _Box:
 
 
 def inline(figure: Figure) -> Markup:
-    """Return a figure as markup for a page whose style includes `style`."""
-    content, height = _content(figure)
+    """Return a figure as markup for a page whose style includes `style`, wide and narrow.
+
+    The style shows the one that suits the width of the window.
+    """
     alt = escape(visible(figure.text))
-    return Markup(  # noqa: S704 - `_text` escapes every text of the content
-        f'<svg class="fig" viewBox="0 0 {WIDTH} {height:.0f}" role="img" aria-label="{alt}">'
-        f"{content}</svg>"
-    )
+    parts = []
+    for css, width in (("wide", WIDTH), ("narrow", NARROW)):
+        content, height = _content(figure, width)
+        parts.append(
+            f'<svg class="fig {css}" viewBox="0 0 {width} {height:.0f}" role="img"'
+            f' aria-label="{alt}">{content}</svg>'
+        )
+    return Markup("".join(parts))  # noqa: S704 - `_text` escapes every text of the content
 
 
-def file(figure: Figure) -> bytes:
+def file(figure: Figure, width: int = WIDTH) -> bytes:
     """Return a figure as an SVG file."""
-    content, height = _content(figure)
-    return _file(f"<title>{escape(visible(figure.text))}</title>{content}", WIDTH, height)
+    content, height = _content(figure, width)
+    return _file(f"<title>{escape(visible(figure.text))}</title>{content}", width, height)
 
 
 def thumbnail(figure: Figure | None, words: str = "") -> bytes:
@@ -171,9 +183,25 @@ def _file(content: str, width: float, height: float, aspect: str = "") -> bytes:
     ).encode()
 
 
-def _content(figure: Figure) -> tuple[str, float]:
-    boxes = list(_beside(figure.panels) if figure.beside else _stacked(figure.panels))
+def _content(figure: Figure, width: int) -> tuple[str, float]:
+    panels, beside = figure.panels, figure.beside
+    if width < WIDTH:
+        beside, lower = False, _LOWER if figure.beside else 1.0
+        panels = tuple(_narrowed(panel, width, lower) for panel in panels)
+    boxes = list(_beside(panels, width) if beside else _stacked(panels, width))
     return "".join(map(_panel, boxes)), max(box.foot + _below(box) for box in boxes)
+
+
+def _narrowed(panel: Panel, width: int, lower: float) -> Panel:
+    """Return a panel without its second axis, and with half of the pixels of images."""
+    if panel.to_scale:
+        left, right = _margins([panel])
+        lower = (width - left - right) / (WIDTH - left - right)
+    layers = tuple(
+        Image(layer.pixels[:, ::2], layer.palette) if isinstance(layer, Image) else layer
+        for layer in panel.layers
+    )
+    return replace(panel, layers=layers, right=None, height=lower * panel.height)
 
 
 # Layout --------------------------------------------------------------------------------------
@@ -187,9 +215,9 @@ def _margins(panels: Sequence[Panel]) -> tuple[float, float]:
     return left, right or 18
 
 
-def _stacked(panels: Sequence[Panel]) -> Iterator[_Box]:
+def _stacked(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
     left, right = _margins(panels)
-    width = WIDTH - left - right
+    width = whole - left - right
     y = 0.0
     for place, (panel, legend) in enumerate(zip(panels, _legends(panels), strict=True), 1):
         labelled = place == len(panels) or panels[place].x is not panel.x
@@ -199,9 +227,9 @@ def _stacked(panels: Sequence[Panel]) -> Iterator[_Box]:
         y = box.foot + _below(box)
 
 
-def _beside(panels: Sequence[Panel]) -> Iterator[_Box]:
+def _beside(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
     left, right = _margins(panels)
-    width = (WIDTH - left - right - _BETWEEN * (len(panels) - 1)) / len(panels)
+    width = (whole - left - right - _BETWEEN * (len(panels) - 1)) / len(panels)
     legends = list(_legends(panels))
     top = max(_above(panel, legend, width) for panel, legend in zip(panels, legends, strict=True))
     for place, (panel, legend) in enumerate(zip(panels, legends, strict=True)):
@@ -239,7 +267,7 @@ def _panel(box: _Box) -> str:
         grid += f"M{box.left:.1f} {y:.1f}h{box.width:.1f}"
         edge += f"M{box.left:.1f} {y:.1f}h-4"
         words.append(_text(box.left - 9, y + 4, label, "e"))
-    for x, label in box.x.ticks(max(2, round(box.width / 110))):
+    for x, label in _spaced(box.x.ticks(max(2, round(box.width / 110)))):
         grid += f"M{x:.1f} {box.top:.1f}v{height:.1f}"
         edge += f"M{x:.1f} {box.foot:.1f}v4"
         for row, line in enumerate(label.split("\n") if box.labelled else ()):
@@ -265,6 +293,22 @@ def _panel(box: _Box) -> str:
         f'{"".join(layers)}</svg><path class="axis" d="{edge}"/>'
         f"{''.join(words)}{_sides(box)}{_legend(box)}"
     )
+
+
+def _spaced(ticks: Sequence[tuple[float, str]]) -> Sequence[tuple[float, str]]:
+    """Return every tick, or every second, third, ... so that their labels do not touch."""
+    for every in range(1, len(ticks)):
+        kept = ticks[::every]
+        if all(
+            after[0] - before[0] >= _half_width(before[1]) + _half_width(after[1]) + _TICK / 2
+            for before, after in pairwise(kept)
+        ):
+            return kept
+    return ticks[:1]
+
+
+def _half_width(label: str) -> float:
+    return 0.5 * _LETTER * max(map(len, label.split("\n")))
 
 
 def _sides(box: _Box) -> str:
@@ -331,7 +375,7 @@ def _round_ticks(axis: Axis, at_most: int) -> list[tuple[float, str]]:
     """Return round values and their labels, with equal decimals on a linear axis."""
     if axis.log:
         return [(tick, number(tick)) for tick in _decades(axis.low, axis.high)]
-    ticks = _round_steps(min(axis.low, axis.high), max(axis.low, axis.high), at_most)
+    ticks = round_steps(min(axis.low, axis.high), max(axis.low, axis.high), at_most)
     words = [number(tick) for tick in ticks]
     if not any("\N{MULTIPLICATION SIGN}" in text for text in words):
         decimals = max((len(text.partition(".")[2]) for text in words), default=0)
@@ -339,7 +383,7 @@ def _round_ticks(axis: Axis, at_most: int) -> list[tuple[float, str]]:
     return list(zip(ticks, words, strict=True))
 
 
-def _round_steps(low: float, high: float, at_most: int) -> list[float]:
+def round_steps(low: float, high: float, at_most: int) -> list[float]:
     """Return multiples of 1, 2, 2.5 or 5 times a power of ten between two values."""
     rough = (high - low) / at_most
     power = 10.0 ** np.floor(np.log10(rough))

@@ -126,18 +126,23 @@ def usual_step(time: Times) -> np.timedelta64:
     return np.timedelta64(int(np.median(steps)) if steps.size else 60_000_000_000, "ns")
 
 
-def time_axis(time: Times) -> TimeAxis:
+def time_axis(time: Times, bounds: tuple[Times, Times] | None = None) -> TimeAxis:
     """Lay out an axis for sorted times; gaps are cut out if they take most of the span.
 
     Parameters
     ----------
     time : ndarray of datetime64, shape (n,)
         Middles of profiles, rising; at least one.
+    bounds : tuple of ndarray, optional
+        Start and end of each profile; by default half the usual step around it.
     """
     half = usual_step(time) / 2
+    start, stop = bounds or (time - half, time + half)
     stretches = segments(time)
-    starts = np.asarray(time[[s.start for s in stretches]] - half)
-    stops = np.asarray(time[[s.stop - 1 for s in stretches]] + half)
+    starts = np.asarray(start[[s.start for s in stretches]])
+    stops = np.asarray([stop[s].max() for s in stretches])
+    # A single profile without a length still needs a place.
+    stops = np.where(stops > starts, stops, starts + 2 * half)
     spans = (stops - starts) / _DAY
     if spans.sum() >= _SPARSE * ((stops[-1] - starts[0]) / _DAY):
         whole = (stops[-1] - starts[0]) / _DAY

@@ -29,6 +29,8 @@ from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
+NARROW: Final = "narrow"
+"""Folder of the report with the same figures for a narrow place, which a page shows first."""
 _FLAG_ROWS: Final = 40
 
 
@@ -37,9 +39,11 @@ class Picture:
     """A figure of the report."""
 
     file: str
-    """File name in the report folder."""
+    """File name in the report folder, and in its folder `NARROW`."""
     instrument: str
     caption: str
+    words: str
+    """Description, with channel and number of scenes."""
     alt: str
 
 
@@ -92,6 +96,8 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
                 for drawn in view.draw(contents) if contents and not full else ():
                     file = _unique(f"{view.name}_{group.instrument}_{group.channel}", taken)
                     write_atomically(folder / file, svg.file(drawn))
+                    (folder / NARROW).mkdir(exist_ok=True)
+                    write_atomically(folder / NARROW / file, svg.file(drawn, svg.NARROW))
                     gallery.pictures.append(_picture(file, drawn, group))
     return gallery
 
@@ -104,8 +110,8 @@ def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterato
 
 def _picture(file: str, drawn: Figure, group: Group) -> Picture:
     scenes = counted(len(group.members), "scene")
-    words = f"{group.label}; {scenes}. {drawn.words}."
-    return Picture(file, group.instrument, f"{drawn.caption}: {words}", drawn.text)
+    words = f"{scenes}. {drawn.words}."
+    return Picture(file, group.instrument, f"{drawn.caption}: {group.label}", words, drawn.text)
 
 
 def missing_products(record: RunRecord) -> frozenset[str]:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
@@ -18,6 +18,7 @@ from lidarops.errors import CatalogError
 from lidarops.figures.wording import duration, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
+from lidarops.reports.difference import difference
 from lidarops.reports.findings import finding_rows, lacking
 from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME
@@ -30,6 +31,10 @@ ROWS: Final = 2000
 """Most rows of a table on the page. The run record beside it holds all rows."""
 
 
+_SHOWN: Final = 9
+"""Most figures on the page, of each instrument in turn; the others are folded."""
+
+
 @dataclass(frozen=True, slots=True)
 class ProductLink:
     """A product in the table of scenes."""
@@ -38,6 +43,8 @@ class ProductLink:
     href: str
     """Empty where the file is missing."""
     flagged: str
+    empty: bool
+    """Whether no value is usable."""
     size: str
     sha256: str
     path: str
@@ -141,6 +148,9 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         summary=run_tables.summary(record),
         verdict=run_tables.verdict(record),
         outcome=run_tables.outcome_class(record),
+        difference=difference(record, folder),
+        narrow=gallery.NARROW,
+        overview=_overview(pictures),
         findings=finding_rows(record.findings),
         instruments=run_tables.instruments(record),
         stages=stages,
@@ -203,6 +213,7 @@ def _scene_row(
                 label=f"{product.kind} {product.channel}",
                 href="" if product.path in missing else _href(record, product.path, folder),
                 flagged=flagged[product.path],
+                empty=product.usable == 0,
                 size=size(product.size),
                 sha256=product.sha256,
                 path=product.path,
@@ -231,6 +242,13 @@ def _by_instrument(pictures: Sequence[Picture]) -> list[tuple[str, list[Picture]
         (name, list(figures))
         for name, figures in groupby(ordered, lambda picture: picture.instrument)
     ]
+
+
+def _overview(pictures: Sequence[tuple[str, Sequence[Picture]]]) -> list[Picture]:
+    """Return the first figures of each instrument, up to `_SHOWN`, sorted by instrument."""
+    turns = zip_longest(*(figures for _, figures in pictures))
+    first = [picture for turn in turns for picture in turn if picture is not None][:_SHOWN]
+    return sorted(first, key=lambda picture: picture.instrument)
 
 
 def _compared_words(compared: Sequence[Compared]) -> Mapping[str, str]:

@@ -24,21 +24,26 @@ from lidarops.errors import CatalogError
 from lidarops.figures import any_kind, svg
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
+from lidarops.figures.quality_panel import quality_figure, read_quality
 from lidarops.kinds import kinds
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.reports.reading import UNREADABLE
 from lidarops.site import pages, product_contents
+from lidarops.site.links import BESIDE, COPIES, Links
+from lidarops.site.neighbours import around
 from lidarops.site.paths import (
     SITE,
     day_page,
+    month_list,
     product_folder,
     product_page,
     product_paths,
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
+from lidarops.site.values import read_values
 from lidarops.system.files import sha256_of, within, write_atomically
 from lidarops.system.processes import end_with_parent
 
@@ -46,7 +51,7 @@ MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
 _FORMAT: Final = "lidarops site"
 _EMPTY: Final = "no figure of the product"
-_OURS: Final = ("product", "station")
+_OURS: Final = ("product", "station", COPIES)
 """Folders that only the site writes to."""
 _UNREADABLE: Final = (*UNREADABLE, TypeError, ArithmeticError, MemoryError)
 """Exceptions observed when damaged or foreign files are read and drawn."""
@@ -78,7 +83,12 @@ _Outcome = tuple[Entry | Problem, bool]
 
 
 def build_site(
-    output: str | Path, *, workers: int = 1, progress: Callable[[int], None] | None = None
+    output: str | Path,
+    *,
+    workers: int = 1,
+    products_at: str = BESIDE,
+    copies: bool = False,
+    progress: Callable[[int], None] | None = None,
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
 
@@ -92,6 +102,10 @@ def build_site(
         Output folder of a campaign, with its folder ``products``.
     workers : int, optional
         Number of processes.
+    products_at : str, optional
+        Where the downloads lead: an address, or a place relative to the site.
+    copies : bool, optional
+        Whether the site holds copies of the products, so that it can be served alone.
     progress : callable, optional
         Called with the number of products done since the last call.
 
@@ -108,12 +122,16 @@ def build_site(
         If the site cannot be written, or the folder ``site`` has other content.
     """
     output = Path(output).resolve()
+    links = Links(output, COPIES if copies else products_at)
     products, site = product_folder(output), output / SITE
-    before = _manifest(site)
+    before = _manifest(site, links)
     tasks = [_Task(path, products, site, before.get(path)) for path in product_paths(products)]
     entries, problems, made = _collect(tasks, workers, progress)
-    expected = _write_calendar(site, entries, problems)
-    _write_manifest(site, entries, problems)
+    entries = list(_linked(site, entries, links))
+    expected = _write_calendar(site, entries, problems, links)
+    if copies:
+        expected |= _copy(products, site, entries)
+    _write_manifest(site, entries, problems, links)
     _sweep(site, expected)
     return Site(site / pages.INDEX, len(entries), made, tuple(problems))
 
@@ -209,7 +227,9 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         kind = product_contents.attribute(opened, "lidarops_kind")
         figures, problem = _draw(opened, kind)
         page = product_page(task.path)
+        values = read_values(opened, kind)
         station = product_contents.attribute(opened, "lidarops_station")
+        instrument = product_contents.attribute(opened, "lidarops_instrument")
         entry = Entry(
             path=task.path,
             sha256=sha256,
@@ -220,9 +240,15 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             campaign=product_contents.attribute(opened, "lidarops_campaign"),
             station=station,
             place=product_contents.attribute(opened, "platform", station),
-            instrument=product_contents.attribute(opened, "lidarops_instrument"),
+            instrument=instrument,
+            name=product_contents.attribute(opened, "instrument", instrument),
             kind=kind,
             channel=product_contents.attribute(opened, "lidarops_channel"),
+            light=product_contents.light(opened),
+            latitude=product_contents.scalar(opened, "latitude"),
+            longitude=product_contents.scalar(opened, "longitude"),
+            altitude=product_contents.scalar(opened, "station_altitude"),
+            license=product_contents.attribute(opened, "license", ""),
             start=span.start,
             stop=span.stop,
             values=quality.values,
@@ -232,13 +258,20 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             problem=_joined(problem, origin.problem, _missing_flags(opened)),
         )
         contents = (
-            pages.product(entry, opened, quality, origin, figures),
+            pages.product(entry, opened, quality, origin, _with_quality(opened, figures), values),
             svg.thumbnail(figures[0] if figures else None, _EMPTY),
             origin.text.encode(),
+            values.csv,
         )
     for name, content in zip(entry.files, contents, strict=True):
         _write(task.site, name, content)
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
+
+
+def _with_quality(opened: xr.Dataset, figures: Sequence[Figure]) -> list[Figure]:
+    """Return the figures with that of quality over time as the second."""
+    quality = read_quality(opened)
+    return [*figures[:1], *([quality_figure(quality)] if quality else []), *figures[1:]]
 
 
 def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:
@@ -288,25 +321,57 @@ def _write(site: Path, name: str, content: bytes) -> None:
         ) from error
 
 
-def _write_calendar(site: Path, entries: Sequence[Entry], problems: Sequence[Problem]) -> set[str]:
+def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entry]:
+    """Write what leads to and from each product into its page; yield entries with new digests."""
+    for entry, neighbours in around(entries):
+        page = within(site, entry.page).read_bytes()
+        linked = pages.with_around(page, pages.around(entry, neighbours, links))
+        if linked != page:
+            _write(site, entry.page, linked)
+        yield replace(entry, digests=(hashlib.sha256(linked).hexdigest(), *entry.digests[1:]))
+
+
+def _copy(products: Path, site: Path, entries: Sequence[Entry]) -> set[str]:
+    """Copy the products that the site lacks or has in another version; return their names."""
+    names = set()
+    for entry in entries:
+        name = f"{COPIES}/{entry.path}"
+        names.add(name)
+        copy = within(site, name)
+        if not copy.is_file() or sha256_of(copy) != entry.sha256:
+            _write(site, name, within(products, entry.path).read_bytes())
+    return names
+
+
+def _write_calendar(
+    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links
+) -> set[str]:
     """Write all calendar pages; return the files that belong in the site's folders."""
     expected = {name for entry in entries for name in entry.files}
+
+    def write(name: str, content: bytes) -> None:
+        expected.add(name)
+        _write(site, name, content)
+
     for station, station_entries in pages.stations(entries).items():
         by_year = pages.years(station_entries)
         for year, year_entries in by_year.items():
-            name = year_page(station, int(year))
-            expected.add(name)
-            _write(site, name, pages.year(station, int(year), year_entries, list(by_year)))
+            for kind in pages.tabs(year_entries):
+                name = year_page(station, int(year), kind)
+                write(name, pages.year(station, int(year), year_entries, list(by_year), kind))
+        for month, month_entries in pages.months(station_entries).items():
+            name = month_list(station, month)
+            lines = [f"{links.product(entry, name)}\n" for entry in month_entries]
+            write(name, "".join(lines).encode())
         by_day = pages.days(station_entries)
         around = [None, *by_day, None]
         for (before, _), (day, after) in zip(pairwise(around), pairwise(around[1:]), strict=False):
             if day is not None:
                 name = day_page(station, day)
-                expected.add(name)
-                _write(site, name, pages.day(station, day, by_day[day], before, after))
+                write(name, pages.day(station, day, by_day, before, after))
     campaigns = sorted({entry.campaign for entry in entries})
     _write(site, "site.css", pages.style().encode())
-    _write(site, pages.INDEX, pages.index(entries, problems, campaigns))
+    _write(site, pages.INDEX, pages.index(entries, problems, campaigns, links))
     return expected
 
 
@@ -319,6 +384,8 @@ def _sweep(site: Path, expected: set[str]) -> None:
                     file.rmdir()
             elif file.relative_to(site).as_posix() not in expected:
                 file.unlink(missing_ok=True)
+    if (site / COPIES).is_dir() and not any((site / COPIES).iterdir()):
+        (site / COPIES).rmdir()
 
 
 @cache
@@ -344,9 +411,12 @@ def _version() -> str:
 _SOURCES: Final = (".py", ".html", ".css")
 
 
-def _write_manifest(site: Path, entries: Sequence[Entry], problems: Sequence[Problem]) -> None:
+def _write_manifest(
+    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links
+) -> None:
     document = {
         "format": _FORMAT,
+        "products_at": links.products,
         "version": _version(),
         "products": [asdict(entry) for entry in entries],
         "problems": [asdict(problem) for problem in problems],
@@ -355,7 +425,7 @@ def _write_manifest(site: Path, entries: Sequence[Entry], problems: Sequence[Pro
     _write(site, MANIFEST, text.encode("ascii") + b"\n")
 
 
-def _manifest(site: Path) -> dict[str, Entry]:
+def _manifest(site: Path, links: Links) -> dict[str, Entry]:
     """Return the entries of the existing site by path; empty if they are unknown or outdated."""
     file = site / MANIFEST
     if not file.is_file():
@@ -366,7 +436,7 @@ def _manifest(site: Path) -> dict[str, Entry]:
                 remedy="move it away, so that its content is not lost",
             )
         # Written first, so that an interrupted build is recognised as a site.
-        _write_manifest(site, [], [])
+        _write_manifest(site, [], [], links)
         return {}
     try:
         document = json.loads(file.read_bytes())

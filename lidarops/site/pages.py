@@ -20,9 +20,13 @@ from lidarops.figures.templates import environment
 from lidarops.figures.wording import counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.site.paths import day_page, href, slug, year_page
-from lidarops.site.product_contents import Origin, QualityCounts, variables
+from lidarops.site.links import Links
+from lidarops.site.neighbours import Neighbours
+from lidarops.site.paths import day_page, href, month_list, slug, year_page
+from lidarops.site.product_contents import Origin, QualityCounts, citation, variables
 from lidarops.site.product_entry import UNKNOWN, Entry, Grade, Problem, mean_share
+from lidarops.site.station_map import Place, station_map
+from lidarops.site.values import Values
 
 INDEX: Final = "index.html"
 ROWS: Final = 2000
@@ -31,6 +35,10 @@ _YEARS: Final = 48
 """Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
 _LATEST: Final = 6
+_AROUND: Final = (b"<!-- around -->", b"<!-- /around -->")
+"""Ends of the part of a product page that does not follow from the product."""
+_FILTERED: Final = 16
+"""Most kinds that can be chosen on a page of a day."""
 
 ByDay = Mapping[str, Sequence[Entry]]
 
@@ -55,6 +63,7 @@ def product(
     quality: QualityCounts,
     origin: Origin,
     figures: Sequence[Figure],
+    values: Values,
 ) -> bytes:
     """Return the page of a product; it depends only on the product and its path."""
     page = entry.page
@@ -62,22 +71,19 @@ def product(
     summary = [
         ("Title", str(opened.attrs.get("title", "not stated"))),
         ("Station", _named(entry.place, entry.station)),
-        ("Instrument", entry.instrument),
+        ("Instrument", _named(entry.name, entry.instrument)),
         ("Kind", entry.kind),
-        ("Channel", entry.channel),
-        ("Data", f"{_clock(entry.start)} to {_clock(entry.stop)} UTC"),
+        ("Channel", entry.label),
+        ("Data", _span(entry)),
+        ("File", file),
         ("Size", f"{size(entry.size)} ({entry.size:,} bytes)"),
     ]
     return _render(
         "product.html",
         page,
-        heading=f"{_about(entry.kind, 'Product of kind')}, {entry.channel}",
-        lead=f"{entry.place}, {entry.instrument}, {_clock(entry.start)} to"
-        f" {_clock(entry.stop)} UTC",
+        heading=f"{_about(entry.kind, 'Product of kind')}, {entry.light or entry.channel}",
+        lead=f"{entry.place}; {entry.name}; {_span(entry)}",
         trail=[*_trail(entry, page), (entry.day, href(day_page(entry.station, entry.day), page))],
-        download=href(f"../products/{entry.path}", page),
-        file=file,
-        size=size(entry.size),
         sha256=entry.sha256,
         problem=entry.problem,
         summary=summary,
@@ -87,10 +93,51 @@ def product(
         quality_text=_quality(entry),
         origin=origin,
         prov=href(entry.files[2], page),
+        values=values,
+        values_csv=href(entry.files[3], page),
+        citation=citation(opened),
+        license=entry.license,
+        references=str(opened.attrs.get("references", "")).splitlines(),
         variables=variables(opened),
         attributes=[(str(name), str(value)) for name, value in opened.attrs.items()],
         most=ROWS,
     )
+
+
+def around(entry: Entry, neighbours: Neighbours, links: Links) -> bytes:
+    """Return the part of a product page that leads to its file and to other products."""
+    page = entry.page
+    ends = [
+        None
+        if other is None
+        else {"href": href(other.page, page), "words": f"{_clock(other.start)} UTC"}
+        for other in (neighbours.before, neighbours.after)
+    ]
+    beside = [
+        {
+            "href": href(other.page, page),
+            "words": f"{_about(other.kind, 'Kind')}, {other.light or other.channel}",
+        }
+        for other in neighbours.siblings
+    ]
+    module = environment("lidarops.site").get_template("around.html")
+    text = module.render(
+        download=links.product(entry, page),
+        file=entry.path.rsplit("/", 1)[-1],
+        size=size(entry.size),
+        stac=links.stac(entry, page),
+        before=ends[0],
+        after=ends[1],
+        siblings=beside,
+    )
+    return text.encode("utf-8", "replace")
+
+
+def with_around(page: bytes, part: bytes) -> bytes:
+    """Return a product page with another part of `around`."""
+    head, first, rest = page.partition(_AROUND[0])
+    _, last, tail = rest.partition(_AROUND[1])
+    return b"".join((head, first, b"\n", part, b"\n", last, tail))
 
 
 def _about(kind: str, other: str) -> str:
@@ -103,6 +150,13 @@ def _about(kind: str, other: str) -> str:
 
 def _named(place: str, key: str) -> str:
     return place if place == key else f"{place} ({key})"
+
+
+def _span(entry: Entry) -> str:
+    start, stop = _clock(entry.start), _clock(entry.stop)
+    day_, clock = start.split()
+    same = stop.startswith(day_)
+    return f"{day_}, {clock} to {stop[11:]} UTC" if same else f"{start} to {stop} UTC"
 
 
 def _clock(moment: str) -> str:
@@ -132,7 +186,9 @@ def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
         "thumbnail": href(entry.thumbnail, page),
         "alt": entry.alt,
         "href": href(entry.page, page),
+        "title": _about(entry.kind, "Kind"),
         "kind": entry.kind,
+        "light": entry.light or entry.channel,
         "channel": entry.channel,
         "where": where,
         "grade": entry.grade,
@@ -173,12 +229,28 @@ def years(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
     return _by(entries, lambda entry: entry.day[:4])
 
 
+def months(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
+    """Return the entries by month, such as ``2024-09``."""
+    return _by(entries, lambda entry: entry.day[:7])
+
+
+def tabs(entries: Iterable[Entry]) -> list[str]:
+    """Return the kinds of products in the order of their rank, after an empty one for all."""
+    kinds_ = sorted({entry.kind for entry in entries}, key=lambda kind: (rank_of(kind), kind))
+    return ["", *kinds_]
+
+
 def days(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
     """Return the entries by day."""
     return _by(entries, lambda entry: entry.day)
 
 
-def index(entries: Sequence[Entry], problems: Sequence[Problem], campaigns: Sequence[str]) -> bytes:
+def index(
+    entries: Sequence[Entry],
+    problems: Sequence[Problem],
+    campaigns: Sequence[str],
+    links: Links,
+) -> bytes:
     """Return the first page."""
     by_station = stations(entries)
     rows = sum(len(years(group)) for group in by_station.values())
@@ -192,7 +264,10 @@ def index(entries: Sequence[Entry], problems: Sequence[Problem], campaigns: Sequ
         lead=_index_lead(entries, by_station),
         trail=[],
         grades=list(Grade),
-        months=calendar.month_name[1:],
+        map=station_map(_places(by_station)),
+        stac=links.catalog(INDEX),
+        report=links.report(INDEX),
+        licenses=sorted({entry.license for entry in entries if entry.license}),
         stations=[_station(key, group, matrix=rows <= _YEARS) for key, group in by_station.items()],
         latest=[_card(entry, INDEX, place=True) for entry in retrieved[:_LATEST]],
         problems=problems,
@@ -214,11 +289,12 @@ def _index_lead(entries: Sequence[Entry], by_station: Mapping[str, Sequence[Entr
 def _station(key: str, entries: Sequence[Entry], *, matrix: bool) -> dict[str, Any]:
     by_year = years(entries)
     links = [{"year": year, "href": href(year_page(key, int(year)), INDEX)} for year in by_year]
-    instruments = sorted({entry.instrument for entry in entries})
+    instruments = sorted({entry.name for entry in entries})
     return {
         "anchor": f"s-{slug(key)}",
         "name": entries[0].place,
-        "about": f"{counted(len(entries), 'product')}, {', '.join(instruments[:6])}",
+        "about": f"{counted(len(entries), 'product')}; {'; '.join(instruments[:6])}",
+        "position": _position(entries[0]),
         "links": links,
         "years": [
             link | {"cells": _months(group)}
@@ -229,6 +305,23 @@ def _station(key: str, entries: Sequence[Entry], *, matrix: bool) -> dict[str, A
     }
 
 
+def _places(by_station: Mapping[str, Sequence[Entry]]) -> list[Place]:
+    return [
+        Place(first.place, f"s-{slug(key)}", first.latitude, first.longitude)
+        for key, (first, *_) in by_station.items()
+        if first.latitude is not None and first.longitude is not None
+    ]
+
+
+def _position(entry: Entry) -> str:
+    """Return the position of a station in words; empty if unknown."""
+    if entry.latitude is None or entry.longitude is None:
+        return ""
+    north, east = "NS"[entry.latitude < 0], "EW"[entry.longitude < 0]
+    words = f"{abs(entry.latitude):.5g}° {north}, {abs(entry.longitude):.6g}° {east}"
+    return words if entry.altitude is None else f"{words}, {entry.altitude:.4g} m"
+
+
 def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
     cells: list[dict[str, Any] | None] = [None] * 12
     for month, group in _by(entries, lambda entry: entry.day[5:7]).items():
@@ -236,6 +329,7 @@ def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
         number = int(month)
         cells[number - 1] = {
             "number": number,
+            "name": calendar.month_abbr[number],
             "label": f"{calendar.month_name[number]} {group[0].day[:4]}",
             "days": len({entry.day for entry in group}),
             "share": _short(share),
@@ -244,18 +338,31 @@ def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
     return cells
 
 
-def year(key: str, number: int, entries: Sequence[Entry], all_years: Sequence[str]) -> bytes:
-    """Return the page of a year of a station; `all_years` are those with data."""
-    page = year_page(key, number)
-    by_day = days(entries)
-    months = sorted({int(day[5:7]) for day in by_day})
-    weeks = calendar.Calendar()
+def year(
+    key: str, number: int, entries: Sequence[Entry], all_years: Sequence[str], kind: str = ""
+) -> bytes:
+    """Return the page of a year of a station, of all kinds of product or of one.
+
+    `all_years` are those with data; `entries` are of all kinds.
+    """
+    page = year_page(key, number, kind)
+    of_kind = [entry for entry in entries if kind in ("", entry.kind)]
+    by_day = days(of_kind)
+    by_month = months(of_kind)
     return _render(
         "year.html",
         page,
         place=entries[0].place,
         year=number,
-        lead=f"{counted(len(entries), 'product')} of {counted(len(by_day), 'day')}",
+        lead=f"{counted(len(of_kind), 'product')} of {counted(len(by_day), 'day')}",
+        kind=_about(kind, "Kind") if kind else "",
+        tabs=[
+            (
+                _about(tab, "Kind") if tab else "All kinds",
+                "" if tab == kind else href(year_page(key, number, tab), page),
+            )
+            for tab in tabs(entries)
+        ],
         trail=[("Archive", href(INDEX, page))],
         others=[
             (other, "" if int(other) == number else href(year_page(key, int(other)), page))
@@ -267,16 +374,25 @@ def year(key: str, number: int, entries: Sequence[Entry], all_years: Sequence[st
         weekdays=calendar.day_name[:],
         months=[
             {
-                "number": month,
-                "name": calendar.month_name[month],
-                "weeks": [
-                    [_day(key, date_, month, by_day, page) for date_ in week]
-                    for week in weeks.monthdatescalendar(number, month)
-                ],
+                "number": int(month[5:]),
+                "name": calendar.month_name[int(month[5:])],
+                "files": href(month_list(key, month), page),
+                "about": f"{counted(len(group), 'file')},"
+                f" {size(sum(entry.size for entry in group))}",
+                "weeks": _weeks(key, month, by_day, page),
             }
-            for month in months
+            for month, group in (months(entries) if not kind else by_month).items()
         ],
     )
+
+
+def _weeks(key: str, month: str, by_day: ByDay, page: str) -> list[list[dict[str, Any]]]:
+    """Return the days of a month by week."""
+    year_, number = int(month[:4]), int(month[5:])
+    return [
+        [_day(key, date_, number, by_day, page) for date_ in week]
+        for week in calendar.Calendar().monthdatescalendar(year_, number)
+    ]
 
 
 def _day(key: str, date_: date, month: int, by_day: ByDay, page: str) -> dict[str, Any]:
@@ -295,11 +411,11 @@ def _day(key: str, date_: date, month: int, by_day: ByDay, page: str) -> dict[st
     }
 
 
-def day(
-    key: str, day_: str, entries: Sequence[Entry], before: str | None, after: str | None
-) -> bytes:
+def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | None) -> bytes:
     """Return the page of a day of a station, with links to the previous and next day with data."""
     page = day_page(key, day_)
+    entries = by_day[day_]
+    shown_kinds = tabs(entries)[1:]
     ordered = sorted(entries, key=_order)
     share = mean_share(entries)
     mean = "" if share is None else f", on average {percent(share)} of values usable"
@@ -316,17 +432,24 @@ def day(
         trail=_trail(entries[0], page),
         before=beside(before),
         after=beside(after),
+        month=f"{calendar.month_name[int(day_[5:7])]} {day_[:4]}",
+        weeks=_weeks(key, day_[:7], by_day, page),
+        weekdays=calendar.day_name[:],
+        grades=[grade for grade in Grade if any(entry.grade is grade for entry in entries)],
+        kinds=[_about(kind, "Kind") for kind in shown_kinds[:_FILTERED]],
         instruments=[
             (
-                instrument,
+                _named(group_[0].name, instrument),
                 [
                     (
+                        shown_kinds.index(kind),
                         _about(kind, "Kind"),
                         [_card(entry, page, place=False) for entry in rows],
                     )
-                    for kind, rows in groupby(group, key=lambda entry: entry.kind)
+                    for kind, rows in groupby(group_, key=lambda entry: entry.kind)
                 ],
             )
             for instrument, group in groupby(ordered, key=lambda entry: entry.instrument)
+            for group_ in [list(group)]
         ],
     )

@@ -16,6 +16,7 @@ from lidarops.figures.series_data import quality_bits
 from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.records import GLUED
 from lidarops.site.product_entry import UNKNOWN
 
 PROVENANCE: Final = "provenance"
@@ -194,6 +195,47 @@ def variables(product: xr.Dataset) -> list[VariableRow]:
 def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
     """Return a global attribute as text."""
     return str(product.attrs.get(name, "")).strip() or default
+
+
+def light(product: xr.Dataset) -> str:
+    """Return wavelength and detection of the channel in words; empty if unknown."""
+    wavelength = scalar(product, "wavelength")
+    words = "" if wavelength is None else f"{wavelength:g} {product['wavelength'].attrs['units']}"
+    glued = attribute(product, "lidarops_channel").startswith(GLUED)
+    mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
+    return ", ".join(filter(None, (words, mode)))
+
+
+_DETECTION: Final = {
+    "photon": "photon counting",
+    "analog": "analog",
+    GLUED: "analog glued to photon counting",
+}
+
+
+def scalar(product: xr.Dataset, name: str) -> float | None:
+    """Return a variable that is one finite number; None without it."""
+    if name not in product.variables or product[name].ndim or "units" not in product[name].attrs:
+        return None
+    value = product[name].values.astype(np.float64).item()
+    return float(value) if np.isfinite(value) else None
+
+
+def citation(product: xr.Dataset) -> str:
+    """Return how to cite a product, from its attributes; empty without a title."""
+    names = ("creator_name", "title", "product_version", "publisher_name", "naming_authority", "id")
+    creator, title, version, publisher, authority, key = (
+        attribute(product, name, "") for name in names
+    )
+    if not title:
+        return ""
+    year = attribute(product, "date_issued", attribute(product, "date_created", ""))[:4]
+    who = f"{creator or publisher} ({year})" if year else creator or publisher
+    doi = attribute(product, "doi", "")
+    identifier = doi or ":".join(filter(None, (authority, key)))
+    issued = publisher if publisher != creator else ""
+    parts = (who, title, version and f"Version {version}", issued, identifier)
+    return " ".join(f"{part.rstrip('.')}." for part in parts if part)
 
 
 def origin(product: xr.Dataset) -> Origin:

@@ -74,8 +74,17 @@ class Entry:
     place: str
     """Name of the station."""
     instrument: str
+    name: str
+    """Name of the instrument."""
     kind: str
     channel: str
+    light: str
+    """Wavelength and detection of the channel in words; empty if unknown."""
+    latitude: float | None
+    longitude: float | None
+    altitude: float | None
+    """m, of the station."""
+    license: str
     start: str
     """UTC, ISO 8601 to the second."""
     stop: str
@@ -92,7 +101,13 @@ class Entry:
     @property
     def files(self) -> tuple[str, ...]:
         """Files of the page, relative to the site."""
-        return self.page, self.thumbnail, f"{self.page.removesuffix('.html')}.prov.json"
+        stem = self.page.removesuffix(".html")
+        return self.page, self.thumbnail, f"{stem}.prov.json", f"{stem}.csv"
+
+    @property
+    def label(self) -> str:
+        """Channel in words, with its name."""
+        return f"{self.light} ({self.channel})" if self.light else self.channel
 
     @property
     def day(self) -> str:

@@ -149,6 +149,12 @@ class TestErrorBudget:
         assert marks.y.size == 1
 
 
+IMAGES = tuple(
+    f"elastic-{name}"
+    for name in ("aerosol-backscatter", "aerosol-extinction", "attenuated-backscatter")
+)
+
+
 def _run(archive: Archive, *paths_and_data) -> RunRecord:
     products = []
     for name, data in paths_and_data:
@@ -163,16 +169,17 @@ def _run(archive: Archive, *paths_and_data) -> RunRecord:
 
 
 class TestGallery:
-    def test_a_run_shows_backscatter_and_a_profile(self, archive, made, tmp_path):
+    def test_a_run_shows_images_and_a_profile(self, archive, made, tmp_path):
         record = _run(archive, ("e/elastic.nc", made))
         folder = tmp_path / "report"
         folder.mkdir()
         drawn = gallery.fill(record, folder)
         assert not drawn.problems
         names = [picture.file.removesuffix(".svg") for picture in drawn.pictures]
-        assert names == [f"elastic_horizontal_{CHANNEL}", f"profile_horizontal_{CHANNEL}"]
+        assert names == [f"{view}_horizontal_{CHANNEL}" for view in (*IMAGES, "profile")]
         for picture in drawn.pictures:
-            assert (folder / picture.file).read_bytes().startswith(b"<svg")
+            for place in (folder, folder / gallery.NARROW):
+                assert (place / picture.file).read_bytes().startswith(b"<svg")
             assert CHANNEL in picture.caption
             assert picture.alt
         assert drawn.flags
@@ -183,12 +190,12 @@ class TestGallery:
         bad.write_bytes(bad.read_bytes()[:2000])
         drawn = gallery.fill(record, tmp_path)
         assert [problem.path for problem in drawn.problems] == ["e/bad.nc"]
-        assert len(drawn.pictures) == 2
+        assert len(drawn.pictures) == len(IMAGES) + 1
 
     def test_a_run_without_references_has_no_profile(self, archive, made, tmp_path):
         made["quality_flag"][:] |= np.int32(ElasticQuality.NO_REFERENCE)
         made["reference_bottom"][:] = np.nan
         made["reference_top"][:] = np.nan
         drawn = gallery.fill(_run(archive, ("e/none.nc", made)), tmp_path)
-        assert [picture.file.split("_")[0] for picture in drawn.pictures] == ["elastic"]
+        assert [picture.file.split("_")[0] for picture in drawn.pictures] == [*IMAGES]
         assert not drawn.problems

@@ -6,11 +6,16 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 from support.products.drawn import figures, image, labelled
+from support.products.encoded_products import build_product
 from support.products.fabricated import START, signal, times
+from support.products.made_products import MAKERS, context
 
-from lidarops.figures.pixels import BLANK, REJECTED
-from lidarops.figures.raster import COLUMNS
+from lidarops.figures.pixels import BLANK, NEGATIVE, REJECTED
+from lidarops.figures.raster import COLUMNS, colour_limits
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
@@ -39,8 +44,8 @@ def test_colours_are_the_signal_and_flags_are_striped():
     assert (striped == rejected).mean() > 0.99
     value = np.clip(product["signal"].values, panel.bar.low, panel.bar.high)
     share = np.log(value / panel.bar.low) / np.log(panel.bar.high / panel.bar.low)
-    expected = 3 + 252 * share[np.ix_(column, row)].T
-    close = np.abs(pixels - expected)[~rejected & ~striped] < 1.5
+    expected = 4 + 251 * share[np.ix_(column, row)].T
+    close = np.abs(pixels - expected)[~rejected & ~striped & (pixels != NEGATIVE)] < 1.5
     assert close.mean() > 0.99
     assert panel.bar.label == "range-corrected signal (MHz m²)"
     (line,) = (layer for layer in below.layers if hasattr(layer, "mark"))
@@ -116,3 +121,81 @@ def test_triangles_mark_the_lowest_cloud_bases():
     (marks,) = labelled(figure.panels[0], "base of the lowest cloud")
     np.testing.assert_array_equal(marks.y[:4], [0.09, np.nan, 0.04, 0.06])
     assert "cloud base in 3 of 8 columns (triangles)" in figure.words
+
+
+def measured(product, seconds):
+    """Return a product whose profiles were measured for a part of the time between them."""
+    half = np.timedelta64(int(500 * seconds), "ms")
+    time = product["time"].values
+    return product.assign(time_bnds=(("time", "nv"), np.stack([time - half, time + half], -1)))
+
+
+def filled(panel):
+    return (image(panel) != BLANK).any(axis=0)
+
+
+def test_time_without_measurement_is_blank():
+    """A mean of 5 s every 42 min is drawn as what it is."""
+    product = measured(signal(times(START, 12, 2520.0), bins=100), 5.0)
+    panel = drawn(product).panels[0]
+    assert filled(panel).sum() == 12
+    start, stop = product["time_bnds"].values[[0, -1], [0, 1]]
+    assert panel.x.high - panel.x.low == pytest.approx((stop - start) / np.timedelta64(1, "D"))
+
+
+def test_short_pauses_between_profiles_are_filled_and_said():
+    product = measured(signal(times(START, 60, 60.0), bins=100), 12.0)
+    figure = drawn(product)
+    assert filled(figure.panels[0]).all()
+    assert "measured in 20.3 % of the time that is filled" in figure.words
+    whole = drawn(measured(signal(times(START, 60, 60.0), bins=100), 60.0))
+    assert "that is filled" not in whole.words
+
+
+def test_the_background_stands_at_the_time_of_its_profile():
+    product = measured(signal(times(START, 12, 600.0), bins=100), 60.0)
+    main, below = drawn(product).panels
+    (line,) = (layer for layer in below.layers if hasattr(layer, "mark"))
+    since = product["time"].values - product["time_bnds"].values[0, 0]
+    np.testing.assert_allclose(line.x - main.x.low, since / np.timedelta64(1, "D"), atol=1e-9)
+
+
+def test_means_at_or_below_zero_are_grey():
+    product = signal(times(START, 10, 60.0), bins=40)
+    product["quality_flag"][:] = 0
+    product["signal"][:] = 1.0
+    product["signal"].values[:, 10:20] = -1.0
+    product["signal_standard_error"][:] = 0.1
+    pixels = image(drawn(product).panels[0])
+    assert (pixels == NEGATIVE).mean() == pytest.approx(0.25, abs=0.02)
+    assert (pixels[190:220] == NEGATIVE).all()
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-3])
+def test_colours_of_a_retrieved_quantity_mean_the_same_in_all_products(factor):
+    product = xr.decode_cf(build_product(MAKERS["elastic"](), context("elastic")))
+    product["aerosol_backscatter"] = product["aerosol_backscatter"] * factor
+    (figure,) = figures("elastic", "elastic-aerosol-backscatter", [product])
+    bar = figure.panels[0].bar
+    assert (bar.low, bar.high, bar.label) == (0.01, 10.0, "aerosol backscatter (Mm⁻¹ sr⁻¹)")
+
+
+@given(low=st.floats(1e-9, 1e9), ratio=st.floats(1.0, 1e3))
+def test_other_scales_end_at_round_values(low, ratio):
+    ends = colour_limits(np.repeat([low, low * ratio], 1000))
+    for end in ends:
+        digits = f"{end:.6e}".split("e")[0]
+        assert float(digits) in (1.0, 2.0, 5.0)
+    assert ends[0] <= low * (1 + 1e-9)
+    assert ends[1] >= 0.99 * low * ratio
+
+
+def test_a_cloud_that_passes_is_not_cut_off():
+    product = signal(times(START, 60, 60.0), bins=1000, bin_width=15.0)
+    product["quality_flag"][:] = 0
+    product["signal_standard_error"][:] = 1.0
+    noise = np.random.default_rng(0).standard_normal((60, 1000))
+    product["signal"][:] = noise + 10.0 * (product["range"].values < 3000.0)
+    assert drawn(product).panels[0].y.high == pytest.approx(3.6, abs=0.3)
+    product["signal"].values[20:30, 600:640] += 30.0
+    assert drawn(product).panels[0].y.high == pytest.approx(1.2 * 9.6, abs=0.4)

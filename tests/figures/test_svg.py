@@ -26,6 +26,7 @@ from lidarops.figures.panels import (
     percentile_axis,
     units,
 )
+from lidarops.figures.time_axis import Tick
 
 ONE = np.array([0.0, 1.0])
 
@@ -186,3 +187,39 @@ def test_units_have_superscripts():
     assert units("m-1 sr-1") == "m⁻¹ sr⁻¹"
     assert units("MHz m2") == "MHz m²"
     assert units("1") == "1"
+
+
+def narrow(*panels, **options):
+    return svg.file(figure(*panels, **options), svg.NARROW).decode()
+
+
+def test_a_narrow_figure_has_panels_below_each_other():
+    pair = (panel(Curve(ONE, ONE)), panel(Curve(ONE, ONE)))
+    wide, small = drawn(*pair, beside=True), narrow(*pair, beside=True)
+    assert f'width="{svg.NARROW}"' in small
+    tops = [
+        [float(y) for y in re.findall(r'<svg x="[\d.]+" y="([\d.]+)"', document)]
+        for document in (wide, small)
+    ]
+    assert tops[0][0] == tops[0][1]
+    assert tops[1][1] > tops[1][0] + 100
+
+
+def test_labels_of_a_narrow_figure_do_not_touch():
+    ticks = tuple(Tick(float(k), f"{k:02d}:00") for k in range(13))
+    one = Panel(Axis("time", 0.0, 12.0, ticks=ticks), Axis("up", 0.0, 1.0), (Curve(ONE, ONE),))
+    assert {tick.label for tick in ticks} <= set(texts(drawn(one)))
+    shown = [text for text in texts(narrow(one)) if text and text.endswith(":00")]
+    assert shown == [f"{k:02d}:00" for k in range(0, 13, 2)]
+
+
+def test_a_map_keeps_its_shape():
+    flat = Panel(Axis("east", 0.0, 2.0), Axis("north", 0.0, 1.0), (), height=434, to_scale=True)
+    for document in (drawn(flat), narrow(flat)):
+        _, _, width, height = frame(document)
+        assert width / height == pytest.approx(2.0, rel=0.01)
+
+
+def test_a_page_gets_both_widths():
+    markup = str(svg.inline(figure(panel(Curve(ONE, ONE)))))
+    assert re.findall(r'class="fig (\w+)"', markup) == ["wide", "narrow"]

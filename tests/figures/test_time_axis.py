@@ -110,3 +110,11 @@ def test_usual_step_is_the_median():
     assert usual_step(at([0, 10, 20, 30, 500])) == 10 * SECOND
     assert usual_step(at([7])) == 60 * SECOND
     assert segments(at([])) == []
+
+
+def test_an_axis_reaches_from_the_first_start_to_the_last_end():
+    time = at([100, 3700, 7300])
+    axis = time_axis(time, (time - 2 * SECOND, time + 3 * SECOND))
+    assert (axis.starts[0], axis.stops[-1]) == (time[0] - 2 * SECOND, time[-1] + 3 * SECOND)
+    single = time_axis(time[:1], (time[:1], time[:1]))
+    assert single.limits[1] > single.limits[0]

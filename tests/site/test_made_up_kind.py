@@ -151,7 +151,7 @@ def _report(folder: Path) -> Gallery:
 def test_without_figures_the_main_variable_is_shown(register: Register, tmp_path: Path) -> None:
     register()
     text = _page(tmp_path / "out")
-    assert text.count('<svg class="fig"') == 1
+    assert text.count('<svg class="fig wide"') == 2
     assert "Extinction coefficient of molecules and particles against time" in text
     first, second, third = _report(tmp_path).pictures
     assert first.file.startswith("homogeneous_")
@@ -163,7 +163,7 @@ def test_without_figures_the_main_variable_is_shown(register: Register, tmp_path
 def test_figures_are_those_of_the_kind(register: Register, tmp_path: Path) -> None:
     register(figures=FIGURES)
     text = _page(tmp_path / "out")
-    assert text.count('<svg class="fig"') == 1
+    assert text.count('<svg class="fig wide"') == 2
     assert "A smooth figure" in text
     _, figure, _ = _report(tmp_path).pictures
     assert figure.file.startswith("even_")

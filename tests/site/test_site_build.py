@@ -76,7 +76,9 @@ def _copy(archive: Path, target: Path) -> Path:
 
 def test_every_link_leads_to_a_file_of_the_output(archive: Path, site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
-    assert len(pages) == 1 + 2 + 4 + 20
+    kinds = len({path.name for path in (site / "product/odesa/lidar-1").iterdir()} | {"wind"})
+    # The first page, a year of all kinds and of each, another year of one kind; days; products.
+    assert len(pages) == 1 + (1 + kinds) + 2 + 4 + 20
     for page in pages:
         tags = _page(page)
         targets = [
@@ -151,7 +153,8 @@ def test_product_page_has_flags_provenance_and_download(archive: Path, site: Pat
     assert file == archive.resolve() / "products" / page.relative_to(site / "product").with_suffix(
         ".nc"
     )
-    assert text.count('<svg class="fig"') == 2
+    # Three images and a profile, with the quality as the second.
+    assert text.count('<svg class="fig wide"') == 5
     document = json.loads(page.with_suffix(".prov.json").read_text())
     assert document["agent"]["lidarops:software"]["lidarops:code_version"] == "0123456789abcdef"
 
@@ -176,7 +179,7 @@ def test_a_product_of_unknown_kind_gets_a_figure_and_a_problem(site: Path) -> No
     text = (site / "product/odesa/wind.html").read_text(encoding="utf-8")
     assert "Product of kind wind" in text
     assert "the product has no provenance" in text
-    assert text.count('<svg class="fig"') == 1
+    assert text.count('<svg class="fig wide"') == 2
     assert "4 of 6 series" in text
 
 

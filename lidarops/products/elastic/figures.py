@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
+from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, ProductSource, View, image_view
 from lidarops.figures.panels import (
     Axis,
@@ -23,6 +24,7 @@ from lidarops.figures.panels import (
     span_in_words,
 )
 from lidarops.figures.raster import raster_variables, read_raster
+from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import utc
 from lidarops.products.elastic.figure_data import PROFILE_VARIABLES, Profile, clearest_profile
 
@@ -37,7 +39,17 @@ _CAUSES: Final = {
 _UNIT: Final = "Mm⁻¹ sr⁻¹"
 _MEGA: Final = 1e6
 _HEIGHT: Final = 366
-_QUANTITY: Final = "attenuated_backscatter"
+_IMAGES: Final = {
+    "aerosol_backscatter": ImageQuantity(
+        "aerosol backscatter", _MEGA, _UNIT, (0.01, 10.0), background=False
+    ),
+    "aerosol_extinction": ImageQuantity(
+        "aerosol extinction", _MEGA, "Mm⁻¹", (1.0, 1000.0), background=False
+    ),
+    "attenuated_backscatter": ImageQuantity("attenuated backscatter", _MEGA, _UNIT, (0.1, 100.0)),
+}
+"""Images by variable; colours from background aerosol to dust and cirrus. The attenuated
+backscatter holds that of molecules, about 1 Mm-1 sr-1 near the ground at 532 nm."""
 
 
 def _read(product: xr.Dataset, _: ProductSource) -> Profile | None:
@@ -106,11 +118,14 @@ def _reference(profile: Profile, x: Axis) -> Band:
 
 FIGURES: Final = KindFigures(
     (
-        image_view(
-            "elastic",
-            raster_variables(_QUANTITY),
-            partial(read_raster, quantity=_QUANTITY, kind="elastic"),
-            "attenuated backscatter",
+        *(
+            image_view(
+                f"elastic-{name.replace('_', '-')}",
+                raster_variables(name),
+                partial(read_raster, quantity=name, kind="elastic"),
+                image,
+            )
+            for name, image in _IMAGES.items()
         ),
         View(
             "profile",
@@ -121,4 +136,8 @@ FIGURES: Final = KindFigures(
         ),
     ),
     preferred="aerosol_backscatter",
+    values=(
+        Quantity("aerosol_backscatter", _MEGA, _UNIT),
+        Quantity("aerosol_extinction", _MEGA, "Mm⁻¹"),
+    ),
 )

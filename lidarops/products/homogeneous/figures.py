@@ -53,5 +53,7 @@ def _compare(contents: Sequence[list[Section]]) -> Iterator[Comparison | None]:
 
 
 FIGURES: Final = KindFigures(
-    (View("homogeneous", SECTION_VARIABLES, _read, _draw, _compare),), preferred="total_extinction"
+    (View("homogeneous", SECTION_VARIABLES, _read, _draw, _compare),),
+    preferred="total_extinction",
+    values=(Quantity("total_extinction", 1e3, "km⁻¹"),),
 )

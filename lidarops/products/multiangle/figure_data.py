@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
-from lidarops.figures.raster import Raster, bin_edges, read_raster
+from lidarops.figures.raster import TIME_BOUNDS, Raster, bin_edges, read_raster
 from lidarops.figures.series_data import quality_bits, require
 from lidarops.figures.time_axis import usual_step
 from lidarops.kinds import flags_of
@@ -31,7 +31,7 @@ _ALONG_BOTH: Final = (
 _PROFILES: Final = ("time", "altitude", "reach", *_ALONG_BOTH)
 CYCLE_VARIABLES: Final = (*_PROFILES, "time_bnds", "station_altitude", "wavelength")
 """Variables that `clearest_cycle` needs."""
-EXTINCTION_VARIABLES: Final = _PROFILES
+EXTINCTION_VARIABLES: Final = (*_PROFILES, TIME_BOUNDS)
 """Variables that `read_extinction` needs."""
 RESIDUAL_VARIABLES: Final = (
     "time",
@@ -481,4 +481,6 @@ def read_extinction(product: xr.Dataset, *, profiles: int = 0) -> Raster:
         .assign(background=unknown, background_standard_error=unknown)
     )
     drawn["total_extinction"].attrs["units"] = "km-1"
+    if TIME_BOUNDS in product.variables:
+        drawn[TIME_BOUNDS] = product[TIME_BOUNDS]
     return read_raster(drawn, quantity="total_extinction", kind="multiangle", profiles=profiles)

@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures import pixels
+from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, ProductSource, View, image_view
 from lidarops.figures.panels import (
     Axis,
@@ -26,6 +27,7 @@ from lidarops.figures.panels import (
     percentile_axis,
     span_in_words,
 )
+from lidarops.figures.series_panels import Quantity
 from lidarops.figures.time_axis import Tick
 from lidarops.figures.wording import counted, utc
 from lidarops.kinds import flags_of
@@ -52,6 +54,8 @@ _SCALES: Final = {
     "vertical_optical_depth": (1.0, "vertical optical depth from the lidar"),
     "total_extinction": (1e3, "total extinction (km⁻¹)"),
 }
+_EXTINCTION: Final = ImageQuantity("total extinction", units="km⁻¹", limits=(0.01, 10.0))
+"""From clean air at the ground to fog."""
 _HEIGHT: Final = 366
 _MARKS: Final = 30
 """About the largest number of marks of one kind in a panel."""
@@ -233,12 +237,11 @@ def _beam_label(residuals: ScanResiduals) -> str:
 
 FIGURES: Final = KindFigures(
     (
-        image_view(
-            "multiangle", EXTINCTION_VARIABLES, read_extinction, "total extinction", "altitude"
-        ),
+        image_view("multiangle", EXTINCTION_VARIABLES, read_extinction, _EXTINCTION, "altitude"),
         View("scan-profile", CYCLE_VARIABLES, _read_cycle, _draw_cycle, first=True),
         View("scan-image", VARIABLES, read_scan_image, draw_scan_images, first=True),
         View("scan-residuals", RESIDUAL_VARIABLES, _read_residuals, _draw_residuals, first=True),
     ),
     preferred="vertical_optical_depth",
+    values=(Quantity("total_extinction", 1e3, "km⁻¹"), Quantity("vertical_optical_depth", 1.0, "")),
 )

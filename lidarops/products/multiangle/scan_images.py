@@ -175,7 +175,8 @@ def _plan_position(image: ScanImage, beams: Indices, ends: tuple[float, float]) 
     nearest = _nearest(turn, image.azimuth[beams], period=360.0)
     middle = beams[0]
     height = np.interp(np.hypot(east, north), image.distance[middle], image.height, right=np.inf)
-    return _panel(image, beams, nearest, height, (x, y), ends, size=_PPI_HEIGHT)
+    panel = _panel(image, beams, nearest, height, (x, y), ends, size=_PPI_HEIGHT)
+    return replace(panel, to_scale=True)
 
 
 def _panel(

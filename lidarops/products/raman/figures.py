@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, ProductSource, View, image_view
 from lidarops.figures.panels import (
     Axis,
@@ -23,6 +24,7 @@ from lidarops.figures.panels import (
 )
 from lidarops.figures.raster import raster_variables, read_raster
 from lidarops.figures.series_data import require
+from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import utc
 from lidarops.kinds import flags_of
 
@@ -31,6 +33,11 @@ Floats = NDArray[np.float64]
 _MEGA: Final = 1e6
 _HEIGHT: Final = 366
 _QUANTITY: Final = "aerosol_extinction"
+_IMAGES: Final = {
+    "aerosol_extinction": ImageQuantity("aerosol extinction", _MEGA, "Mm⁻¹", (1.0, 1000.0)),
+    "aerosol_backscatter": ImageQuantity("aerosol backscatter", _MEGA, "Mm⁻¹ sr⁻¹", (0.01, 10.0), background=False),
+}
+"""Images by variable; colours from background aerosol to dust and cirrus, as of ``elastic``."""
 _SHOWN: Final = (
     ("aerosol_extinction", "aerosol extinction (Mm⁻¹)", _MEGA),
     ("aerosol_backscatter", "aerosol backscatter (Mm⁻¹ sr⁻¹)", _MEGA),
@@ -117,13 +124,21 @@ def _panel(profile: _Profile, name: str, label: str, scale: float, y: Axis) -> P
 
 FIGURES: Final = KindFigures(
     (
-        image_view(
-            "raman",
-            raster_variables(_QUANTITY),
-            partial(read_raster, quantity=_QUANTITY, kind="raman"),
-            "aerosol extinction",
+        *(
+            image_view(
+                f"raman-{name}",
+                raster_variables(name),
+                partial(read_raster, quantity=name, kind="raman"),
+                image,
+            )
+            for name, image in _IMAGES.items()
         ),
         View("profile", ("time", "range", *_ALONG_BOTH), _read, _draw, first=True),
     ),
     preferred="aerosol_extinction",
+    values=(
+        Quantity("aerosol_extinction", _MEGA, "Mm⁻¹"),
+        Quantity("aerosol_backscatter", _MEGA, "Mm⁻¹ sr⁻¹"),
+        Quantity("lidar_ratio", 1.0, "sr"),
+    ),
 )

@@ -87,7 +87,7 @@ def _draw_map(contents: Sequence[NetworkMap]) -> list[Figure]:
         *crossings,
         Words(network.crossings[:, 0], network.crossings[:, 1], texts),
     )
-    panel = Panel(x, y, layers, _HEIGHT)
+    panel = Panel(x, y, layers, _HEIGHT, to_scale=True)
     return [Figure("Map of beams and crossings", _in_words(network), (panel,))]
 
 
@@ -148,4 +148,5 @@ FIGURES: Final = KindFigures(
         View("network", MAP_VARIABLES, _read_map, _draw_map, first=True),
     ),
     preferred="visibility_in_air",
+    values=(Quantity("visibility_in_air", 1e-3, "km"), Quantity("extinction", 1e3, "km⁻¹")),
 )

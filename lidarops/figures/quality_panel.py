@@ -1,0 +1,98 @@
+"""The figure of quality over time: shares of good values, of those to use with care, of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.figures.panels import Axis, Band, Figure, Panel, time_panel_axis
+from lidarops.figures.raster import column_edges, profile_bounds
+from lidarops.figures.series_data import quality_bits
+from lidarops.figures.time_axis import Tick, Times, segments, time_axis
+from lidarops.figures.wording import percent
+from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
+from lidarops.netcdf.variables import QUALITY_FLAG
+
+Floats = NDArray[np.float64]
+
+_COLUMNS: Final = 240
+"""Most columns."""
+_READ_BYTES: Final = 16_000_000
+"""Most bytes of flags in memory."""
+_HEIGHT: Final = 110
+_TICKS: Final = tuple(Tick(share, f"{100 * share:.0f}") for share in (0.0, 0.5, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class QualityOverTime:
+    """Shares of the values of a product by quality, over time."""
+
+    start: Times
+    """(column,) UTC."""
+    stop: Times
+    good: Floats
+    """(column,) Share of values without a bit."""
+    rejected: Floats
+    """(column,) Share of values not to use."""
+
+
+def read_quality(product: xr.Dataset) -> QualityOverTime | None:
+    """Return the quality of a product over time; None without flags over time.
+
+    Parameters
+    ----------
+    product : Dataset
+        Of any kind; may be lazy, because flags are read in blocks.
+    """
+    if QUALITY_FLAG not in product or product[QUALITY_FLAG].dims[:1] != ("time",):
+        return None
+    flags = product[QUALITY_FLAG]
+    if flags.size == 0 or product["time"].dtype.kind != "M":
+        return None
+    order = np.argsort(product["time"].values, kind="stable")
+    start, stop = (edge[order] for edge in profile_bounds(product))
+    rejecting = rejecting_mask(stored_bits(flags.attrs, product.attrs.get("lidarops_kind")))
+    counts = np.zeros((2, order.size))
+    step = max(1, _READ_BYTES * order.size // (8 * flags.size))
+    for first in range(0, order.size, step):
+        bits = quality_bits(flags.isel(time=slice(first, first + step)))
+        bits = bits.reshape(bits.shape[0], -1)
+        counts[:, first : first + step] = (bits == 0).mean(1), ((bits & rejecting) != 0).mean(1)
+    middle = start + (stop - start) / 2
+    size = -(-order.size // _COLUMNS)
+    columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(middle)])
+    profiles = np.diff([*columns, order.size])
+    good, rejected = np.add.reduceat(counts[:, order], columns, axis=1) / profiles
+    return QualityOverTime(*column_edges(start, stop, columns), good, rejected)
+
+
+def quality_figure(quality: QualityOverTime) -> Figure:
+    """Return a figure of the shares of good values, values to use with care, and others."""
+    axis = time_axis(
+        quality.start + (quality.stop - quality.start) / 2, (quality.start, quality.stop)
+    )
+    x = np.stack([axis.x(quality.start), axis.x(quality.stop)], axis=-1)
+    # An area of its own for each column, so that nothing is drawn where nothing was measured.
+    along = np.insert(x, 2, np.nan, axis=1).ravel()
+
+    def steps(share: Floats) -> Floats:
+        return np.repeat(share, 3)
+
+    usable = steps(1.0 - quality.rejected)
+    good, none, whole = steps(quality.good), np.zeros(along.size), np.ones(along.size)
+    layers = (
+        Band(along, none, good, "full q-good", label="good"),
+        Band(along, good, usable, "full q-care", label="use with care"),
+        Band(along, usable, whole, "full q-reject", label="do not use"),
+    )
+    y = Axis("values (%)", 0.0, 1.0, ticks=_TICKS)
+    mean = float(quality.good.mean()), float(quality.rejected.mean())
+    words = (
+        f"On average {percent(mean[0])} of the values good,"
+        f" {percent(max(0.0, 1.0 - sum(mean)))} to use with care, {percent(mean[1])} not to use"
+    )
+    return Figure("Quality over time", words, (Panel(time_panel_axis(axis), y, layers, _HEIGHT),))

@@ -1,0 +1,299 @@
+"""What pages show: values as numbers, neighbours, downloads, filters, citation, map."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.archives.site_archive import add, contents, small_archive
+from typer.testing import CliRunner
+
+from lidarops.cli import app
+from lidarops.errors import CatalogError
+from lidarops.site.build import build_site
+from lidarops.site.station_map import Place, station_map
+from lidarops.site.values import read_values
+
+
+class _Links(HTMLParser):
+    """Collects links with their text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: dict[str, str] = {}
+        self._href: str | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "a":
+            self._href = dict(attrs).get("href")
+            self.found.setdefault(self._href or "", "")
+
+    def handle_data(self, data: str) -> None:
+        if self._href is not None:
+            self.found[self._href] += data
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "a":
+            self._href = None
+
+
+def links(page: Path) -> dict[str, str]:
+    """Return the text of links by what they lead to."""
+    return _Links(page.read_text(encoding="utf-8")).found
+
+
+@pytest.fixture(scope="module")
+def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = small_archive(tmp_path_factory.mktemp("pages") / "out")
+    build_site(made)
+    return made
+
+
+def page_of(output: Path, kind: str, day: str = "20260301") -> Path:
+    return next((output / "site").glob(f"product/odesa/lidar-1/{kind}/**/*{day}T*.html"))
+
+
+@pytest.mark.parametrize("kind", ["elastic", "homogeneous", "multiangle", "signal"])
+def test_the_csv_holds_the_values_of_the_file(output: Path, kind: str) -> None:
+    page = page_of(output, kind)
+    rows = list(csv.DictReader(io.StringIO(page.with_suffix(".csv").read_text("utf-8"))))
+    file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
+    with xr.open_dataset(file, decode_timedelta=False) as product:
+        along, name = (list(rows[0])[place].partition(" (")[0] for place in (2, 3))
+        factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
+        values = product[name].values.astype(float)
+        assert len(rows) == values.size
+        column = next(key for key in rows[0] if key.startswith(name))
+        stated = np.array([float(row[column]) for row in rows]).reshape(values.shape)
+        np.testing.assert_allclose(stated, factor * values, rtol=1e-5)
+        flags = product["quality_flag"].values.ravel()
+        usable = product["usable"].values.ravel()
+    for row, flag, grade in zip(rows, flags, usable, strict=True):
+        assert row["quality"] == ("good", "care", "reject")[int(grade)]
+        assert bool(row["flags"]) == bool(flag)
+    assert rows[0]["time_start"] == "2026-03-01T10:00:00Z"
+    assert rows[0]["time_end"] == "2026-03-01T10:10:00Z"
+    assert along in {"range", "altitude", "section"}
+
+
+def test_a_value_can_be_read_from_the_page(output: Path) -> None:
+    page = page_of(output, "homogeneous")
+    file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
+    with xr.open_dataset(file, decode_timedelta=False) as product:
+        value = 1e3 * float(product["total_extinction"][2, 0])
+        error = 1e3 * float(product["total_extinction_standard_error"][2, 0])
+    text = page.read_text(encoding="utf-8")
+    assert "Total extinction (km⁻¹)" in text
+    row = text[text.index("2026-03-01 10:20\u201310:30") :]
+    cell = row[row.index("<td") : row.index("</td>")].partition(">")[2]
+    stated, _, uncertain = cell.partition(" \u00b1 ")
+    assert float(stated) == pytest.approx(value, rel=5e-3)
+    assert float(uncertain.rstrip(" *")) == pytest.approx(error, rel=5e-2)
+
+
+def test_long_products_are_thinned_to_round_times_and_said() -> None:
+    time = np.datetime64("2026-03-01T00:03", "ns") + np.arange(144) * np.timedelta64(10, "m")
+    height = 7.5 * (np.arange(4000) + 0.5)
+    signal = np.where(height < 6000.0, 5.0, 0.0) + np.random.default_rng(1).normal(
+        0, 1, (144, 4000)
+    )
+    product = xr.Dataset(
+        {
+            "signal": (("time", "range"), signal, {"units": "MHz m2"}),
+            "signal_standard_error": (("time", "range"), np.ones_like(signal)),
+            "quality_flag": (("time", "range"), np.zeros(signal.shape, np.int32)),
+        },
+        coords={"time": time, "range": ("range", height, {"units": "m"})},
+    )
+    values = read_values(product, "signal")
+    (table,) = values.tables
+    assert [clock[11:16] for clock, _ in table.rows][1:4] == ["00:58", "01:58", "02:58"]
+    assert len(table.columns) <= 12
+    assert table.note.startswith(f"{len(table.rows)} of 144 times, nearest to round times")
+    assert "up to 7.2" in values.note
+    assert values.csv.count(b"\n") <= 20_001
+
+
+def test_a_product_leads_to_the_previous_the_next_and_its_siblings(output: Path) -> None:
+    pages = [page_of(output, "elastic", day) for day in ("20260301", "20260302", "20260410")]
+    for place, page in enumerate(pages):
+        text = page.read_text(encoding="utf-8")
+        ends = {
+            rel: (page.parent / unquote(href)).resolve()
+            for rel, href in re.findall(r'<a rel="(prev|next)" href="([^"]+)"', text)
+        }
+        expected = dict(zip(("prev", "next"), (pages[place - 1 :: 1][:1], pages[place + 1 :][:1]),
+                            strict=True))  # fmt: skip
+        if place == 0:
+            expected["prev"] = []
+        assert ends == {rel: other[0].resolve() for rel, other in expected.items() if other}
+        siblings = [page_of(output, "signal", page.stem[-15:-7]), page_of(output, "raman",
+                    page.stem[-15:-7])]  # fmt: skip
+        targets = {(page.parent / unquote(href)).resolve() for href in links(page)}
+        assert {sibling.resolve() for sibling in siblings} <= targets
+
+
+def test_a_new_product_changes_only_the_links_of_its_neighbours(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    for day in (0, 2):
+        add(output, "signal", day)
+    build_site(output)
+    add(output, "signal", 1)
+    again = build_site(output)
+    assert (again.made, again.products) == (1, 3)
+    first = page_of(output, "signal", "20260301").read_text("utf-8")
+    assert "2026-03-02 10:00 UTC" in first
+    fresh = tmp_path / "fresh"
+    shutil.copytree(output / "products", fresh / "products")
+    build_site(fresh)
+    assert contents(fresh / "site") == contents(output / "site")
+
+
+def test_metadata_come_after_figure_and_quality_and_are_folded(output: Path) -> None:
+    text = page_of(output, "elastic").read_text(encoding="utf-8")
+    order = [text.index(words) for words in (
+        "values usable", '<svg class="fig wide"', 'id="values"', 'id="quality"', "How to cite"
+        if "How to cite" in text else 'id="use"', 'id="provenance"', 'id="variables"',
+    )]  # fmt: skip
+    assert order == sorted(order)
+    for words in ("Steps carried out</h3>\n<details>", "</h2>\n<details><summary>4 files"):
+        assert words in text
+
+
+def test_citation_and_licence_are_those_of_the_file(output: Path) -> None:
+    page = page_of(output, "elastic")
+    file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
+    text = page.read_text(encoding="utf-8")
+    cited = text[text.index('class="cite"') :].partition("</p>")[0]
+    with xr.open_dataset(file, decode_timedelta=False) as product:
+        for name in ("creator_name", "id", "product_version"):
+            assert str(product.attrs[name]) in cited
+        assert product.attrs["date_issued"][:4] in cited
+        assert f"Licence: {product.attrs['license']}" in text
+
+
+def test_a_site_with_copies_can_be_served_alone(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    files = [add(output, kind) for kind in ("signal", "elastic")]
+    result = CliRunner().invoke(app, ["site", str(output), "--copies"])
+    assert result.exit_code == 0, result.output
+    site = shutil.copytree(output / "site", tmp_path / "alone")
+    for page in site.rglob("*.html"):
+        for href in links(page):
+            path = (page.parent / unquote(href.partition("#")[0])).resolve()
+            assert path.is_relative_to(site), href
+            assert path.exists(), href
+    for file in files:
+        copy = site / "files" / file.relative_to(output / "products")
+        assert copy.read_bytes() == file.read_bytes()
+    build_site(output)
+    assert not (output / "site/files").exists()
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ("https://data.example.org/lidar/", "https://data.example.org/lidar/odesa/"),
+        ("..", "../../../../../../odesa/"),
+    ],
+)
+def test_downloads_lead_where_products_are_published(
+    tmp_path: Path, place: str, expected: str
+) -> None:
+    output = tmp_path / "out"
+    file = add(output, "signal")
+    result = CliRunner().invoke(app, ["site", str(output), "--products-at", place])
+    assert result.exit_code == 0, result.output
+    name = file.relative_to(output / "products").as_posix()
+    (href,) = (h for h, words in links(page_of(output, "signal")).items() if "NetCDF" in words)
+    assert href == f"{expected}{name.removeprefix('odesa/')}"
+    (listing,) = (output / "site").rglob("2026-03.txt")
+    assert listing.read_text().endswith(f"{name}\n")
+
+
+@pytest.mark.parametrize("place", ["javascript:alert(1)", "/etc", "a b", '"><script>', "ftp://x"])
+def test_other_places_are_refused(tmp_path: Path, place: str) -> None:
+    add(tmp_path, "signal")
+    with pytest.raises(CatalogError, match="neither an address nor a relative place"):
+        build_site(tmp_path, products_at=place)
+
+
+def test_a_month_can_be_downloaded_from_its_list(output: Path) -> None:
+    site = output / "site"
+    listing = site / "station/odesa/2026-03.txt"
+    files = [(listing.parent / unquote(line)).resolve() for line in listing.read_text().split()]
+    assert sorted(files) == sorted((output / "products").resolve().rglob("*202603*.nc"))
+    assert "2026-03.txt" in links(site / "station/odesa/2026.html")
+
+
+def test_a_year_can_be_seen_by_kind(output: Path) -> None:
+    year = output / "site/station/odesa/2026.html"
+    assert "Backscatter of elastic profiles" in links(year)["2026-elastic.html"]
+    text = (output / "site/station/odesa/2026-elastic.html").read_text("utf-8")
+    assert "3 products of 3 days" in text
+    assert 'aria-current="page">Backscatter of elastic profiles' in text
+
+
+def test_days_have_a_calendar_and_filters(output: Path) -> None:
+    day = output / "site/station/odesa/2026/2026-03-01.html"
+    assert "2026-03-02.html" in links(day)
+    text = day.read_text("utf-8")
+    style = (output / "site/site.css").read_text("utf-8")
+    boxes = re.findall(r'<input type="checkbox" id="([^"]+)" checked>', text)
+    assert len(boxes) > 6
+    for box in boxes:
+        assert f"body:has(#{box}:not(:checked))" in style
+
+
+def test_human_names_stand_beside_identifiers(output: Path) -> None:
+    text = page_of(output, "signal").read_text("utf-8")
+    assert "<h1>Range-corrected signals, 532 nm, photon counting</h1>" in text
+    assert "Одеса, hill; Lidar One; 2026-03-01, 10:00 to 10:50 UTC" in text
+    assert "532 nm, photon counting (photon_532o)" in text
+
+
+def test_the_stac_item_is_linked_where_it_exists(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    add(output, "signal")
+    build_site(output)
+    assert "STAC" not in page_of(output, "signal").read_text("utf-8")
+    pytest.importorskip("pystac")
+    assert CliRunner().invoke(app, ["aggregate", str(output), "--stac"]).exit_code == 0
+    build_site(output)
+    page = page_of(output, "signal")
+    (item,) = (href for href, words in links(page).items() if words == "STAC item")
+    document = json.loads((page.parent / unquote(item)).read_text())
+    assert document["id"] == page.stem
+    index = output / "site/index.html"
+    (catalog,) = (href for href, words in links(index).items() if words == "STAC catalog")
+    assert (index.parent / catalog).is_file()
+
+
+def test_stations_are_on_a_map(output: Path) -> None:
+    text = (output / "site/index.html").read_text("utf-8")
+    assert '<a href="#s-odesa">' in text
+    assert 'id="s-odesa"' in text
+    assert "46.44° N, 30.76° E, 53.5 m" in text
+
+
+def test_the_map_is_to_the_north_and_escapes_names() -> None:
+    places = [Place("<b>", "s-a", 60.0, -20.0), Place("south", "s-b", -10.0, 30.0)]
+    markup = str(station_map(places))
+    assert "<b>" not in markup
+    points = [tuple(map(float, point)) for point in re.findall(r'd="M([\d.]+) ([\d.]+)a5', markup)]
+    assert points[0][1] < points[1][1], "north is up"
+    assert points[0][0] < points[1][0], "east is right"
+    assert "20° W" in markup
+    assert not station_map([])
+    one = str(station_map([Place("alone", "s-c", 90.0, 180.0)]))
+    assert "nan" not in one
