@@ -111,21 +111,30 @@ def publish(
     ],
     out: OutOption = None,
     catalog: CatalogOption = None,
+    site: Annotated[
+        bool, typer.Option("--site", help="Also copy the pages, to the folder site.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Copy products to an object store: send what it lacks or has outdated; remove nothing.
 
-    Example: lidarops publish catalogs/demo.yaml s3://bucket/demo
+    With --site, pages go beside them: make these with lidarops site OUT --products-at .. before.
+
+    Example: lidarops publish catalogs/demo.yaml s3://bucket/demo --site
     """
     from lidarops.campaign.model import load_campaign
-    from lidarops.run.publication import publish_products
+    from lidarops.run.publication import publish_products, publish_site
     from lidarops.system.stores import without_keys
 
     settings = load_campaign(campaign, output=out, catalog=catalog)
     published = publish_products(settings, url)
+    pages = publish_site(settings, url) if site else None
     if as_json:
-        typer.echo(json.dumps(asdict(published), indent=2))
+        document = asdict(published) | ({} if pages is None else {"site": asdict(pages)})
+        typer.echo(json.dumps(document, indent=2))
         return
     others = f", {published.others} other files left alone" if published.others else ""
     counts = f"{len(published.uploaded)} sent, {published.unchanged} unchanged{others}"
     say(f"{without_keys(url)}: {counts}")
+    if pages is not None:
+        say(f"pages: {len(pages.uploaded)} sent, {pages.unchanged} unchanged")

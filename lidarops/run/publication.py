@@ -1,13 +1,22 @@
-"""Copy the products of a campaign to an object store."""
+"""Copy the products of a campaign, and its site, to an object store."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
+from typing import Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
+from lidarops.system.files import sha256_of
 from lidarops.system.stores import Published, RemoteStore
+
+_SITE: Final = "site"
+"""Folder of the site, in the output and in the store."""
+_BESIDE: Final = ".."
+"""Where the products are in a store, relative to the site."""
 
 
 def publish_products(campaign: Campaign, url: str) -> Published:
@@ -35,7 +44,59 @@ def publish_products(campaign: Campaign, url: str) -> Published:
         store.all_products() as made,
     ):
         products = {product.path: product.sha256 for product in made}
-    # One journal per store.
+    return RemoteStore(url).publish(campaign.products_root, products, _journal(campaign, url))
+
+
+def publish_site(campaign: Campaign, url: str) -> Published:
+    """Copy the site of a campaign to the folder ``site`` of a store, as far as it changed.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    url : str
+        Destination of the products; the site goes beside them.
+
+    Returns
+    -------
+    Published
+
+    Raises
+    ------
+    CatalogError
+        If there is no site, or its downloads would not lead to published products.
+    ProductError
+        If the store cannot be written.
+    """
+    site = Path(campaign.output) / _SITE
+    _check_links(site)
+    files = {
+        path.relative_to(site).as_posix(): sha256_of(path)
+        for path in sorted(site.rglob("*"))
+        if path.is_file() and not path.is_symlink()
+    }
+    place = f"{url.rstrip('/')}/{_SITE}"
+    return RemoteStore(place).publish(site, files, _journal(campaign, place))
+
+
+def _check_links(site: Path) -> None:
+    """Refuse a site whose downloads lead to the disk that it was made on."""
+    manifest = site / "manifest.json"
+    try:
+        place = str(json.loads(manifest.read_bytes())["products_at"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CatalogError(
+            "there is no complete site", file=manifest, remedy="run lidarops site OUT first"
+        ) from error
+    if place.startswith(_BESIDE) and place.rstrip("/") != _BESIDE:
+        raise CatalogError(
+            f"downloads lead to {place}, but published products are beside the site",
+            file=manifest,
+            field="products_at",
+            remedy=f"run lidarops site OUT --products-at {_BESIDE}, or --copies",
+        )
+
+
+def _journal(campaign: Campaign, url: str) -> Path:
+    """Return the journal of what was sent to a store."""
     name = hashlib.sha256(url.encode()).hexdigest()[:12]
-    journal = Path(campaign.output) / f"published-{name}.sha256"
-    return RemoteStore(url).publish(campaign.products_root, products, journal)
+    return Path(campaign.output) / f"published-{name}.sha256"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 import yaml
@@ -131,3 +133,27 @@ def test_keys_in_the_url_are_not_shown(campaign_file: Path) -> None:
         assert refused.exit_code == code
         assert "://bucket" in refused.output
         assert "ret" not in refused.output
+
+
+def test_the_site_is_published_beside_the_products(tmp_path: Path, campaign_file: Path) -> None:
+    campaign = load_campaign(campaign_file)
+    assert reprocess(campaign) is not None
+    runner, store = CliRunner(), tmp_path / "store"
+    words = ["publish", str(campaign_file), store.as_uri(), "--site"]
+    refused = runner.invoke(app, words, env={"COLUMNS": "300"})
+    assert refused.exit_code == 1
+    assert "there is no complete site" in refused.output
+    assert runner.invoke(app, ["site", str(campaign.output)]).exit_code == 0
+    refused = runner.invoke(app, words, env={"COLUMNS": "300"})
+    assert refused.exit_code == 1
+    assert "--products-at .." in refused.output
+    made = runner.invoke(app, ["site", str(campaign.output), "--products-at", ".."])
+    assert made.exit_code == 0, made.output
+    sent = runner.invoke(app, words)
+    assert sent.exit_code == 0, sent.output
+    for page in (store / "site").rglob("*.html"):
+        for href in re.findall(r'<a [^>]*href="([^"#]+)', page.read_text(encoding="utf-8")):
+            file = (page.parent / unquote(href)).resolve()
+            assert file.is_relative_to(store.resolve()), href
+            assert file.is_file(), href
+    assert "0 sent" in runner.invoke(app, words).output.splitlines()[-1]
