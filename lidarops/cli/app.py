@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -72,6 +73,9 @@ _P = ParamSpec("_P")
 
 _LEAST_COLUMN_WIDTH = 12
 """Least width of a table column, in characters."""
+
+_TABLE_LINES = 3
+"""Characters between the columns of a table."""
 
 _FILE_WIDTH = 10_000
 """Width of tables that are not printed on a terminal: no cell folds."""
@@ -218,18 +222,69 @@ def show(table: Table) -> None:
 
 
 def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Print a table of plain text whose cells fold, unless it has no rows."""
+    """Print a table of plain text, unless it has no rows.
+
+    On a terminal, cells fold between words only, so that names can be read and copied. Where the
+    words are too long for columns, each row is a paragraph.
+    """
+    names = list(columns)
+    # A file name may hold what moves the cursor of a terminal.
+    cells = [[visible(str(cell)) for cell in row] for row in rows]
+    if not cells:
+        return
+    # As the title of the table it would fold at the width of the table.
+    for line in wrapped(title, ""):
+        say(line)
+    widths = _column_widths(names, cells, terminal_width())
+    if widths is None:
+        for row in cells:
+            for name, cell in zip(names, row, strict=True):
+                for line in wrapped(f"{name}: {cell}" if name else cell, "  "):
+                    say(line)
+            say("")
+        return
     from rich.table import Table
     from rich.text import Text
 
     table = Table()
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    for row in rows:
-        # Text, because rich would read brackets in a path or reason as markup. A file name may hold
-        # what moves the cursor of a terminal.
-        table.add_row(*(Text(visible(str(cell))) for cell in row))
-    if table.row_count:
-        # As the title of the table it would fold at the width of the table.
-        say(title)
-        show(table)
+    for name, width in zip(names, widths, strict=True):
+        table.add_column(name, width=width, overflow="fold")
+    for row in cells:
+        # Text, because rich would read brackets in a path or reason as markup.
+        table.add_row(*(Text(cell) for cell in row))
+    show(table)
+
+
+def terminal_width() -> int:
+    """Return the number of characters in a line; many if the output is no terminal."""
+    from rich.console import Console
+
+    console = Console()
+    return console.width if console.is_terminal else _FILE_WIDTH
+
+
+def wrapped(text: str, indent: str) -> list[str]:
+    """Return lines of a text that fold between words only, the later ones indented further."""
+    later = f"{indent}  "
+    return textwrap.wrap(
+        " ".join(text.split()),
+        max(terminal_width(), len(later) + 1),
+        initial_indent=indent,
+        subsequent_indent=later,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list[int] | None:
+    """Return widths of columns that break no word; None if these do not fit in a line."""
+    columns = [list(column) for column in zip(names, *cells, strict=True)]
+    words = ([word for cell in column for word in cell.split()] for column in columns)
+    least = [max(map(len, column), default=0) for column in words]
+    whole = [max(map(len, column)) for column in columns]
+    spare = width - sum(least) - _TABLE_LINES * len(columns) - 1
+    if spare < 0:
+        return None
+    wanted = sum(whole) - sum(least)
+    share = min(1.0, spare / wanted) if wanted else 0.0
+    return [low + int(share * (high - low)) for low, high in zip(least, whole, strict=True)]

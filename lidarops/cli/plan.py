@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,9 +23,11 @@ from lidarops.cli.app import (
     WaitOption,
     command,
     exit_with_status,
+    say,
     show_rows,
 )
 from lidarops.cli.findings import findings_document, show_findings
+from lidarops.cli.plan_summary import grouped, scene_title, show_scene, show_times
 from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
 
 if TYPE_CHECKING:
@@ -51,6 +53,10 @@ def show_plan(
     stale: Annotated[
         bool, typer.Option("--stale", help="Show only the products to be made, and why.")
     ] = False,
+    everything: Annotated[
+        bool,
+        typer.Option("--all", help="Show settings and reasons of every step, and all left out."),
+    ] = False,
     wait: WaitOption = 0.0,
     all_steps: AllStepsOption = False,
     as_json: JsonOption = False,
@@ -59,9 +65,10 @@ def show_plan(
 
     Makes no folder: without an output folder the catalog is made for the moment.
 
-    Also shows the estimated CPU time, and the memory that a process needs for each scene. Exit
-    code 1 if a scene cannot be planned, failed before or gave no usable value, a pattern or channel
-    is in no file, or headers contradict a station.
+    Shows a summary of each scene; with --all every step with its settings and reasons. Also shows
+    the estimated CPU time, and the memory that a process needs for each scene. Exit code 1 if a
+    scene cannot be planned, failed before or gave no usable value, a pattern or channel is in no
+    file, or headers contradict a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
@@ -70,11 +77,17 @@ def show_plan(
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
     with without_writing(settings) as planned:
-        _plan(planned, selection, stale=stale, wait=wait, as_json=as_json)
+        _plan(planned, selection, stale=stale, everything=everything, wait=wait, as_json=as_json)
 
 
 def _plan(
-    settings: Campaign, selection: Selection, *, stale: bool, wait: float, as_json: bool
+    settings: Campaign,
+    selection: Selection,
+    *,
+    stale: bool,
+    everything: bool,
+    wait: float,
+    as_json: bool,
 ) -> None:
     from lidarops.plan.cost_estimate import RunTime
     from lidarops.run.archive import assess, earlier_problems, survey
@@ -83,7 +96,7 @@ def _plan(
 
     findings = survey(settings, selection=selection, wait=wait)
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
-    making, everything = RunTime(), RunTime()
+    making, whole_run = RunTime(), RunTime()
     scenes = []
     no_scene = True
     failed = False
@@ -98,7 +111,7 @@ def _plan(
         scene, whole = judged.scene, settings.all_steps
         times = {
             "to_be_made": making.add(scene, judged.needed(), whole=whole),
-            "everything": everything.add(scene, judged.requested, whole=whole),
+            "everything": whole_run.add(scene, judged.requested, whole=whole),
         }
         memory = {
             "to_be_made": scene_memory(scene, judged.needed()).total,
@@ -108,17 +121,17 @@ def _plan(
             estimates = {"estimated_cpu_seconds": times, "estimated_memory_bytes": memory}
             scenes.append({**_plain(judged), **estimates})
             continue
-        title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
         needs = {
             name: f"about {times[name]:.2g} s of CPU time and {memory[name] / 1e6:.0f} MB of memory"
             for name in times
         }
-        if not stale:
-            _show_plan(f"{title}, {needs['everything']}", judged.requested)
-        _show_stale(f"{title}, {needs['to_be_made']}", judged)
+        if everything:
+            _show_all(judged, needs, plan=not stale)
+        else:
+            show_scene(judged, needs["to_be_made" if stale else "everything"], plan=not stale)
     no_scene = no_scene and selects_no_scene(settings, selection)
     # With --stale, fresh scenes were not judged.
-    runs = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
+    runs = {"to be made": making} | ({} if stale else {"everything, with --force": whole_run})
     if as_json:
         estimate = {
             name.partition(",")[0].replace(" ", "_"): run.parts for name, run in runs.items()
@@ -135,35 +148,30 @@ def _plan(
         typer.echo(json.dumps(document, indent=2))
     else:
         if no_scene:
-            typer.echo(NO_SCENE)
+            say(NO_SCENE)
         show_findings(findings)
         _show_earlier(earlier)
-        _show_times(runs)
+        (_show_times if everything else show_times)(runs)
     exit_with_status(failed=failed or any(earlier) or findings.failed)
+
+
+def _show_all(judged: Judgement, needs: Mapping[str, str], *, plan: bool) -> None:
+    title = scene_title(judged)
+    if plan:
+        _show_plan(f"{title}, {needs['everything']}", judged.requested)
+    _show_stale(f"{title}, {needs['to_be_made']}", judged)
 
 
 def _show_plan(title: str, plan: Plan) -> None:
     """Print the steps of a plan, and what it leaves out; equal lines of channels are one."""
     columns = ("step", "channels", "what, and why")
-    steps = _by_channels(
+    steps = grouped(
         (step.name, _words(_effect(step, plan), step, needs), step.channel)
         for step, needs in zip(plan.steps, _needs(plan), strict=True)
     )
     show_rows(f"{title}, plan {plan.hash[:12]}", columns, steps)
-    left_out = _by_channels(
-        (left.name, _words("", left, ""), left.channel) for left in plan.left_out
-    )
+    left_out = grouped((left.name, _words("", left, ""), left.channel) for left in plan.left_out)
     show_rows("Left out", columns, left_out)
-
-
-def _by_channels(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
-    """Yield name, channels and text for lines of name, text and channel, grouped by name."""
-    channels: dict[str, dict[str, dict[str, None]]] = {}
-    for name, text, channel in lines:
-        channels.setdefault(name, {}).setdefault(text, {})[channel] = None
-    for name, texts in channels.items():
-        for text, names in texts.items():
-            yield name, ", ".join(filter(None, names)), text
 
 
 def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
@@ -227,7 +235,7 @@ def _show_earlier(earlier: EarlierProblems) -> None:
 
 def _show_stale(title: str, judged: Judgement) -> None:
     rows = list(
-        _by_channels((product.kind, product.reason, product.channel) for product in judged.stale)
+        grouped((product.kind, product.reason, product.channel) for product in judged.stale)
     )
     if judged.failure:
         unchanged = "not tried again, because nothing has changed: " if judged.held else ""

@@ -127,7 +127,7 @@ def test_a_product_that_no_scene_gives_is_named_in_the_last_line_and_the_report(
     record, page = last_run(archive)
     assert [unmade.kind for unmade in record.findings.unmade] == ["elastic"]
     assert "Requested, but made in no scene: elastic analog_532o of rich." in page
-    assert '<strong class="care">' in page
+    assert '<p class="verdict care">' in page
     again = invoke(archive, "reprocess")
     assert "requested, but made in no scene: elastic analog_532o of rich" in again.output
     assert document(archive, "plan")["never_made"][0]["kind"] == "elastic"
@@ -248,14 +248,14 @@ def test_a_plan_tells_of_scenes_that_failed_before(archive: Archive) -> None:
 
 
 def test_a_plan_prints_equal_lines_of_channels_once(archive: Archive) -> None:
-    output = invoke(archive, "plan").output
+    output = invoke(archive, "plan", "--all").output
     overlap = [line for line in output.splitlines() if line.split("│")[1:2] == [" overlap     "]]
     assert all("analog_532o, photon_532o" in line for line in overlap)
     assert max(map(len, output.splitlines())) > 80
 
 
 def test_a_plan_states_the_units_of_settings(archive: Archive) -> None:
-    shown = " ".join(invoke(archive, "plan", "--instrument", "rich").output.split())
+    shown = " ".join(invoke(archive, "plan", "--all", "--instrument", "rich").output.split())
     assert "wavelength 5.32e-07 m;" in shown
     assert "dead_time 4e-09 s," in shown
 

@@ -269,7 +269,7 @@ def test_a_plan_marks_a_range_window_without_effect(archive: Archive) -> None:
     archive.write()
     assert _window_effects(_planned(archive)) == ["signal needs all bins"] * 4
     assert _window_effects(_planned(archive, "--product", "homogeneous")) == [""] * 4
-    shown = CliRunner().invoke(app, ["plan", str(archive.file)], env={"COLUMNS": "300"})
+    shown = CliRunner().invoke(app, ["plan", str(archive.file), "--all"], env={"COLUMNS": "300"})
     assert shown.stdout.count("no effect: signal needs all bins") == 4
 
 
@@ -277,7 +277,7 @@ def test_a_plan_shows_its_hash_and_what_each_step_needs(archive: Archive) -> Non
     archive.write()
     selection = ["--instrument", "poor", "--until", "2026-03-02T00:00:00"]
     (scene,) = _planned(archive, *selection)["scenes"]
-    command = ["plan", str(archive.file), *selection]
+    command = ["plan", str(archive.file), *selection, "--all"]
     shown = CliRunner().invoke(app, command, env={"COLUMNS": "100"}).stdout
     assert f"plan {scene['hash'][:12]}" in " ".join(shown.split())
     rows = [[cell.strip() for cell in line.split("│")] for line in shown.splitlines()]

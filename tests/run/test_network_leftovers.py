@@ -111,7 +111,8 @@ def test_lidars_used_only_by_a_network_are_no_failure(net: Net) -> None:
     assert (code, summary["empty_scenes"]) == (0, {})
     # Wide, so that the reason is not folded.
     wide = {"COLUMNS": "200"}
-    shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"], env=wide).stdout
+    command = ["plan", str(net.file), "--all", "--station", "west"]
+    shown = CliRunner().invoke(app, command, env=wide).stdout
     assert "used only by network valley" in shown
 
 

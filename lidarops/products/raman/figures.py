@@ -35,7 +35,9 @@ _HEIGHT: Final = 366
 _QUANTITY: Final = "aerosol_extinction"
 _IMAGES: Final = {
     "aerosol_extinction": ImageQuantity("aerosol extinction", _MEGA, "Mm⁻¹", (1.0, 1000.0)),
-    "aerosol_backscatter": ImageQuantity("aerosol backscatter", _MEGA, "Mm⁻¹ sr⁻¹", (0.01, 10.0), background=False),
+    "aerosol_backscatter": ImageQuantity(
+        "aerosol backscatter", _MEGA, "Mm⁻¹ sr⁻¹", (0.01, 10.0), background=False
+    ),
 }
 """Images by variable; colours from background aerosol to dust and cirrus, as of ``elastic``."""
 _SHOWN: Final = (

@@ -1,0 +1,91 @@
+"""What `lidarops plan` shows of a scene by default: a screen of text, whose words stay whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Final
+
+from lidarops.cli.app import say, wrapped
+from lidarops.figures.wording import counted
+from lidarops.kinds import kinds
+
+if TYPE_CHECKING:
+    from lidarops.plan.cost_estimate import RunTime
+    from lidarops.records import Plan
+    from lidarops.run.staleness import Judgement
+
+_REQUEST: Final = "request"
+"""Rule by which products are left out that the campaign does not request."""
+
+
+def scene_title(judged: Judgement) -> str:
+    """Return the name of a scene with its numbers of files."""
+    scene = judged.scene
+    return f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+
+
+def show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
+    """Print a scene: what is to be made and why, its steps, and what is left out.
+
+    Parameters
+    ----------
+    judged : Judgement
+    needs : str
+        Time and memory.
+    plan : bool
+        Whether steps are shown; a scene without anything to be made is left out otherwise.
+    """
+    stale = list(
+        grouped((product.kind, product.reason, product.channel) for product in judged.stale)
+    )
+    if not plan and not stale and not judged.failure:
+        return
+    _say(f"{scene_title(judged)}, plan {judged.requested.hash[:12]}", "")
+    _say(needs, "  ")
+    _say("to be made:" if stale else "to be made: nothing", "  ")
+    for kind, channels, reason in stale:
+        _say(f"{kind} {channels}: {reason}", "    ")
+    if judged.failure:
+        held = "; not tried again, because nothing has changed" if judged.held else ""
+        _say(f"failed before{held}: {judged.failure.error}", "  ")
+    if plan:
+        _say_steps(judged.requested)
+
+
+def _say_steps(plan: Plan) -> None:
+    names = dict.fromkeys(step.name for step in plan.steps)
+    if names:
+        _say(f"steps: {', '.join(names)}", "  ")
+    missed = [left for left in plan.left_out if left.name in kinds() and left.rule != _REQUEST]
+    for name, channels, reason in grouped(
+        (left.name, left.reason, left.channel) for left in missed
+    ):
+        _say(f"requested, but left out: {name} {channels}: {reason}", "  ")
+    others = dict.fromkeys(left.name for left in plan.left_out if left.name not in kinds())
+    if others:
+        _say(f"left out, of some channels: {', '.join(others)}", "  ")
+
+
+def show_times(runs: Mapping[str, RunTime]) -> None:
+    """Print the estimated times of runs, and how to see more."""
+    times = (
+        f"{name}: about {run.parts['all']:.2g} s for {counted(run.count, 'scene')}"
+        for name, run in runs.items()
+    )
+    _say(f"CPU time, {'; '.join(times)}", "")
+    _say("--all shows settings and reasons of every step; --json shows everything.", "")
+
+
+def grouped(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    """Yield name, channels and text for lines of name, text and channel, grouped by name."""
+    channels: dict[str, dict[str, dict[str, None]]] = {}
+    for name, text, channel in lines:
+        channels.setdefault(name, {}).setdefault(text, {})[channel] = None
+    for name, texts in channels.items():
+        for text, names in texts.items():
+            yield name, ", ".join(filter(None, names)), text
+
+
+def _say(text: str, indent: str) -> None:
+    for line in wrapped(text, indent):
+        say(line)
