@@ -148,5 +148,5 @@ FIGURES: Final = KindFigures(
         View("network", MAP_VARIABLES, _read_map, _draw_map, first=True),
     ),
     preferred="visibility_in_air",
-    values=(Quantity("visibility_in_air", 1e-3, "km"), Quantity("extinction", 1e3, "km⁻¹")),
+    values=(Quantity("visibility_in_air", 1e-3, "km"), Quantity("total_extinction", 1e3, "km⁻¹")),
 )
