@@ -58,6 +58,10 @@ class Kind:
     """Whether a scene should give usable values. False where the method is applied to any air, so
     that fog or darkness may reject all values."""
 
+    common: tuple[str, str] | None = None
+    """Variable that all channels of a wavelength measure alike, whatever their detection and
+    polarisation, and the coordinate along its profiles."""
+
     @property
     def scope(self) -> Scope:
         """Data that one product is made of."""

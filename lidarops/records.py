@@ -285,6 +285,20 @@ class ProductRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class Disagreement:
+    """Two channels of a scene that measure the same and disagree by more than their errors."""
+
+    kind: str
+    channels: tuple[str, str]
+    outlier: str
+    """Channel that also disagrees with another one, which the rest agree with; else empty."""
+    place: float
+    """Coordinate along the profile where they disagree most, m."""
+    deviation: float
+    """Standard errors of the difference there."""
+
+
+@dataclass(frozen=True, slots=True)
 class SceneOutcome:
     """Result of processing one scene."""
 
@@ -308,6 +322,8 @@ class SceneOutcome:
     """CPU time of the thread that processed the scene; 0 where not measured."""
     left_out: tuple[LeftOut, ...] = ()
     """Requested steps that are not in `plan`, because their product or channel was not made."""
+
+    disagreements: tuple[Disagreement, ...] = ()
 
     internal: str = ""
     """Traceback of the internal error (a bug of lidarops) that `error` names; else empty."""

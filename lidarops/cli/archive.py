@@ -35,7 +35,7 @@ from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, se
 from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from contextlib import AbstractContextManager
 
     from distributed import Client
@@ -332,6 +332,11 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "empty_scenes": dict(result.empty_scenes),
         "more_of_both": result.more_unused,
         **findings_document(result.findings),
+        "disagreements": [
+            {"scene": scene.scene, **asdict(pair)}
+            for scene in scenes
+            for pair in scene.disagreements
+        ],
         "orphans": {
             orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
         },
@@ -376,6 +381,7 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     _show_refused(refused)
     _show_unused(result, {granule.path for granule in refused})
     show_findings(result.findings)
+    _show_disagreements(scenes)
     if not removing:
         _show_orphans(result, None)
     kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
@@ -392,6 +398,13 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         if not result.findings.failed:
             state = "every requested product is fresh or cannot be made"
         say(f"nothing to do: {state}{never_made(result.findings)}")
+
+
+def _show_disagreements(scenes: Iterable[SceneOutcome]) -> None:
+    from lidarops.reports.findings import disagreement_rows
+
+    rows = ((row.instrument, row.subject, row.problem) for row in disagreement_rows(scenes))
+    show_rows("Channels that disagree", ("instrument", "channels", "finding"), rows)
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:

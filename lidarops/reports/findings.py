@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from lidarops.figures.wording import counted
-from lidarops.records import Findings, Unmet
+from lidarops.records import Findings, SceneOutcome, Unmet
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +24,19 @@ class FindingRow:
 def finding_rows(findings: Findings) -> list[FindingRow]:
     """Return the findings besides missing channels, those that fail a run first."""
     return sorted(_rows(findings), key=lambda row: not row.fails)
+
+
+def disagreement_rows(scenes: Iterable[SceneOutcome]) -> Iterator[FindingRow]:
+    """Yield a row for each two channels of a scene that disagree."""
+    for scene in scenes:
+        for pair in scene.disagreements:
+            failing = f"; {pair.outlier} disagrees with the others too" if pair.outlier else ""
+            problem = (
+                f"differ by {pair.deviation:.1f} standard errors at {pair.place:g} m in"
+                f" {scene.scene}, though both measure the same: one is wrong{failing}"
+            )
+            subject = f"{pair.kind}: {pair.channels[0]}, {pair.channels[1]}"
+            yield FindingRow(scene.instrument, subject, problem, fails=False)
 
 
 def unmade_words(findings: Findings) -> list[str]:

@@ -19,7 +19,7 @@ from lidarops.figures.wording import duration, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
-from lidarops.reports.findings import finding_rows, lacking
+from lidarops.reports.findings import disagreement_rows, finding_rows, lacking
 from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME
 from lidarops.reports.sources import Compared
@@ -151,7 +151,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         difference=difference(record, folder),
         narrow=gallery.NARROW,
         overview=_overview(pictures),
-        findings=finding_rows(record.findings),
+        findings=[*finding_rows(record.findings), *disagreement_rows(record.scenes)],
         instruments=run_tables.instruments(record),
         stages=stages,
         scenes=[

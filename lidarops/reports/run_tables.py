@@ -13,7 +13,7 @@ from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome
-from lidarops.reports.findings import finding_rows, unmade_words
+from lidarops.reports.findings import disagreement_rows, finding_rows, unmade_words
 from lidarops.steps.reading import idle_window
 
 _MOST_NAMES: Final = 8
@@ -203,6 +203,9 @@ def _cautions(record: RunRecord) -> Iterator[str]:
     )
     if empty:
         yield f"{counted(empty, 'product')} without a usable value"
+    disagreeing = sorted({row.subject for row in disagreement_rows(record.scenes)})
+    if disagreeing:
+        yield f"Channels that measure the same disagree: {listed(disagreeing)}"
     unmade = unmade_words(record.findings)
     if unmade:
         yield f"Requested, but made in no scene: {listed(unmade)}"

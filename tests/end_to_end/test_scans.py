@@ -12,6 +12,7 @@ import yaml
 from support.archives.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.reports.findings import disagreement_rows
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
@@ -113,6 +114,51 @@ def test_a_fixed_beam_is_not_a_scan(tmp_path):
     settings, _ = campaign(tmp_path, duration=400, instruments={"scanner": still})
     (reason,) = bring_up_to_date(settings).empty_scenes.values()
     assert "does not scan" in reason
+
+
+def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
+    """The dead time of one polarisation is stated wrongly, as if it were known well."""
+    lidar, scanner = TREE["instruments"]["scanner"], TREE["simulation"]["instruments"]["scanner"]
+    (detector,) = scanner["detectors"]
+    analog = {"analog": {"gain": 0.5, "noise": 0.02, "dark_offset": 2.0}}
+    detectors = [
+        detector | {"signal_rate": 60, "polarisation": name} | recorders
+        for name, recorders in (("p", analog), ("s", {}))
+    ]
+    names = ["photon_532p", "analog_532p", "photon_532s"]
+
+    def tree(dead_time: float) -> dict[str, Any]:
+        channels = {"photon_532p": 3e-9, "photon_532s": dead_time}
+        facts = {
+            name: {"dead_time": seconds, "dead_time_uncertainty": 0.01}
+            for name, seconds in channels.items()
+        }
+        products = {"multiangle": lidar["products"]["multiangle"] | {"channels": names}}
+        changed = lidar | {
+            "facts": [{"full_overlap_range": 300, "channels": facts}],
+            "products": products,
+        }
+        instruments = {"scanner": scanner | {"detectors": detectors}}
+        return TREE | {
+            "instruments": {"scanner": changed},
+            "output": f"out-{dead_time}",
+            "simulation": TREE["simulation"] | {"duration": 600, "instruments": instruments},
+        }
+
+    path = tmp_path / "scans.yaml"
+    for dead_time, outliers in ((3e-9, set()), (9e-9, {"photon_532s"})):
+        path.write_text(yaml.safe_dump(tree(dead_time)), encoding="utf-8")
+        settings = load_campaign(path)
+        if not outliers:
+            simulate_campaign(settings)
+        run = reprocess(settings)
+        pairs = run.scenes[0].disagreements
+        assert {pair.outlier for pair in pairs} == outliers
+        others = {name for pair in pairs for name in pair.channels} - {"photon_532s"}
+        assert others == ({"photon_532p", "analog_532p"} if outliers else set())
+        rows = list(disagreement_rows(run.scenes))
+        assert len(rows) == len(pairs)
+        assert all("photon_532s disagrees with the others too" in row.problem for row in rows)
 
 
 @pytest.mark.slow

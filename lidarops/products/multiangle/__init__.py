@@ -13,4 +13,5 @@ KIND: Final = Kind(
     package=__name__,
     settings=MultiAngleSettings,
     rank=30,
+    common=("vertical_optical_depth", "altitude"),
 )
