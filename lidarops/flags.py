@@ -27,7 +27,8 @@ class Severity(IntEnum):
     """What a raised bit means for the use of the value."""
 
     CARE = 1
-    """Use with care: the value is valid, but its stated uncertainty may be too small."""
+    """Use with care: the value is valid, but its stated uncertainty may be too small, or as large
+    as the value."""
     REJECT = 2
     """Do not use: the value does not represent the named quantity."""
 
@@ -112,6 +113,14 @@ class Quality(FlagBit):
     )
     OUTLIER = 12, Severity.CARE, "at least one bin deviates by more than 5 standard errors"
     NO_REAL_SOLUTION = 13, Severity.REJECT, "the estimating equation has no admissible real root"
+    LOW_SIGNAL_TO_NOISE = (
+        14,
+        Severity.CARE,
+        (
+            "the value is smaller than its standard error (or another multiple, by"
+            " least_signal_to_noise): keep it in means, which would be biased without such values"
+        ),
+    )
     BACKGROUND_UNCERTAIN = (
         15,
         Severity.CARE,
@@ -136,6 +145,7 @@ SIGNAL_BITS: Final = (
     Quality.PILE_UP,
     Quality.INCOMPLETE_OVERLAP,
     Quality.OUTLIER,
+    Quality.LOW_SIGNAL_TO_NOISE,
     Quality.BACKGROUND_UNCERTAIN,
     Quality.NO_GLUING,
 )

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from lidarops.kinds import kinds
 
@@ -264,6 +264,19 @@ class Provenance:
     code_version: str
 
 
+class Verdicts(NamedTuple):
+    """Numbers of values by the worst severity of their quality bits."""
+
+    good: int
+    care: int
+    reject: int
+
+    @property
+    def values(self) -> int:
+        """Number of all values."""
+        return sum(self)
+
+
 @dataclass(frozen=True, slots=True)
 class ProductRecord:
     """One written product."""
@@ -282,6 +295,12 @@ class ProductRecord:
     """Number of values that carry no bit."""
     usable: int | None = None
     """Number of values without a rejecting bit; None where they were not counted."""
+
+    @property
+    def verdicts(self) -> Verdicts:
+        """Numbers of good values, of those to be used with care, and of rejected ones."""
+        usable = self.unflagged if self.usable is None else self.usable
+        return Verdicts(self.unflagged, usable - self.unflagged, self.values - usable)
 
 
 @dataclass(frozen=True, slots=True)

@@ -213,6 +213,18 @@ def _divides_day(interval: timedelta) -> timedelta:
 PartOfDay = Annotated[Interval, AfterValidator(_divides_day)]
 
 
+def signal_to_noise_limit() -> Any:
+    """Return the field ``least_signal_to_noise`` of a kind of product."""
+    return quantity(
+        1.0,
+        unit=NO_UNIT,
+        ge=0,
+        le=100,
+        description="values smaller than this times their standard error have the bit"
+        " low_signal_to_noise, of severity care; 0 for none",
+    )
+
+
 class ChannelProduct(SettingsModel):
     """Base of the settings of a kind of product that is made of one channel."""
 

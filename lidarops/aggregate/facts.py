@@ -20,6 +20,7 @@ from lidarops.kinds import kinds
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
+from lidarops.records import Verdicts
 from lidarops.system.files import sha256_of, within
 
 FOLDER: Final = "aggregates"
@@ -68,6 +69,11 @@ class Facts:
     code_version: str
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Quality bit name -> number of values that carry it, if any."""
+
+    @property
+    def verdicts(self) -> Verdicts:
+        """Numbers of good values, of those to be used with care, and of rejected ones."""
+        return Verdicts(self.unflagged, self.usable - self.unflagged, self.values - self.usable)
 
     @property
     def group(self) -> Group:

@@ -60,8 +60,9 @@ _COLUMNS: Final[Mapping[str, tuple[str, _Cell]]] = {
     "size": ("int64", lambda facts: facts.size),
     "profiles": ("int32", lambda facts: facts.profiles),
     "values": ("int64", lambda facts: facts.values),
-    "usable": ("int64", lambda facts: facts.usable),
-    "unflagged": ("int64", lambda facts: facts.unflagged),
+    "good": ("int64", lambda facts: facts.verdicts.good),
+    "care": ("int64", lambda facts: facts.verdicts.care),
+    "reject": ("int64", lambda facts: facts.verdicts.reject),
     "grid": ("dictionary", lambda facts: facts.grid),
     "code_version": ("dictionary", lambda facts: facts.code_version),
 }
@@ -168,8 +169,8 @@ def find_products(
         One row per product, sorted by start, then path: ``path`` relative to ``attrs["root"]``,
         ``start`` and ``stop``, place (degree, m), ``wavelength`` (m), ``id``, ``sha256_prefix``
         (first 32 hexadecimal digits of the sha256 of the file), ``size`` (bytes), numbers of
-        ``values``, ``usable`` values (no bit rejects them) and ``unflagged`` values, and a count
-        per quality bit.
+        ``values``, of ``good`` ones, of those to be used with ``care`` and of ones to ``reject``,
+        and a count per quality bit.
 
     Raises
     ------
@@ -183,7 +184,7 @@ def find_products(
     Examples
     --------
     >>> found = lidarops.find_products("demo/aggregates/products.parquet", kind="elastic")
-    >>> found.query("usable > 0").path.tolist()  # doctest: +SKIP
+    >>> found.query("good + care > 0").path.tolist()  # doctest: +SKIP
     """
     selection = parse_selection(kind, channel, station, instrument, since, until)
     path = Path(index)

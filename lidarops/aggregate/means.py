@@ -28,11 +28,15 @@ from lidarops.aggregate.means_variables import MeansDescription, Period, Weights
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
+from lidarops.netcdf.variables import layout_of
 from lidarops.netcdf.write import write_product
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
 
 Record = Mapping[str, NDArray[Any]]
+
+
+_WEIGHED: Final = np.int32(Quality.LOW_SIGNAL_TO_NOISE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +136,15 @@ class _PeriodSums:
         self.profiles += chosen.size
         self.usable = self.usable + usable.sum(axis=0)
         self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)
-        kept = np.where(usable, flags, np.int32(0))
+        # Of the mean, not of its members: see `record`.
+        kept = np.where(usable, flags & ~_WEIGHED, np.int32(0))
         self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
         self.shots += float(profiles.shots[chosen].sum())
 
     def record(self) -> dict[str, NDArray[Any]]:
         """Return the variables of the period, without dimension time."""
         flags = np.where(self.usable > 0, self.usable_flags, self.flags)
+        weighed = layout_of(self.kind).weighed
         variables: dict[str, NDArray[Any]] = {
             "usable_share": self.usable / np.float64(self.profiles),
             "shots": np.asarray(self.shots),
@@ -151,6 +157,9 @@ class _PeriodSums:
             variables[f"{name}_observations"] = mean.observations
             if mean.systematic is not None:
                 variables[f"{systematic(self.kind, name)}"] = mean.systematic
+            if name in weighed:
+                error = mean.standard_error
+                flags = flags | np.where(np.abs(mean.mean) < error, _WEIGHED, np.int32(0))
             if mean.mean.shape == flags.shape:
                 # Usable values without an error for weighting give no mean: flag it as missing.
                 unflagged = ~np.isfinite(mean.mean) & (flags == 0)

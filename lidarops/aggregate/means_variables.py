@@ -186,7 +186,8 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     )
     yield replace(
         flags,
-        comment="Bits of the values in the mean; if there is no usable value, bits of all values.",
+        comment="Bits of the values in the mean; if there is no usable value, bits of all values."
+        " low_signal_to_noise is that of the mean: it is smaller than its standard error.",
     )
     shots = source.row("shots")
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")

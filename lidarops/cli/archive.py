@@ -328,6 +328,11 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "unusable_scenes": list(result.unusable_scenes),
         "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
         "products": [product.path for scene in scenes for product in scene.products],
+        "quality": {
+            product.path: product.verdicts._asdict()
+            for scene in scenes
+            for product in scene.products
+        },
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
         "more_of_both": result.more_unused,
@@ -375,7 +380,7 @@ def _refused(campaign: Campaign, result: Result) -> list[Granule]:
 
 def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removing: bool) -> None:
     scenes = () if result.record is None else result.record.scenes
-    columns = ("scene", "kind", "channel", "values", "unflagged", "flags")
+    columns = ("scene", "kind", "channel", "values", "good", "care", "reject", "flags")
     show_rows("Products", columns, (row for scene in scenes for row in _product_rows(scene)))
     refused = _refused(campaign, result)
     _show_refused(refused)
@@ -410,10 +415,10 @@ def _show_disagreements(scenes: Iterable[SceneOutcome]) -> None:
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
     for product in scene.products:
         flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
-        numbers = (product.values, product.unflagged)
+        numbers = (product.values, *product.verdicts)
         yield scene.scene, product.kind, product.channel, *numbers, flags
     if scene.error:
-        yield scene.scene, "none", "", "", "", scene.error
+        yield scene.scene, "none", "", "", "", "", "", scene.error
 
 
 def _show_unused(result: Result, listed: Collection[str]) -> None:

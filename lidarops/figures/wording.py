@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     import numpy as np
 
+    from lidarops.records import Verdicts
+
 _REORDERING: Final = frozenset(
     "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
     "\N{LEFT-TO-RIGHT OVERRIDE}\N{RIGHT-TO-LEFT OVERRIDE}"
@@ -27,6 +29,14 @@ def percent(share: float) -> str:
     if 99.9 < number < 100.0:
         return ">99.9 %"
     return f"{number:.1f} %" if number % 100.0 else f"{number:.0f} %"
+
+
+def verdicts_in_words(verdicts: Verdicts) -> str:
+    """Return the shares of good values, of those to be used with care, and of rejected ones."""
+    if not verdicts.values:
+        return "no value"
+    named = zip(verdicts._fields, verdicts, strict=True)
+    return ", ".join(f"{percent(count / verdicts.values)} {word}" for word, count in named)
 
 
 def size(count: float) -> str:

@@ -168,6 +168,8 @@ class Layout:
     data: tuple[Row, ...]
     feature_type: str | None = None
     """CF ``featureType`` (discrete sampling geometry, chapter 9), unless it depends on the beam."""
+    weighed: tuple[str, ...] = ()
+    """Variables that raise LOW_SIGNAL_TO_NOISE where they are small against their error."""
 
     @property
     def variables(self) -> tuple[Row, ...]:
@@ -366,7 +368,7 @@ def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
         "comment": "0: no test failed. "
         + "; ".join(f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in flags)
         + ". reject: do not use the value; care: the value is valid, but its stated uncertainty"
-        " may be too small.",
+        " may be too small, or as large as the value.",
     }
 
 

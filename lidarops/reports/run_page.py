@@ -42,7 +42,7 @@ class ProductLink:
     label: str
     href: str
     """Empty where the file is missing."""
-    flagged: str
+    quality: str
     empty: bool
     """Whether no value is usable."""
     size: str
@@ -130,7 +130,7 @@ def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:
             "refused": row.refused,
             "products": row.products,
             "retrieved values": row.values,
-            "flagged": row.flagged_share,
+            "quality": row.quality,
             "time": duration(row.seconds),
         }
         for row in run_tables.instruments(record)
@@ -201,7 +201,7 @@ def _scene_row(
     missing: frozenset[str],
     stages: Sequence[str],
 ) -> SceneRow:
-    flagged = run_tables.flagged_words(scene)
+    quality = run_tables.quality_words(scene)
     return SceneRow(
         scene=scene.scene,
         instrument=scene.instrument,
@@ -212,7 +212,7 @@ def _scene_row(
             ProductLink(
                 label=f"{product.kind} {product.channel}",
                 href="" if product.path in missing else _href(record, product.path, folder),
-                flagged=flagged[product.path],
+                quality=quality[product.path],
                 empty=product.usable == 0,
                 size=size(product.size),
                 sha256=product.sha256,

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final
 
-from lidarops.figures.wording import counted, decided_on, duration, percent
+from lidarops.figures.wording import counted, decided_on, duration, percent, verdicts_in_words
 from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome
+from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome, Verdicts
 from lidarops.reports.findings import disagreement_rows, finding_rows, unmade_words
 from lidarops.steps.reading import idle_window
 
@@ -93,13 +93,14 @@ class InstrumentRow:
     refused: int
     products: int
     values: int
-    flagged: int
+    verdicts: Verdicts
+    """Of the retrieved values."""
     seconds: float
 
     @property
-    def flagged_share(self) -> str:
-        """Share of the retrieved values that carry a quality bit."""
-        return percent(self.flagged / self.values) if self.values else "no value"
+    def quality(self) -> str:
+        """Shares of good values, of those to be used with care, and of rejected ones."""
+        return verdicts_in_words(self.verdicts)
 
 
 def summary(record: RunRecord) -> list[tuple[str, str]]:
@@ -125,8 +126,11 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
         ("Products", f"{products.total():,}" + (f": {kinds}" if kinds else "")),
         ("Granules", f"{processed:,} processed, {refused:,} refused"),
         *(
-            (f"Flagged, {kind}", f"{percent(flagged / values)} of {counted(values, 'value')}")
-            for kind, values, flagged in _flagged_by_kind(record)
+            (
+                f"Quality, {kind}",
+                f"{verdicts_in_words(verdicts)} of {counted(verdicts.values, 'value')}",
+            )
+            for kind, verdicts in _verdicts_by_kind(record)
         ),
     ]
 
@@ -388,24 +392,22 @@ def outcome_word(scene: SceneOutcome) -> str:
     return "done" if scene.products else "no product"
 
 
-def flagged_words(scene: SceneOutcome) -> Mapping[str, str]:
-    """Return the share of flagged values of each product of a scene, by path."""
-    return {
-        product.path: percent((product.values - product.unflagged) / product.values)
-        if product.values
-        else "no value"
-        for product in scene.products
+def quality_words(scene: SceneOutcome) -> Mapping[str, str]:
+    """Return the shares of good, care and reject values of each product of a scene, by path."""
+    return {product.path: verdicts_in_words(product.verdicts) for product in scene.products}
+
+
+def _verdicts_by_kind(record: RunRecord) -> list[tuple[str, Verdicts]]:
+    products = [product for scene in record.scenes for product in scene.products]
+    sums = {
+        kind: _sum(product.verdicts for product in products if product.kind == kind)
+        for kind in sorted({product.kind for product in products})
     }
+    return [(kind, verdicts) for kind, verdicts in sums.items() if verdicts.values]
 
 
-def _flagged_by_kind(record: RunRecord) -> list[tuple[str, int, int]]:
-    values: Counter[str] = Counter()
-    flagged: Counter[str] = Counter()
-    for scene in record.scenes:
-        for product in scene.products:
-            values[product.kind] += product.values
-            flagged[product.kind] += product.values - product.unflagged
-    return [(kind, values[kind], flagged[kind]) for kind in sorted(values) if values[kind]]
+def _sum(several: Iterable[Verdicts]) -> Verdicts:
+    return Verdicts(*(sum(counts) for counts in zip((0, 0, 0), *several, strict=True)))
 
 
 def _instrument_row(
@@ -424,7 +426,7 @@ def _instrument_row(
         refused=refused_before + sum(len(scene.refused) for scene in scenes),
         products=sum(len(scene.products) for scene in scenes),
         values=sum(product.values for product in retrieved),
-        flagged=sum(product.values - product.unflagged for product in retrieved),
+        verdicts=_sum(product.verdicts for product in retrieved),
         seconds=sum(sum(scene.seconds.values()) for scene in scenes),
     )
 

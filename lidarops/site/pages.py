@@ -17,7 +17,7 @@ from lidarops import __version__
 from lidarops.figures import svg
 from lidarops.figures.panels import Figure
 from lidarops.figures.templates import environment
-from lidarops.figures.wording import counted, percent, size
+from lidarops.figures.wording import counted, percent, size, verdicts_in_words
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.links import Links
@@ -174,8 +174,7 @@ def _trail(entry: Entry, page: str) -> list[tuple[str, str]]:
 def _quality(entry: Entry) -> str:
     if entry.share is None:
         return "no quality flags"
-    flagged = percent((entry.values - entry.unflagged) / entry.values)
-    return f"{percent(entry.share)} of {entry.values:,} values usable, {flagged} flagged"
+    return f"{verdicts_in_words(entry.verdicts)} of {entry.values:,} values"
 
 
 def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
@@ -192,7 +191,7 @@ def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
         "channel": entry.channel,
         "where": where,
         "grade": entry.grade,
-        "quality": "" if share is None else f"{percent(share)} usable",
+        "quality": "" if share is None else verdicts_in_words(entry.verdicts),
         "problem": entry.problem,
     }
 

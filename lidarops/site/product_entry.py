@@ -9,6 +9,7 @@ from statistics import fmean
 from typing import Final
 
 from lidarops.netcdf.variables import is_retrieved
+from lidarops.records import Verdicts
 
 UNKNOWN: Final = "unknown"
 
@@ -118,6 +119,11 @@ class Entry:
     def share(self) -> float | None:
         """Share of usable values; None without quality flags."""
         return self.usable / self.values if self.values else None
+
+    @property
+    def verdicts(self) -> Verdicts:
+        """Numbers of good values, of those to be used with care, and of rejected ones."""
+        return Verdicts(self.unflagged, self.usable - self.unflagged, self.values - self.usable)
 
     @property
     def grade(self) -> Grade:

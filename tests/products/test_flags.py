@@ -32,6 +32,7 @@ SHARED = {
     "not_homogeneous": 11,
     "outlier": 12,
     "no_real_solution": 13,
+    "low_signal_to_noise": 14,
     "background_uncertain": 15,
     "no_gluing": 16,
 }
@@ -78,7 +79,7 @@ RETIRED = {"multiangle": {25, 30}}
 """Places of bits of former versions: one_sided and horizontal_gradient."""
 
 LEFT = {
-    "shared": 4,
+    "shared": 3,
     "signal": 14,
     "homogeneous": 10,
     "elastic": 9,
@@ -107,6 +108,8 @@ SCENES = {
     "Quality.NOT_HOMOGENEOUS": "test_path_fit::"
     "test_backscatter_that_varies_along_the_path_is_flagged",
     "Quality.OUTLIER": "test_path_fit::test_cloud_and_outlier_are_flagged",
+    "Quality.LOW_SIGNAL_TO_NOISE": "test_signal_to_noise::"
+    "test_values_below_their_error_are_used_with_care",
     "Quality.BACKGROUND_UNCERTAIN": "test_labeled_elastic::"
     "test_aerosol_in_the_far_range_makes_the_background_uncertain",
     "Quality.NO_GLUING": "test_labeled_gluing::test_no_gluing_where_no_range_is_linear_in_both",

@@ -26,7 +26,7 @@ from support.products.fabricated import (
 
 from lidarops.errors import CatalogError
 from lidarops.figures import svg
-from lidarops.figures.wording import counted, duration, percent, size
+from lidarops.figures.wording import counted, duration, percent, size, verdicts_in_words
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of
 from lidarops.records import (
@@ -134,8 +134,9 @@ class TestSimulatedRun:
     def test_counts_are_those_of_the_products(self, simulated, tmp_path):
         page = built(simulated, tmp_path / "report", figures=0)
         for product in simulated.scenes[0].products:
-            share = percent((product.values - product.unflagged) / product.values)
-            assert f"Flagged, {product.kind} {share} of {product.values:,} values" in page.text
+            good, care, reject = (percent(n / product.values) for n in product.verdicts)
+            shares = f"{good} good, {care} care, {reject} reject of {product.values:,} values"
+            assert f"Quality, {product.kind} {shares}" in page.text
             for name, count in product.flagged.items():
                 bit = flags_of(product.kind).named(name)
                 row = f"{product.kind} {name} "
@@ -278,7 +279,7 @@ class TestDegenerateRuns:
             assert granule.path in page.text
         (row,) = run_page.summary_rows(run)
         assert (row["scenes"], row["failed"], row["refused"]) == (3, 3, 9)
-        assert row["flagged"] == "no value"
+        assert row["quality"] == "no value"
 
     def test_internal_errors_stand_apart_from_failed_scenes(self, tmp_path):
         trace = "Traceback (most recent call last):\n  File <a>\nTypeError: no"
@@ -578,7 +579,7 @@ def test_summary_rows_are_plain(simulated):
         "refused": 0,
         "products": 2,
         "retrieved values": 192,
-        "flagged": percent((192 - product.unflagged) / 192),
+        "quality": verdicts_in_words(product.verdicts),
         "time": "1.8 s",
     }
 

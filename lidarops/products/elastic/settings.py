@@ -7,7 +7,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, PartOfDay, SettingsModel, quantity
+from lidarops.settings import (
+    ChannelProduct,
+    Metres,
+    PartOfDay,
+    SettingsModel,
+    quantity,
+    signal_to_noise_limit,
+)
 
 
 class ReferenceSettings(SettingsModel):
@@ -43,3 +50,4 @@ class ElasticSettings(ChannelProduct):
     molecular_relative_error: float = quantity(
         0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
     )
+    least_signal_to_noise: float = signal_to_noise_limit()

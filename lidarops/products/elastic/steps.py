@@ -12,6 +12,7 @@ from pydantic import model_validator
 
 from lidarops.campaign.model import channel_facts
 from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.products.elastic.variables import LAYOUT
 from lidarops.records import Role
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
@@ -24,6 +25,7 @@ from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
 from lidarops.steps.profiles import gluing
 from lidarops.steps.reading import WAVELENGTH
+from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import (
     REQUESTED,
     Datum,
@@ -148,6 +150,7 @@ class InversionSettings(SettingsModel):
     lidar_ratio_profile: str | None = None
     """Ancillary file of both over altitude."""
     molecular_relative_error: float
+    least_signal_to_noise: float
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -175,7 +178,9 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
             yield Leave(limits.reason)
             return
         settings = InversionSettings(
-            **_lidar_ratio(case), molecular_relative_error=case.request.molecular_relative_error
+            **_lidar_ratio(case),
+            molecular_relative_error=case.request.molecular_relative_error,
+            least_signal_to_noise=case.request.least_signal_to_noise,
         )
         yield Run(REQUESTED, settings)
 
@@ -248,7 +253,8 @@ class _Inversion(RowProduct):
             known_shape=data.get(KNOWN_SHAPE) is True,
             overlap=None if overlap is None else overlap(averages["range"].to_numpy()),
         )
-        return inverted.assign(gluing(averages))
+        least = settings.least_signal_to_noise
+        return with_low_signal_to_noise(inverted, LAYOUT.weighed, least).assign(gluing(averages))
 
 
 def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:

@@ -116,6 +116,7 @@ LAYOUT: Final = Layout(
     " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
     " bin deviates from theirs by more than noise explains.",
     sampled="range",
+    weighed=("aerosol_backscatter",),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(

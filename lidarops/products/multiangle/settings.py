@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, located_error, quantity
+from lidarops.settings import ChannelProduct, Metres, located_error, quantity, signal_to_noise_limit
 
 Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"]
 
@@ -40,6 +40,8 @@ class MultiAngleSettings(ChannelProduct):
         le=1e-2,
         description="largest horizontal gradient of ln(backscatter) included in the error",
     )
+
+    least_signal_to_noise: float = signal_to_noise_limit()
 
     @model_validator(mode="after")
     def _holds_altitudes(self) -> Self:

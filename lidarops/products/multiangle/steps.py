@@ -18,6 +18,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
+from lidarops.products.multiangle.variables import LAYOUT
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
@@ -29,6 +30,7 @@ from lidarops.steps.data import Chunk, Data, Indices, WholeProduct, in_one_batch
 from lidarops.steps.pointing import no_scan
 from lidarops.steps.preparation import BACKGROUND, MOLECULES, Background
 from lidarops.steps.reading import WAVELENGTH
+from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import (
     REQUESTED,
     Choice,
@@ -266,6 +268,7 @@ class ScanSettings(SettingsModel):
     )
     largest_gradient: float = quantity(unit="m-1")
     layers: tuple[tuple[float, float], ...] = quantity(unit="m", description="above the station")
+    least_signal_to_noise: float
 
 
 class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
@@ -304,6 +307,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
                 regularisation=settings.regularisation,
                 largest_gradient=settings.largest_gradient,
                 layers=tuple(settings.layers),
+                least_signal_to_noise=settings.least_signal_to_noise,
             ),
         )
 
@@ -378,7 +382,8 @@ class _Scans(WholeProduct):
         )
         if settings.method in _DIFFERENTIATING:
             optical_depth = optical_depth.assign_attrs(references=_PAPER)
-        return in_one_batch(optical_depth)
+        least = settings.least_signal_to_noise
+        return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
 
 
 STEP: Final = MultiAngle()

@@ -154,6 +154,7 @@ LAYOUT: Final = Layout(
     " Methods without smoothing state noise alone; for them this rule overstates the error of a"
     " mean.",
     sampled="altitude",
+    weighed=("vertical_optical_depth", "total_extinction"),
     coordinates=(
         TIME,
         _ALTITUDE,

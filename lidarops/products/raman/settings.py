@@ -14,6 +14,7 @@ from lidarops.settings import (
     SettingsModel,
     located_error,
     quantity,
+    signal_to_noise_limit,
 )
 
 
@@ -80,6 +81,7 @@ class RamanProductSettings(ChannelProduct):
         description="full width at half maximum of the filters of nitrogen; by default, all lines"
         " pass at all temperatures",
     )
+    least_signal_to_noise: float = signal_to_noise_limit()
 
     @model_validator(mode="after")
     def _has_raman_channels(self) -> Self:

@@ -11,6 +11,7 @@ import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.products.raman.settings import RamanProductSettings
+from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import LeftOut, PlannedStep
 from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
@@ -25,6 +26,7 @@ from lidarops.steps.data import Averages, Chunk, Data, ProductStream, RowProduct
 from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
 from lidarops.steps.reading import WAVELENGTH
+from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import REQUESTED, Decisions, Leave, Look, ProductStep, Run
 from lidarops.steps.workload import Workload
 
@@ -61,6 +63,7 @@ class RetrievalSettings(SettingsModel):
     molecular_relative_error: float
     overlap_relative_error: float
     filter_width: float | None = quantity(None, unit="m")
+    least_signal_to_noise: float
     dark: bool = False
     """Whether a look at some profiles found no Raman signal, so that nothing is retrieved."""
 
@@ -157,6 +160,7 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
             molecular_relative_error=request.molecular_relative_error,
             overlap_relative_error=request.overlap_relative_error,
             filter_width=request.filter_width,
+            least_signal_to_noise=request.least_signal_to_noise,
         )
         yield Run(REQUESTED, settings)
 
@@ -269,7 +273,7 @@ class _Retrieval(RowProduct):
         data, settings = self._data, self._settings
         raman = _of(data, settings.nitrogen)[WAVELENGTH]
         overlap = data.get(OVERLAP)
-        return labeled.retrieve(
+        retrieved = labeled.retrieve(
             elastic.assign_coords(_pointing(data)),
             nitrogen,
             molecules=data[MOLECULES],
@@ -278,6 +282,7 @@ class _Retrieval(RowProduct):
             water=None if water is None else self._water(water),
             overlap=None if overlap is None else overlap(elastic["range"].to_numpy()),
         )
+        return with_low_signal_to_noise(retrieved, LAYOUT.weighed, settings.least_signal_to_noise)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
         settings = self._settings

@@ -132,6 +132,7 @@ LAYOUT: Final = Layout(
     " nearly as molecules do look like aerosol-free air: only the error of the scattering ratio"
     " declared in the settings covers them.",
     sampled="range",
+    weighed=("aerosol_extinction", "aerosol_backscatter"),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(

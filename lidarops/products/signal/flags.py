@@ -15,6 +15,7 @@ FLAGS: Final = Flags(
         Quality.PILE_UP,
         Quality.INCOMPLETE_OVERLAP,
         Quality.NO_REAL_SOLUTION,
+        Quality.LOW_SIGNAL_TO_NOISE,
         Quality.BACKGROUND_UNCERTAIN,
         Quality.NO_GLUING,
     ),

@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import BackgroundRange, ChannelProduct, quantity
+from lidarops.settings import BackgroundRange, ChannelProduct, quantity, signal_to_noise_limit
 
 
 class SignalSettings(ChannelProduct):
@@ -20,6 +20,8 @@ class SignalSettings(ChannelProduct):
         default="tail_mean",
         description="mean of background_range, or the cubic of a homogeneous section there",
     )
+
+    least_signal_to_noise: float = signal_to_noise_limit()
 
     @model_validator(mode="after")
     def _has_its_section(self) -> Self:

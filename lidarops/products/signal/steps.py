@@ -11,27 +11,36 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.products.signal.settings import SignalSettings
+from lidarops.products.signal.variables import LAYOUT
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
+from lidarops.settings import SettingsModel
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct
 from lidarops.steps.preparation import BACKGROUND, FEWEST_BINS, Background, tail
 from lidarops.steps.profiles import gluing
+from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import (
     REQUESTED,
     Decisions,
     Leave,
-    NoSettings,
     ProductStep,
     Run,
 )
 from lidarops.steps.workload import Workload
 
 
-class Signal(ProductStep[SignalSettings, NoSettings]):
+class RangeCorrection(SettingsModel):
+    """Settings of the step ``signal``."""
+
+    least_signal_to_noise: float
+
+
+class Signal(ProductStep[SignalSettings, RangeCorrection]):
     """Subtract the background and correct for range."""
 
     name = "signal"
+    settings = RangeCorrection
     inputs = (PROFILES, BACKGROUND, OVERLAP)
     parts = (Background(),)
 
@@ -41,7 +50,8 @@ class Signal(ProductStep[SignalSettings, NoSettings]):
         start, stop = tail(case, limits)
         bins = (stop - start) / case.channel.bin_width
         if bins >= FEWEST_BINS:
-            yield Run(REQUESTED)
+            least = case.request.least_signal_to_noise
+            yield Run(REQUESTED, RangeCorrection(least_signal_to_noise=least))
             return
         stop = limits[1] if limits else case.last
         reason = (
@@ -50,11 +60,11 @@ class Signal(ProductStep[SignalSettings, NoSettings]):
         )
         yield Leave(reason, number=bins)
 
-    def stream(self, settings: NoSettings, data: Data) -> RowProduct:  # noqa: ARG002
+    def stream(self, settings: RangeCorrection, data: Data) -> RowProduct:
         """Return the product, which is written as profiles come."""
-        return _Signals(data)
+        return _Signals(settings, data)
 
-    def cpu_time(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
+    def cpu_time(self, settings: RangeCorrection, work: Workload) -> float:  # noqa: ARG002
         """Return the CPU time by the number of bins of all profiles, s."""
         return 0.05 + 2e-8 * work.profiles * work.bins
 
@@ -62,7 +72,8 @@ class Signal(ProductStep[SignalSettings, NoSettings]):
 class _Signals(RowProduct):
     """Range-corrected signals of each profile."""
 
-    def __init__(self, data: Data) -> None:
+    def __init__(self, settings: RangeCorrection, data: Data) -> None:
+        self._settings = settings
         self._profiles = data[PROFILES]
         self._background = data[BACKGROUND]
         overlap: Callable[..., npt.NDArray[np.float64]] | None = data.get(OVERLAP)
@@ -79,6 +90,8 @@ class _Signals(RowProduct):
         ).assign(gluing(conditioned))
         if self._overlap is not None:
             signals = _without_overlap(signals, self._overlap)
+        least = self._settings.least_signal_to_noise
+        signals = with_low_signal_to_noise(signals, LAYOUT.weighed, least)
         shots = self._profiles.shots(chunk.counts)
         yield signals.assign(shots=shots).assign_coords(chunk.geometry.variables)
 

@@ -30,6 +30,7 @@ LAYOUT: Final = Layout(
     comment="The standard errors of all range bins of a profile include the error of its"
     " background, which is common to them. lidarops_steps states the method of the background.",
     sampled="range",
+    weighed=("signal",),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(
