@@ -26,3 +26,26 @@ DEFAULT_DEAD_TIME: Final = 4.0e-9
 """s. Assumed for noise and flags where the campaign gives no dead time; never used to correct."""
 DEAD_TIME_UNCERTAINTY: Final = 0.2
 """Relative standard error of a dead time whose campaign gives none."""
+
+CUBIC_PAPER: Final = (
+    "Bobrovsky, A. P. et al. (2024): Transparent measurement of low turbidity atmosphere using"
+    " lidar systems (in Russian)."
+)
+"""The papers whose methods products use, as the products cite them; `docs/papers`."""
+LEAST_SQUARES_PAPER: Final = (
+    "Potapova, I. A. et al. (2021), J. Instrum. Eng. 64, 384-391 (in Russian),"
+    " doi:10.17586/0021-3454-2021-64-5-384-391."
+)
+MULTIANGLE_PAPER: Final = (
+    "Gobrusenko, K. I. and Ivanenko, B. P. (1989): Restoring the optical depth of the atmosphere"
+    " from multiangle lidar sensing (in Russian), Optika Atmosfery 2 (8); Atmos. Opt. 2, 741-743."
+)
+MULTIPOSITION_PAPER: Final = (
+    "Drabenko, Vad. A. et al. (2021): Reducing the systematic error in measuring the meteorological"
+    " visibility range with multiposition lidar sounding (in Russian),"
+    " doi:10.54092/25421085_2021_10_60."
+)
+LIDAR_EQUATION_PAPER: Final = (
+    "Vasylkivskyi, I. V. et al. (2009): Analysis of the equation of laser sensing of the atmosphere"
+    " with lidar (in Ukrainian), Visnyk of Vinnytsia Polytechnic Institute."
+)

@@ -37,6 +37,7 @@ MODULES: Final = (
     "lidarops.retrieve.multiangle",
     "lidarops.retrieve.multiangle.labeled",
     "lidarops.retrieve.network.extinction_field",
+    "lidarops.retrieve.network.triangles",
     "lidarops.retrieve.network.geometry",
     "lidarops.retrieve.network.labeled",
     "lidarops.simulate.campaign",

@@ -92,7 +92,7 @@ class Optics(SettingsModel):
 
         Notes
         -----
-        :math:`(E \lambda / h c) \eta A (c / 2) \beta R^{-2}` (`vasylkivskyi2022`, 23).
+        :math:`(E \lambda / h c) \eta A (c / 2) \beta R^{-2}` (`vasylkivskyi2009`, 23).
         """
         photons = self.energy * wavelength * 1e-9 / (6.62607015e-34 * 299_792_458.0)
         return photons * self.efficiency * self.area * 299_792_458.0 / 2.0 * 1e-6 / 1e6 * 1e-6

@@ -47,7 +47,7 @@ def pulse_echo(
 
     References
     ----------
-    `vasylkivskyi2022`, equations 20 to 23.
+    `vasylkivskyi2009`, equations 20 to 23.
     """
     step = float(distance[1] - distance[0])
     shape, centroid = _shape_of(pulse)

@@ -78,7 +78,7 @@ class Lidar:
 
     @property
     def power_constant(self) -> float:
-        r"""K of the power on the detector, W m3 sr: :math:`E A \eta c / 2` (`vasylkivskyi2022`)."""
+        r"""K of the power on the detector, W m3 sr: :math:`E A \eta c / 2` (`vasylkivskyi2009`)."""
         return self.energy * self.area * self.optical_efficiency * 0.5 * SPEED_OF_LIGHT
 
     @property
@@ -118,7 +118,7 @@ class Lidar:
     ) -> Array:
         """Return the mean power on the detector in the bins, W; see `pulsed_signal`.
 
-        Power times `bin_time` is the energy of `vasylkivskyi2022`, equation 14.
+        Power times `bin_time` is the energy of `vasylkivskyi2009`, equation 14.
         """
         return self.power_constant * self._signal(
             distance, extinction, backscatter, returning_extinction, path, resolution

@@ -153,7 +153,7 @@ def tropospheric_scattering(wavelength: float) -> Scattering:
 
     References
     ----------
-    `vasylkivskyi2022`, figure.
+    `vasylkivskyi2009`, figure.
     """
     return lognormal_scattering(Lognormal(0.5e-6, 1.5), 1.45 - 0.005j, wavelength)
 

@@ -67,7 +67,7 @@ class GeometricalOverlap:
 
     References
     ----------
-    `vasylkivskyi2022`, equation 8, with an overlap of 1 inside the field of view and 0 outside.
+    `vasylkivskyi2009`, equation 8, with an overlap of 1 inside the field of view and 0 outside.
     """
 
     aperture_radius: float

@@ -5,7 +5,7 @@ from nearer ranges, arrives at the same time:
 
 .. math:: P(R) = K \int \beta(R') T(R') O(R') F(2 (R - R') / c) \frac{dR'}{R'^2} \frac{2}{c}
 
-(`vasylkivskyi2022`, 20, with K = E A eta c / 2). A detector that integrates over a bin acts
+(`vasylkivskyi2009`, 20, with K = E A eta c / 2). A detector that integrates over a bin acts
 like a longer pulse. The integral is a sum over cells of the pulse. Each cell from R_a to R_b
 is taken at the geometric mean of its edges with the weight :math:`(R_b - R_a) / (R_a R_b)`, which
 is the integral of :math:`R^{-2}` itself: a rectangular pulse gives the near-range factor
@@ -291,7 +291,7 @@ def pulsed_signal(
 
     References
     ----------
-    `vasylkivskyi2022`, equations 10, 14 and 20.
+    `vasylkivskyi2009`, equations 10, 14 and 20.
     """
     _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
     shape = overlap or SineOverlap(full_overlap_range)

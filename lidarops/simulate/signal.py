@@ -82,7 +82,7 @@ def transmission(distance: Array, extinction: Array) -> Array:
 
     References
     ----------
-    `vasylkivskyi2022`, equation 13.
+    `vasylkivskyi2009`, equation 13.
     """
     transmitted: Array = np.exp(-optical_depth(distance, extinction))
     return transmitted
@@ -103,7 +103,7 @@ def isotropic_backscatter(number_density: Array | float, cross_section: float) -
 
     References
     ----------
-    `vasylkivskyi2022`, equation 16.
+    `vasylkivskyi2009`, equation 16.
     """
     _checks.not_negative("cross_section", cross_section, "m2")
     density = np.asarray(number_density, dtype=np.float64)
@@ -155,7 +155,7 @@ def backscatter_signal(
 
     References
     ----------
-    `vasylkivskyi2022`, equations 15 and 22 (23 where both wavelengths are equal), taken at the
+    `vasylkivskyi2009`, equations 15 and 22 (23 where both wavelengths are equal), taken at the
     bin centre.
     """
     _check_ranges(distance)

@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.campaign.simulated_files import DamageKind, Handling
+from lidarops.constants import LIDAR_EQUATION_PAPER
 from lidarops.records import DetectionMode
 
 Array = NDArray[np.float64]
@@ -228,6 +229,7 @@ class TruthTable:
                 " total_extinction and B in amplitude. P* is the background (sky light) if dark"
                 " files were subtracted, else background plus dark_offset. Photon counting: rates"
                 " before dead time.",
+                "references": LIDAR_EQUATION_PAPER,
             },
         )
         for (channel, quantity), column in sorted(self._channels.items()):

@@ -60,7 +60,12 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
         )
         reason = f"mean of {where}; signal there biases it"
         if method == "cubic":
-            reason = f"cubic of a homogeneous section, {where}; other sections bias it"
+            # `test_the_cubic_doubts_weak_signals`
+            reason = (
+                f"cubic of a homogeneous section, {where}; other sections bias it, and all values"
+                " are marked as uncertain where the signal of the first bin of the section is less"
+                " than 30 times its noise, some up to 300 times"
+            )
         elif method == "known_shape":
             reason = (
                 "fitted with the shape of clean air, which is assumed in the far range, and tested;"

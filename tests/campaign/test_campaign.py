@@ -17,6 +17,7 @@ from lidarops.errors import CampaignError, CatalogError
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.homogeneous.settings import HomogeneousSettings
 from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.products.visibility.settings import VisibilityProductSettings
 
 MINIMAL = """\
 name: small
@@ -312,3 +313,13 @@ def test_an_error_survives_pickling(*, wrong_use: bool) -> None:
 def test_the_folder_goes_with_a_campaign_to_other_processes(tmp_path: Path) -> None:
     campaign = load_campaign(_write(tmp_path, MINIMAL))
     assert pickle.loads(pickle.dumps(campaign)).folder == campaign.folder
+
+
+def test_a_multiplier_replaces_the_prior() -> None:
+    whole: dict[str, object] = {"channel": "photon_532o"}
+    for value in (0.0, 0.8, "chosen"):
+        settings = VisibilityProductSettings.model_validate(whole | {"multiplier": value})
+        assert settings.multiplier == value
+    for wrong in ({"multiplier": 1.2}, {"multiplier": "best"}, {"multiplier": 1, "prior": "none"}):
+        with pytest.raises(ValidationError):
+            VisibilityProductSettings.model_validate(whole | wrong)

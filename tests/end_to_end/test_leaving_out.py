@@ -631,3 +631,16 @@ def test_the_plan_warns_that_the_cubic_rejects_weak_signals():
     }
     assert "rejects all values" in reasons["cubic"]
     assert "rejects" not in reasons["auto"]
+
+
+def test_the_plan_warns_that_the_cubic_of_a_signal_needs_light():
+    cubic = {"background": "cubic", "background_range": [750, 4500]}
+    reasons = {
+        method: next(step.reason for step in plan.steps if step.name == "background")
+        for method, plan in {
+            "cubic": planned(LEVEL, **with_products(signal=cubic)),
+            "tail": planned(LEVEL, **with_products(signal={})),
+        }.items()
+    }
+    assert "less than 30 times its noise" in reasons["cubic"]
+    assert "noise" not in reasons["tail"]

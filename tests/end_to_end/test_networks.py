@@ -186,3 +186,21 @@ def test_a_level_path_gives_visibility_too(tmp_path):
     )
     assert inside.values[usable].mean() > 0.6
     assert "contrast 0.02" in product.attrs["lidarops_steps"]
+
+
+def test_a_campaign_chooses_the_multiplier(tmp_path):
+    tree = made.tree(made.HOMOGENEOUS)
+    for network in tree["networks"].values():
+        network["visibility"]["multiplier"] = "chosen"
+    campaign, truth = made.written(tmp_path, tree)
+    (outcome,) = reprocess_network(campaign).scenes
+    product = opened(campaign, outcome)
+    known = product["multiplier"].values[np.isfinite(product["multiplier"].values)]
+    assert known.size > 0
+    assert (known > 0.5).all()
+    assert (known < 1.0).all()
+    score = scores(product, made.truth_at(product, truth, beams_of(outcome)))
+    assert score.size > 0
+    assert (abs(score) < 3).all()
+    (reason,) = (step.reason for step in outcome.plan.left_out if step.name == "prior")
+    assert "multiplier" in reason

@@ -71,7 +71,7 @@ def test_scans_become_optical_depths_within_their_errors(tmp_path):
 def test_a_product_names_the_paper_and_the_steps_of_its_own_method(tmp_path):
     settings, _ = campaign(tmp_path, duration=1200)
     lidar = settings.instruments["scanner"]
-    shown = {}
+    shown, variables = {}, {}
     for method in ("mld", "two_angle", "joint"):
         scan = lidar.products.multiangle.model_copy(update={"method": method})
         products = lidar.products.model_copy(update={"multiangle": scan})
@@ -83,9 +83,11 @@ def test_a_product_names_the_paper_and_the_steps_of_its_own_method(tmp_path):
         (path,) = (product.path for product in outcome.products if product.kind == "multiangle")
         with xr.open_dataset(again.products_root / path) as product:
             shown[method] = product.attrs["references"], product.attrs["lidarops_steps"]
+            variables[method] = set(product.variables)
     assert {method for method, (cited, _) in shown.items() if "Gobrusenko" in cited} == {"mld"}
     fitted = {m for m, (_, steps) in shown.items() if "left out horizontal_gradient" not in steps}
     assert fitted == {"joint"}
+    assert {method for method, names in variables.items() if "regularisation" in names} == {"mld"}
 
 
 def test_a_campaign_fixes_the_regularisation(tmp_path):
@@ -103,6 +105,11 @@ def test_a_campaign_fixes_the_regularisation(tmp_path):
         (outcome,) = reprocess(again).scenes
         with xr.open_dataset(again.products_root / outcome.products[0].path) as product:
             share.append(product["data_share"].median())
+            used = product["regularisation"].values
+            np.testing.assert_allclose(used[np.isfinite(used)], strength, rtol=1e-3)
+            assert np.isfinite(used).any()
+            prior = product["prior_vertical_optical_depth"].values
+            assert (prior[np.isfinite(prior)] == 0.0).all()
     assert 0.99 < share[0] <= 1.0
     assert share[1] < 0.9
 

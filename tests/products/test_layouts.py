@@ -146,6 +146,8 @@ def test_variables_without_standard_name():
             "log_intercept",
             "log_intercept_standard_error",
             "data_share",
+            "regularisation",
+            "prior_vertical_optical_depth",
             "inhomogeneity",
             "residual",
             "beam_signal",
@@ -164,6 +166,7 @@ def test_variables_without_standard_name():
             "reduced_chi2",
             "degrees_of_freedom",
             "prior_deviation",
+            "multiplier",
             "beam_range",
         },
         "homogeneous": {

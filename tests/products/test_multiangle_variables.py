@@ -44,7 +44,13 @@ def test_layers_need_their_errors_and_altitudes():
 
 
 def test_each_optional_row_may_be_left_out():
-    for name in ("monotone_vertical_optical_depth", "reduced_chi2"):
+    optional = (
+        "monotone_vertical_optical_depth",
+        "reduced_chi2",
+        "regularisation",
+        "prior_vertical_optical_depth",
+    )
+    for name in optional:
         product = build_product(multiangle().drop_vars(name), context("multiangle"))
         assert name not in product
         assert name in build_product(multiangle(), context("multiangle"))

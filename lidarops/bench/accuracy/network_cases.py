@@ -17,6 +17,7 @@ from lidarops.retrieve.network.extinction_field import (
     retrieve_network,
 )
 from lidarops.retrieve.network.thresholds import THRESHOLDS
+from lidarops.retrieve.network.triangles import systematic_error
 from lidarops.simulate.signal import backscatter_signal
 
 Array = npt.NDArray[np.float64]
@@ -254,34 +255,6 @@ class FigurePoint:
     """At a crossing from which the cycle leads away from the lidars."""
 
 
-def systematic_error(optical_depth: Array, multiplier: float) -> float:
-    r"""Return (true - estimate) / true of reciprocal extinction at the start of a cycle of beams.
-
-    .. math::
-        \frac{S_1 - \tilde S_1}{S_1} = \frac{\sum_{j<k} (\mu_j - \mu_{j+1})
-        e^{-2 \sum_{l \le j} \tau_l}}{1 - \mu_k e^{-2 \sum_l \tau_l}}, \quad \mu_j = \lambda^{j-1}
-
-    It holds in any field, because extinction at the crossings cancels (drabenko2021, equation 17).
-
-    Parameters
-    ----------
-    optical_depth : (row,) float
-        Exponent m times optical depth of each row, negative where it leads towards its lidar.
-    multiplier : float
-        0 to 1.
-
-    Returns
-    -------
-    float
-        NaN beyond the pole.
-    """
-    attenuation = np.exp(-2.0 * np.cumsum(optical_depth))
-    powers = multiplier ** np.arange(attenuation.size)
-    determinant = float(1.0 - powers[-1] * attenuation[-1])
-    neglected = float(np.sum((powers[:-1] - powers[1:]) * attenuation[:-1]))
-    return neglected / determinant if determinant > 0.0 else np.nan
-
-
 def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     """Return one point of figure 2 of drabenko2021, without signs and with correct ones."""
     lidars = LidarLine("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
@@ -294,9 +267,9 @@ def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     return FigurePoint(
         first_lidar,
         elevation,
-        printed=systematic_error(depths, PAPER_MULTIPLIER),
-        signed=_finite(systematic_error(depths if leads_away else -depths, PAPER_MULTIPLIER)),
-        near=_finite(systematic_error(near, PAPER_MULTIPLIER)),
+        printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
+        signed=_error_of(depths if leads_away else -depths),
+        near=_error_of(near),
     )
 
 
@@ -306,7 +279,8 @@ def _leads_away(net: geometry.Network) -> bool:
     return bool(crossings[0] in net.on_beam(2)[0])
 
 
-def _finite(value: float) -> float | None:
+def _error_of(depths: Array) -> float | None:
+    value = float(systematic_error(depths, PAPER_MULTIPLIER))
     return value if np.isfinite(value) else None
 
 

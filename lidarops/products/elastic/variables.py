@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
+from lidarops.constants import LEAST_SQUARES_PAPER, LIDAR_EQUATION_PAPER
 from lidarops.netcdf.variables import (
     GLUING,
     NO_STANDARD_NAME,
@@ -106,6 +107,8 @@ LAYOUT: Final = Layout(
     references=(
         "Fernald, F. G. (1984), Appl. Opt. 23, 652-653.",
         "Sasano, Y. et al. (1985), Appl. Opt. 24, 3929-3932.",
+        LEAST_SQUARES_PAPER,
+        LIDAR_EQUATION_PAPER,
     ),
     comment="aerosol_extinction is aerosol_backscatter times the assumed lidar ratio, not an"
     " independent measurement. Profiles are means over time; range is along the beam. Particles in"

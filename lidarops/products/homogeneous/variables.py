@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     SECTION,
@@ -46,8 +47,8 @@ LAYOUT: Final = Layout(
     ),
     processing_level="L2: retrieved quantities",
     references=(
-        "Bobrovsky, A. P. et al. (2024): Transparency of a weakly turbid atmosphere with lidars.",
-        "Potapova, I. A. et al. (2021), Izv. Vuzov. Priborostroenie 64, 384-391.",
+        CUBIC_PAPER,
+        LEAST_SQUARES_PAPER,
         "Golub, G. H. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432.",
     ),
     comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 total_extinction r),"

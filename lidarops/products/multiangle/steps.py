@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from lidarops.constants import MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
@@ -58,10 +59,6 @@ _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
 """Methods that cannot fit a horizontal gradient."""
 _DIFFERENTIATING: Final = frozenset({"mld", "mld_prior"})
 """Methods of Gobrusenko and Ivanenko."""
-_PAPER: Final = (
-    "Gobrusenko, K. I. and Ivanenko, B. P. (1989): Restoring the optical depth of the atmosphere"
-    " from multiangle lidar sensing (in Russian), Institute of Atmospheric Optics, Tomsk."
-)
 _JOINT: Final = frozenset({"auto", "joint"})
 
 
@@ -381,7 +378,7 @@ class _Scans(WholeProduct):
             layers=[(low + self._station, high + self._station) for low, high in settings.layers],
         )
         if settings.method in _DIFFERENTIATING:
-            optical_depth = optical_depth.assign_attrs(references=_PAPER)
+            optical_depth = optical_depth.assign_attrs(references=MULTIANGLE_PAPER)
         least = settings.least_signal_to_noise
         return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
 

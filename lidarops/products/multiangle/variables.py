@@ -254,6 +254,32 @@ LAYOUT: Final = Layout(
             comment=f"1 where neither smoothness nor a prior has an effect. {NO_STANDARD_NAME}",
         ),
         Row(
+            name="regularisation",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="strength of the penalty on the derivative along the slant path",
+            coverage=Coverage.AUXILIARY,
+            valid_min=0.0,
+            significant_bits=_BITS,
+            optional=True,
+            comment="For slant paths scaled to a span of 1, and residuals scaled to their noise."
+            " Given by the settings, or the largest one whose residuals are not larger than the"
+            f" noise. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="prior_vertical_optical_depth",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="optical depth to which the penalty pulls",
+            coverage=Coverage.AUXILIARY,
+            significant_bits=_BITS,
+            optional=True,
+            comment="0, or that of the altitude below. The share 1 - data_share of the optical"
+            f" depth comes from it. {NO_STANDARD_NAME}",
+        ),
+        Row(
             name="inhomogeneity",
             dims=_LEVELS,
             dtype="f4",

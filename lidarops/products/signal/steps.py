@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from lidarops.constants import CUBIC_PAPER
 from lidarops.flags import Quality
 from lidarops.products.signal.settings import SignalSettings
 from lidarops.products.signal.variables import LAYOUT
@@ -99,7 +100,8 @@ class _Signals(RowProduct):
         """Return times, pointing and ranges of all profiles."""
         words = background_words(self._background.method, self._background.range)
         frame = self._geometry.assign_coords(range=self._profiles.range)
-        return frame.assign_attrs(steps=words)
+        cited = {"references": CUBIC_PAPER} if self._background.method == "cubic" else {}
+        return frame.assign_attrs(steps=words, **cited)
 
 
 def _without_overlap(signals: xr.Dataset, overlap: npt.NDArray[np.float64]) -> xr.Dataset:

@@ -19,6 +19,7 @@ from lidarops.settings import (
 )
 
 PriorName = Literal["block", "none"]
+MultiplierValue = Annotated[float, Field(ge=0, le=1)] | Literal["chosen"]
 
 
 class VisibilityProductSettings(NetworkProduct):
@@ -33,6 +34,11 @@ class VisibilityProductSettings(NetworkProduct):
         default=timedelta(hours=6), description="interval of averages that share one prior"
     )
     prior: PriorName = "block"
+    multiplier: MultiplierValue | None = Field(
+        default=None,
+        description="lambda of Drabenko et al., 0 to 1 or chosen: solve one triangle of beams at"
+        " each crossing instead of all beams together",
+    )
     visibility: VisibilitySettings = VisibilitySettings()
     tolerance: float = quantity(
         15.0, unit="m", gt=0, le=1000, description="largest distance of beams at a crossing"
@@ -75,6 +81,8 @@ class VisibilityProductSettings(NetworkProduct):
     def _consistent(self) -> Self:
         if self.block % self.average:
             raise ValueError("block must be a multiple of average")
+        if self.multiplier is not None and "prior" in self.model_fields_set:
+            raise located_error("is not used with a multiplier: leave one of them out", "prior")
         return self
 
     def check_members(self, instruments: Sequence[str]) -> None:

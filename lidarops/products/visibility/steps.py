@@ -21,7 +21,11 @@ from lidarops.products.visibility.network import (
     angle_between,
     crossings,
 )
-from lidarops.products.visibility.settings import PriorName, VisibilityProductSettings
+from lidarops.products.visibility.settings import (
+    MultiplierValue,
+    PriorName,
+    VisibilityProductSettings,
+)
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene, is_glued
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.left_signal import window_before
@@ -87,7 +91,9 @@ class Prior(Choice[Case, NoSettings]):
     def decide(self, case: Case) -> Decisions:
         """Run unless the campaign requests no prior."""
         settings = case.request
-        if settings.prior == "none":
+        if settings.multiplier is not None:
+            yield Leave("a multiplier is requested: triangles of beams are solved without prior")
+        elif settings.prior == "none":
             yield Leave("the campaign requests no prior: gradients along beams mimic attenuation")
         else:
             reason = (
@@ -105,6 +111,8 @@ class NetworkSettings(VisibilitySettings):
     """m."""
     block_seconds: float
     prior: PriorName
+    multiplier: MultiplierValue | None = None
+    """Of triangles of beams, instead of all beams together."""
     tolerance: float
     """m."""
     smallest_angle: float
@@ -298,14 +306,21 @@ class _NetworkPlan:
         self, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
     ) -> Run:
         settings = self._settings
+        by_triangles = (
+            ""
+            if settings.multiplier is None
+            else f"; solved by triangles with the multiplier {settings.multiplier}"
+        )
         return Run(
             f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
-            f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones",
+            f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones"
+            f"{by_triangles}",
             NetworkSettings(
                 beams=tuple(beams),
                 wavelength=wavelength,
                 block_seconds=settings.block.total_seconds(),
                 prior=settings.prior,
+                multiplier=settings.multiplier,
                 tolerance=settings.tolerance,
                 smallest_angle=settings.smallest_angle,
                 exponent_relative_error=settings.exponent_relative_error,
@@ -345,6 +360,7 @@ class _NetworkStream(NetworkStream):
                 block_intervals=round(settings.block_seconds / self._seconds),
                 visibility=settings.definition,
                 prior=settings.prior,
+                multiplier=settings.multiplier,
                 exponent_relative_error=settings.exponent_relative_error,
                 lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
                 overlap_relative_error=settings.overlap_relative_error,

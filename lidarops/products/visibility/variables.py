@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from lidarops.constants import MULTIPOSITION_PAPER
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     PLACE,
@@ -112,7 +113,7 @@ LAYOUT: Final = Layout(
     ),
     processing_level="L2: retrieved quantities",
     references=(
-        "Drabenko, Vad. A. et al. (2021), doi:10.54092/25421085_2021_10_60.",
+        MULTIPOSITION_PAPER,
         "Yegorov, A. D. et al. (2008), Int. J. Remote Sensing 29, 2449-2468.",
         "Koschmieder, H. (1924), Beitr. Phys. freien Atmos. 12, 33-53.",
     ),
@@ -194,6 +195,19 @@ LAYOUT: Final = Layout(
             significant_bits=8,
             comment="Root of the sum of squares over the beams. Larger values mean higher"
             f" sensitivity to overlap errors. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="multiplier",
+            dims=_SERIES,
+            dtype="f4",
+            units="1",
+            long_name="multiplier lambda of the equations of a triangle of beams",
+            coverage=Coverage.AUXILIARY,
+            valid_min=0.0,
+            optional=True,
+            comment="Row j of a cycle of three beams is multiplied by its power j - 1. 1 is exact;"
+            " a smaller one limits noise, and its bias in homogeneous air is part of"
+            f" total_extinction_systematic_error. {NO_STANDARD_NAME}",
         ),
         replace(
             quality(_SERIES, FLAGS),

@@ -84,7 +84,7 @@ def molecular_shape(
 
     References
     ----------
-    vasylkivskyi2022
+    vasylkivskyi2009
     """
     beta = inputs.real_array(backscatter, "backscatter").astype(np.float64)
     alpha = inputs.real_array(extinction, "extinction").astype(np.float64)

@@ -166,6 +166,9 @@ def _mld(
         estimates.freedom, settings.largest_gradient * settings.height * estimates.slopes,
     )  # fmt: skip
     _fill_single(profiles, single, settings)
+    within = np.isfinite(profiles.data_share)
+    profiles.regularisation[within] = estimates.strength[within]
+    profiles.prior_optical_depth[within] = estimates.prior[within]
     with np.errstate(invalid="ignore"):
         dominated = np.asarray(profiles.data_share < THRESHOLDS.least_share)
     profiles.flags.prior_dominated[:] |= dominated

@@ -83,6 +83,10 @@ class MultiAngleResult:
     """(...,): effective number of independent values in the profile."""
     data_share: Array
     """Share of the optical depth that comes from the data; 1 without prior and smoothing."""
+    regularisation: Array
+    """Strength of the penalty of "mld" and "mld_prior", given or chosen; NaN for other methods."""
+    prior_optical_depth: Array
+    """Optical depth to which that penalty pulls: 0, or that of the altitude below."""
     inhomogeneity: Array
     """Standard deviation of the logarithms of the signals on top of detector noise."""
     reduced_chi_square: Array

@@ -53,6 +53,8 @@ _PER_ALTITUDE: Final = (
     "inhomogeneity",
     "reduced_chi_square",
 )
+_OF_PENALTY: Final = ("regularisation", "prior_optical_depth")
+"""Of the methods with a penalty."""
 _PER_LAYER: Final = (
     "layer_optical_depth",
     "layer_optical_depth_standard_error",
@@ -131,7 +133,8 @@ def retrieve_optical_depth(
     signal = signals.signal
     sampled = np.isfinite(signal).any(axis=-1)
     values = {
-        _variable(name): (("time", "altitude"), getattr(retrieval, name)) for name in _PER_ALTITUDE
+        _variable(name): (("time", "altitude"), getattr(retrieval, name))
+        for name in (*_PER_ALTITUDE, *(_OF_PENALTY if method in optical_depth.REGULARISED else ()))
     }
     depth = monotone(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)

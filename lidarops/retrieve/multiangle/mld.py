@@ -22,7 +22,7 @@ STRENGTHS: Final[Array] = 10.0 ** np.linspace(-6.0, 6.0, 97)
 """Strengths of the penalty to choose from; dimensionless, for paths scaled to a span of 1."""
 _SAME_NODE: Final = 1e-4
 """Distance of scaled slant paths up to which beams share a node."""
-_ESTIMATES: Final = 6
+_ESTIMATES: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,10 @@ class MldEstimates:
     0, or the optical depth at the altitude below."""
     freedom: Array
     """Degrees of freedom."""
+    strength: Array
+    """Strength of the penalty."""
+    prior: Array
+    """Optical depth to which the penalty pulls."""
     slopes: Array
     """(2, profile, altitude): change of optical depth per unit of a gradient over altitude, to the
     east and north."""
@@ -118,8 +122,8 @@ def solve_mld(
         if from_below:
             solved = np.isfinite(out[:, k, 0])
             prior[solved] = out[solved, k, :2]
-    depth, variance, share, freedom = np.moveaxis(out[..., :4], -1, 0)
-    return MldEstimates(depth, variance, share, freedom, np.moveaxis(out[..., 4:], -1, 0))
+    depth, variance, share, freedom, used, pulled, *slopes = np.moveaxis(out, -1, 0)
+    return MldEstimates(depth, variance, share, freedom, used, pulled, np.stack(slopes))
 
 
 def _solve_altitude(
@@ -148,8 +152,8 @@ def _solve_altitude(
 
     Returns
     -------
-    (profile, 6) float
-        Optical depth, variance, data share, degrees of freedom and slopes.
+    (profile, 8) float
+        Optical depth, variance, data share, degrees of freedom, strength, prior and slopes.
     """
     left = y + 2.0 * path * prior[:, :1]
     left -= left.mean(axis=1, keepdims=True)
@@ -168,6 +172,8 @@ def _solve_altitude(
             (t**2 * variance).sum(axis=1) + (1.0 - share) ** 2 * prior[:, 1],
             share,
             kept.sum(axis=1)[chosen],
+            strengths[chosen],
+            prior[:, 0],
             *np.einsum("ti,di->dt", t, distance),
         ],
         axis=1,

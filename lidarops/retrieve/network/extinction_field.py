@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,7 @@ from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, 
 from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Problem, solve_block
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
+from lidarops.retrieve.network.triangles import CHOSEN, solve_triangles
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -84,7 +85,8 @@ class CrossingFlags:
     poor_fit: Booleans
     """The beams disagree by more than their noise."""
     not_measured: Booleans
-    """Fewer than two beams have full overlap and a signal there."""
+    """Fewer than two beams have full overlap and a signal there; with a multiplier, also where no
+    triangle of beams leads away from the crossing."""
 
     @property
     def flagged(self) -> Booleans:
@@ -116,6 +118,11 @@ class NetworkResult:
     """(...)."""
     prior_deviation: Array
     """(...) standard deviation of ln extinction about a linear field; inf without prior."""
+    multiplier: Array
+    """(..., crossing) of the rows of triangles; NaN where all beams are solved together."""
+    multiplier_error: Array
+    """(..., crossing) m-1, systematic: what the multiplier adds to extinction in homogeneous air;
+    0 where all beams are solved together."""
 
 
 def retrieve_network(
@@ -129,6 +136,7 @@ def retrieve_network(
     exponent: npt.ArrayLike = 1.0,
     blocks: npt.ArrayLike | None = None,
     prior: str = "block",
+    multiplier: npt.ArrayLike | Literal["chosen"] | None = None,
     bins: int = THRESHOLDS.fit_bins,
 ) -> NetworkResult:
     """Retrieve extinction and visibility where the beams of several lidars cross.
@@ -158,6 +166,10 @@ def retrieve_network(
         of a block depend on its own profiles only.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.
+    multiplier : float or (..., crossing) float or "chosen", optional
+        Lambda of the paper, 0 to 1: each crossing is solved by one triangle of beams
+        (`lidarops.retrieve.network.triangles`), without prior, instead of all beams together.
+        "chosen" is the one with the smallest expected error in the block.
     bins : int
         Number of bins of the fit that gives the signal at a crossing.
 
@@ -185,7 +197,9 @@ def retrieve_network(
         power, range, network, variance=variance, overlap=overlap,
         full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, bins=bins,
     )  # fmt: skip
-    return _flag_result(beams, _solve_network(beams, network.crossing, field_prior))
+    if multiplier is None:
+        return _flag_result(beams, _solve_network(beams, network.crossing, field_prior))
+    return _flag_result(beams, _solve_triangles(beams, _multipliers(multiplier, beams)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,18 +224,31 @@ class _Estimates:
     """(profile, 2) of these."""
     deviation: Array
     """(profile,) standard deviation of the prior; inf without one."""
+    multiplier: Array
+    """(profile, crossing)."""
+    multiplier_error: Array
+    """(profile, crossing) m-1."""
+    open: Booleans
+    """(crossing,) True where no triangle leads away, with a multiplier."""
+
+    @classmethod
+    def missing(cls, beams: BeamSignals) -> _Estimates:
+        """Return estimates without values, of all beams together; solvers fill the arrays."""
+        profiles = beams.block.size
+        shape = (profiles, beams.layout.crossings)
+        return cls(
+            np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
+            np.zeros(profiles, dtype=np.bool_), np.zeros(profiles, dtype=np.bool_),
+            np.zeros((profiles, beams.exponent.size), dtype=np.bool_),
+            np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan),
+            np.full(profiles, np.inf), np.full(shape, np.nan), np.zeros(shape),
+            np.zeros(shape[1], dtype=np.bool_),
+        )  # fmt: skip
 
 
 def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> _Estimates:
     """Solve each block, and return its values with all their errors."""
-    layout, profiles = beams.layout, beams.block.size
-    shape = (profiles, layout.crossings)
-    out = _Estimates(
-        np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
-        np.zeros(profiles, dtype=np.bool_), np.zeros(profiles, dtype=np.bool_),
-        np.zeros((profiles, beams.exponent.size), dtype=np.bool_),
-        np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan), np.full(profiles, np.inf),
-    )  # fmt: skip
+    layout, out = beams.layout, _Estimates.missing(beams)
     number = np.cumsum(layout.measured) - 1
     crossing = number[layout.passages.crossing].astype(np.intp)
     for block in np.unique(beams.block) if crossing.size else ():
@@ -257,6 +284,37 @@ def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> _E
     return out
 
 
+def _multipliers(multiplier: npt.ArrayLike | str, beams: BeamSignals) -> Array | None:
+    """Return (profile, crossing) multipliers, None where they are to be chosen."""
+    if isinstance(multiplier, str) and multiplier == CHOSEN:
+        return None
+    array = inputs.real_array(multiplier, "multiplier").astype(np.float64)
+    shape = (*beams.leading, beams.layout.crossings)
+    # NaN where a result that is given back has no value.
+    if array.shape not in {(), shape} or not np.all((array >= 0) & (array <= 1) | np.isnan(array)):
+        raise RetrievalInputError(
+            "is not from 0 to 1, or of a wrong shape",
+            field="multiplier",
+            remedy=f"give one number, or {shape}, or {CHOSEN!r}",
+        )
+    return np.broadcast_to(array, shape).reshape(beams.block.size, -1)
+
+
+def _solve_triangles(beams: BeamSignals, multiplier: Array | None) -> _Estimates:
+    """Solve one triangle at each crossing, and return its values with their errors."""
+    out, solution = _Estimates.missing(beams), solve_triangles(beams, multiplier)
+    variance = solution.variance
+    for block in np.unique(beams.block):
+        rows = np.flatnonzero(beams.block == block)
+        carried = solution.carried[rows]
+        variance[rows] += _block_errors.curvature_variance(beams.data.take(rows), carried)
+    out.extinction[:] = solution.extinction
+    out.variance[:] = out.prior_true_variance[:] = solution.extinction**2 * variance
+    out.multiplier[:], out.multiplier_error[:] = solution.multiplier, solution.multiplier_error
+    out.open[:] = solution.open
+    return out
+
+
 def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
     shape, passages = estimate.extinction.shape, beams.layout.passages
@@ -283,7 +341,7 @@ def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
         "outlying": _lost_signal(beams, OUTLYING),
         "unsettled": np.broadcast_to(~converged[:, np.newaxis], shape),
         "poor_fit": np.broadcast_to(poor[:, np.newaxis], shape),
-        "not_measured": np.broadcast_to(~beams.layout.measured, shape),
+        "not_measured": np.broadcast_to(~beams.layout.measured | estimate.open, shape),
     }
     crossings = (*beams.leading, shape[1])
     freedom, chi_square = estimate.degrees_of_freedom[:, 0], estimate.chi_square[:, 0]
@@ -297,6 +355,8 @@ def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
         reduced.reshape(beams.leading),
         freedom.reshape(beams.leading),
         estimate.deviation.reshape(beams.leading),
+        np.where(near, estimate.multiplier, np.nan).reshape(crossings),
+        np.where(finite & near, estimate.multiplier_error, np.nan).reshape(crossings),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -80,6 +80,9 @@ class NetworkSettings:
     """Number of clock intervals that share a prior."""
     visibility: VisibilityDefinition
     prior: str = "block"
+    multiplier: float | Literal["chosen"] | None = None
+    """Of triangles of beams (drabenko2021), instead of all beams together; see
+    `extinction_field.retrieve_network`."""
     exponent_relative_error: float = 0.1
     """Relative error of the exponent m."""
     lidar_ratio_relative_error: float = 0.02
@@ -142,6 +145,7 @@ def retrieve_network(
     signals = _gather_signals(beams, intervals, network)
     solver = _Solver(beams, network, settings, signals, intervals)
     result = solver.solve(signals.power)
+    solver.keep_multiplier(result)
     errors = _Errors.estimate(solver, result, settings)
     near = np.flatnonzero(network.near_crossing)
     extinction = result.extinction[:, near]
@@ -174,6 +178,7 @@ def retrieve_network(
             ),
             "shots": ("time", _shots(beams, intervals)),
             "beam_range": (("beam", "crossing"), _distances(network)[:, near]),
+            **_multiplier_variable(result.multiplier[:, near], settings),
         },
         coords=_coordinates(beams, intervals, network, near),
         attrs={"steps": _describe_steps(beams, network, settings)},
@@ -255,6 +260,7 @@ class _Solver:
         """Beams that are changed together."""
         self._arguments: dict[str, Any] = {
             "prior": settings.prior,
+            "multiplier": settings.multiplier,
             "variance": signals.variance,
             "overlap": signals.overlap,
             "full_overlap_range": np.array([beam.nearest for beam in beams]),
@@ -270,6 +276,11 @@ class _Solver:
             exponent=self.exponent if exponent is None else exponent,
             **self._arguments,
         )
+
+    def keep_multiplier(self, result: NetworkResult) -> None:
+        """Use the multipliers of a result from now on, so that changes are those of signals."""
+        if self._arguments["multiplier"] is not None:
+            self._arguments["multiplier"] = result.multiplier
 
     def near_end_weights(self) -> Array:
         """Return (beam, bin) weights from 1 at the nearest crossing of a beam to 0 at its last."""
@@ -347,6 +358,7 @@ class _Errors:
             by_lidar_ratio,
             tail_signal,
             condition * result.extinction * settings.overlap_relative_error,
+            result.multiplier_error,
         ]
         return _Errors(random, _root_sum_square(contributions), tail_signal, condition)
 
@@ -401,6 +413,13 @@ def _quality_flags(
         result.flags.weak_signal, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION)
     )
     return bits | np.where(unexplained, reason, np.int32(0))
+
+
+def _multiplier_variable(multiplier: Array, settings: NetworkSettings) -> dict[str, Any]:
+    """Return the multipliers of triangles; nothing where all beams are solved together."""
+    if settings.multiplier is None:
+        return {}
+    return {"multiplier": (("time", "crossing"), multiplier)}
 
 
 def _optical_depth(extinction: Array, network: Network) -> Array:
@@ -469,6 +488,8 @@ def _describe_steps(
 ) -> str:
     """Return a description of the beams, their crossings and the definition of visibility."""
     texts = [settings.visibility.words]
+    if settings.multiplier is not None:
+        texts.append(f"triangles of beams, with the multiplier {settings.multiplier}")
     for index, beam in enumerate(beams):
         numbers, ranges = network.on_beam(index)
         crossings = ", ".join(f"{v} at {r:.0f} m" for v, r in zip(numbers, ranges, strict=True))

@@ -332,3 +332,18 @@ def test_haze_in_the_far_range_does_not_bias_the_background():
     total = np.hypot(found.standard_error, found.left.most)
     assert np.all(np.abs(found.background - SKY) < 2.0 * total)
     assert np.median(np.abs(found.background - SKY)) < np.median(np.abs(fit.background - SKY))
+
+
+@pytest.mark.parametrize(("near", "extinction"), [(750.0, 1e-4), (2500.0, 3e-5)])
+def test_the_cubic_doubts_weak_signals(near, extinction):
+    """The plan states these limits."""
+    distance = np.arange(near, near + 6000.0, 7.5)
+    shape = (near / distance) ** 2 * np.exp(-2 * extinction * (distance - near))
+    doubted = {}
+    for strength in (30.0, 300.0):
+        rng = np.random.default_rng(1)
+        power = SKY + strength * shape + rng.standard_normal((200, distance.size))
+        span = (distance[0], distance[-1])
+        doubted[strength] = flagged(from_cubic(power, distance, np.ones_like(power), span)).mean()
+    assert doubted[30.0] == 1.0
+    assert doubted[300.0] < 0.02

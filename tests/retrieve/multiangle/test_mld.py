@@ -174,3 +174,20 @@ def test_missing_beams_have_no_effect():
     whole = retrieve(signal, angles, "mld")
     assert whole.optical_depth[:, 3:] == pytest.approx(subset.optical_depth[:, 3:], rel=1e-12)
     assert not np.allclose(whole.optical_depth[:, :3], subset.optical_depth[:, :3])
+
+
+@pytest.mark.parametrize("method", ["mld", "mld_prior"])
+def test_a_result_states_the_chosen_strength_and_the_prior(method):
+    """Given back, the chosen strength gives the same profile where it is the same everywhere."""
+    signal, angles = published(50.0, profiles=5)
+    result = retrieve(signal, angles, method)
+    chosen = result.regularisation
+    assert np.isin(chosen, mld.STRENGTHS).all()
+    below = np.pad(result.optical_depth, ((0, 0), (1, 0)))[:, :-1]
+    prior = below if method == "mld_prior" else np.zeros_like(below)
+    np.testing.assert_allclose(result.prior_optical_depth, prior, rtol=1e-12)
+    path = 1 / np.cos(np.radians(angles))
+    share = [[-2 * weights(path, strength) @ path for strength in row] for row in chosen]
+    np.testing.assert_allclose(result.data_share, share, rtol=1e-9)
+    plain = retrieve(signal, angles, "kano_hamilton")
+    assert np.isnan(plain.regularisation).all()

@@ -187,3 +187,17 @@ def test_bins_that_are_not_used_do_not_matter(monkeypatch):
     monkeypatch.setattr(labeled, "THRESHOLDS", replace(THRESHOLDS, bins_beyond=10**6))
     xr.testing.assert_identical(cut, solved(beams))
     assert beams[0].averages.sizes["range"] > 700
+
+
+def test_the_bias_of_a_multiplier_is_part_of_the_systematic_error():
+    beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
+    errors = {f"{name}_relative_error": 0.0 for name in ("exponent", "overlap", "lidar_ratio")}
+    result = solved(beams, multiplier=0.8, **errors)
+    np.testing.assert_allclose(result["multiplier"], 0.8)
+    excess = (result["total_extinction"] - EXTINCTION).median("time").dropna("crossing")
+    stated = result["total_extinction_systematic_error"].median("time").dropna("crossing")
+    assert excess.size > 0
+    assert (excess > 0.05 * EXTINCTION).all()
+    np.testing.assert_allclose(excess, stated, rtol=0.1)
+    assert "multiplier" not in solved(beams)
+    assert "triangles of beams, with the multiplier 0.8" in result.attrs["steps"]

@@ -308,6 +308,8 @@ def multiangle(
         "log_intercept": 14.0,
         "log_intercept_standard_error": 0.02,
         "data_share": 0.99,
+        "regularisation": 0.1,
+        "prior_vertical_optical_depth": 0.2,
         "inhomogeneity": 0.03,
         "monotone_vertical_optical_depth": 0.3,
         "reduced_chi2": 1.0,
@@ -404,6 +406,7 @@ def visibility(
         "total_extinction_standard_error": error,
         "total_extinction_systematic_error": systematic,
         "condition": rng.uniform(1.0, 3.0, shape),
+        "multiplier": np.full(shape, 0.95),
     }
     scalars = {"path_optical_depth": 0.8, "reduced_chi2": 1.1, "degrees_of_freedom": 1.0}
     distance = np.full((beams, crossings), np.nan)

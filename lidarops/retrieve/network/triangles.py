@@ -1,0 +1,345 @@
+r"""Triangles of three beams, with the multiplier of drabenko2021.
+
+A cycle leads along three beams from a crossing to a second one, a third one and back. Its row j
+starts at the signal alpha_j and ends at alpha'_j, with the integral J_j = 2 m (integral of a)
+between them, negative towards the lidar:
+
+    alpha_j / extinction_j - alpha'_j / extinction_(j+1) = J_j.
+
+The sum of the rows, row j multiplied by ``multiplier ** (j - 1)``, gives the extinction of the
+first crossing if the terms of the others are left out. With 1 they cancel; a smaller multiplier
+limits the noise, and biases the value by `systematic_error`; 0 leaves the first beam alone.
+
+A cycle starts away from a lidar, and in the direction in which homogeneous air attenuates. In the
+other one, the denominator has a pole.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.network._beam_signals import BeamSignals
+from lidarops.retrieve.network._fit_layout import FitLayout
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+Booleans = npt.NDArray[np.bool_]
+
+__all__ = ["CHOSEN", "MULTIPLIERS", "cycle_start", "solve_triangles", "systematic_error"]
+
+CHOSEN: Final = "chosen"
+"""Multiplier with the smallest sum of squared bias and variance in the block."""
+MULTIPLIERS: Final[Array] = 1.0 - np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 61)])
+"""Multipliers to choose from: 15 per decade of the difference from 1, which grows with the noise
+(`test_the_chosen_multiplier_is_no_worse_than_any_fixed_one`)."""
+_BEAMS: Final = 3
+
+
+def cycle_start(
+    start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike, multiplier: npt.ArrayLike
+) -> Array:
+    r"""Return the reciprocal extinction at the first crossing of a cycle of beams.
+
+    .. math::
+        \frac{1}{\hat\sigma_1} = \frac{\sum_j \mu_j Q_{j-1} J_j / \alpha_j}{1 - \mu_K Q_K},
+        \quad Q_j = \prod_{l \le j} \alpha'_l / \alpha_l, \quad \mu_j = \lambda^{j-1}
+
+    For any number K of beams; with K = 3, equations 11 and 12 of the paper.
+
+    Parameters
+    ----------
+    start, end : (..., row) float
+        Signals (P r^2)^m at the beginning and the end of each row, in any unit of the beam.
+    integral : (..., row) float
+        m times that unit: 2 m times the integral of the signal, negative where the row leads
+        towards its lidar.
+    multiplier : (...) float
+        Lambda of the paper, 0 to 1.
+
+    Returns
+    -------
+    (...) float
+        m; negative or infinite where the rows have no solution.
+
+    References
+    ----------
+    drabenko2021.
+    """
+    alpha, beyond, area, powers = (
+        np.asarray(values, dtype=np.float64) for values in (start, end, integral, multiplier)
+    )
+    return _sum_rows(alpha, beyond, area, powers).reciprocal
+
+
+def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) -> Array:
+    r"""Return (true - estimate) / true of reciprocal extinction at the start of a cycle of beams.
+
+    .. math::
+        \frac{S_1 - \tilde S_1}{S_1} = \frac{\sum_{j<K} (\mu_j - \mu_{j+1})
+        e^{-2 \sum_{l \le j} \tau_l}}{1 - \mu_K e^{-2 \sum_l \tau_l}}, \quad \mu_j = \lambda^{j-1}
+
+    It holds in any field, because extinction at the crossings cancels. With K = 3, equation 17 of
+    the paper.
+
+    Parameters
+    ----------
+    optical_depth : (..., row) float
+        Exponent m times optical depth of each row, negative where it leads towards its lidar.
+    multiplier : (...) float
+        0 to 1.
+
+    Returns
+    -------
+    (...) float
+        NaN beyond the pole.
+
+    References
+    ----------
+    drabenko2021.
+    """
+    attenuation = np.exp(-2.0 * np.cumsum(np.asarray(optical_depth, dtype=np.float64), axis=-1))
+    powers = _powers(np.asarray(multiplier, dtype=np.float64), attenuation.shape[-1])
+    determinant = 1.0 - powers[..., -1] * attenuation[..., -1]
+    neglected = ((powers[..., :-1] - powers[..., 1:]) * attenuation[..., :-1]).sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(determinant > 0.0, neglected / determinant, np.nan))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangle:
+    """A cycle of three beams that starts at a crossing."""
+
+    first: Indices
+    """(3,) passage at the beginning of each row."""
+    last: Indices
+    """(3,) passage at its end."""
+    direction: Array
+    """(3,) 1 away from the lidar, -1 towards it."""
+    depth: Array
+    """(3,) m, exponent times length, negative towards the lidar."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleSolution:
+    """Extinction at the first crossings of triangles; NaN where there is none."""
+
+    extinction: Array
+    """(profile, crossing) m-1."""
+    variance: Array
+    """(profile, crossing) of its logarithm, by noise."""
+    carried: Array
+    """(profile, crossing, passage) change of its logarithm with that of the signals."""
+    multiplier: Array
+    """(profile, crossing)."""
+    multiplier_error: Array
+    """(profile, crossing) m-1, what the multiplier adds to extinction in homogeneous air."""
+    open: Booleans
+    """(crossing,) True where no triangle leads away."""
+
+
+def solve_triangles(beams: BeamSignals, multiplier: npt.ArrayLike | None) -> TriangleSolution:
+    """Solve the triangle of each crossing.
+
+    Parameters
+    ----------
+    beams : BeamSignals
+    multiplier : float or (profile, crossing) float, optional
+        Chosen for each block and crossing where not given.
+    """
+    profiles, passages = beams.data.log_value.shape
+    shape = (profiles, beams.layout.crossings)
+    out = TriangleSolution(
+        np.full(shape, np.nan), np.full(shape, np.nan), np.zeros((*shape, passages)),
+        np.full(shape, np.nan), np.full(shape, np.nan), np.ones(shape[1], dtype=np.bool_),
+    )  # fmt: skip
+    fixed = None if multiplier is None else np.broadcast_to(multiplier, shape)
+    for crossing, triangle in find_triangles(beams.layout, beams.exponent).items():
+        rows = _Rows.of(beams, triangle)
+        out.open[crossing] = False
+        for block in np.unique(beams.block):
+            members = np.flatnonzero((beams.block == block) & rows.usable)
+            if members.size:
+                given = None if fixed is None else fixed[members, crossing]
+                _solve_block(rows.take(members), triangle, given, out, (members, crossing))
+    return out
+
+
+def find_triangles(layout: FitLayout, exponent: Array) -> dict[int, Triangle]:
+    """Return, by crossing, the triangle that attenuates most in homogeneous air.
+
+    Crossings from which no triangle leads away are missing.
+    """
+    best: dict[int, Triangle] = {}
+    for triangle in _cycles(layout, exponent):
+        crossing = int(layout.passages.crossing[triangle.first[0]])
+        least = best[crossing].depth.sum() if crossing in best else 0.0
+        if triangle.depth.sum() > least:
+            best[crossing] = triangle
+    return best
+
+
+def _cycles(layout: FitLayout, exponent: Array) -> Iterator[Triangle]:
+    """Yield the cycles of three beams whose first row leads away from its lidar."""
+    passages = layout.passages
+    beam, crossing = passages.beam, passages.crossing
+    place = {
+        key: number for number, key in enumerate(zip(beam.tolist(), crossing.tolist(), strict=True))
+    }
+    beams_at = [beam[crossing == number].tolist() for number in range(layout.crossings)]
+    crossings_on = [set(crossing[beam == number].tolist()) for number in range(exponent.size)]
+    for (own, start), number in place.items():
+        for far in range(number + 1, int(layout.first_passage[own + 1])):
+            second = int(crossing[far])
+            for middle, closing in itertools.product(beams_at[second], beams_at[start]):
+                if len({own, middle, closing}) < _BEAMS:
+                    continue
+                for third in sorted(crossings_on[middle] & crossings_on[closing]):
+                    if third not in (start, second):
+                        first = [number, place[middle, second], place[closing, third]]
+                        last = [far, place[middle, third], place[closing, start]]
+                        yield _triangle(np.array(first), np.array(last), layout, exponent)
+
+
+def _triangle(first: Indices, last: Indices, layout: FitLayout, exponent: Array) -> Triangle:
+    run = layout.passages.range[last] - layout.passages.range[first]
+    return Triangle(first, last, np.sign(run), run * exponent[layout.passages.beam[first]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Signals of the three rows of a triangle."""
+
+    start: Array
+    """(profile, row)."""
+    end: Array
+    integral: Array
+    covariance: Array
+    """(profile, row, 3, 3) of ln start, ln end and the integral of each row."""
+    usable: Booleans
+    """(profile,)."""
+
+    @classmethod
+    def of(cls, beams: BeamSignals, triangle: Triangle) -> _Rows:
+        """Return the rows of all profiles."""
+        data, layout = beams.data, beams.layout
+        profiles = len(data.log_value)
+        integral, covariance = np.empty((profiles, _BEAMS)), np.empty((profiles, _BEAMS, 3, 3))
+        for row, (first, last) in enumerate(zip(triangle.first, triangle.last, strict=True)):
+            between = slice(min(first, last), max(first, last))
+            integral[:, row] = triangle.direction[row] * data.integral[:, between].sum(axis=1)
+            beam = layout.passages.beam[first]
+            own = layout.first_passage[beam]
+            count = int(layout.first_passage[beam + 1] - own)
+            taken = np.zeros((3, 2 * count - 1))
+            taken[0, first - own] = taken[1, last - own] = 1.0
+            taken[2, count + between.start - own : count + between.stop - own] = triangle.direction[
+                row
+            ]
+            packed = data.covariance[:, layout.offset[beam] : layout.offset[beam + 1]]
+            square = packed.reshape(profiles, 2 * count - 1, 2 * count - 1)
+            covariance[:, row] = taken @ square @ taken.T
+        start, end = (np.exp(data.log_value[:, ends]) for ends in (triangle.first, triangle.last))
+        usable = data.usable[:, np.concatenate([triangle.first, triangle.last])].all(axis=1)
+        return cls(start, end, integral, covariance, np.asarray(usable))
+
+    def take(self, profiles: Indices) -> _Rows:
+        """Return the selected profiles."""
+        return _Rows(*(getattr(self, name)[profiles] for name in self.__slots__))
+
+    def solve(self, multiplier: Array) -> tuple[Array, Array, Array]:
+        """Return reciprocal extinction, the variance of its logarithm, and its derivatives.
+
+        The derivatives are those of the logarithm by ln start and ln end, (profile, 2, row).
+        """
+        sums = _sum_rows(self.start, self.end, self.integral, multiplier)
+        by_integral = sums.by_integral / sums.reciprocal[:, np.newaxis]
+        by_ratio = sums.by_ratio / sums.reciprocal[:, np.newaxis]
+        derivative = np.stack(
+            [-by_ratio - by_integral * self.integral, by_ratio, by_integral], axis=-1
+        )
+        variance = np.einsum("nri,nrij,nrj->n", derivative, self.covariance, derivative)
+        return sums.reciprocal, variance, derivative[..., :2].transpose(0, 2, 1)
+
+
+def _solve_block(
+    rows: _Rows,
+    triangle: Triangle,
+    multiplier: Array | None,
+    out: TriangleSolution,
+    place: tuple[Indices, int],
+) -> None:
+    """Solve the profiles of one block, in place."""
+    with np.errstate(all="ignore"):
+        # The extinction of homogeneous air that the first beam shows.
+        level = float(np.median((rows.start[:, 0] - rows.end[:, 0]) / rows.integral[:, 0]))
+        depth = triangle.depth * level
+        if multiplier is None:
+            multiplier = np.full(len(rows.usable), _choose(rows, depth, level))
+        reciprocal, variance, derivative = rows.solve(multiplier)
+        solved = (reciprocal > 0.0) & np.isfinite(variance)
+        extinction = np.where(solved, 1.0 / reciprocal, np.nan)
+        error = np.abs(systematic_error(np.broadcast_to(depth, rows.start.shape), multiplier))
+    out.extinction[place] = extinction
+    out.variance[place] = np.where(solved, variance, np.nan)
+    out.multiplier[place] = multiplier
+    # Where the block shows no attenuation, the error is unknown unless the rows cancel.
+    out.multiplier_error[place] = np.where(multiplier == 1.0, 0.0, error) * extinction
+    members, crossing = place
+    for ends, values in zip((triangle.first, triangle.last), (0, 1), strict=True):
+        for row, passage in enumerate(ends):
+            out.carried[members, crossing, passage] -= np.where(
+                solved, derivative[:, values, row], 0.0
+            )
+
+
+def _choose(rows: _Rows, depth: Array, level: float) -> float:
+    """Return the multiplier with the smallest sum of squared bias and variance, 1 if none has one.
+
+    The variance is the median of the block, relative to the extinction that the first beam shows.
+    """
+    bias = systematic_error(np.broadcast_to(depth, (MULTIPLIERS.size, _BEAMS)), MULTIPLIERS)
+    risk = np.full(MULTIPLIERS.size, np.inf)
+    for number, multiplier in enumerate(MULTIPLIERS):
+        reciprocal, variance, _ = rows.solve(np.full(len(rows.usable), multiplier))
+        noise = float(np.median(variance * (reciprocal * level) ** 2))
+        risk[number] = bias[number] ** 2 + noise
+    risk = np.where(np.isfinite(risk), risk, np.inf)
+    return float(MULTIPLIERS[np.argmin(risk)])
+
+
+class _Sums(NamedTuple):
+    """The sum of the rows of a cycle, and its derivatives."""
+
+    reciprocal: Array
+    """(...) m."""
+    by_integral: Array
+    """(..., row) derivative by the integrals."""
+    by_ratio: Array
+    """(..., row) derivative by the logarithm of end over start, at the same integral over start."""
+
+
+def _sum_rows(start: Array, end: Array, integral: Array, multiplier: Array) -> _Sums:
+    powers = _powers(multiplier, start.shape[-1])
+    product = np.cumprod(end / start, axis=-1)
+    before = np.concatenate([np.ones_like(product[..., :1]), product[..., :-1]], axis=-1)
+    terms = powers * before * integral / start
+    closing = (powers * product)[..., -1:]
+    determinant = 1.0 - closing
+    reciprocal = terms.sum(axis=-1, keepdims=True) / determinant
+    later = terms[..., ::-1].cumsum(axis=-1)[..., ::-1] - terms
+    return _Sums(
+        reciprocal[..., 0],
+        powers * before / start / determinant,
+        (later + reciprocal * closing) / determinant,
+    )
+
+
+def _powers(multiplier: Array, rows: int) -> Array:
+    """Return (..., row) multipliers of the rows."""
+    return np.asarray(multiplier[..., np.newaxis] ** np.arange(rows))
