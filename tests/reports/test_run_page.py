@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import os
+import re
 from dataclasses import replace
 from datetime import timedelta
 from html.parser import HTMLParser
@@ -101,7 +104,14 @@ def built(run, folder: Path, **options) -> Page:
         else:
             assert page.target(link).is_file(), link
     assert all(len(alt) > 20 for alt in page.alts)
-    assert "http" not in path.read_text().replace("http-equiv", "")
+    text = path.read_text()
+    assert "http" not in text.replace("http-equiv", "")
+    # Nothing runs, and only this style sheet applies, whatever a name or text of the archive holds.
+    (style,) = re.findall(r"<style>(.*?)</style>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="(.*?)"', text)
+    assert policy.startswith(f"default-src 'none'; style-src 'sha256-{digest}';")
+    assert " style=" not in text
     return page
 
 
