@@ -52,9 +52,9 @@ COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-ha
 	--no-emit-index-url --no-strip-extras --custom-compile-command "make lock" pyproject.toml
 
 lock:
-	$(COMPILE) -o requirements.lock
+	$(COMPILE) --extra prefect -o requirements.lock
 	$(COMPILE) --extra dev -c requirements.lock -o requirements-dev.lock
-	$(COMPILE) --extra postgresql --extra s3 --extra slurm -c requirements-dev.lock \
+	$(COMPILE) --extra postgresql --extra prefect --extra s3 --extra slurm -c requirements-dev.lock \
 		-o deploy/requirements.lock
 
 clean:

@@ -12,9 +12,15 @@ also gives the temporary one a password.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import secrets
 from typing import Final
+
+if importlib.util.find_spec("prefect") is None:
+    raise ImportError(
+        "flows need Prefect: pip install lidarops[prefect], or use lidarops reprocess"
+    )
 
 WITH_FAILURES: Final = "Completed with failures"
 """State of a run that ended, but with refused files, failed scenes or the like.
