@@ -124,13 +124,13 @@ def test_keys_in_the_url_are_not_shown(campaign_file: Path) -> None:
     campaign = load_campaign(campaign_file)
     assert reprocess(campaign) is not None
     place = f"bucket/{campaign_file.parent.name}"
-    done = CliRunner().invoke(app, ["publish", str(campaign_file), f"memory://key:sec/ret@{place}"])
+    done = CliRunner().invoke(app, ["publish", str(campaign_file), f"memory://{place}"])
     assert done.exit_code == 0, done.output
     assert done.output.startswith(f"memory://{place}: 2 sent")
-    for scheme, code in (("http", 2), ("luck", 2)):
+    for scheme in ("memory", "http", "luck"):
         url = f"{scheme}://key:sec/ret@{place}"
         refused = CliRunner().invoke(app, ["publish", str(campaign_file), url])
-        assert refused.exit_code == code
+        assert refused.exit_code == 2
         assert "://bucket" in refused.output
         assert "ret" not in refused.output
 
