@@ -25,7 +25,8 @@ _UNREADABLE: Final = "cannot be read"
 _TRY_AGAIN: Final = (_UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
 
-_HEADER_BYTES = 16384
+HEADER_BYTES: Final = 16384
+"""Bytes that hold the header of any format."""
 _ROUNDING_OF_ANGLES: Final = 1.0
 """degree; headers hold whole degrees."""
 _ROUNDING_OF_WAVELENGTHS: Final = 1e-9
@@ -128,7 +129,7 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
         claimants = f"{due.instrument} and {', '.join(due.rivals)}"
         return _refused(due, f"claimed by instruments {claimants} (make their patterns disjoint)")
     try:
-        head = headers.source.head(file.path, _HEADER_BYTES)
+        head = headers.source.head(file.path, HEADER_BYTES)
         header = parse_raw_header(head, file=file.path, size=file.size)
         return _accepted(due, header, headers.place(due.instrument))
     except RawFormatError as error:

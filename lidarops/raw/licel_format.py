@@ -21,6 +21,13 @@ from lidarops.raw.licel_header import memories
 _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
 
 
+_WRONG_IN_THEMSELVES: Final = 1
+"""Bins that may hold any counts: one of 272 real files has one bin beyond full scale."""
+_SCALED_TO: Final = np.iinfo(np.int32).max
+"""Largest count of simulated signals that are scaled to 32 bits: no counts of a recorder."""
+_SECTOR: Final = 128
+"""Bins in 512 bytes, the smallest block that a disk loses."""
+
 _COMMON: Final = tuple(field.name for field in fields(RawChannel) if field.name != "places")
 """Properties of channels that datasets have under the same name."""
 
@@ -32,7 +39,11 @@ def _recognises(head: bytes) -> bool:
 def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
     header = raw_header(licel.parse_header(head, file=file, size=size))
     if len(head) == size:
-        _check_shots(head, header)
+        for channel in header.channels:
+            first, *further = (np.frombuffer(head, "<i4", channel.bins, p) for p in channel.places)
+            counts = sum(further, start=first)
+            _check_full_scale(counts, channel, header.path)
+            _check_blocks(counts, channel, header.path)
     return header
 
 
@@ -62,24 +73,48 @@ def _after_lasers(header: licel.Header) -> bytes:
     return header.source.split(b"\r\n", lines)[lines]
 
 
-def _check_shots(content: bytes, header: RawHeader) -> None:
-    """Refuse a file whose largest counts are full scale of more shots than it states."""
-    for channel in header.channels:
-        if channel.full_scale is None:
-            continue
-        first, *further = (np.frombuffer(content, "<i4", channel.bins, p) for p in channel.places)
-        counts = sum(further, start=first)
-        largest, full_scale = int(counts.max()), (1 << channel.adc_bits) - 1
-        # A single bin may be wrong in itself.
-        is_plateau = largest % full_scale == 0 and np.count_nonzero(counts == largest) > 1
-        if largest > channel.full_scale and is_plateau:
-            raise RawFormatError(
-                f"states {channel.shots} shots, but saturates at full scale of"
-                f" {largest // full_scale}: its values would be wrong by that ratio",
-                file=header.path,
-                field=f"shots of {channel.name}",
-                remedy="leave the file out, or correct the shots in its header",
-            )
+def _check_full_scale(counts: NDArray[np.int32], channel: RawChannel, path: str) -> None:
+    """Refuse counts beyond the full scale of the shots and bits that a file states."""
+    if channel.full_scale is None or not channel.shots:
+        return
+    largest, full_scale = int(counts.max()), (1 << channel.adc_bits) - 1
+    beyond = int(np.count_nonzero(counts > channel.full_scale))
+    if beyond <= _WRONG_IN_THEMSELVES or largest == _SCALED_TO:
+        return
+    is_plateau = largest % full_scale == 0
+    if is_plateau and np.count_nonzero(counts == largest) > _WRONG_IN_THEMSELVES:
+        raise RawFormatError(
+            f"states {channel.shots} shots, but saturates at full scale of"
+            f" {largest // full_scale}: its values would be wrong by that ratio",
+            file=path,
+            field=f"shots of {channel.name}",
+            remedy="leave the file out, or correct the shots in its header",
+        )
+    raise RawFormatError(
+        f"{beyond} bins hold up to {largest} counts, but {channel.shots} shots of"
+        f" {channel.adc_bits} bits give at most {channel.full_scale}",
+        file=path,
+        field=f"shots or ADC bits of {channel.name}",
+        remedy="leave the file out, or correct its header",
+    )
+
+
+def _check_blocks(counts: NDArray[np.int32], channel: RawChannel, path: str) -> None:
+    """Refuse a block of zeros between counts that are nowhere else zero, as of a lost sector.
+
+    A recorder that is off gives zeros only, one that stops early zeros at the end, and few
+    photons zeros among other counts.
+    """
+    zeros = np.flatnonzero(counts == 0)
+    if zeros.size < _SECTOR or zeros[-1] - zeros[0] != zeros.size - 1:
+        return
+    if zeros[0] > 0 and zeros[-1] < counts.size - 1:
+        raise RawFormatError(
+            f"bins {zeros[0]} to {zeros[-1]} hold zeros, and no other does: their counts are lost",
+            file=path,
+            field=f"counts of {channel.name}",
+            remedy="copy the file again from the instrument, or leave it out",
+        )
 
 
 @lru_cache(maxsize=128)

@@ -18,15 +18,19 @@ from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, as_settings
+from lidarops.catalog.headers import HEADER_BYTES
 from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdict
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import AncillaryError
+from lidarops.errors import AncillaryError, LidarOpsError
 from lidarops.netcdf.provenance import package_versions
+from lidarops.plan.outlying_headers import NEAR_DAYS, without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.process.guard import Failure, guarded
+from lidarops.raw.formats import parse_raw_header
+from lidarops.raw.header import RawHeader
 from lidarops.records import Granule, InputRecord, Plan, Role, Scene
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
@@ -43,7 +47,11 @@ if workers process the scenes, the next group."""
 
 # Settings that change neither the scenes nor the content of a product.
 _OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "simulation"})
-_PLANNING: Final = ("lidarops.plan.scene_plan", "lidarops.plan.scenes")
+_PLANNING: Final = (
+    "lidarops.plan.outlying_headers",
+    "lidarops.plan.scene_plan",
+    "lidarops.plan.scenes",
+)
 """Modules that decide which scenes and plans a day has. A product records its own scene and plan,
 so that a change of these modules makes it stale only if they changed."""
 
@@ -174,10 +182,10 @@ class Judge:
         for day_sum in self._store.day_sums():
             fingerprint = (day_sum.role.value, day_sum.good, day_sum.low, day_sum.high)
             sums[day_sum.day].append(fingerprint)
-            if day_sum.role is Role.DARK:
-                for near in range(1, DARK_DAYS + 1):
-                    sums[day_sum.day - near].append((near, *fingerprint))
-                    sums[day_sum.day + near].append((-near, *fingerprint))
+            reach = NEAR_DAYS + (DARK_DAYS if day_sum.role is Role.DARK else 0)
+            for near in range(1, reach + 1):
+                sums[day_sum.day - near].append((near, *fingerprint))
+                sums[day_sum.day + near].append((-near, *fingerprint))
         products, broken = self._product_days()
         base = self._base()
         signatures = {}
@@ -307,15 +315,29 @@ class Judge:
         return last is not None and bool(last.error) and complete
 
     def _cut(self, first: int, last: int, days: set[int]) -> Cut:
-        granules = self._store.granules_of(first, last, dark_days=DARK_DAYS)
-        return cut_scenes(
+        granules = self._store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
+        used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
+        kept, refused = without_outlying(granules, used, self._header)
+        cut = cut_scenes(
             self.campaign,
             [
                 granule
-                for granule in granules
+                for granule in kept
                 if granule.role is Role.DARK or day_of(_moment(granule)) in days
             ],
         )
+        aside = [granule for granule in refused if day_of(_moment(granule)) in days]
+        return replace(cut, set_aside=(*cut.set_aside, *aside))
+
+    def _header(self, granule: Granule) -> RawHeader | None:
+        """Return the header of a file; None where it cannot be read now."""
+        try:
+            head = self._source.head(granule.path, HEADER_BYTES)
+            return parse_raw_header(
+                head, file=granule.path, size=granule.size, known=granule.format
+            )
+        except (OSError, LidarOpsError):
+            return None
 
     # One scene
 

@@ -203,13 +203,15 @@ def test_mistyped_wavelength():
         (("000", "101", "101"), False),
     ],
 )
-def test_shots_that_line_3_and_all_other_datasets_contradict_are_refused(shots, refused):
+def test_shots_that_all_other_channels_contradict_are_refused(shots, refused):
     lines = (ANALOG, PHOTON, ANALOG.replace("00532.p", "00355.o"))
     data = tuple(
         line.replace("000101", number.zfill(6)) for line, number in zip(lines, shots, strict=False)
     )
     if refused:
-        with pytest.raises(RawFormatError, match="states 181 shots, line 3") as error:
+        with pytest.raises(
+            RawFormatError, match="states 181 shots, all other channels 101"
+        ) as error:
             parse(line_3=LINE_3.format(len(data)), datasets=data)
         assert error.value.field == "shots of photon_532p"
     else:

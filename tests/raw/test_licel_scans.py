@@ -25,12 +25,18 @@ START = datetime(2018, 10, 18, 2, 59, 43, tzinfo=UTC)
 
 
 def scan_file(
-    elevation="-10.0", azimuth="37.0", *, offset="00.0", stop="18/10/2018 02:59:43", **changes
+    elevation="-10.0",
+    azimuth="37.0",
+    *,
+    offset="00.0",
+    stop="18/10/2018 02:59:43",
+    lasers=LASERS,
+    **changes,
 ):
     """Return the bytes of a file of a scan, built without the writer under test."""
     line_2 = LINE_2.format("02:59:43", stop, elevation, azimuth)
     grid = GRID.format(offset)
-    lines = {"line_2": line_2, "line_3": f"{grid.ljust(78)}\r\n{LASERS}"}
+    lines = {"line_2": line_2, "line_3": f"{grid.ljust(78)}\r\n{lasers}"}
     return raw_file(**{"datasets": CHANNELS, **lines, **changes})
 
 
@@ -110,7 +116,7 @@ def test_an_unknown_repetition_rate_gives_no_interval():
 @pytest.mark.parametrize("second", ["empty", "used"])
 def test_counts_and_shots_of_both_memories_are_added(saved, second):
     rng = np.random.default_rng(1)
-    counts = rng.integers(0, 4095 * 27, (4, 4), dtype=np.int32)
+    counts = rng.integers(0, 4095 * 27 // 2, (4, 4), dtype=np.int32)
     if second == "empty":
         counts[2:] = 0
     path = saved(scan_file(data=[struct.pack("<4i", *row) for row in counts]))
@@ -139,6 +145,17 @@ def test_memories_of_one_channel_only_are_added(saved):
     )
     opened = open_archive(saved(scan_file(datasets=lines)))
     assert {"analog_355p", "analog_355p_2", "photon_355p", "photon_355p_2"} <= set(opened)
+
+
+def test_the_shots_of_both_memories_are_compared_with_those_of_other_channels():
+    third = tuple(line.replace("00355.p", "00387.o") for line in (CHANNELS[1], CHANNELS[3]))
+    lines = (*CHANNELS, *third)
+    lasers = LASERS.replace(" 04", " 06")
+    assert licel.parse_header(scan_file(datasets=lines, lasers=lasers)).datasets
+    damaged = (*lines[:-1], lines[-1].replace("000013", "000093"))
+    with pytest.raises(RawFormatError, match="states 107 shots, all other channels 27") as error:
+        licel.parse_header(scan_file(datasets=damaged, lasers=lasers))
+    assert error.value.field == "shots of photon_387o"
 
 
 def test_a_sum_beyond_32_bits_stays_above_full_scale(saved):

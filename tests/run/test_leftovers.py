@@ -211,7 +211,7 @@ def _fail(archive: Archive, scenes: str, *, unmade: bool = False) -> None:
 
 
 def test_failures_are_removed_on_days_between_others(archive: Archive) -> None:
-    _fail(archive, "poor_%")
+    _fail(archive, "poor_%", unmade=True)
     for day in (0, 2):
         for path in (archive.folder / "raw/poor").glob(f"h{day}*"):
             path.unlink()

@@ -1,0 +1,150 @@
+"""A header that all files around it contradict is refused or noted, and moves no other product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import xarray as xr
+from support.archives.small_archive import DAY, Archive
+
+from lidarops.records import RunRecord
+from lidarops.run import staleness
+from lidarops.run.archive import Result, bring_up_to_date
+from lidarops.run.reproduction import reproduce_product
+
+FILES = 5
+ANALOG = b" 1 0 1 01500 1 0000 7.50 00532.o 0 0 00 000 12 000600 0.500 BT0"
+PHOTON = b" 1 1 1 01500 1 0000 7.50 00532.o 0 0 00 000 00 000600 3.1746 BC0"
+
+
+def _archive(folder: Path, minutes: list[float]) -> Archive:
+    archive = Archive(folder, days=0)
+    del archive.tree["instruments"]["rich"]
+    for number, minute in enumerate(minutes):
+        archive.raw(f"poor/h{number}", minute, seed=number)
+    archive.write()
+    return archive
+
+
+def _damage(archive: Archive, number: int, old: bytes, new: bytes) -> None:
+    path = archive.folder / f"raw/poor/h{number}"
+    content = path.read_bytes()
+    assert old in content
+    assert len(old) == len(new)
+    path.write_bytes(content.replace(old, new, 1))
+
+
+def _run(archive: Archive) -> tuple[Result, set[str]]:
+    result = bring_up_to_date(archive.write())
+    record = result.record
+    return result, _products(record)
+
+
+def _products(record: RunRecord | None) -> set[str]:
+    return {
+        product.path for scene in (record.scenes if record else ()) for product in scene.products
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "old", "new", "said", "number"),
+    [
+        (ANALOG, b"00532", b"00537", "channels analog_537o, photon_532o, the files around it", 2),
+        (ANALOG, b" 1 0 1", b" 1 1 1", "channels photon_532o", 2),
+        (ANALOG, b" 12 ", b" 16 ", "analog_532o adc_bits 16, the files around it 12", 0),
+        (ANALOG, b"0.500", b"0.100", "analog_532o input_range 0.1, the files around it 0.5", 2),
+        (ANALOG, b"7.50", b"3.50", "analog_532o bin_width 3.5, the files around it 7.5", 4),
+        (PHOTON, b"7.50", b"7.40", "photon_532o bin_width 7.4, the files around it 7.5", 3),
+    ],
+)
+def test_a_file_that_all_around_it_contradict_is_refused_and_renames_no_product(
+    tmp_path: Path, line: bytes, old: bytes, new: bytes, said: str, number: int
+) -> None:
+    minutes = [600.0 + k for k in range(FILES)]
+    archive = _archive(tmp_path / "damaged", minutes)
+    _damage(archive, number, line, line.replace(old, new, 1))
+    result, products = _run(archive)
+    assert list(result.set_aside) == [f"poor/h{number}"]
+    assert said in result.set_aside[f"poor/h{number}"]
+    assert result.has_failures
+    undamaged, expected = _run(_archive(tmp_path / "whole", minutes))
+    assert products == expected
+    assert not undamaged.has_failures
+    assert result.record is not None
+    assert {scene.granules for scene in result.record.scenes} == {FILES - 1}
+
+
+@pytest.mark.parametrize(
+    ("line", "old", "new", "said"),
+    [
+        (ANALOG, b" 0000 7", b" 0800 7", "analog_532o high_voltage 800.0"),
+        (PHOTON, b"3.1746", b"3.1748", "photon_532o discriminator"),
+        (b" Coast ", b"Coast", b"C0ast", "site C0ast, the files around it Coast"),
+    ],
+)
+def test_what_changes_no_value_is_noted(
+    tmp_path: Path, line: bytes, old: bytes, new: bytes, said: str
+) -> None:
+    archive = _archive(tmp_path, [600.0 + k for k in range(FILES)])
+    _damage(archive, 2, line, line.replace(old, new, 1))
+    result, products = _run(archive)
+    assert not result.has_failures
+    product = archive.folder / "out/products" / min(products)
+    with xr.open_dataset(product) as opened:
+        assert said in opened.attrs["lidarops_input_notes"]
+        assert opened.sizes["time"] == FILES
+    assert reproduce_product(product).identical
+
+
+def test_other_shots_are_no_damage(tmp_path: Path) -> None:
+    """The last file of a run is often shorter."""
+    archive = _archive(tmp_path, [600.0 + k for k in range(FILES)])
+    _damage(archive, 2, b" 0000600 0010", b" 0000540 0010")
+    for line in (ANALOG, PHOTON):
+        _damage(archive, 2, line, line.replace(b"000600", b"000540"))
+    result, products = _run(archive)
+    assert not result.has_failures
+    with xr.open_dataset(archive.folder / "out/products" / min(products)) as opened:
+        assert "lidarops_input_notes" not in opened.attrs
+
+
+def test_a_change_of_the_lidar_is_no_damage(tmp_path: Path) -> None:
+    archive = _archive(tmp_path, [600.0 + k for k in range(2 * FILES)])
+    for number in range(FILES, 2 * FILES):
+        _damage(archive, number, ANALOG, ANALOG.replace(b" 12 ", b" 16 "))
+    result, products = _run(archive)
+    assert not result.set_aside
+    assert len(products) == 4
+
+
+def test_two_files_do_not_outvote_one(tmp_path: Path) -> None:
+    archive = _archive(tmp_path, [600.0, 601.0, 602.0])
+    _damage(archive, 1, ANALOG, ANALOG.replace(b" 12 ", b" 16 "))
+    assert not _run(archive)[0].set_aside
+
+
+@pytest.mark.parametrize("at_a_time", [1, 50_000])
+def test_neighbouring_days_are_compared_whatever_is_judged_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_a_time: int
+) -> None:
+    monkeypatch.setattr(staleness, "MOST_GRANULES", at_a_time)
+    # Two files on each day but the third, which has one.
+    minutes = [600.0, 601.0, DAY + 600.0, DAY + 601.0, 2 * DAY + 600.0, 3 * DAY + 600.0]
+    archive = _archive(tmp_path, [*minutes, 3 * DAY + 601.0])
+    _damage(archive, 4, ANALOG, ANALOG.replace(b"0.500", b"0.100"))
+    result, _ = _run(archive)
+    assert list(result.set_aside) == ["poor/h4"]
+
+
+def test_a_new_state_is_accepted_when_more_files_have_it(tmp_path: Path) -> None:
+    changed = ANALOG.replace(b"0.500", b"0.100")
+    minutes = [600.0 + k for k in range(FILES)]
+    archive = _archive(tmp_path, [*minutes, DAY - 0.5])
+    _damage(archive, FILES, ANALOG, changed)
+    assert list(_run(archive)[0].set_aside) == [f"poor/h{FILES}"]
+    archive.raw(f"poor/h{FILES + 1}", DAY + 1.0, seed=9)
+    _damage(archive, FILES + 1, ANALOG, changed)
+    result, _ = _run(archive)
+    assert not result.set_aside
+    assert not result.has_failures
