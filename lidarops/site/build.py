@@ -32,7 +32,7 @@ from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.reports.reading import UNREADABLE
 from lidarops.site import pages, product_contents
 from lidarops.site.links import BESIDE, COPIES, Links
-from lidarops.site.neighbours import around
+from lidarops.site.neighbours import with_neighbours
 from lidarops.site.paths import (
     SITE,
     day_page,
@@ -323,7 +323,7 @@ def _write(site: Path, name: str, content: bytes) -> None:
 
 def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entry]:
     """Write what leads to and from each product into its page; yield entries with new digests."""
-    for entry, neighbours in around(entries):
+    for entry, neighbours in with_neighbours(entries):
         page = within(site, entry.page).read_bytes()
         linked = pages.with_around(page, pages.around(entry, neighbours, links))
         if linked != page:

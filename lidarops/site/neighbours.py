@@ -23,7 +23,7 @@ class Neighbours:
     """Of the other kinds and channels of the instrument, the product nearest in time."""
 
 
-def around(entries: Sequence[Entry]) -> Iterator[tuple[Entry, Neighbours]]:
+def with_neighbours(entries: Sequence[Entry]) -> Iterator[tuple[Entry, Neighbours]]:
     """Yield every product with those beside it, in the given order."""
     series: dict[tuple[str, ...], list[Entry]] = defaultdict(list)
     for entry in sorted(entries, key=lambda entry: (entry.start, entry.path)):
