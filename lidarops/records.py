@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -264,6 +265,65 @@ class Provenance:
     code_version: str
 
 
+class Grade(StrEnum):
+    """How much a product differs from the one that it replaces."""
+
+    NONE = "none"
+    """The same values and texts; the old file stays."""
+    MINOR = "minor"
+    """Texts, or values within a tenth of their stated errors."""
+    MAJOR = "major"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """How a product differs from the one that it replaces, and why."""
+
+    grade: Grade
+    largest: float
+    """Largest difference: of values over their standard error, or relative where none is stated.
+    Infinite where values or variables came or went."""
+    variable: str
+    """Of the largest difference; empty without one."""
+    share: float
+    """Share of the values that differ."""
+    causes: tuple[str, ...]
+    """Inputs, settings, steps and software that differ."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types; None for an infinite difference."""
+        return {
+            "grade": self.grade.value,
+            "largest": self.largest if math.isfinite(self.largest) else None,
+            "variable": self.variable,
+            "share": self.share,
+            "causes": list(self.causes),
+        }
+
+    @property
+    def words(self) -> str:
+        """The difference as a phrase."""
+        if self.grade is Grade.NONE:
+            return "the same"
+        if not self.variable:
+            return "the same values, other texts"
+        size = (
+            f"up to {self.largest:.2g} standard errors"
+            if math.isfinite(self.largest)
+            else ("values that came, went or have other bits")
+        )
+        return f"{size} in {self.variable}; {100.0 * self.share:.2g} % of the values"
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """Number of a version of a product, and when it was written."""
+
+    version: int = 1
+    written: datetime | None = None
+    """UTC; None for the time at which it is written."""
+
+
 class Verdicts(NamedTuple):
     """Numbers of values by the worst severity of their quality bits."""
 
@@ -295,6 +355,10 @@ class ProductRecord:
     """Number of values that carry no bit."""
     usable: int | None = None
     """Number of values without a rejecting bit; None where they were not counted."""
+    stamp: Stamp = field(default_factory=Stamp)
+    """Of its file."""
+    change: Change | None = None
+    """How it differs from the product that it replaces; None for a new one."""
 
     @property
     def verdicts(self) -> Verdicts:

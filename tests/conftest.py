@@ -20,6 +20,9 @@ hypothesis.settings.load_profile("lidarops")
 # Tests run in as many processes as there are cores: more threads would wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# Products state when they were written; equal inputs shall give equal bytes in tests.
+os.environ.setdefault("SOURCE_DATE_EPOCH", "1700000000")
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 

@@ -333,6 +333,23 @@ class Scenes(SettingsModel):
         return self
 
 
+class Period(SettingsModel):
+    """A period of a campaign."""
+
+    since: Instant
+    until: Instant = Field(description="end, not included")
+    frozen: bool = Field(
+        default=False,
+        description="products of scenes that begin in the period are not replaced without --thaw",
+    )
+
+    @model_validator(mode="after")
+    def _ends_after_its_start(self) -> Self:
+        if self.until <= self.since:
+            raise ValueError("until must be later than since")
+        return self
+
+
 class Campaign(SettingsModel):
     """One campaign: stations, instruments, networks, raw files and requested products."""
 
@@ -346,6 +363,7 @@ class Campaign(SettingsModel):
     instruments: dict[Identifier, Instrument] = Field(min_length=1)
     networks: dict[Identifier, Network] = Field(default={})
     scenes: Scenes = Scenes()
+    periods: list[Period] = Field(default=[])
     simulation: SimulationSettings | None = None
     catalog: str | None = Field(
         default=None,
@@ -391,6 +409,12 @@ class Campaign(SettingsModel):
                         index,
                     )
         return self
+
+    def is_frozen(self, moment: datetime) -> bool:
+        """Return whether a moment lies in a frozen period."""
+        return any(
+            period.frozen and period.since <= moment < period.until for period in self.periods
+        )
 
     @property
     def folder(self) -> Path:

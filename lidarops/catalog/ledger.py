@@ -38,6 +38,7 @@ from lidarops.records import (
     ProductRecord,
     Role,
     SceneOutcome,
+    Stamp,
 )
 
 
@@ -77,6 +78,7 @@ class RecordedProduct:
     mtime_ns: int
     depends_on: Dependence
     run: str
+    stamp: Stamp
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -180,6 +182,7 @@ _P: Final = PRODUCT.c
 _MADE: Final = (
     _P.path, _P.scene, _P.day, _P.kind, _P.channel, _P.sha256, _P.size, _P.mtime_ns,
     _P.plan_hash, _P.settings_hash, _P.inputs_hash, _P.code_version, _P.run,
+    _P.version, _P.written,
 )  # fmt: skip
 
 
@@ -321,6 +324,7 @@ class Ledger(Granules):
 
     def _product_row(self, new: NewProduct, entry: SceneEntry, run: str) -> dict[str, Any]:
         stated = ("path", "kind", "channel", "sha256", "size", "usable")
+        change, written = new.record.change, new.record.stamp.written
         return {
             "campaign": self.campaign,
             "scene": entry.outcome.scene,
@@ -329,6 +333,9 @@ class Ledger(Granules):
             "run": run,
             **{name: getattr(new.record, name) for name in stated},
             **asdict(new.depends_on),
+            "version": new.record.stamp.version,
+            "written": None if written is None else naive(written),
+            "change": "" if change is None else json.dumps(change.as_dict()),
         }
 
     def _enter_inputs(self, connection: sa.Connection, products: Sequence[NewProduct]) -> None:
@@ -618,7 +625,8 @@ def _set_id(files: Sequence[InputRecord]) -> str:
 
 def _made_from(row: Any) -> RecordedProduct:
     # In the order of `_MADE`.
-    return RecordedProduct(*(*row[:8], Dependence(*row[8:12]), row.run))
+    stamp = Stamp(row.version, None if row.written is None else aware(row.written))
+    return RecordedProduct(*(*row[:8], Dependence(*row[8:12]), row.run, stamp))
 
 
 def _stages(connection: sa.Connection, run: str) -> dict[str, float]:

@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 8
+SCHEMA_VERSION: Final = 9
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -100,6 +100,11 @@ PRODUCT = sa.Table(
     sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
     # Number of usable values; null if they were not counted.
     sa.Column("usable", sa.BigInteger),
+    # Number of the version of the content, and when its file was written.
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("written", sa.DateTime),
+    # How it differs from the product that it replaced, as JSON; empty for a new one.
+    sa.Column("change", sa.Text, nullable=False),
     sa.Index("product_by_day", "campaign", "day"),
     sqlite_with_rowid=False,
 )

@@ -148,6 +148,9 @@ def reprocess(
     force: Annotated[
         bool, typer.Option("--force", help="Process everything selected, even what is fresh.")
     ] = False,
+    thaw: Annotated[
+        bool, typer.Option("--thaw", help="Replace products of frozen periods, too.")
+    ] = False,
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Number of worker processes; default 1.")
     ] = None,
@@ -214,6 +217,7 @@ def reprocess(
     with progress_bar("reprocess", None, "granules") as bar:
         options = pipeline.Options(
             force=force,
+            thaw=thaw,
             workers=workers or 1,
             memory=memory_limit,
             cluster=connect,
@@ -333,6 +337,16 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             for scene in scenes
             for product in scene.products
         },
+        "versions": {
+            product.path: product.stamp.version for scene in scenes for product in scene.products
+        },
+        "changes": {
+            product.path: product.change.as_dict()
+            for scene in scenes
+            for product in scene.products
+            if product.change is not None
+        },
+        "frozen_products": dict(result.frozen),
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
         "more_of_both": result.more_unused,
@@ -382,6 +396,7 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     scenes = () if result.record is None else result.record.scenes
     columns = ("scene", "kind", "channel", "values", "good", "care", "reject", "flags")
     show_rows("Products", columns, (row for scene in scenes for row in _product_rows(scene)))
+    _show_changes(result)
     refused = _refused(campaign, result)
     _show_refused(refused)
     _show_unused(result, {granule.path for granule in refused})
@@ -419,6 +434,21 @@ def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
         yield scene.scene, product.kind, product.channel, *numbers, flags
     if scene.error:
         yield scene.scene, "none", "", "", "", "", "", scene.error
+
+
+def _show_changes(result: Result) -> None:
+    """Print how products differ from those that they replace, and frozen ones that would."""
+    scenes = () if result.record is None else result.record.scenes
+    rows = (
+        (product.path, change.grade.value, change.words, "; ".join(change.causes))
+        for scene in scenes
+        for product in scene.products
+        for change in [product.change]
+        if change is not None
+    )
+    show_rows("Products made again", ("file", "change", "difference", "cause"), rows)
+    title = "Frozen products that would be replaced (--thaw replaces them)"
+    show_rows(title, ("file", "reason"), result.frozen.items())
 
 
 def _show_unused(result: Result, listed: Collection[str]) -> None:

@@ -112,3 +112,29 @@ def reproduce(
     result = reproduce_product(product, archive=archive, ancillary=ancillary, catalog=catalog)
     typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
     exit_with_status(failed=not result.identical)
+
+
+@command()
+def compare(
+    old: Annotated[Path, typer.Argument(help="A product.", metavar="OLD")],
+    new: Annotated[Path, typer.Argument(help="Another version of it.", metavar="NEW")],
+    as_json: JsonOption = False,
+) -> None:
+    """Show how a product differs from another version of it, and why. Exit code 0 if it does not.
+
+    none: the same values and texts; minor: other texts, or values within a tenth of their stated
+    errors; major: all else.
+
+    Example: lidarops compare demo/superseded/OLD.nc demo/products/NEW.nc
+    """
+    from lidarops.netcdf.comparison import compare_products
+    from lidarops.records import Grade
+
+    change = compare_products(old, new)
+    if as_json:
+        typer.echo(json.dumps(change.as_dict(), indent=2))
+    else:
+        typer.echo(f"{change.grade.value}: {change.words}")
+        for cause in change.causes:
+            typer.echo(f"  {cause}")
+    exit_with_status(failed=change.grade is not Grade.NONE)

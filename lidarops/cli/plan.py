@@ -129,6 +129,7 @@ def _plan(
             _show_all(judged, needs, plan=not stale)
         else:
             show_scene(judged, needs["to_be_made" if stale else "everything"], plan=not stale)
+        _show_frozen(judged)
     no_scene = no_scene and selects_no_scene(settings, selection)
     # With --stale, fresh scenes were not judged.
     runs = {"to be made": making} | ({} if stale else {"everything, with --force": whole_run})
@@ -243,13 +244,22 @@ def _show_stale(title: str, judged: Judgement) -> None:
     show_rows(f"{title}: to be made", ("product", "channels", "reason"), rows)
 
 
+def _show_frozen(judged: Judgement) -> None:
+    rows = ((product.kind, product.channel, product.reason) for product in judged.frozen)
+    title = f"{judged.scene.id}: frozen, would be replaced with --thaw"
+    show_rows(title, ("product", "channel", "reason"), rows)
+
+
 def _plain(judged: Judgement) -> dict[str, Any]:
     from lidarops.steps.reading import idle_window
 
-    stale = [
-        {"kind": product.kind, "channel": product.channel, "reason": product.reason}
-        for product in judged.stale
-    ]
+    stale, frozen = (
+        [
+            {"kind": product.kind, "channel": product.channel, "reason": product.reason}
+            for product in products
+        ]
+        for products in (judged.stale, judged.frozen)
+    )
     plan = judged.requested
     idle = [idle_window(step, plan.steps) for step in plan.steps]
     steps = [
@@ -261,6 +271,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         "hash": plan.hash,
         "steps": steps,
         "stale": stale,
+        "frozen": frozen,
         "fresh": judged.fresh,
         "failure": asdict(judged.failure) if judged.failure else None,
         "held": judged.held,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
-from lidarops.records import DetectionMode, Provenance
+from lidarops.netcdf.provenance import writing_time
+from lidarops.records import DetectionMode, Provenance, Stamp
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -39,6 +40,13 @@ class Context:
     provenance: Provenance
     raw_format: str
     """Raw format of its files, in words."""
+    stamp: Stamp = field(default_factory=Stamp)
+    """Version of its content, and when it is written."""
+
+    @property
+    def written(self) -> datetime:
+        """When the product is written, UTC."""
+        return self.stamp.written or writing_time()
 
 
 def product_path(context: Context) -> str:

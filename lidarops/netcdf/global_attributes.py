@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarops import __version__
 from lidarops.netcdf.context import Context
-from lidarops.netcdf.provenance import product_date, product_id
+from lidarops.netcdf.provenance import product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
 from lidarops.records import DetectionMode, is_glued
 
@@ -38,14 +38,14 @@ class Extents:
 
 def global_attributes(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
     """Return the global attributes of a product, in the order in which they are written."""
-    date, origin = product_date(extents.stop)
+    date = context.written
     profiles = "timeSeriesProfile" if extents.vertical else None
     feature_type = layout.feature_type or profiles
     feature = {"featureType": feature_type} if feature_type else {}
     return {
         "Conventions": CONVENTIONS,
         **feature,
-        **_description(context, layout, date, origin),
+        **_description(context, layout, date),
         **_people(context),
         **_place(context, layout, extents),
         **_times(extents, date),
@@ -53,16 +53,13 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
     }
 
 
-def _description(context: Context, layout: Layout, date: datetime, origin: str) -> dict[str, Any]:
+def _description(context: Context, layout: Layout, date: datetime) -> dict[str, Any]:
     metadata = context.metadata
     station = context.station.name
     wavelength = _wavelength(context)
     summary = (
         f"{layout.summary} Channel {context.channel} ({wavelength},"
         f" {_detection(context)}) of {context.instrument_name} at {station}."
-    )
-    dates = (
-        f"Dates of creation and modification are {origin}, so that equal inputs give equal files."
     )
     references = (metadata.references, *layout.references)
     return {
@@ -77,10 +74,10 @@ def _description(context: Context, layout: Layout, date: datetime, origin: str) 
         "processing_level": layout.processing_level,
         # As the templates of NCEI name time series of profiles at stations.
         "cdm_data_type": "Station",
-        "product_version": f"{__version__}+{context.provenance.code_version}",
+        "product_version": str(context.stamp.version),
         "history": _history(context, date),
         "references": "\n".join(text for text in references if text) or "Not stated.",
-        "comment": _sentences(metadata.comment, layout.comment, dates),
+        "comment": _sentences(metadata.comment, layout.comment),
         "acknowledgement": metadata.acknowledgement or "Not stated.",
         "license": metadata.license or "Not stated.",
         "standard_name_vocabulary": STANDARD_NAME_TABLE,

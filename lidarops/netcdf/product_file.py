@@ -15,10 +15,13 @@ from lidarops.errors import ProductError
 from lidarops.flags import FlagBit
 from lidarops.kinds import flags_of
 from lidarops.netcdf.build import ProductEncoder
+from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.input_checks import Values
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.netcdf.write import RowFile, create_file, written_file
+from lidarops.netcdf.write import RowFile, Written, create_file, written_file
+from lidarops.records import Change, Grade
+from lidarops.system.files import sha256_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +37,14 @@ class WrittenProduct:
     """Number of values without any bit."""
     usable: int
     """Number of values without a bit of severity reject."""
+    change: Change | None
+    """How it differs from the product that it replaces; None without one."""
 
 
 @contextmanager
-def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[ProductWriter]:
+def create_product(
+    frame: xr.Dataset, context: Context, path: Path, former: str = ""
+) -> Iterator[ProductWriter]:
     """Yield a writer of a product; at the end the file is complete, on disk and has its name.
 
     The bytes depend on the data only, not on how many profiles are added at a time. Several threads
@@ -53,6 +60,8 @@ def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[
     path : Path
         Missing folders are created. A former file is replaced at the end, and stays if anything
         fails.
+    former : str
+        SHA-256 of the former file. If it is so, both are compared, and it stays if it is the same.
 
     Raises
     ------
@@ -61,7 +70,7 @@ def create_product(frame: xr.Dataset, context: Context, path: Path) -> Iterator[
         written. Other errors of the ``with`` block are raised as they are.
     """
     with ExitStack() as until_complete:
-        writer = ProductWriter(frame, context, path, until_complete)
+        writer = ProductWriter(frame, context, path, until_complete, former)
         yield writer
         if writer.file is None:
             raise ProductError("has no profiles", file=path)
@@ -71,10 +80,17 @@ class ProductWriter:
     """A product that is being written; see `create_product`."""
 
     def __init__(
-        self, frame: xr.Dataset, context: Context, path: Path, until_complete: ExitStack
+        self,
+        frame: xr.Dataset,
+        context: Context,
+        path: Path,
+        until_complete: ExitStack,
+        former: str,
     ) -> None:
         self._encoder = ProductEncoder(frame, context)
         self._path = path
+        self._former = former
+        self._change: Change | None = None
         self._until_complete = until_complete
         self._values = 0
         self._unflagged = 0
@@ -100,9 +116,18 @@ class ProductWriter:
         encoded = self._encoder.encode(profiles)
         if self.file is None:
             skeleton = self._encoder.skeleton(encoded)
-            self.file = self._until_complete.enter_context(create_file(skeleton, self._path))
+            self.file = self._until_complete.enter_context(
+                create_file(skeleton, self._path, replaces=self._replaces)
+            )
         self.file.add(encoded)
         self._count(encoded[QUALITY_FLAG])
+
+    def _replaces(self, new: Path) -> bool:
+        """Return whether the new file differs from the former one."""
+        if not (self._former and self._path.is_file() and sha256_of(self._path) == self._former):
+            return True
+        self._change = compare_products(self._path, new)
+        return self._change.grade is not Grade.NONE
 
     def _count(self, flags: Values) -> None:
         self._values += flags.size
@@ -121,7 +146,11 @@ class ProductWriter:
         ProductError
             If it is not written.
         """
-        file = written_file(self.file, self._path)
+        change = self._change
+        if change is not None and change.grade is Grade.NONE:
+            file = Written(self._former, self._path.stat().st_size)
+        else:
+            file = written_file(self.file, self._path)
         return WrittenProduct(
             sha256=file.sha256,
             size=file.size,
@@ -129,4 +158,5 @@ class ProductWriter:
             flagged={str(bit.name): self._flagged[bit] for bit in sorted(self._flagged)},
             unflagged=self._unflagged,
             usable=self._values - self._rejected,
+            change=change,
         )

@@ -219,6 +219,27 @@ def package_versions() -> Mapping[str, str]:
     return {name: version(name) for name in _PACKAGES} | {"python": platform.python_version()}
 
 
+def writing_time() -> datetime:
+    """Return the time now in UTC to the second, or that of ``SOURCE_DATE_EPOCH`` if it is set.
+
+    Raises
+    ------
+    ProductError
+        If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
+    """
+    epoch = os.environ.get(EPOCH_VARIABLE, "")
+    if not epoch:
+        return datetime.now(UTC).replace(microsecond=0)
+    try:
+        return datetime.fromtimestamp(int(epoch), UTC)
+    except (ValueError, OverflowError, OSError) as error:
+        raise ProductError(
+            f"is {epoch!r}, not a number of seconds",
+            field=EPOCH_VARIABLE,
+            remedy="set it to whole seconds since 1970-01-01, or unset it",
+        ) from error
+
+
 def product_date(end: datetime) -> tuple[datetime, str]:
     """Return the date of a product, which does not depend on when or where it is made.
 

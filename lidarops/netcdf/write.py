@@ -11,7 +11,7 @@ import math
 import os
 import secrets
 import unicodedata
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,7 +158,10 @@ def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Forma
 
 @contextmanager
 def create_file(
-    skeleton: Skeleton, path: Path, model: _Format = "NETCDF4_CLASSIC"
+    skeleton: Skeleton,
+    path: Path,
+    model: _Format = "NETCDF4_CLASSIC",
+    replaces: Callable[[Path], bool] = lambda _new: True,
 ) -> Iterator[RowFile]:
     """Yield a file to which rows are added; at the end it is complete, on disk and has its name.
 
@@ -172,6 +175,8 @@ def create_file(
         fails.
     model : str
         Data model of netCDF.
+    replaces : callable
+        Returns of the complete file, under its temporary name, whether it replaces the former one.
 
     Raises
     ------
@@ -196,6 +201,9 @@ def create_file(
                 file.close()
         with _disk_errors(path):
             written = _settle(temporary)
+        if not replaces(temporary):
+            return
+        with _disk_errors(path):
             temporary.replace(path)
             _sync(path.parent)
         file.written = written

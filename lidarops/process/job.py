@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
-from lidarops.records import Plan, PlannedStep, Scene
-from lidarops.steps.dependence import scene_facts
+from lidarops.records import Plan, PlannedStep, Scene, Stamp
+from lidarops.steps.dependence import ProductKey, scene_facts
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What stands at the place of a product that is made."""
+
+    stamp: Stamp
+    """Of the product to be made."""
+    sha256: str = ""
+    """Of the product that it replaces; empty where it replaces none."""
+    former: Stamp = field(default_factory=Stamp)
+    """Of that product."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +32,12 @@ class Job:
     profiles_per_chunk: int | None = None
     only: str | None = None
     """The channel whose products are made; all channels where None."""
+    places: Mapping[ProductKey, Place] = field(default_factory=dict)
+    """Of products that were made before."""
+
+    def place(self, kind: str, channel: str) -> Place:
+        """Return what stands at the place of a product."""
+        return self.places.get((kind, channel), Place(Stamp()))
 
     def concerns(self, step: PlannedStep) -> bool:
         """Whether the products of the step's channel are made."""

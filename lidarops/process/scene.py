@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import dask.config
@@ -22,10 +22,11 @@ from lidarops.process.agreement import find_disagreements
 from lidarops.process.context import product_context
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.input_files import check_files, local_files, open_granules
-from lidarops.process.job import Job
+from lidarops.process.job import Job, Place
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
+    Grade,
     Granule,
     InputRecord,
     Plan,
@@ -199,7 +200,8 @@ class _Work:
     def _writer(self, frame: xr.Dataset, context: Context) -> Iterator[ProductWriter]:
         """Yield a writer of a product, which is complete at the end."""
         target = self.job.campaign.products_root / product_path(context)
-        with create_product(frame, context, target) as writer:
+        former = self.job.place(context.kind, context.channel).sha256
+        with create_product(frame, context, target, former) as writer:
             yield writer
         self._clock.lap("write")
 
@@ -210,7 +212,10 @@ class _Work:
                 self._clock.lap("retrieve")
                 writer.add(rows)
                 self._clock.lap("write")
-        return _record(context, writer)
+        return self._record(context, writer)
+
+    def _record(self, context: Context, writer: ProductWriter) -> ProductRecord:
+        return _record(context, writer, self.job.place(context.kind, context.channel))
 
 
 class _Instrument(_Work):
@@ -263,7 +268,7 @@ class _Instrument(_Work):
                     else:
                         writer = self._writer(rows, contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
-        yield from (_record(contexts[kind], writer) for kind, writer in writers.items())
+        yield from (self._record(contexts[kind], writer) for kind, writer in writers.items())
         for kind, stream in streams.items():
             if isinstance(stream, WholeProduct):
                 yield self._written(contexts[kind], stream.results())
@@ -332,7 +337,13 @@ class _Network(_Work):
             )
 
 
-def _record(context: Context, writer: ProductWriter) -> ProductRecord:
+def _record(context: Context, writer: ProductWriter, place: Place) -> ProductRecord:
+    written = writer.written
+    stays = written.change is not None and written.change.grade is Grade.NONE
     return ProductRecord(
-        product_path(context), context.kind, context.channel, **asdict(writer.written)
+        product_path(context),
+        context.kind,
+        context.channel,
+        **{item.name: getattr(written, item.name) for item in fields(written)},
+        stamp=place.former if stays else context.stamp,
     )

@@ -150,6 +150,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         verdict=run_tables.verdict(record),
         outcome=run_tables.outcome_class(record),
         difference=difference(record, folder),
+        changes=run_tables.changes(record),
         narrow=gallery.NARROW,
         overview=_overview(pictures),
         findings=[*finding_rows(record.findings), *disagreement_rows(record.scenes)],

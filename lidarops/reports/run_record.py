@@ -16,7 +16,7 @@ FILE_NAME: Final = "run.json"
 """Name of the record inside a run's report folder."""
 
 _FORMAT: Final = "lidarops run record"
-_VERSION: Final = 4
+_VERSION: Final = 5
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
 
 

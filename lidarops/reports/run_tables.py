@@ -6,13 +6,13 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, NamedTuple
 
 from lidarops.figures.wording import counted, decided_on, duration, percent, verdicts_in_words
 from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.records import LeftOut, PlannedStep, RunRecord, SceneOutcome, Verdicts
+from lidarops.records import Grade, LeftOut, PlannedStep, RunRecord, SceneOutcome, Verdicts
 from lidarops.reports.findings import disagreement_rows, finding_rows, unmade_words
 from lidarops.steps.reading import idle_window
 
@@ -101,6 +101,40 @@ class InstrumentRow:
     def quality(self) -> str:
         """Shares of good values, of those to be used with care, and of rejected ones."""
         return verdicts_in_words(self.verdicts)
+
+
+class ChangeRow(NamedTuple):
+    """How a product differs from the one that it replaces."""
+
+    scene: str
+    label: str
+    version: int
+    grade: str
+    difference: str
+    cause: str
+
+
+def changes(record: RunRecord) -> list[ChangeRow]:
+    """Return the products that were made again, the largest changes first."""
+    rows = [
+        (
+            change.grade,
+            ChangeRow(
+                scene.scene,
+                f"{product.kind} {product.channel}",
+                product.stamp.version,
+                change.grade.value,
+                change.words,
+                "; ".join(change.causes),
+            ),
+        )
+        for scene in record.scenes
+        for product in scene.products
+        for change in [product.change]
+        if change is not None
+    ]
+    order = list(Grade)
+    return [row for _, row in sorted(rows, key=lambda pair: -order.index(pair[0]))]
 
 
 def summary(record: RunRecord) -> list[tuple[str, str]]:

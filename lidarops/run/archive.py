@@ -173,7 +173,7 @@ def assess(
         days = _days_to_judge(judge, store, selection, force=everything)
         for batch in judge.batches(days):
             for judged in judge.days(batch).judgements:
-                if everything or judged.due or judged.held:
+                if everything or judged.due or judged.held or judged.frozen:
                     yield judged
 
 
@@ -258,6 +258,8 @@ class _Gathered:
     orphans: list[Orphan] = field(default_factory=list)
     set_aside: list[Granule] = field(default_factory=list)
     held: list[Judgement] = field(default_factory=list)
+    frozen: dict[str, str] = field(default_factory=dict)
+    """Product of a frozen period that would be replaced -> why."""
     empty_scenes: list[Judgement] = field(default_factory=list)
     verdicts: dict[int, Verdict] = field(default_factory=dict)
     """Of days that are settled, without signature; of those in `open` only once all their scenes
@@ -329,6 +331,7 @@ class _Pass:
             empty_scenes={judged.scene.id: judged.empty_reason for judged in gathered.empty_scenes},
             set_aside={granule.path: granule.reason for granule in gathered.set_aside},
             more_unused=sum(verdicts[day].unused for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
+            frozen=gathered.frozen,
             findings=findings,
             signal=caught,
         )
@@ -343,7 +346,8 @@ class _Pass:
 
     def _new_judge(self, *, again: bool = False) -> Judge:
         force = self.options.force and not again
-        return Judge(self.campaign, self.store, selection=self.selection, force=force)
+        thaw = self.options.thaw
+        return Judge(self.campaign, self.store, selection=self.selection, force=force, thaw=thaw)
 
     # Processing
 
@@ -427,7 +431,13 @@ class _Pass:
             self._note(judged)
             due = [scene for scene in judged.judgements if scene.due]
             jobs = [
-                Job(self.campaign, scene.scene, scene.needed(), self.options.profiles_per_chunk)
+                Job(
+                    self.campaign,
+                    scene.scene,
+                    scene.needed(),
+                    self.options.profiles_per_chunk,
+                    places=scene.places,
+                )
                 for scene in due
                 if scene.stale
             ]
@@ -460,6 +470,12 @@ class _Pass:
         gathered.verdicts.update(judged.verdicts)
         gathered.empty_scenes += _empty_scenes(judged)
         gathered.held += [scene for scene in judged.judgements if scene.held]
+        gathered.frozen |= {
+            stale.before.path: stale.reason
+            for scene in judged.judgements
+            for stale in scene.frozen
+            if stale.before
+        }
         if judged.digests or judged.touched or judged.gone:
             _acquire(self.lock)
             self.store.store_digests(judged.digests)

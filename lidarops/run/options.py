@@ -28,6 +28,8 @@ class Options:
 
     force: bool = False
     """Process everything selected, also what is fresh."""
+    thaw: bool = False
+    """Replace products of frozen periods, too."""
     workers: int = 1
     """Local processes; they scan and report also if a cluster processes the scenes."""
     memory: str | None = None
@@ -66,6 +68,8 @@ class Result:
     """Path of a good granule that belongs to no scene -> why."""
     more_unused: int = 0
     """Number of further empty scenes and granules set aside, on unchanged days."""
+    frozen: Mapping[str, str] = field(default_factory=dict)
+    """Product of a frozen period that would be replaced -> why."""
     findings: Findings = field(default_factory=Findings)
     signal: int = 0
     """The signal that stopped the run."""

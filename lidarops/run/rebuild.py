@@ -150,6 +150,7 @@ def _found(campaign: Campaign, path: str) -> _Found:
         flagged={},
         unflagged=int(np.count_nonzero(values == 0)),
         usable=int(np.count_nonzero(values & rejecting == 0)),
+        stamp=recipe.stamp,
     )
     return _Found(path, recipe, record, status.st_mtime_ns)
 

@@ -14,10 +14,20 @@ from pydantic import ValidationError
 
 from lidarops.campaign.model import Campaign
 from lidarops.errors import ProductError
-from lidarops.netcdf.provenance import EPOCH_VARIABLE, read_provenance
+from lidarops.netcdf.provenance import read_provenance
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
-from lidarops.records import Granule, InputRecord, LeftOut, Plan, PlannedStep, Role, Scene, Status
+from lidarops.records import (
+    Granule,
+    InputRecord,
+    LeftOut,
+    Plan,
+    PlannedStep,
+    Role,
+    Scene,
+    Stamp,
+    Status,
+)
 
 RAW: Final = (Role.SIGNAL, Role.DARK)
 """Roles of files in the archive; paths of other inputs start from the campaign folder."""
@@ -36,8 +46,8 @@ class Recipe:
     inputs: tuple[InputRecord, ...]
     code_version: str
     versions: Mapping[str, str]
-    epoch: str
-    """SOURCE_DATE_EPOCH by which the product was dated; empty if there was none."""
+    stamp: Stamp
+    """Version and time of writing that the product states."""
 
     @classmethod
     def of(cls, file: Path) -> Recipe:
@@ -57,7 +67,7 @@ class Recipe:
                 inputs=_inputs(entities, document["used"]),
                 code_version=software["lidarops:code_version"],
                 versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
-                epoch=_epoch(file),
+                stamp=_stamp(file),
             )
         except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise _insufficient(file, repr(error)) from error
@@ -206,13 +216,11 @@ def _inputs(
     )
 
 
-def _epoch(file: Path) -> str:
+def _stamp(file: Path) -> Stamp:
     with xr.open_dataset(file, decode_cf=False) as product:
         attributes = product.attrs
-    if f"that of {EPOCH_VARIABLE}" not in str(attributes["comment"]):
-        return ""
-    created = datetime.fromisoformat(str(attributes["date_created"]))
-    return str(round(created.timestamp()))
+    written = datetime.fromisoformat(str(attributes["date_modified"]))
+    return Stamp(int(attributes["product_version"]), written)
 
 
 def _instrument(settings: Mapping[str, Any], products: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,8 +19,8 @@ from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.ledger import Run
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
-from lidarops.netcdf.provenance import EPOCH_VARIABLE, package_versions
-from lidarops.process.job import Job
+from lidarops.netcdf.provenance import package_versions
+from lidarops.process.job import Job, Place
 from lidarops.process.scene import process_scene
 from lidarops.records import InputRecord
 from lidarops.run.recipe import RAW, Recipe, stays_inside
@@ -302,9 +302,10 @@ def _software(recipe: Recipe) -> Iterator[Difference]:
 
 def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
     """Yield the differences between a product and the one made from its inputs now."""
-    with _dated(recipe.epoch):
-        campaign, scene = recipe.campaign(root, folder, out), recipe.scene(root)
-        outcome = process_scene(Job(campaign, scene, recipe.plan, only=recipe.channel))
+    campaign, scene = recipe.campaign(root, folder, out), recipe.scene(root)
+    # Version and time of writing are those of the file, so that every byte can be compared.
+    places = {(recipe.kind, recipe.channel): Place(recipe.stamp)}
+    outcome = process_scene(Job(campaign, scene, recipe.plan, only=recipe.channel, places=places))
     if outcome.internal:
         _LOG.error("scene %s: %s\n%s", outcome.scene, outcome.error, outcome.internal)
     record = next((made for made in outcome.products if made.kind == recipe.kind), None)
@@ -314,20 +315,6 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
         return
     if record.sha256 != sha256_of(recipe.file):
         yield from _compared(recipe.file, out / "products" / record.path)
-
-
-@contextmanager
-def _dated(epoch: str) -> Iterator[None]:
-    """Set SOURCE_DATE_EPOCH to the one by which the product was dated."""
-    before = os.environ.pop(EPOCH_VARIABLE, None)
-    if epoch:
-        os.environ[EPOCH_VARIABLE] = epoch
-    try:
-        yield
-    finally:
-        os.environ.pop(EPOCH_VARIABLE, None)
-        if before is not None:
-            os.environ[EPOCH_VARIABLE] = before
 
 
 def _compared(before: Path, after: Path) -> list[Difference]:

@@ -29,9 +29,10 @@ from lidarops.plan.outlying_headers import NEAR_DAYS, without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.process.guard import Failure, guarded
+from lidarops.process.job import Place
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
-from lidarops.records import Granule, InputRecord, Plan, Role, Scene
+from lidarops.records import Granule, InputRecord, Plan, Role, Scene, Stamp
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection, requested_kinds
@@ -46,7 +47,9 @@ MOST_GRANULES: Final = 50_000
 if workers process the scenes, the next group."""
 
 # Settings that change neither the scenes nor the content of a product.
-_OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "simulation"})
+_OPERATION: Final = frozenset(
+    {"archive", "output", "catalog", "superseded", "simulation", "periods"}
+)
 _PLANNING: Final = (
     "lidarops.plan.outlying_headers",
     "lidarops.plan.scene_plan",
@@ -65,6 +68,17 @@ class Stale:
     reason: str
     before: RecordedProduct | None = None
     """Its ledger entry, if it was made before."""
+    restored: bool = False
+    """Whether it depends on the same as before, so that only its file is made again."""
+
+    @property
+    def place(self) -> Place | None:
+        """What stands at its place; None for a new product."""
+        if self.before is None:
+            return None
+        former = self.before.stamp
+        stamp = former if self.restored else Stamp(former.version + 1)
+        return Place(stamp, self.before.sha256, former)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +94,8 @@ class Judgement:
     """Present ancillary files that the steps of the plan read."""
     stale: tuple[Stale, ...]
     fresh: int = 0
+    frozen: tuple[Stale, ...] = ()
+    """Products of a frozen period that would be replaced."""
     key: str = ""
     """Digest of everything that may change the outcome."""
     failure: Failure | None = None
@@ -102,6 +118,11 @@ class Judgement:
     def due(self) -> bool:
         """Whether the run must enter an outcome of the scene."""
         return bool(self.stale) or (self.failure is not None and not self.held)
+
+    @property
+    def places(self) -> dict[ProductKey, Place]:
+        """What stands at the places of the stale products."""
+        return {(stale.kind, stale.channel): stale.place for stale in self.stale if stale.place}
 
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
@@ -148,6 +169,8 @@ class Judge:
     selection : Selection
     force : bool
         Whether every selected product counts as stale.
+    thaw : bool
+        Whether products of frozen periods are replaced, too.
     """
 
     def __init__(
@@ -157,11 +180,13 @@ class Judge:
         *,
         selection: Selection | None = None,
         force: bool = False,
+        thaw: bool = False,
     ) -> None:
         self.campaign = campaign
         self._store = store
         self._selection = selection or Selection()
         self._force = force
+        self._thaw = thaw
         self._settings = dependence.Settings(campaign)
         self._ancillaries: dict[str, str] = {}
         self._problems: dict[tuple[str, Role], str] = {}
@@ -275,6 +300,8 @@ class Judge:
         unplanned = {judged.scene.id for judged in judgements if not judged.planned}
         orphans = [orphan for orphan in orphans if orphan[0].scene not in unplanned]
         unsettled = {product.day for product, _ in orphans}
+        # A frozen product is reported by every run.
+        unsettled |= {judged.day for judged in judgements if judged.frozen}
         # The signature of a day does not hold all that may end an internal error.
         unsettled |= {
             judged.day
@@ -382,11 +409,23 @@ class Judge:
         products = dependence.planned_products(requested)
         for kind, channel in products:
             known = made.get((scene.id, kind, channel))
-            reason = self._reason(judged, (kind, channel), known, touched)
+            reason, restored = self._reason(judged, (kind, channel), known, touched)
             if reason:
-                stale.append(Stale(kind, channel, reason, known))
-        fresh = len(products) - len(stale)
-        return replace(judged, requested=requested, stale=tuple(stale), fresh=fresh)
+                stale.append(Stale(kind, channel, reason, known, restored))
+        frozen = [one for one in stale if self._stays_frozen(scene, one)]
+        stale = [one for one in stale if one not in frozen]
+        return replace(
+            judged,
+            requested=requested,
+            stale=tuple(stale),
+            frozen=tuple(frozen),
+            fresh=len(products) - len(stale) - len(frozen),
+        )
+
+    def _stays_frozen(self, scene: Scene, stale: Stale) -> bool:
+        """Return whether a product would be replaced, and its period forbids it."""
+        replaced = stale.before is not None and not stale.restored
+        return replaced and not self._thaw and self.campaign.is_frozen(scene.start)
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement by which every product of a scene is stale."""
@@ -490,10 +529,21 @@ class Judge:
         product: ProductKey,
         known: RecordedProduct | None,
         touched: dict[str, int],
+    ) -> tuple[str, bool]:
+        """Return why a product is stale, and whether it depends on the same as before.
+
+        The reason is empty if it is fresh.
+        """
+        if known is None:
+            return "forced" if self._force else "not made yet", False
+        difference = self._dependence_reason(judged, product, known)
+        reason = difference or self._file_reason(known, touched)
+        return "forced" if self._force else reason, not difference
+
+    def _dependence_reason(
+        self, judged: Judgement, product: ProductKey, known: RecordedProduct
     ) -> str:
-        """Return why a product is stale; empty if it is fresh."""
-        if self._force or known is None:
-            return "forced" if self._force else "not made yet"
+        """Return what has changed of what a product depends on; empty if nothing has."""
         recorded = known.depends_on
         closure = dependence.plan_closure(judged.plan, [product])
         settings = dependence.digest(self._settings.of(judged.scene, closure, product))
@@ -508,7 +558,7 @@ class Judge:
         used = dependence.product_inputs(closure, _files(judged, self._content))
         if recorded.inputs_hash != dependence.inputs_digest(used):
             return _difference(self._store.inputs_of(known.path), used)
-        return self._file_reason(known, touched)
+        return ""
 
     def _file_reason(self, made: RecordedProduct, touched: dict[str, int]) -> str:
         path = self.campaign.products_root / made.path

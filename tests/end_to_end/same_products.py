@@ -37,10 +37,10 @@ CAMPAIGNS = Path(__file__).resolve().parent / "campaigns"
 
 DERIVED = {
     "id": "UUID of inputs, plan, settings and code",
-    "product_version": "ends in the digest of the code",
+    "product_version": "number of the version of the content",
     "lidarops_code_version": "digest of the sources",
     "lidarops_plan_sha256": "digest of the plan, whose reasons are texts",
-    "date_created": "release date of the code, where data are older",
+    "date_created": "when the product was written",
     "date_modified": "as date_created",
     "date_issued": "as date_created",
     "date_metadata_modified": "as date_created",
@@ -130,13 +130,10 @@ def make(out: Path, names: list[str]) -> int:
 
 def _environment(root: Path, out: Path) -> dict[str, str]:
     """Return an environment in which the checkout alone decides on the products."""
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith("LIDAROPS_") and name != "SOURCE_DATE_EPOCH"
-    }
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("LIDAROPS_")}
     folders = (root, root / "tests", root / "tests" / "plugin")
     return kept | {
+        "SOURCE_DATE_EPOCH": "1700000000",
         "PYTHONPATH": os.pathsep.join(map(str, folders)),
         "NUMBA_CACHE_DIR": str(out / "cache" / "numba"),
         "XDG_CACHE_HOME": str(out / "cache"),

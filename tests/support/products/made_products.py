@@ -19,6 +19,7 @@ from lidarops.records import (
     PlannedStep,
     Provenance,
     Role,
+    Stamp,
 )
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
@@ -92,6 +93,7 @@ def context(kind: str = "homogeneous", **changes: Any) -> Context:
         "provenance": provenance(kind),
         "raw_format": "Licel",
         "notes": (),
+        "stamp": Stamp(1, START + timedelta(days=2)),
     }
     return Context(**(fields | changes))
 

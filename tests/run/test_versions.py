@@ -1,0 +1,140 @@
+"""Versions of products: counted by content, graded, kept where nothing changed, and frozen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import xarray as xr
+from support.archives.small_archive import Archive
+from typer.testing import CliRunner
+
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.records import Grade, ProductRecord
+from lidarops.run.archive import Options, Selection, bring_up_to_date
+from lidarops.run.options import Result
+from lidarops.run.reproduction import reproduce_product
+
+SIGNALS = Selection(instruments=("poor",))
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Archive:
+    """A small archive, whose signals are processed."""
+    archive = Archive(tmp_path_factory.mktemp("versions"), days=2)
+    brought(archive)
+    return archive
+
+
+def brought(archive: Archive, **options: bool) -> Result:
+    return bring_up_to_date(archive.write(), selection=SIGNALS, options=Options(**options))
+
+
+def products(result: Result) -> dict[str, ProductRecord]:
+    scenes = () if result.record is None else result.record.scenes
+    return {product.path: product for scene in scenes for product in scene.products}
+
+
+def attributes(path: Path) -> dict[str, str]:
+    with xr.open_dataset(path, decode_cf=False) as product:
+        return {str(key): str(value) for key, value in product.attrs.items()}
+
+
+def set_dead_time(archive: Archive, value: float) -> None:
+    channels = {"photon_532o": {"dead_time": value}}
+    archive.tree["instruments"]["poor"]["facts"] = [{"channels": channels}]
+
+
+def test_versions_count_changes_of_content(
+    source: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = source.write().products_root
+    before = {path: (root / path).read_bytes() for path in _paths(root)}
+    assert {attributes(root / path)["product_version"] for path in before} == {"1"}
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    set_dead_time(source, 5e-9)
+    remade = products(brought(source))
+    changes = {path: product.change for path, product in remade.items()}
+    graded = {path: change.grade for path, change in changes.items() if change}
+    major = [path for path, grade in graded.items() if grade is Grade.MAJOR]
+    assert major
+    for path, product in remade.items():
+        change = changes[path]
+        assert change is not None
+        assert any("dead_time" in cause for cause in change.causes)
+        if change.grade is Grade.NONE:
+            assert (root / path).read_bytes() == before[path]
+            assert product.stamp.version == 1
+        else:
+            assert product.stamp.version == 2
+            stated = attributes(root / path)
+            assert stated["product_version"] == "2"
+            assert stated["date_modified"] > "2026"
+            assert stated["history"].startswith(stated["date_modified"])
+            assert reproduce_product(root / path).identical
+    campaign = source.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        rows = {row["path"]: row for row in store.products() if row["path"] in major}
+    assert {row["version"] for row in rows.values()} == {2}
+    assert {json.loads(row["change"])["grade"] for row in rows.values()} == {"major"}
+    assert products(brought(source)) == {}
+
+
+def test_a_restored_file_is_the_same_version(source: Archive) -> None:
+    root = source.write().products_root
+    path = _paths(root)[0]
+    content = (root / path).read_bytes()
+    (root / path).unlink()
+    (product,) = products(brought(source)).values()
+    assert product.path == path
+    assert (root / path).read_bytes() == content
+
+
+def test_a_forced_run_keeps_files_whose_content_is_the_same(source: Archive) -> None:
+    root = source.write().products_root
+    times = {path: (root / path).stat().st_mtime_ns for path in _paths(root)}
+    remade = products(brought(source, force=True))
+    assert {product.change.grade for product in remade.values() if product.change} == {Grade.NONE}
+    assert {path: (root / path).stat().st_mtime_ns for path in _paths(root)} == times
+
+
+def test_products_of_a_frozen_period_are_not_replaced(source: Archive) -> None:
+    root = source.write().products_root
+    before = {path: (root / path).read_bytes() for path in _paths(root)}
+    source.tree["periods"] = [{"since": "2000-01-01", "until": "2100-01-01", "frozen": True}]
+    set_dead_time(source, 7e-9)
+    for _ in range(2):
+        result = brought(source)
+        assert set(result.frozen) == set(before)
+        assert products(result) == {}
+    assert {path: (root / path).read_bytes() for path in _paths(root)} == before
+    planned = CliRunner().invoke(app, ["plan", str(source.file), "--stale", "--json"])
+    scenes = json.loads(planned.output)["scenes"]
+    assert sum(len(scene["frozen"]) for scene in scenes) == len(before)
+    thawed = brought(source, thaw=True)
+    assert set(products(thawed)) == set(before)
+    assert not thawed.frozen
+    assert not brought(source).frozen
+
+
+def test_compare_prints_grade_and_cause(source: Archive, tmp_path: Path) -> None:
+    root = source.write().products_root
+    path = next(path for path in _paths(root) if "photon" in path)
+    old = tmp_path / "old.nc"
+    old.write_bytes((root / path).read_bytes())
+    same = CliRunner().invoke(app, ["compare", str(old), str(root / path)])
+    assert same.exit_code == 0
+    assert same.output.startswith("none")
+    set_dead_time(source, 20e-9)
+    brought(source, thaw=True)
+    found = CliRunner().invoke(app, ["compare", "--json", str(old), str(root / path)])
+    assert found.exit_code == 1
+    document = json.loads(found.output)
+    assert document["grade"] == "major"
+    assert any("dead_time" in cause for cause in document["causes"])
+
+
+def _paths(root: Path) -> list[str]:
+    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*.nc"))
