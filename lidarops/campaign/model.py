@@ -301,22 +301,34 @@ else:
 
 
 class Metadata(SettingsModel):
-    """Creator, publisher and terms of use: global attributes of every product (ACDD-1.3)."""
+    """Creator, publisher and terms of use: global attributes of every product (ACDD-1.3).
 
-    institution: str = "unknown institution"
-    project: str = "lidarops"
-    creator_name: str = "unknown creator"
-    creator_email: str = "unknown@example.org"
-    creator_url: str = "https://example.org"
+    Products lack the attributes of what is not given.
+    """
+
+    institution: str = ""
+    project: str = ""
+    creator_name: str = ""
+    creator_email: str = ""
+    creator_url: str = ""
     publisher_name: str = ""
     publisher_email: str = ""
     publisher_url: str = ""
-    naming_authority: str = "org.example"
-    license: str = "Not stated. Ask the creator before use."
-    acknowledgement: str = "Not stated."
+    naming_authority: str = ""
+    license: str = ""
+    acknowledgement: str = ""
     references: str = ""
     comment: str = ""
     program: str = ""
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """The recommended attributes of ACDD that are not given."""
+        recommended = (
+            "institution", "project", "creator_name", "creator_email", "creator_url",
+            "naming_authority", "license", "acknowledgement",
+        )  # fmt: skip
+        return tuple(name for name in recommended if not getattr(self, name).strip())
 
 
 class Scenes(SettingsModel):

@@ -144,6 +144,7 @@ def _plan(
             "failed_before": earlier.failed,
             "without_a_usable_value": list(earlier.unusable),
             **findings_document(findings),
+            "lacking_metadata": list(settings.metadata.lacking),
             "estimated_cpu_seconds": estimate,
         }
         typer.echo(json.dumps(document, indent=2))
@@ -151,6 +152,9 @@ def _plan(
         if no_scene:
             say(NO_SCENE)
         show_findings(findings)
+        if settings.metadata.lacking:
+            names = ", ".join(settings.metadata.lacking)
+            say(f"metadata of the campaign: products will lack {names}")
         _show_earlier(earlier)
         (_show_times if everything else show_times)(runs)
     exit_with_status(failed=failed or any(earlier) or findings.failed)

@@ -42,7 +42,7 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
     profiles = "timeSeriesProfile" if extents.vertical else None
     feature_type = layout.feature_type or profiles
     feature = {"featureType": feature_type} if feature_type else {}
-    return {
+    attributes = {
         "Conventions": CONVENTIONS,
         **feature,
         **_description(context, layout, date),
@@ -51,6 +51,12 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
         **_times(extents, date),
         **_processing(context),
     }
+    # What is not known is left out.
+    return {name: value for name, value in attributes.items() if not _is_empty(value)}
+
+
+def _is_empty(value: Any) -> bool:
+    return isinstance(value, str) and not value
 
 
 def _description(context: Context, layout: Layout, date: datetime) -> dict[str, Any]:
@@ -76,10 +82,10 @@ def _description(context: Context, layout: Layout, date: datetime) -> dict[str, 
         "cdm_data_type": "Station",
         "product_version": str(context.stamp.version),
         "history": _history(context, date),
-        "references": "\n".join(text for text in references if text) or "Not stated.",
+        "references": "\n".join(text for text in references if text),
         "comment": _sentences(metadata.comment, layout.comment),
-        "acknowledgement": metadata.acknowledgement or "Not stated.",
-        "license": metadata.license or "Not stated.",
+        "acknowledgement": metadata.acknowledgement,
+        "license": metadata.license,
         "standard_name_vocabulary": STANDARD_NAME_TABLE,
     }
 
@@ -144,6 +150,8 @@ def _people(context: Context) -> dict[str, str]:
 
 
 def _kind_of(name: str, institution: str) -> str:
+    if not name:
+        return ""
     return "institution" if name == institution else "person"
 
 

@@ -282,12 +282,17 @@ def test_the_summary_states_the_detection():
         assert words in attrs["summary"]
 
 
-def test_empty_metadata_have_defaults():
-    bare = Metadata(publisher_name="", references="", acknowledgement="", license="")
+def test_what_a_campaign_does_not_give_is_left_out():
+    bare = Metadata()
     attrs = build_product(homogeneous(), context(metadata=bare)).attrs
-    assert all(attrs[name] for name in ("publisher_name", "publisher_email", "publisher_url"))
-    assert attrs["license"] == attrs["acknowledgement"] == "Not stated."
+    assert not {*bare.lacking, "publisher_name", "creator_type", "metadata_link"} & set(attrs)
+    assert not [value for value in attrs.values() if "unknown" in str(value)]
     assert "Golub" in attrs["references"]
+    given = Metadata(creator_name="A. Person", creator_email="a.person@example.org")
+    attrs = build_product(homogeneous(), context(metadata=given)).attrs
+    assert attrs["publisher_name"] == "A. Person"
+    assert attrs["publisher_email"] == "a.person@example.org"
+    assert set(bare.lacking) - set(given.lacking) == {"creator_name", "creator_email"}
 
 
 def test_no_attribute_is_empty():
