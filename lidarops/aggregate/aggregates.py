@@ -162,6 +162,7 @@ def _means(
     done = write_means(made.root, products, period, weights=weights)
     made.means += done.files
     made.refused += done.refused
+    made.notes += [done.note] if done.note else []
 
 
 def _stac(made: AggregateResult, products: Sequence[Facts], selection: ProductSelection) -> None:

@@ -57,6 +57,8 @@ class MeansResult:
 
     files: tuple[MeansFile, ...]
     refused: tuple[Refused, ...]
+    note: str = ""
+    """Why the group has no means by its nature; empty where it has."""
 
 
 def write_means(
@@ -87,7 +89,7 @@ def write_means(
     Raises
     ------
     ProductError
-        If the beam moves, two products have a profile at the same time, or a file cannot be
+        If two products have a profile at the same time, or a file cannot be
         written.
     """
     averaging = _Averaging(period, weights)
@@ -100,9 +102,10 @@ def write_means(
         except ProductError as error:
             refused.append(Refused(facts.path, error.problem))
             continue
-        if frame is None:
-            group_frame.refuse_moving_beam(facts.path)
-            frame = group_frame
+        if group_frame.moving:
+            note = f"no means of {facts.kind}: profiles of several directions have none"
+            return MeansResult((), tuple(refused), f"{note} ({facts.path})")
+        frame = group_frame
         averaging.add(profiles)
     averaging.finish()
     files = () if frame is None else tuple(_written(root, products[0].group, frame, averaging))

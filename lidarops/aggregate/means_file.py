@@ -22,7 +22,6 @@ from lidarops.aggregate.means_variables import (
     global_attributes,
     layout,
 )
-from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.build import bitround
 from lidarops.netcdf.provenance import NAMESPACE, package_versions
@@ -46,22 +45,6 @@ class Frame:
     """Dimensions -> auxiliary coordinates of the data that have them."""
     moving: tuple[str, ...]
     """Names of beam angles that change with time."""
-
-    def refuse_moving_beam(self, file: str) -> None:
-        """Refuse products of a moving beam, because profiles of several directions have no mean.
-
-        Raises
-        ------
-        ProductError
-            If the beam moves.
-        """
-        if self.moving:
-            raise ProductError(
-                "the beam moves; profiles of several directions have no mean",
-                file=file,
-                field=self.moving[0],
-                remedy="select a product kind made from scans, or instruments with a fixed beam",
-            )
 
 
 def read_frame(root: Path, facts: Facts) -> Frame:
