@@ -56,10 +56,12 @@ def test_a_page_names_functions_and_tests_that_exist(
     name: str, repository: Path, tests_of_the_suite: set[str]
 ) -> None:
     text = _page(repository, name)
-    functions = re.findall(r"`(lidarops(?:\.\w+)+)`", text)
-    assert functions
+    prefix = re.search(r"^Names begin with `([\w.]+)\.`$", text, re.MULTILINE)
+    assert prefix
+    functions = re.findall(r"`((?:\w+\.)+\w+)`", text)
+    assert len(functions) > 1
     for dotted in functions:
-        assert _resolved(dotted) is not None
+        assert _resolved(f"{prefix[1]}.{dotted}") is not None
     named = set(re.findall(r"`(test_\w+)`", text))
     assert len(named) > 5
     assert named <= tests_of_the_suite
