@@ -46,7 +46,12 @@ OWN = {
         "negative_backscatter": 20,
         "unknown_overlap": 21,
     },
-    "raman": {"no_reference": 17, "weak_signal": 18, "no_lidar_ratio": 19},
+    "raman": {
+        "no_reference": 17,
+        "weak_signal": 18,
+        "no_lidar_ratio": 19,
+        "negative_extinction": 20,
+    },
     "multiangle": {
         "no_leverage": 20,
         "poor_stratification": 21,
@@ -71,7 +76,7 @@ VERSION = {
     "signal": 2,
     "homogeneous": 2,
     "elastic": 4,
-    "raman": 1,
+    "raman": 2,
     "multiangle": 3,
     "visibility": 2,
 }
@@ -83,7 +88,7 @@ LEFT = {
     "signal": 14,
     "homogeneous": 10,
     "elastic": 9,
-    "raman": 11,
+    "raman": 10,
     "multiangle": 3,
     "visibility": 10,
 }
@@ -128,6 +133,8 @@ SCENES = {
     "test_profiles_without_raman_signal_have_no_values",
     "RamanQuality.NO_LIDAR_RATIO": "test_raman_retrieval::"
     "test_profiles_without_raman_signal_have_no_values",
+    "RamanQuality.NEGATIVE_EXTINCTION": "test_raman_retrieval::"
+    "test_an_overlap_that_is_not_full_where_stated_is_found",
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
     "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"

@@ -129,7 +129,7 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
         return None
     information = _working(values, noise, used)[0]
     mean = float(information.mean())
-    inverse = _solved(information, weight * mean, np.eye(signal.size))
+    inverse = _solved(information, weight * mean, np.eye(signal.size, order="F"))
     return DepthFit(used, information, inverse, walk * mean)
 
 

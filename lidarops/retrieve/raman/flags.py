@@ -29,3 +29,11 @@ class RamanQuality(FlagBit):
             " missing; other values are not concerned"
         ),
     )
+    NEGATIVE_EXTINCTION = (
+        FIRST_OWN + 3,
+        Severity.REJECT,
+        (
+            "beyond, the Raman signal falls less than in air without particles, by more than its"
+            " error: the overlap may not be full where stated, or a background is wrong"
+        ),
+    )

@@ -241,6 +241,8 @@ class _Cause:
     """m-1."""
     backscatter: Array
     """m-1 sr-1."""
+    depth: Array
+    """Of the fitted optical depth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,6 +370,8 @@ class _Solution:
     backscatter_budget: dict[str, Array]
     lidar_ratio: tuple[Array, Array, Array]
     """Value, random and systematic standard error, sr."""
+    negative: Mask
+    """Cells beyond which the Raman signal falls by less than in clean air."""
 
     @classmethod
     def of(
@@ -395,9 +399,10 @@ class _Solution:
         budget = _summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
         budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
         empty = np.full(molecular.size, np.nan)
+        negative = _negative(profile.fit, [cause.depth for cause in causes], partial)
         if calibrated is None:
             absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)
-            return cls(number, profile, budget, empty, absent, (empty, empty, empty))
+            return cls(number, profile, budget, empty, absent, (empty, empty, empty), negative)
         noise = calibrated.respond(np.zeros((molecular.size, 1)), profile.fit.noise)
         of_backscatter = _summed(BACKSCATTER_CAUSES, [(c.name, c.backscatter) for c in causes])
         of_backscatter["noise"] = np.sqrt(
@@ -407,7 +412,28 @@ class _Solution:
         )
         value = calibrated.total - molecular
         ratios = _lidar_ratio(profile.extinction, calibrated, value, noise, causes)
-        return cls(number, profile, budget, value, of_backscatter, ratios)
+        return cls(number, profile, budget, value, of_backscatter, ratios, negative)
+
+
+def _negative(fit: DepthFit, effects: Sequence[Array], partial: Mask) -> Mask:
+    """Return the cells from which on extinction is negative in total, by more than its error.
+
+    The total is from a cell to any other beyond. Air without particles has none, so that overlap
+    is not complete there, or the background is wrong.
+    """
+    usable = np.flatnonzero(~partial & (fit.expected_error <= THRESHOLDS.most_uncertain))
+    covariance = fit.inverse[np.ix_(usable, usable)]
+    own, depth = np.diag(covariance), fit.depth[usable]
+    lost = np.maximum(np.subtract.outer(depth, depth), 0.0)
+    least = THRESHOLDS.negative**2
+    noise = own[:, np.newaxis] + own - 2.0 * covariance
+    rows, columns = np.nonzero(np.triu(lost**2 > least * noise, 1))
+    variance = noise[rows, columns]
+    for effect in effects:
+        variance += (effect[usable[rows]] - effect[usable[columns]]) ** 2
+    negative = np.zeros(partial.size, dtype=np.bool_)
+    negative[usable[rows[lost[rows, columns] ** 2 > least * variance]]] = True
+    return negative
 
 
 def _ratio(profile: _Profile, partial: Mask, ratio: float) -> _backscatter.Ratio:
@@ -449,7 +475,7 @@ class _Effects:
             yield self._signals(name, of_raman, none)
             yield self._signals(name, none, of_elastic)
         error = self.settings.reference_relative_error
-        yield _Cause("reference", none, error * self._total(molecular))
+        yield _Cause("reference", none, error * self._total(molecular), none)
         yield self._angstrom(none)
         yield self._molecular(molecular)
         seen = self.cells.mean(np.where(np.isnan(self.air.overlap), 1.0, self.air.overlap))
@@ -461,7 +487,7 @@ class _Effects:
         depth = self.profile.fit.respond(np.where(self.partial, 0.0, raman))
         relative = elastic - np.where(self.partial, raman, 0.0)
         alpha = slope(depth, self.cells.step) / (1.0 + self.settings.ratio)
-        return _Cause(name, alpha, self._respond(relative, depth))
+        return _Cause(name, alpha, self._respond(relative, depth), depth)
 
     def _angstrom(self, none: Array) -> _Cause:
         change = self.settings.ratio_error / (1.0 + self.settings.ratio)
@@ -470,6 +496,7 @@ class _Effects:
             "angstrom",
             -change * self.profile.extinction.value,
             self._respond(relative, none),
+            none,
         )
 
     def _molecular(self, molecular: Array) -> _Cause:
@@ -478,7 +505,7 @@ class _Effects:
         raman = error * (depth + self.cells.mean(self.air.raman_depth))
         effect = self._signals("molecular", raman, 2.0 * error * depth)
         shifted = effect.backscatter + error * (self._total(molecular) - molecular)
-        return _Cause("molecular", effect.extinction, shifted)
+        return _Cause("molecular", effect.extinction, shifted, effect.depth)
 
     def _total(self, molecular: Array) -> Array:
         """Return total backscatter; NaN without calibration."""
@@ -588,6 +615,8 @@ def _joined(
         for name, row in _values(one, fit, extinction):
             put(name, one.number, row)
     flags = quality | np.where(weak, np.int32(RamanQuality.WEAK_SIGNAL), np.int32(0))
+    for one in solved:
+        flags[one.number, one.negative] |= np.int32(RamanQuality.NEGATIVE_EXTINCTION)
     flags[~window.chosen] |= np.int32(RamanQuality.NO_REFERENCE)
     partial = (quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
 

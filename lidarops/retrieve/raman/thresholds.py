@@ -28,6 +28,10 @@ class Thresholds:
     """sr, by which extinction helps to decide whether backscatter is certain enough for a lidar
     ratio. Decided by backscatter alone, lidar ratios of few counts are 21 % too small
     (`tests/retrieve/raman/test_raman_coverage.py`)."""
+    negative: float = 4.0
+    """Standard errors by which the optical depth between two cells must be below zero to contradict
+    the signal. Of 800 profiles of simulated haze the lowest is -3.0; in the night of Manaus, whose
+    overlap is not full where it was stated to be, -16 and -23."""
     fewest_cells: int = 8
     """Cells with data of a profile that is fitted. Assumed."""
     many_counts: float = 1000.0

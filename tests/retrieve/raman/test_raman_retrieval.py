@@ -132,6 +132,23 @@ def test_profiles_do_not_depend_on_each_other():
         np.testing.assert_array_equal(getattr(three, name)[1], getattr(one, name)[0])
 
 
+def test_an_overlap_that_is_not_full_where_stated_is_found():
+    rng = np.random.default_rng(4)
+    for true, to in ((300.0, 0.0), (2500.0, 2200.0)):
+        sky = make_sky(HAZE, STEP, 5000.0, full_overlap=true, window=WINDOW)
+        raman, elastic = (
+            sky.signal(rng.poisson(mean, (5, R.size)).astype(float))
+            for mean in (sky.raman, sky.elastic)
+        )
+        r = sky.cells.range
+        partial = np.where(r < 1000.0, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
+        quality = np.tile(partial, (5, 1))
+        found = retrieve_raman(raman, elastic, sky.air, sky.cells, sky.settings, quality=quality)
+        negative = (found.quality & RamanQuality.NEGATIVE_EXTINCTION) != 0
+        assert negative[:, (r > 1000.0) & (r < to)].all()
+        assert to > 0.0 or not negative.any()
+
+
 def test_lines_in_a_narrow_filter_change_with_temperature():
     centre = raman_wavelength(354.7e-9, NITROGEN_SHIFT)
     assert centre == pytest.approx(386.7e-9, abs=0.1e-9)
