@@ -13,7 +13,14 @@ from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
 from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.bench.harness.rows import Study
 from lidarops.bench.stability import study
-from lidarops.bench.throughput import archives, campaigns, memory, readers, retrievals
+from lidarops.bench.throughput import (
+    archives,
+    campaigns,
+    memory,
+    raman_night,
+    readers,
+    retrievals,
+)
 from lidarops.errors import CampaignError
 
 _Names = TypeVar("_Names", bound=StrEnum)
@@ -30,6 +37,7 @@ class Benchmark(StrEnum):
     MEMORY = "memory"
     MULTIANGLE = "multiangle"
     NETWORK = "network"
+    RAMAN = "raman"
     READER = "reader"
 
 
@@ -105,6 +113,7 @@ def _throughput(files: Sequence[Path]) -> _Studies:
         Benchmark.MEMORY: memory.measure_memory,
         Benchmark.MULTIANGLE: retrievals.measure_scans,
         Benchmark.NETWORK: retrievals.measure_networks,
+        Benchmark.RAMAN: raman_night.measure_raman,
         Benchmark.READER: partial(readers.measure_readers, paths=files),
     }
 

@@ -1,0 +1,130 @@
+"""CPU time of the Raman products of a night, beyond reading its files."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.costs import time_methods
+from lidarops.bench.harness.rows import Chapter, Results, Study
+from lidarops.bench.harness.timing import READ
+from lidarops.records import DetectionMode
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.raman import labeled
+from lidarops.retrieve.raman.retrieval import RamanSettings
+from lidarops.retrieve.signal.labeled import condition
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+
+PROFILES: Final = 720
+BINS: Final = 4000
+CHANNELS: Final = {"355": 355e-9, "387": 386.7e-9, "408": 407.5e-9, "532": 532e-9, "607": 607.4e-9}
+"""m, by name. The pairs are 355 with 387 and 408, 532 with 607."""
+MEANS: Final = 24
+_STEP: Final = 7.5
+_SECONDS: Final = 60
+_COUNTS: Final = 300.0
+"""Mean counts of a bin of a profile at 1 km."""
+_BACKGROUND: Final = 0.02
+AVERAGES: Final = "signals and means"
+RETRIEVALS: Final = "two pairs and water vapour"
+
+
+def measure_raman(effort: Effort, *, profiles: int = PROFILES) -> Study:
+    """Time signals, means and retrievals of a night of five channels, from counts in memory."""
+    counts = night(profiles)
+    means = means_of(counts)
+    calls = {
+        READ: (lambda: [np.max(counts[f"photon_{name}"]) for name in CHANNELS], profiles),
+        AVERAGES: (lambda: means_of(counts), profiles),
+        RETRIEVALS: (lambda: retrieved(means), profiles),
+    }
+    case = f"{profiles} profiles to {means['355'].sizes['time']} means, five channels"
+    rows = time_methods(case, calls, effort.repeats or 3)
+    effort.progress(1)
+    chapter = Chapter(
+        "A night of two Raman pairs",
+        f"{len(CHANNELS)} channels of photon counting, {BINS} bins: signals with noise and quality,"
+        " means over half an hour; then extinction, backscatter and lidar ratio of two pairs, and"
+        " water vapour. Reading and writing of files are left out. One thread.",
+        [Results("CPU time of a profile", rows, f"Reads: multiples of {READ}.", case="night")],
+    )
+    return Study("Raman: time of a night", effort.date, [chapter])
+
+
+def night(profiles: int) -> xr.Dataset:
+    """Return the counts of the channels over clean air, as of an open archive."""
+    rng = np.random.default_rng(1)
+    distance = _STEP * (np.arange(BINS) + 0.5)
+    shape = MolecularProfile.us_standard().number_density(distance) / distance**2
+    mean = _COUNTS * shape / np.interp(1000.0, distance, shape) + _BACKGROUND
+    length = np.timedelta64(_SECONDS, "s")
+    starts = np.datetime64("2026-03-01T18:00", "ns") + np.arange(profiles) * length
+    both = ("time", "range")
+    unit = {"detection_mode": DetectionMode.PHOTON, "bin_width": _STEP}
+    variables = {}
+    for name in CHANNELS:
+        counts = rng.poisson(mean, (profiles, BINS)).astype(np.int32)
+        variables[f"photon_{name}"] = (both, counts, unit)
+        variables[f"photon_{name}_shots"] = ("time", np.full(profiles, 1200, np.int32), {})
+    return xr.Dataset(
+        variables,
+        coords={
+            "time": starts + length // 2,
+            "time_bnds": (("time", "nv"), np.stack([starts, starts + length], axis=1)),
+            "range": ("range", distance, {"units": "m"}),
+        },
+    )
+
+
+def means_of(counts: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return the means of each channel, by name."""
+    means = {}
+    for name in CHANNELS:
+        shots = counts[f"photon_{name}_shots"]
+        average = ClockAverage(
+            counts[["time", "time_bnds"]], counts["range"].to_numpy(), seconds=1800.0, shots=shots
+        )
+        for first in range(0, counts.sizes["time"], 90):
+            chunk = counts.isel(time=slice(first, first + 90))
+            average.add(
+                condition(chunk, f"photon_{name}", dead_time=4e-9, full_overlap_range=300.0)
+            )
+        means[name] = average.result()
+    return means
+
+
+def retrieved(means: dict[str, xr.Dataset]) -> list[xr.Dataset]:
+    """Return the products of both pairs."""
+    water = labeled.WaterVapour(means["408"], CHANNELS["408"], 0.2, 0.01)
+    return [
+        _pair(means, "355", "387", water),
+        _pair(means, "532", "607", None),
+    ]
+
+
+def _pair(
+    means: dict[str, xr.Dataset], laser: str, raman: str, water: labeled.WaterVapour | None
+) -> xr.Dataset:
+    settings = RamanSettings(
+        wavelength=CHANNELS[laser],
+        raman_wavelength=CHANNELS[raman],
+        angstrom_exponent=1.2,
+        angstrom_standard_error=0.5,
+        lowest=6000.0,
+        highest=12_000.0,
+        width=2000.0,
+        scattering_ratio=1.0,
+        reference_relative_error=0.02,
+        molecular_relative_error=0.01,
+    )
+    return labeled.retrieve(
+        means[laser].assign_coords(zenith_angle=0.0),
+        means[raman],
+        molecules=MolecularProfile.us_standard(),
+        station_altitude=100.0,
+        assumptions=labeled.Assumptions(settings, 60.0, 15_000.0, known_shape=True),
+        water=water,
+    )
