@@ -12,6 +12,7 @@ import yaml
 from support.archives import mixed_campaign
 
 from lidarops.campaign.model import load_campaign
+from lidarops.constants import CUBIC_PAPER
 from lidarops.flags import Quality
 from lidarops.run.archive import reprocess
 from lidarops.simulate.campaign import simulate_campaign
@@ -69,6 +70,7 @@ def test_the_cubic_gives_the_background_within_its_error(products, channel):
     assert np.abs(deviations).max() < 4.0
     assert 0.7 < np.sqrt(np.mean(deviations**2)) < 1.3
     assert product.attrs["lidarops_steps"].startswith("background: cubic of a homogeneous section")
+    assert CUBIC_PAPER in product.attrs["references"]
 
 
 @pytest.mark.parametrize("channel", BACKGROUND)
