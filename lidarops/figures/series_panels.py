@@ -171,7 +171,8 @@ def _score_panel(x: Axis, quantity: str, layers: Sequence[Layer], limit: float) 
     ticks = tuple(
         Tick(level, number(level)) for level in (-6.0, -3.0, 0.0, 3.0, 6.0) if abs(level) < limit
     )
-    y = Axis(f"{quantity}: error / \N{GREEK SMALL LETTER SIGMA}", -limit, limit, ticks=ticks)
+    name = quantity.replace("_", " ")
+    y = Axis(f"{name}: error / \N{GREEK SMALL LETTER SIGMA}", -limit, limit, ticks=ticks)
     zero = Curve(ends, np.zeros(2), "ink thin")
     return Panel(x, y, (one, zero, *layers, *levels), height=150)
 

@@ -221,6 +221,15 @@ def scalar(product: xr.Dataset, name: str) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def middle(product: xr.Dataset, name: str) -> float | None:
+    """Return the mean of a coordinate, of the crossings of a network; None without a value."""
+    if name not in product.variables:
+        return None
+    values = product[name].values.astype(np.float64)
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else None
+
+
 def citation(product: xr.Dataset) -> str:
     """Return how to cite a product, from its attributes; empty without a title."""
     names = ("creator_name", "title", "product_version", "publisher_name", "naming_authority", "id")

@@ -20,13 +20,15 @@ from lidarops.figures.series_data import quality_bits
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import counted
 from lidarops.netcdf.stored_flags import StoredBit, rejecting_mask, stored_bits
-from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.netcdf.variables import QUALITY_FLAG, is_retrieved
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 ROWS: Final = 20_000
-"""Most rows of a CSV file, about 1.5 MB."""
+"""Most rows of a CSV file of retrieved quantities, about 1.5 MB."""
+_SIGNAL_ROWS: Final = 4_000
+"""Most rows of a CSV file of signals, which few read as text."""
 _SMOOTH: Final = 25
 """Bins of the running mean of value over error, so that one noisy bin is not taken for signal."""
 _BEYOND: Final = 1.2
@@ -118,7 +120,8 @@ def read_values(product: xr.Dataset, kind: str) -> Values:
         _table(q, grid, arrays[q.name], errors[q.name], (flags, rejected), reach)
         for q in quantities
     )
-    rows = _near_round_times(grid, max(1, ROWS // reach))
+    most = ROWS if is_retrieved(kind) else _SIGNAL_ROWS
+    rows = _near_round_times(grid, max(1, most // reach))
     text = _csv(grid, quantities, arrays, errors, (flags, rejected), bits, (rows, reach))
     return Values(tables, text, _csv_note(grid, rows, reach))
 
