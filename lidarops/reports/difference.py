@@ -8,23 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.errors import CatalogError
-from lidarops.figures.wording import counted, percent
+from lidarops.figures.wording import counted
 from lidarops.records import ProductRecord, RunRecord
 from lidarops.reports.run_record import FILE_NAME, load_run_record
 
 _LOOK_BACK: Final = 20
 """Most earlier runs that are read."""
-
-
-@dataclass(frozen=True, slots=True)
-class ChangedProduct:
-    """A product whose file differs from that of an earlier run."""
-
-    scene: str
-    label: str
-    before: str
-    """Share of usable values."""
-    after: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +23,6 @@ class Difference:
     previous: str
     """Identifier of the run before; empty for the first."""
     sentences: tuple[str, ...]
-    changed: tuple[ChangedProduct, ...] = ()
     newly_refused: tuple[str, ...] = ()
 
 
@@ -55,7 +43,7 @@ def difference(record: RunRecord, folder: Path) -> Difference:
         for scene in other.scenes:
             for product in scene.products:
                 known.setdefault(product.path, product)
-    new, same, changed = 0, 0, []
+    new = same = changed = 0
     for scene in record.scenes:
         for product in scene.products:
             old = known.get(product.path)
@@ -64,12 +52,10 @@ def difference(record: RunRecord, folder: Path) -> Difference:
             elif old.sha256 == product.sha256:
                 same += 1
             else:
-                label = f"{product.kind} {product.channel}"
-                shares = _share(old), _share(product)
-                changed.append(ChangedProduct(scene.scene, label, *shares))
+                changed += 1
     before, now = _refused(earlier[:1]), _refused([record])
     newly = tuple(sorted(now - before))
-    made = f"{counted(new, 'product')} new, {len(changed):,} with other content"
+    made = f"{counted(new, 'product')} new, {changed:,} with other content"
     words = [
         f"{made}, {same:,} made again with the same content",
         f"{counted(len(newly), 'file')} newly refused, {len(before - now):,} no longer refused",
@@ -77,7 +63,7 @@ def difference(record: RunRecord, folder: Path) -> Difference:
     failed = _failed(record) - _failed(earlier[0])
     if failed:
         words.append(f"newly failed: {', '.join(sorted(failed))}")
-    return Difference(earlier[0].id, tuple(f"{w}." for w in words), tuple(changed), newly)
+    return Difference(earlier[0].id, tuple(f"{w}." for w in words), newly)
 
 
 def _earlier(record: RunRecord, folder: Path) -> Iterator[RunRecord]:
@@ -92,12 +78,6 @@ def _earlier(record: RunRecord, folder: Path) -> Iterator[RunRecord]:
                 continue
             if earlier.campaign == record.campaign and earlier.started < record.started:
                 yield earlier
-
-
-def _share(product: ProductRecord) -> str:
-    if product.usable is None or not product.values:
-        return "not counted"
-    return percent(product.usable / product.values)
 
 
 def _refused(records: Sequence[RunRecord]) -> set[str]:

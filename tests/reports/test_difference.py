@@ -48,10 +48,7 @@ def test_products_are_compared_with_the_last_run_that_made_them(tmp_path: Path) 
         replace(PRODUCT, path="h/c.nc"),
     )  # fmt: skip
     assert "1 product new, 1 with other content, 1 made again" in compared(tmp_path, now)
-    found = difference(now, tmp_path / now.id)
-    assert found.previous == "20240302T000000-x"
-    (row,) = found.changed
-    assert (row.label, row.before, row.after) == ("homogeneous c", "90.0 %", "45.0 %")
+    assert difference(now, tmp_path / now.id).previous == "20240302T000000-x"
 
 
 def test_refused_files_and_failed_scenes_are_compared_with_the_run_before(tmp_path: Path) -> None:
