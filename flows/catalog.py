@@ -16,10 +16,10 @@ from flows.reprocess import Seconds, Workers
 from flows.temporary_server import tie_to_this_process
 from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import load_campaign
+from lidarops.catalog.access import check_archive_and_catalog
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.records import Status
-from lidarops.run import selection
 from lidarops.run.archive import update_catalog
 
 
@@ -80,7 +80,7 @@ def main(
         stored_url = catalog_parameter(url)
         catalog.validate_parameters({"campaign": campaign, "archive": archive, "wait": wait})
         settings = load_campaign(campaign, archive=archive, output=out, catalog=url)
-        selection.check_archive_and_catalog(settings, archive=archive)
+        check_archive_and_catalog(settings, archive=archive)
     tie_to_this_process()
     with plain_errors():
         summary = catalog(campaign, archive, out, wait, catalog=stored_url)

@@ -42,6 +42,7 @@ from flows import WITH_FAILURES
 from flows.temporary_server import tie_to_this_process
 from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.catalog.access import check_archive_and_catalog
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
@@ -60,7 +61,7 @@ from lidarops.run.archive import (
 )
 from lidarops.run.options import missing_report
 from lidarops.run.publication import publish_products
-from lidarops.run.selection import check_archive_and_catalog, check_selection, selects_no_scene
+from lidarops.run.selection import check_selection, selects_no_scene
 from lidarops.settings import Instant
 
 _T = TypeVar("_T")

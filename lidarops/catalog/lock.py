@@ -113,7 +113,7 @@ class Lock:
         waited = False
         while not self._try():
             if time.monotonic() >= until:
-                raise self._refused()
+                raise self.refusal()
             waited = True
             time.sleep(_POLL)
         self.held = True
@@ -199,7 +199,8 @@ class Lock:
                 # The disk is busy or full: the next write reports it; the next beat may succeed.
                 continue
 
-    def _refused(self) -> CatalogError:
+    def refusal(self) -> CatalogError:
+        """Return the error of a process that does not get the lock; it names the holder."""
         current = self.holder()
         if current is None:
             problem = "another run holds the catalog"

@@ -77,9 +77,9 @@ def verify(
     Example: lidarops verify catalogs/demo.yaml
     """
     from lidarops.campaign.model import load_campaign
+    from lidarops.catalog.access import check_archive_and_catalog
     from lidarops.catalog.store import Store
     from lidarops.catalog.verify import verify_archive
-    from lidarops.run.selection import check_archive_and_catalog
 
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     if archive and not products_only:

@@ -35,7 +35,7 @@ def loaded_campaign(
 ) -> Campaign:
     """Return the campaign of a file, with the places that options override."""
     from lidarops.campaign.model import load_campaign
-    from lidarops.run.selection import check_archive_and_catalog
+    from lidarops.catalog.access import check_archive_and_catalog
 
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     check_archive_and_catalog(settings, archive=archive)

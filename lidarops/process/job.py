@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.records import Plan, PlannedStep, Scene, Stamp
-from lidarops.steps.dependence import ProductKey, scene_facts
+from lidarops.steps.dependence import ProductKey, is_product, scene_facts
+from lidarops.steps.step import REQUEST
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,3 +48,13 @@ class Job:
     def facts(self) -> InstrumentFacts:
         """Facts about the instrument at the time of the scene."""
         return scene_facts(self.campaign, self.scene)
+
+
+def nothing_to_do(plan: Plan) -> str:
+    """Return why a plan makes no product: omissions of requested steps, those of products first."""
+    requested = [omission for omission in plan.left_out if omission.rule != REQUEST]
+    omissions = sorted(requested or plan.left_out, key=lambda omission: not is_product(omission))
+    reasons = dict.fromkeys(
+        f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
+    )
+    return "nothing to do: " + "; ".join(reasons)

@@ -22,14 +22,13 @@ from lidarops.process.agreement import find_disagreements
 from lidarops.process.context import product_context
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.input_files import check_files, local_files, open_granules
-from lidarops.process.job import Job, Place
+from lidarops.process.job import Job, Place, nothing_to_do
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
     Grade,
     Granule,
     InputRecord,
-    Plan,
     PlannedStep,
     ProductRecord,
     Scene,
@@ -47,7 +46,6 @@ from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
 from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
 from lidarops.steps.registry import gives, network_step
-from lidarops.steps.step import REQUEST
 
 
 def process_scene(job: Job) -> SceneOutcome:
@@ -112,16 +110,6 @@ def _process(job: Job, root: Path) -> SceneOutcome:
         seconds=clock.laps,
         bytes_read=read + tally.bytes,
     )
-
-
-def nothing_to_do(plan: Plan) -> str:
-    """Return why a plan makes no product: omissions of requested steps, those of products first."""
-    requested = [omission for omission in plan.left_out if omission.rule != REQUEST]
-    omissions = sorted(requested or plan.left_out, key=lambda omission: not is_product(omission))
-    reasons = dict.fromkeys(
-        f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
-    )
-    return "nothing to do: " + "; ".join(reasons)
 
 
 class _Clock:

@@ -22,12 +22,10 @@ from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
 from lidarops.reports.findings import disagreement_rows, finding_rows, lacking
 from lidarops.reports.gallery import Gallery, Picture
-from lidarops.reports.run_record import FILE_NAME
+from lidarops.reports.run_record import FILE_NAME, INDEX
 from lidarops.reports.sources import Compared
 from lidarops.system.files import write_atomically
 
-INDEX: Final = "index.html"
-"""Name of the page inside a run's report folder."""
 ROWS: Final = 2000
 """Most rows of a table on the page. The run record beside it holds all rows."""
 

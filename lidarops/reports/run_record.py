@@ -15,6 +15,8 @@ from lidarops.system.files import write_atomically
 FILE_NAME: Final = "run.json"
 """Name of the record inside a run's report folder."""
 
+INDEX: Final = "index.html"
+"""Name of the page beside it."""
 _FORMAT: Final = "lidarops run record"
 _VERSION: Final = 5
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"

@@ -15,8 +15,6 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from dask.utils import parse_bytes
-
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import versions
 from lidarops.catalog.ledger import RunStatus, Verdict
@@ -26,7 +24,7 @@ from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.process.job import Job
 from lidarops.records import Findings, Granule, RunRecord
-from lidarops.reports import run_page, run_record
+from lidarops.reports import run_record
 from lidarops.run.executor import (
     EndedScene,
     StopRequest,
@@ -45,6 +43,8 @@ from lidarops.system.processes import objects_frozen, prefetch_one, preload_modu
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from lidarops.reports.run_page import RunReport
 
 __all__ = [
     "Options",
@@ -70,7 +70,12 @@ other days are only counted."""
 MOST_RUNS_REPORTED: Final = 20
 """Last runs whose missing reports are made; older ones are left to ``lidarops report``."""
 
-_WORKER_MODULES: Final = ("distributed.nanny", "lidarops.run.executor", "lidarops.reports.gallery")
+_WORKER_MODULES: Final = (
+    "distributed.nanny",
+    "lidarops.run.executor",
+    "lidarops.process.scene",
+    "lidarops.reports.gallery",
+)
 """Modules that workers need, for scenes and then for the report."""
 
 _LOG = logging.getLogger(__name__)
@@ -366,7 +371,7 @@ class _Pass:
             taken = partial(self._take, note=used_client is None)
             if first is not None:
                 others = chain([first], jobs)
-                memory = None if options.memory is None else parse_bytes(options.memory)
+                memory = _bytes(options.memory)
                 ended = process_jobs(
                     others, client=used_client, stop=stop, taken=taken, memory=memory
                 )
@@ -560,6 +565,14 @@ class _Pass:
         )
 
 
+def _bytes(size: str | None) -> int | None:
+    if size is None:
+        return None
+    from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
+
+    return int(parse_bytes(size))
+
+
 def _empty_scenes(judged: DaysJudged) -> list[Judgement]:
     return [scene for scene in judged.judgements if scene.empty_reason]
 
@@ -628,7 +641,7 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
     return removed
 
 
-def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_page.RunReport:
+def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> RunReport:
     """Save the record of a run and build its report page.
 
     Parameters
@@ -642,6 +655,8 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_p
     -------
     Report
     """
+    from lidarops.reports import run_page  # noqa: PLC0415 - loads what draws
+
     folder = campaign.report_root / run.id
     run_record.save_run_record(run, folder)
     return run_page.build_report(run, folder, workers=workers)
@@ -664,6 +679,6 @@ def report_earlier_runs(
         runs = store.runs(limit=MOST_RUNS_REPORTED)
     for run in runs:
         folder = campaign.report_root / run.id
-        unreported = run_record.exists(folder) and not (folder / run_page.INDEX).exists()
+        unreported = run_record.exists(folder) and not (folder / run_record.INDEX).exists()
         if unreported and run.id != without and run.status is not RunStatus.RUNNING:
             yield report_run(campaign, run_record.load_run_record(folder), workers=workers).page

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from lidarops.errors import SceneError
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.job import Job
-from lidarops.process.scene import attempt
 from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.run import worker
 from lidarops.run.memory import fitted
@@ -249,6 +248,14 @@ def _process_here(
         if taken:
             taken(job)
         yield EndedScene(*_attempt(job, memory))
+
+
+def attempt(job: Job) -> tuple[SceneOutcome, bool]:
+    """Process a scene; see `lidarops.process.scene.attempt`."""
+    # It loads the libraries of arrays and files, which a run with nothing to do does not need.
+    from lidarops.process import scene  # noqa: PLC0415
+
+    return scene.attempt(job)
 
 
 def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:

@@ -12,7 +12,7 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.records import Findings, RunRecord, SceneOutcome
-from lidarops.reports import run_page, run_record
+from lidarops.reports import run_record
 from lidarops.run.leftovers import Orphan
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def missing_report(campaign: Campaign) -> str:
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
         for last in store.runs(limit=1):
             folder = campaign.report_root / last.id
-            if not folder.is_dir() or (folder / run_page.INDEX).exists():
+            if not folder.is_dir() or (folder / run_record.INDEX).exists():
                 return ""
             problem = "the report page of the last run is missing"
             if run_record.exists(folder):

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.database import refuse_wrong_url
 from lidarops.catalog.ledger import RecordedProduct
 from lidarops.catalog.rows import day_of
-from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import CampaignError, CatalogError
+from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
 from lidarops.plan.scenes import cut_scenes, parse_scene_id, scene_stop, select_scenes
 from lidarops.records import Scene
@@ -120,29 +118,6 @@ def requested_kinds(campaign: Campaign) -> list[str]:
     for network in campaign.networks.values():
         requested |= network.requested().keys()
     return [kind for kind in kinds() if kind in requested]
-
-
-def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> None:
-    """Refuse an archive that does not exist and a catalog whose URL names no database.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        As loaded.
-    archive : str, optional
-        Archive that overrides the campaign file. It is wrong use if this one does not exist; the
-        archive of a campaign file may be temporarily unavailable.
-
-    Raises
-    ------
-    CatalogError
-    """
-    refuse_wrong_url(campaign.catalog_url)
-    try:
-        Source.of(campaign.archive).refuse_absent()
-    except CatalogError as error:
-        error.wrong_use = error.wrong_use or bool(archive)
-        raise
 
 
 def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:

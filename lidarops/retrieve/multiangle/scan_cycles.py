@@ -8,9 +8,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.inputs import real_array
@@ -185,6 +182,11 @@ def _clusters(vectors: Array) -> Integers:
 
 def _linked(places: Array, tolerance: float) -> Integers:
     """Return labels of groups of places linked by steps within the tolerance (degree)."""
+    # Only scenes with angles need them, and every run imports this module.
+    from scipy.sparse import coo_array  # noqa: PLC0415
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
     reach = 2.0 * math.sin(0.5 * math.radians(tolerance))
     pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
     links = np.ones(len(pairs), dtype=np.int8)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import _banded
@@ -91,6 +90,8 @@ def _noise(calibration: Calibration, y: Array) -> Array:
     known = calibration.information > 0.0
     error = np.where(known, 1.0 / np.sqrt(np.where(known, calibration.information, 1.0)), 0.0)
     own = (y * error) ** 2 * (1.0 - calibration.share)
+    from scipy.signal import lfilter  # noqa: PLC0415 - loads a third of a second of other modules
+
     common = y * error * np.sqrt(calibration.share)
     decay = calibration.correlation
     tail = lfilter([0.0, decay], [1.0, -decay], common, axis=1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import isotonic_regression
 
 Array = npt.NDArray[np.float64]
 
@@ -25,6 +24,8 @@ def project(profiles: Array) -> Array:
     -------
     (profile, altitude) float64
     """
+    from scipy.optimize import isotonic_regression  # noqa: PLC0415 - loads many other modules
+
     out = np.full(profiles.shape, np.nan)
     for row, rising in zip(profiles, out, strict=True):
         known = ~np.isnan(row)

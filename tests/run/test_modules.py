@@ -1,0 +1,51 @@
+"""Runs load only what they need, because modules take seconds to load."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from support.archives.small_archive import Archive
+
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+
+_LOADED = """
+import sys
+from lidarops.cli import app
+try:
+    app(["reprocess", sys.argv[1]])
+except SystemExit as ended:
+    print(ended.code, *sorted(sys.modules))
+"""
+
+
+def _reprocessed(archive: Archive) -> tuple[int, set[str], str]:
+    """Reprocess in another process; return its exit code, its modules and its errors."""
+    command = [sys.executable, "-c", _LOADED, str(archive.file)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    code, *modules = ended.stdout.splitlines()[-1].split()
+    return int(code), set(modules), ended.stderr
+
+
+def test_a_run_that_the_lock_refuses_loads_nothing_for_its_work(archive: Archive) -> None:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        code, modules, errors = _reprocessed(archive)
+    assert code == 1
+    assert f"process {os.getpid()}" in errors
+    assert not {"lidarops.run.archive", "numba", "xarray"} & modules
+
+
+def test_a_run_with_nothing_to_do_loads_nothing_for_scenes_and_reports(archive: Archive) -> None:
+    """Each of them takes a tenth of a second and more."""
+    code, modules, _ = _reprocessed(archive)
+    assert code == 0
+    idle = {"scipy.signal", "scipy.stats", "scipy.optimize", "scipy.spatial", "dask.array"}
+    assert not (idle | {"distributed", "netCDF4", "jinja2", "lidarops.process.scene"}) & modules
