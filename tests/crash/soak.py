@@ -1,0 +1,300 @@
+"""Kill and disturb commands many times, and check that nothing is lost or wrong.
+
+``python tests/crash/soak.py --kills 1000 --seed 1 --folder /tmp/soak`` kills the process groups, or
+only the first process, of runs on the command line, with dask workers and as flows, of aggregate,
+site, publish and report, at random moments. In half of them calls of the system fail now and then.
+After each kill the ledger holds only what is on the disk, and every product and published file is
+absent or right; after each round of kills, undisturbed commands give what they give without kills.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+
+TESTS = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(TESTS), str(TESTS.parent)]
+
+from support.archives import crash_archive  # noqa: E402
+from support.faults import sitecustomize as faults  # noqa: E402
+
+from lidarops.cli import app  # noqa: E402
+
+SCENES = 4
+FILES = 6
+"""Raw files of a scene of the archive."""
+STEPS = 12
+"""Kills of a round, after which undisturbed commands follow."""
+RATES = (0.0005, 0.005, 0.05)
+"""Shares of the calls on files that fail in a disturbed command."""
+TAG = "LIDAROPS_TEST_SOAK"
+COMMANDS = ("reprocess", "force", "site", "aggregate", "publish", "report")
+WEIGHTS = (6, 2, 2, 2, 2, 1)
+TRACEBACK = 99
+"""Exit code of a command that ended with a traceback."""
+GIVE_UP = 120.0
+"""s that a process may outlive its parent, on a busy machine; it should be none."""
+
+
+@dataclass
+class Tally:
+    """Numbers of what was done."""
+
+    kills: Counter[str] = field(default_factory=Counter)
+    ended: Counter[str] = field(default_factory=Counter)
+    disturbed: int = 0
+    """Commands in which calls of the system failed."""
+    rounds: int = 0
+    tracebacks: int = 0
+    """Disturbed commands that ended with a traceback instead of a message."""
+    corrupted: int = 0
+    slowest_end: float = 0.0
+    """s that the last child of a killed process lived on."""
+
+
+class Soak:
+    """One campaign folder after the other, with seeded kills."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.folder = folder
+        self.tally = Tally()
+        self.disturbed = False
+        """Whether a command of this round was disturbed."""
+        self.calm = folder / "calm"
+        crash_archive.make(self.calm, scenes=SCENES)
+        self.took = {name: self._timed(self.calm, name) for name in COMMANDS}
+        self.took |= {"cluster": 20.0, "pool": 20.0, "flow": 40.0}
+        self.whole = crash_archive.products(self.calm)
+        self.views = _views(self.calm)
+
+    def _timed(self, place: Path, name: str) -> float:
+        began = time.monotonic()
+        code = _wait(_start(_command(place, name), place))
+        assert code == 0, f"{name} without kills ended with {code}"
+        return time.monotonic() - began
+
+    def run(self, kills: int, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while self.tally.kills.total() < kills and time.monotonic() < until:
+            place = self.folder / f"round{self.tally.rounds}"
+            shutil.copytree(self.calm / "raw", place / "raw")
+            shutil.copy(self.calm / "campaign.yaml", place)
+            self.disturbed = False
+            for _ in range(min(STEPS, kills - self.tally.kills.total())):
+                self._step(place)
+            self._conclude(place)
+            self.tally.rounds += 1
+            print(json.dumps(vars(self.tally)), flush=True)
+            shutil.rmtree(place)
+
+    def _step(self, place: Path) -> None:
+        """Start a command, kill it at a random moment, and check what is left."""
+        number = self.tally.kills.total() + self.tally.ended.total()
+        name = self.rng.choices(COMMANDS, WEIGHTS)[0]
+        # These start interpreters, which takes most of their time.
+        name = {14: "cluster", 29: "pool", 44: "cluster", 59: "flow"}.get(number % 60, name)
+        disturbed = self.rng.random() < 0.5
+        self.disturbed |= disturbed
+        self.tally.disturbed += disturbed
+        wrong = f"{self.rng.getrandbits(31)} {self.rng.choice(RATES)}" if disturbed else ""
+        process = _start(_command(place, name), place, wrong)
+        moment = time.monotonic() + self.rng.uniform(0.0, self.took[name])
+        done, status = os.waitpid(process, os.WNOHANG)
+        while not done and time.monotonic() < moment:
+            time.sleep(0.002)
+            done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            self.tally.ended[name] += 1
+            self.tally.tracebacks += os.waitstatus_to_exitcode(status) == TRACEBACK
+        else:
+            alone = self.rng.random() < 0.5
+            (os.kill if alone else os.killpg)(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+            self.tally.kills[f"{name}{', first process' if alone else ''}"] += 1
+        began = time.monotonic()
+        while left := _processes(place):
+            assert time.monotonic() - began < GIVE_UP, f"{name}: {left} live on"
+            time.sleep(0.02)
+        self.tally.slowest_end = max(self.tally.slowest_end, time.monotonic() - began)
+        self._check(place)
+
+    def _check(self, place: Path) -> None:
+        assert crash_archive.wrong_rows(place) == []
+        for root in (place / "out/products", place / "published"):
+            for path, digest in _digests(root).items():
+                # Of a file that could not be read, the product says so, and the next run mends it.
+                right = digest == self.whole[path] or (self.disturbed and _of_part(root / path))
+                assert right, f"{root / path} is wrong"
+        for page in (place / "out/report").glob("*/index.html"):
+            assert page.read_text().rstrip().endswith("</html>")
+
+    def _conclude(self, place: Path) -> None:
+        """Run everything undisturbed, and compare it with what was never disturbed."""
+        changed = self._corrupt(place) if self.rng.random() < 0.3 else ""
+        for name in ("reprocess", "site", "aggregate", "publish"):
+            code, output = _called(_command(place, name), place)
+            assert code == 0, f"{name} after kills ended with {code}: {output}"
+        assert crash_archive.products(place) == self.whole, changed
+        assert _views(place) == self.views
+        code, output = _called(_command(place, "reprocess"), place)
+        assert (code, "nothing to do" in output) == (0, True), output
+        code, output = _called(["verify", _campaign(place), "--json"], place)
+        assert (code, json.loads(output)["mismatches"]) == (0, []), output
+        code, output = _called(["catalog", _campaign(place), "--json"], place)
+        assert json.loads(output)["refused_files"] == [], output
+
+    def _corrupt(self, place: Path) -> str:
+        """Change a byte of a product; verify must name it, and a run make it again."""
+        if _called(_command(place, "reprocess"), place)[0]:
+            return ""
+        file = self.rng.choice(sorted((place / "out/products").rglob("*.nc")))
+        data = bytearray(file.read_bytes())
+        data[self.rng.randrange(len(data))] ^= 1
+        file.write_bytes(bytes(data))
+        self.tally.corrupted += 1
+        code, output = _called(["verify", _campaign(place), "--json"], place)
+        named = [wrong["path"] for wrong in json.loads(output)["mismatches"]]
+        assert (code, [Path(path).name for path in named]) == (1, [file.name]), output
+        return file.name
+
+
+def _of_part(product: Path) -> bool:
+    """Return whether a product is complete, and states fewer raw files than its scene has."""
+    with h5py.File(product) as file:
+        return int(file.attrs["lidarops_input_count"]) < FILES and "quality_flag" in file
+
+
+def _campaign(place: Path) -> str:
+    return str(place / "campaign.yaml")
+
+
+def _command(place: Path, name: str) -> list[str]:
+    """Return the words after ``lidarops``; of a flow, those after ``python``."""
+    if name == "report":
+        runs = sorted((place / "out/report").glob("*/run.json"))
+        return ["report", str(runs[-1].parent)] if runs else _command(place, "reprocess")
+    campaign, out = _campaign(place), str(place / "out")
+    return {
+        "reprocess": ["reprocess", campaign, "--wait", "60"],
+        "force": ["reprocess", campaign, "--wait", "60", "--force"],
+        "cluster": ["reprocess", campaign, "--wait", "60", "--force", "--workers", "2"],
+        "flow": ["-m", "flows.reprocess", campaign, "--wait", "60", "--force"],
+        "site": ["site", out],
+        "pool": ["site", out, "--workers", "2"],
+        "aggregate": ["aggregate", out],
+        "publish": ["publish", campaign, f"file://{place}/published"],
+    }[name]
+
+
+def _start(words: Sequence[str], place: Path, wrong: str = "", output: int | None = None) -> int:
+    """Start a command as the first process of a group, with faults by the seed and rate given."""
+    process = os.fork()
+    if process:
+        return process
+    # Forked, because a new interpreter would load modules for seconds.
+    code = 1
+    try:
+        os.setsid()
+        null = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(null if output is None or stream == 0 else output, stream)
+        os.environ |= {TAG: str(place), "PREFECT_HOME": str(place / "prefect")}
+        os.environ["PYTHONPATH"] = f"{Path(faults.__file__).parent}:{TESTS.parent}"
+        if wrong:
+            os.environ[faults.VARIABLE] = f"{wrong} {place}"
+        if words[0] == "-m":
+            os.execv(sys.executable, [sys.executable, *words])
+        if "--workers" in words:
+            # A pool needs a parent that it can import anew.
+            os.execv(sys.executable, [sys.executable, "-m", "lidarops", *words])
+        faults.install_from_environment()
+        app(list(words))
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    except BaseException:  # noqa: BLE001 - the process is a fork of the soak, and must not go on
+        traceback.print_exc()
+        code = TRACEBACK
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+def _wait(process: int) -> int:
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def _called(words: Sequence[str], place: Path) -> tuple[int, str]:
+    """Run a command to its end without kills and faults; return its exit code and output."""
+    file = place / "output.txt"
+    with file.open("wb") as stream:
+        code = _wait(_start(words, place, output=stream.fileno()))
+    return code, file.read_text()
+
+
+def _processes(place: Path) -> list[int]:
+    """Return the living processes that descend from commands of a folder."""
+    mark = f"{TAG}={place}".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError):
+            ours = entry.name.isdigit() and mark in (entry / "environ").read_bytes().split(b"\0")
+            if ours and (entry / "stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+def _digests(root: Path, skipped: Callable[[Path], bool] = lambda _: False) -> dict[str, str]:
+    return {
+        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and not path.name.startswith(".") and not skipped(path)
+    }
+
+
+def _views(place: Path) -> dict[str, str]:
+    """Return the digests of site, aggregates and published files."""
+    return {
+        f"{name}/{path}": digest
+        for name, root in (
+            ("site", place / "out/site"),
+            ("aggregates", place / "out/aggregates"),
+            ("published", place / "published"),
+        )
+        for path, digest in _digests(root).items()
+    }
+
+
+def main() -> None:
+    """Soak, and print what was done."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this time")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, required=True)
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    soak = Soak(options.folder, options.seed)
+    try:
+        soak.run(options.kills, options.seconds)
+    finally:
+        print(json.dumps(vars(soak.tally)))
+
+
+if __name__ == "__main__":
+    main()
