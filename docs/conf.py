@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import sys
 from importlib.metadata import version as version_of
@@ -50,9 +51,12 @@ myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
 nb_execution_mode = "cache"
+nb_execution_in_temp = True
+# Notebooks call the commands of this environment.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 nb_execution_cache_path = str(HERE / "_build" / "notebooks" / _code_digest())
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120
+nb_execution_timeout = 600
 nb_execution_show_tb = True
 nb_merge_streams = True
 # Sockets of kernels listen on the loopback interface, where others must not read along.

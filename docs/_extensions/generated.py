@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import benchmark_results
 import campaign_keys
 import command_line
 import product_variables
@@ -18,12 +20,17 @@ if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 PARTS: Final[dict[str, Callable[[], str]]] = {
+    "accuracy": partial(benchmark_results.page, "accuracy"),
     "campaign-keys": campaign_keys.page,
     "command-line": command_line.page,
     "every-function": python_api.every_function,
     "modules": python_api.offered,
     "product-variables": product_variables.page,
+    "published": partial(benchmark_results.page, "published"),
+    "scoreboard": benchmark_results.scoreboard,
+    "stability": partial(benchmark_results.page, "stability"),
     "stiff-cases": stiff_cases.page,
+    "throughput": partial(benchmark_results.page, "throughput"),
 }
 
 

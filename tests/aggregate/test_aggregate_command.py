@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -37,18 +36,6 @@ def test_everything_is_made(tmp_path: Path):
     files = [made["index"], made["stac"], *(view["path"] for view in made["views"])]
     files += [means["path"] for means in made["means"]]
     assert all((tmp_path / file).is_file() for file in files)
-
-
-def test_the_command_of_the_readme_works(repository: Path, tmp_path: Path):
-    for day in range(2):
-        add_day(tmp_path, day)
-    text = (repository / "README.md").read_text(encoding="utf-8")
-    (line,) = re.findall(r"^    lidarops aggregate demo (.*?) +# .*daily means, index", text, re.M)
-    code, output = run(tmp_path, *line.split(), "--json")
-    made = json.loads(output)
-    assert code == 0
-    assert made["index"]
-    assert [means["periods"] for means in made["means"]] == [2]
 
 
 def test_a_damaged_product_is_listed_with_exit_code_1(tmp_path: Path):

@@ -173,7 +173,7 @@ def dask_settings(folder: Path) -> dict[str, str]:
 
 
 def certificates(folder: Path, host: str = "127.0.0.1") -> clusters.Tls:
-    """Make an authority and a signed certificate, as deploy/README.md does with openssl."""
+    """Make an authority and a signed certificate, as docs/howto/cluster.md does with openssl."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec

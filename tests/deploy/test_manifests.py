@@ -121,7 +121,7 @@ def test_deployments_are_well_formed_and_have_no_rights(rendered: list[dict[str,
 
 def test_what_manifests_refer_to_is_there(rendered: list[dict[str, Any]]) -> None:
     known = {kind: of_kind(rendered, kind) for kind in {item["kind"] for item in rendered}}
-    readme = (Path(__file__).parents[2] / "deploy" / "README.md").read_text()
+    readme = (Path(__file__).parents[2] / "docs/howto/cluster.md").read_text()
     for deployment in known["Deployment"].values():
         pod = deployment["spec"]["template"]["spec"]
         volumes = {volume["name"] for volume in pod["volumes"]}

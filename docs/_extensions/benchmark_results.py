@@ -1,0 +1,188 @@
+"""The results of benchmarks as they are committed: tables of numbers and figures.
+
+``python docs/_extensions/benchmark_results.py NAME BENCH`` takes what ``lidarops bench ... --out
+BENCH`` wrote into ``docs/results/NAME.json``, and the figures that the page shows.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import tables
+
+from lidarops.bench.harness.rows import Row, Unit, table
+
+RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
+DIGITS: Final = 4
+
+
+class Selection(NamedTuple):
+    """What is taken of a result."""
+
+    command: str
+    titles: tuple[str, ...]
+    """Beginnings of the titles of tables; a table of all if empty."""
+    quantities: tuple[str, ...] = ()
+    """All if empty."""
+    figures: tuple[str, ...] = ()
+
+
+SELECTIONS: Final = {
+    "accuracy": Selection(
+        "lidarops bench accuracy --quick --out bench",
+        ("The most accurate", "Homogeneous path:", "Elastic inversion:", "Scans over zenith"),
+        figures=("all-homogeneous-path", "all-elastic-inversion", "all-scans-over-zenith-angle",
+                 "all-networks-of-lidars"),
+    ),
+    "published": Selection(
+        "lidarops bench accuracy --case elastic --quick --data boeckmann --out bench",
+        ("Background of published files", "Backscatter of published files"),
+    ),
+    "stability": Selection(
+        "lidarops bench stability --quick --out bench",
+        ("",),
+        ("scenes", "values", "not rejected", "and not uncertain", "without any flag", "target"),
+    ),
+    "throughput": Selection(
+        "lidarops bench throughput --quick --out bench", ("float32, dense", "float32, 30 %"),
+        figures=("time",),
+    ),
+}  # fmt: skip
+
+
+def take(name: str, folder: Path) -> None:
+    """Write the results of a benchmark, and copy its figures."""
+    selection = SELECTIONS[name]
+    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    kept = {
+        title: [_row(row) for row in rows if _is_kept(row, selection)]
+        for title, rows in result["tables"].items()
+        if title.startswith(selection.titles)
+    }
+    head = {
+        "command": selection.command,
+        "date": result["date"],
+        "machine": {**result["machine"], "cores": os.cpu_count()},
+    }
+    rows = ",\n".join(
+        f" {json.dumps(title)}: [\n  "
+        + ",\n  ".join(json.dumps(row, ensure_ascii=False) for row in rows)
+        + "]"
+        for title, rows in kept.items()
+    )
+    text = json.dumps(head, indent=1)[:-2] + ',\n "tables": {\n' + rows + "\n}}\n"
+    (RESULTS / f"{name}.json").write_text(text, encoding="utf-8")
+    for figure in selection.figures:
+        shutil.copy(folder / f"{figure}.svg", RESULTS / f"{name}-{figure}.svg")
+
+
+def _is_kept(row: dict[str, Any], selection: Selection) -> bool:
+    return not selection.quantities or row["quantity"] in selection.quantities
+
+
+def _row(row: dict[str, Any]) -> list[Any]:
+    value = row["value"]
+    number = _rounded(value) if isinstance(value, float) else value
+    return [
+        row["case"],
+        row["method"],
+        row["quantity"],
+        number,
+        _rounded(row["error"]),
+        row["unit"],
+    ]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def page(name: str) -> str:
+    """Return the machine and the tables of a benchmark."""
+    result = read(name)
+    lines = [facts(result)]
+    for title, rows in result["tables"].items():
+        shown = table(title, rows)
+        lines += ["", f"*{title}*", *tables.table(shown.columns, shown.rows)]
+    return "\n".join(lines)
+
+
+def read(name: str) -> dict[str, Any]:
+    """Return a committed result, with rows as of the harness."""
+    result = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    return {
+        **result,
+        "tables": {
+            title: [Row(*row[:5], Unit(row[5])) for row in rows]
+            for title, rows in result["tables"].items()
+        },
+    }
+
+
+def facts(result: dict[str, Any]) -> str:
+    """Return what was run, when, and on what machine."""
+    machine = result["machine"]
+    packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
+    return (
+        f"`{result['command']}`, {result['date']}: {machine['processor']}, {machine['cores']} "
+        f"cores shared with other work, Python {machine['python']}, {packages}."
+    )
+
+
+def scoreboard() -> str:
+    """Return the errors of chains on published simulations, ours and those of others."""
+    others = json.loads((RESULTS / "others.json").read_text(encoding="utf-8"))
+    return "\n".join(_scoreboard(read("published")["tables"], others))
+
+
+def _scoreboard(ours: dict[str, list[Row]], others: dict[str, Any]) -> Iterator[str]:
+    for score, form in zip(others["scores"], _FORMS, strict=True):
+        (rows,) = (rows for title, rows in ours.items() if title.startswith(score["table"]))
+        values = {
+            (row.case, row.method): _signed(row.value, form)
+            for row in rows
+            if row.quantity == score["quantity"]
+        }
+        chains = score["chains"]
+        yield f"*{score['title']}*"
+        yield from tables.table(
+            ("background", *(f"lidarops, {method}" for method in score["methods"]), *chains),
+            [
+                (
+                    f"{level} counts",
+                    *(values[level, method] for method in score["methods"]),
+                    *(
+                        _signed(chain[level], form._replace(factor=1.0))
+                        for chain in chains.values()
+                    ),
+                )
+                for level in dict.fromkeys(row.case for row in rows)
+            ],
+        )
+        yield score["note"]
+        yield ""
+
+
+class _Form(NamedTuple):
+    """How an error is written."""
+
+    factor: float
+    digits: int
+
+
+_FORMS: Final = (_Form(1.0, 2), _Form(100.0, 1))
+"""Of background in counts, and of backscatter in percent."""
+
+
+def _signed(value: Any, form: _Form) -> str:
+    return "no value" if value is None else f"{value * form.factor:+.{form.digits}f}"
+
+
+if __name__ == "__main__":
+    take(sys.argv[1], Path(sys.argv[2]))

@@ -1,0 +1,227 @@
+"""Every code block of README and documentation runs, but for those that the build executes.
+
+The blocks of a page run one after another in a folder with the campaign of
+`docs/howto/campaign.md`, its raw files and its products. Commands of lidarops run in this process.
+Tools that install, or need a server, a cluster or a container engine, are stand-ins here: what they
+are given must exist.
+`tests/deploy` runs most of them in earnest, and `.ci/run` the installation.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+from support.pages import REPOSITORY, Block, blocks, name_of, pages
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign
+from lidarops.cli import app
+from lidarops.run.clusters import Scheduler
+
+# Executed elsewhere: the tools named on the page of products, by tests/tools.
+ELSEWHERE = {"docs/products.md"}
+# Directives that show code which nothing runs.
+SHOWN_ONLY = ("{code-block}", "{code}", "{literalinclude}")
+STAND_INS = (
+    "dask", "docker", "kubectl", "make", "pip", "pre-commit", "prefect", "python", "sbatch",
+)  # fmt: skip
+IN_SHELL = re.compile(r"[>|&;*]")
+SIMULATION = """
+simulation:
+  seed: 1
+  start: 2024-09-21T11:40:00Z
+  duration: 2400
+  instruments:
+    pier-lidar:
+      kind: horizontal
+      aerosol_extinction: {minimum: 5.0e-5, maximum: 3.0e-4, hour_of_maximum: 18}
+      aerosol: {lidar_ratio: 50}
+      acquisition: {interval: 120, shots: 3000, repetition_rate: 50, bins: 1200, dark_files: 2}
+      detectors:
+        - {wavelength: 532, signal_rate: 2.0, background: {night: 0.05, day: 5}, photon: {}}
+"""
+
+BLOCKS = [block for page in pages() for block in blocks(page)]
+OURS = [block for block in BLOCKS if block.page not in ELSEWHERE]
+
+
+def lidarops(*arguments: str) -> None:
+    """Run a command; exit code 1 says that there is something to look at."""
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code in {0, 1}, (arguments, result.output)
+
+
+def harbour() -> str:
+    """Return the campaign file of the page on campaigns."""
+    (text,) = [
+        block.text
+        for block in OURS
+        if block.page == "docs/howto/campaign.md" and block.language == "yaml"
+    ]
+    return text
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return a folder with all that commands on the pages name."""
+    folder = tmp_path_factory.mktemp("world")
+    for name in ("catalogs", "deploy", "flows", "docs"):
+        (folder / name).symlink_to(REPOSITORY / name)
+    tools = folder / ".venv" / "bin"
+    tools.mkdir(parents=True)
+    for name in (*STAND_INS, "lidarops"):
+        tool = tools / name
+        tool.write_text(f'#!/bin/sh\nprintf "%s\\n" "$*" >> {folder}/{name}.calls\n')
+        tool.chmod(0o755)
+    shared = folder / "lidar/share/lidarops"
+    shared.mkdir(parents=True)
+    (shared / "catalogs").symlink_to(REPOSITORY / "catalogs")
+    (folder / "lidar/bin").mkdir()
+    (folder / "lidar/bin/activate").touch()
+    (folder / "dist").mkdir()
+    (folder / "dist/lidarops-0-py3-none-any.whl").touch()
+    (folder / "harbour.yaml").write_text(harbour() + SIMULATION)
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        lidarops("simulate", "harbour.yaml")
+        lidarops("reprocess", "harbour.yaml")
+        (folder / "harbour.yaml").write_text(harbour())
+        yield folder
+    finally:
+        os.chdir(before)
+
+
+@pytest.fixture
+def environment(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Set the variables that the pages use."""
+    product = next(world.glob("out/products/**/*_homogeneous_*.nc"))
+    monkeypatch.chdir(world)
+    monkeypatch.setenv("PATH", f"{world}/.venv/bin{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("VIRTUAL_ENV", str(world / "lidar"))
+    monkeypatch.setenv("PRODUCT", str(product))
+
+
+def commands(text: str) -> Iterator[str]:
+    """Give the commands of a block, continued lines joined, without comments."""
+    for line in text.replace("\\\n", " ").splitlines():
+        command = re.sub(r"(^|\s+)# .*$", "", line).strip()
+        if command:
+            yield command
+
+
+def run(command: str, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run one command of a page."""
+    name, *arguments = shlex.split(command)
+    if name == "export":
+        for assignment in arguments:
+            monkeypatch.setenv(*assignment.split("=", 1))
+    elif name == "lidarops" and not IN_SHELL.search(command) and arguments != ["compile"]:
+        # A store that is a folder.
+        stored = [
+            os.path.expandvars(text).replace("s3://", f"{world}/stores/") for text in arguments
+        ]
+        lidarops(*stored)
+    else:
+        done = subprocess.run(
+            ["bash", "-euc", command], cwd=world, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, (command, done.stderr)
+
+
+PAGES = sorted({block.page for block in OURS if block.language == "sh"})
+
+
+@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.usefixtures("environment")
+def test_shell_blocks_run(page: str, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for left in (*world.glob("*.calls"), *world.glob("first.*")):
+        left.unlink()
+    for block in OURS:
+        if block.page == page and block.language == "sh":
+            for command in commands(block.text):
+                run(command, world, monkeypatch)
+    for calls in world.glob("*.calls"):
+        for line in calls.read_text().splitlines():
+            check_arguments(calls.stem, line.split())
+
+
+@pytest.mark.parametrize(
+    "page", sorted({block.page for block in OURS if block.language == "python"})
+)
+@pytest.mark.usefixtures("environment")
+def test_python_blocks_run(page: str) -> None:
+    names: dict[str, object] = {}
+    for block in OURS:
+        if block.page == page and block.language == "python":
+            exec(block.text, names)
+
+
+def check_arguments(tool: str, arguments: list[str]) -> None:
+    """Fail if a tool is given a file of the repository, a module or an option that is not there."""
+    for argument in arguments:
+        if argument.startswith(("deploy/", "catalogs/")) and argument != "deploy/.env":
+            in_cluster = argument == "deploy/lidarops-prefect-worker"
+            assert in_cluster or (REPOSITORY / argument).exists(), argument
+    if tool == "python" and arguments[0] == "-m" and arguments[1].startswith("flows"):
+        assert find_spec(arguments[1])
+    if tool == "make":
+        makefile = (REPOSITORY / "Makefile").read_text()
+        assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in arguments)
+    if tool == "lidarops":
+        command = typer.main.get_command(app).commands[arguments[0]]
+        options = {option for parameter in command.params for option in parameter.opts}
+        assert {text for text in arguments if text.startswith("--")} <= options
+
+
+@pytest.mark.parametrize(
+    "block", [block for block in BLOCKS if block.language == "yaml"], ids=lambda block: block.page
+)
+def test_yaml_blocks_are_valid(block: Block) -> None:
+    part = yaml.safe_load(block.text)
+    if block.page == "docs/howto/cluster.md":
+        assert Scheduler.model_validate(part).tls
+        return
+    campaign = Campaign.model_validate(merged(yaml.safe_load(harbour()), part))
+    assert len(campaign.instruments["pier-lidar"].facts) == 2
+
+
+def merged(whole: Any, part: Any) -> Any:
+    """Return a mapping with the values of a part of it."""
+    if not isinstance(whole, dict) or not isinstance(part, dict):
+        return part
+    return whole | {key: merged(whole.get(key), value) for key, value in part.items()}
+
+
+def test_every_block_is_of_a_kind_that_runs() -> None:
+    for block in BLOCKS:
+        directive = block.language.startswith("{") and not block.language.startswith(SHOWN_ONLY)
+        ours = block.language in {"python", "sh", "yaml"}
+        elsewhere = block.page in ELSEWHERE and block.language in {"python", "sh"}
+        assert directive or ours or elsewhere or block.language == "text", block
+
+
+def test_no_block_is_indented_only() -> None:
+    for page in pages():
+        lines = re.sub(r"^(`{3,}).*?^\1", "", page.read_text("utf-8"), flags=re.M | re.S)
+        assert not re.search(r"\n\n    \S", lines), name_of(page)
+
+
+def test_examples_of_the_help_fit_their_commands() -> None:
+    for name, command in typer.main.get_command(app).commands.items():
+        examples = re.findall(r"^Example: lidarops (.+)$", command.help or "", re.MULTILINE)
+        assert examples, name
+        for example in examples:
+            first, *arguments = shlex.split(example)
+            assert first == name
+            check_arguments("lidarops", [first, *arguments])

@@ -1,0 +1,64 @@
+"""No link of a page is dead, on the site and on a plain forge: files and headings exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from support.pages import REPOSITORY, name_of, pages, prose
+
+# Pages whose headings are generated when the documentation is built.
+GENERATED = {"docs/reference/variables.md", "docs/reference/campaign_keys.md"}
+
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def _anchors(page: Path) -> set[str]:
+    """Return the anchors that a forge and MyST give to headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in _LINK.findall(prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        linked = (page.parent / path).resolve() if path else page
+        assert linked.exists(), target
+        assert linked.is_relative_to(REPOSITORY), target
+        if anchor and name_of(linked) not in GENERATED:
+            assert anchor in _anchors(linked), target
+
+
+def test_files_named_in_code_exist() -> None:
+    known = {path.name for path in REPOSITORY.rglob("*.*") if ".venv" not in path.parts}
+    for page in pages():
+        for name in re.findall(
+            r"`([\w./-]+\.(?:py|toml|bib|md|cff|lock))`", page.read_text("utf-8")
+        ):
+            assert Path(name).name in known, (name_of(page), name)
+
+
+def test_every_page_is_reachable_from_the_readme_and_the_front_page() -> None:
+    reached: set[Path] = set()
+    waiting = [REPOSITORY / "README.md", REPOSITORY / "docs/index.md"]
+    while waiting:
+        page = waiting.pop()
+        if page in reached:
+            continue
+        reached.add(page)
+        text = page.read_text(encoding="utf-8")
+        linked = [target.partition("#")[0] for target in _LINK.findall(prose(page))]
+        for entries in re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL):
+            linked += [
+                f"{entry}.md" for entry in entries.split() if not entry.startswith((":", "made"))
+            ]
+        for target in linked:
+            path = (page.parent / target).resolve()
+            if path.suffix == ".md" and path.is_file():
+                waiting.append(path)
+    apart = {REPOSITORY / "deploy/README.md"}
+    assert set(pages()) - apart <= reached

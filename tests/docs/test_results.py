@@ -1,0 +1,73 @@
+"""The committed results of benchmarks, and the tables that are made of them."""
+
+from __future__ import annotations
+
+import json
+
+import benchmark_results
+import pytest
+
+
+@pytest.fixture
+def taken(tmp_path, monkeypatch):
+    """Return the folder of results, with one taken from a benchmark."""
+    row = {"case": "path", "method": "ours", "error": 0.0}
+    result = {
+        "date": "2026-01-01",
+        "machine": {"processor": "one", "python": "3", "packages": {"numpy": "2"}},
+        "tables": {
+            "The most accurate of all": [
+                {**row, "method": "peer", "quantity": "RMSE", "value": 2.0, "unit": ""},
+                {**row, "quantity": "RMSE", "value": 1.2500001, "error": 0.01, "unit": ""},
+                {**row, "quantity": "95 %", "value": 0.951, "unit": "1"},
+                {**row, "quantity": "CPU time", "value": 2500.0, "unit": "ns"},
+            ],
+            "Another": [],
+        },
+    }
+    bench = tmp_path / "bench"
+    bench.mkdir()
+    (bench / "result.json").write_text(json.dumps(result))
+    for name in benchmark_results.SELECTIONS["accuracy"].figures:
+        (bench / f"{name}.svg").write_text(name)
+    (tmp_path / "results").mkdir()
+    monkeypatch.setattr(benchmark_results, "RESULTS", tmp_path / "results")
+    benchmark_results.take("accuracy", bench)
+    return tmp_path / "results"
+
+
+def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
+    kept = json.loads((taken / "accuracy.json").read_text())
+    assert kept["tables"] == {
+        "The most accurate of all": [
+            ["path", "peer", "RMSE", 2.0, 0.0, ""],
+            ["path", "ours", "RMSE", 1.25, 0.01, ""],
+            ["path", "ours", "95 %", 0.951, 0.0, "1"],
+            ["path", "ours", "CPU time", 2500.0, 0.0, "ns"],
+        ]
+    }
+    assert (taken / "accuracy-all-homogeneous-path.svg").read_text() == "all-homogeneous-path"
+    page = benchmark_results.page("accuracy")
+    assert "| ours | 1.25(1) | 95.1 % | 2.5 µs |" in page
+    assert "2026-01-01: one, " in page
+
+
+@pytest.mark.parametrize("name", ["accuracy", "published", "stability", "throughput"])
+def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
+    path = benchmark_results.RESULTS / f"{name}.json"
+    assert path.stat().st_size < 60_000
+    result = benchmark_results.read(name)
+    assert result["machine"]["cores"]
+    assert result["tables"]
+    assert result["command"] in benchmark_results.page(name)
+
+
+def test_the_scoreboard_shows_ours_beside_all_others() -> None:
+    text = benchmark_results.scoreboard()
+    others = json.loads((benchmark_results.RESULTS / "others.json").read_text())
+    for score in others["scores"]:
+        for chain in score["chains"]:
+            assert f"| {chain} " in text
+    # `test_elastic_published.py` and `test_known_shape.py` hold these files to 1 % and 3.5 errors.
+    assert "| 1e4 counts | +0.03 | +2.72 |" in text
+    assert "| 1e8 counts | no value |" in text
