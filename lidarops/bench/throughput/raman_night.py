@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -64,7 +64,7 @@ def night(profiles: int) -> xr.Dataset:
     starts = np.datetime64("2026-03-01T18:00", "ns") + np.arange(profiles) * length
     both = ("time", "range")
     unit = {"detection_mode": DetectionMode.PHOTON, "bin_width": _STEP}
-    variables = {}
+    variables: dict[str, Any] = {}
     for name in CHANNELS:
         counts = rng.poisson(mean, (profiles, BINS)).astype(np.int32)
         variables[f"photon_{name}"] = (both, counts, unit)
