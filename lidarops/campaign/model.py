@@ -345,7 +345,7 @@ class Scenes(SettingsModel):
         return self
 
 
-class Period(SettingsModel):
+class CampaignPeriod(SettingsModel):
     """A period of a campaign."""
 
     since: Instant
@@ -375,7 +375,7 @@ class Campaign(SettingsModel):
     instruments: dict[Identifier, Instrument] = Field(min_length=1)
     networks: dict[Identifier, Network] = Field(default={})
     scenes: Scenes = Scenes()
-    periods: list[Period] = Field(default=[])
+    periods: list[CampaignPeriod] = Field(default=[])
     simulation: SimulationSettings | None = None
     catalog: str | None = Field(
         default=None,

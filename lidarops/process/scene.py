@@ -18,7 +18,6 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.netcdf.context import Context, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.process import execution
-from lidarops.process.agreement import find_disagreements
 from lidarops.process.context import product_context
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.input_files import check_files, local_files, open_granules
@@ -105,7 +104,6 @@ def _process(job: Job, root: Path) -> SceneOutcome:
         failure,
         plan=work.job.plan,
         products=products,
-        disagreements=find_disagreements(products, job.campaign.products_root),
         inputs=work.inputs,
         seconds=clock.laps,
         bytes_read=read + tally.bytes,

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -251,11 +251,14 @@ def _process_here(
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
-    """Process a scene; see `lidarops.process.scene.attempt`."""
-    # It loads the libraries of arrays and files, which a run with nothing to do does not need.
+    """Process a scene, and compare its channels; see `lidarops.process.scene.attempt`."""
+    # They load the libraries of arrays and files, which a run with nothing to do does not need.
     from lidarops.process import scene  # noqa: PLC0415
+    from lidarops.run.agreement import find_disagreements  # noqa: PLC0415
 
-    return scene.attempt(job)
+    outcome, final = scene.attempt(job)
+    disagreements = find_disagreements(outcome.products, job.campaign.products_root)
+    return replace(outcome, disagreements=disagreements), final
 
 
 def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:

@@ -33,11 +33,12 @@ def test_means_stay_within_their_errors(name: str):
             scene.altitude,
             residuals=depths.residuals,
         )
-        errors = getattr(smooth, f"{name}_standard_error")
+        short = name.removeprefix("vertical_").removeprefix("total_")
+        errors = getattr(smooth, f"{short}_standard_error")
         budget = budget_of(layout_of("multiangle").row(name))
         random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = np.isfinite(smooth.optical_depth)
-        day = Sample(getattr(smooth, name), errors, random, shared, None, usable)
+        day = Sample(getattr(smooth, short), errors, random, shared, None, usable)
         sums = sums or Sums.like(day)
         sums.add(day, np.ones(day.values.shape))
         if days in (1, 5):

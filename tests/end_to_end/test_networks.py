@@ -118,7 +118,7 @@ def test_the_range_window_does_not_change_the_product(tmp_path):
 def test_optically_thin_air_is_flagged(tmp_path):
     air = {
         "homogeneous": {
-            "total_extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
+            "extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
             "molecules_constant": True,
         }
     }

@@ -176,6 +176,7 @@ def test_elastic_steps_in_their_order() -> None:
         "lidar_ratio": 50.0,
         "lidar_ratio_standard_error": 10.0,
         "molecular_relative_error": 0.01,
+        "least_signal_to_noise": 1.0,
     }
     assert steps["reference"] == {
         "lowest": 3000.0,

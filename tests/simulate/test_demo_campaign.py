@@ -31,7 +31,7 @@ def test_the_demo_covers_night_and_day(demo):
     sky = coast["background_photon_532o"].values
     assert (sky < 0.1).mean() > 0.3
     assert (sky > 1.0).mean() > 0.3
-    sigma = coast["extinction"].values
+    sigma = coast["total_extinction"].values
     assert sigma.min() == pytest.approx(5e-5, rel=0.02)
     assert sigma.max() == pytest.approx(4e-4, rel=0.02)
 
