@@ -75,7 +75,8 @@ def datasets(draw, kinds=SIGNALS, active=ACTIVE):
         wavelength=draw(st.sampled_from([355, 387, 532, 607, 1064, 1550, 53200])) * 1e-9,
         bins=draw(st.integers(1, 40)),
         bin_width=draw(WIDTHS),
-        shots=draw(st.one_of(st.just(0), st.integers(1, 999_999))),
+        # A file in which one channel contradicts the shots of all others is refused.
+        shots=draw(st.one_of(st.just(0), st.shared(st.integers(1, 999_999), key="shots"))),
         polarisation=draw(st.sampled_from("opsrl")),
         laser=draw(st.integers(1, 3)),
         high_voltage=draw(st.integers(0, 1500)),
