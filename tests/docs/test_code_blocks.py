@@ -28,8 +28,12 @@ from lidarops.campaign.model import Campaign
 from lidarops.cli import app
 from lidarops.run.clusters import Scheduler
 
-# Executed elsewhere: the tools named on the page of products, by tests/tools.
-ELSEWHERE = {"docs/products.md"}
+# Executed elsewhere: the tools named on the page of products by tests/tools, and the functions of
+# the papers, with arrays of their own, by test_papers.py.
+ELSEWHERE = {
+    "docs/products.md",
+    *(name_of(page) for page in (REPOSITORY / "docs/papers").glob("*.md")),
+}
 # Directives that show code which nothing runs.
 SHOWN_ONLY = ("{code-block}", "{code}", "{literalinclude}")
 STAND_INS = (
