@@ -270,6 +270,9 @@ class Ledger(Granules):
             self._hold(connection, token)
             self._enter_products(connection, entry, run)
             self._enter_scene(connection, entry, run)
+            if outcome.error:
+                day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == entry.day
+                connection.execute(sa.delete(VERDICT).where(*day))
             self._enter_digests(connection, entry.digests)
             self._refuse(connection, outcome.refused)
             connection.execute(

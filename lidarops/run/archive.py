@@ -525,7 +525,10 @@ class _Pass:
             waiting = {judged.day for judged in self.judgements.values()}
             for batch in judge.batches(changed_days - waiting):
                 judged = judge.days(batch)
-                settled |= _signed(signatures_after, judged.verdicts, judged.open)
+                # Of a forced scene that failed, the former products are fresh: the next run judges
+                # its day, and forgets the failure.
+                healed = {scene.day for scene in judged.judgements if scene.scene.id in judged.gone}
+                settled |= _signed(signatures_after, judged.verdicts, judged.open | healed)
         known = self.store.verdicts()
         new = {
             day: verdict

@@ -13,7 +13,7 @@ from support.archives.small_archive import Archive, made
 from lidarops.campaign.model import Campaign
 from lidarops.netcdf.comparison import compare_products
 from lidarops.records import Grade
-from lidarops.run.archive import bring_up_to_date, reprocess
+from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.session import Session
 
 
@@ -25,13 +25,19 @@ def campaign(tmp_path: Path) -> Campaign:
     return archive.write()
 
 
-def _undisturbed(campaign: Campaign, tmp_path: Path) -> dict[str, Path]:
-    """Return the products of a run without hiccups by their relative paths."""
-    settings = campaign.model_copy(update={"output": str(tmp_path / "undisturbed")})
-    record = reprocess(settings)
+def _is_undisturbed(campaign: Campaign, tmp_path: Path) -> bool:
+    """Return whether the products are those of a run that nothing disturbed, but for their version.
+
+    A product that was made of a part of its scene first is its second version.
+    """
+    other = campaign.model_copy(update={"output": str(tmp_path / "undisturbed")})
+    record = reprocess(other)
     assert record is not None
     paths = [product.path for scene in record.scenes for product in scene.products]
-    return {path: settings.products_root / path for path in paths}
+    roots = other.products_root, campaign.products_root
+    return all(
+        compare_products(*(root / path for root in roots)).grade is Grade.NONE for path in paths
+    )
 
 
 @pytest.mark.parametrize("names", [("h01",), ("h00", "h01", "h02")])
@@ -54,10 +60,7 @@ def test_files_that_could_not_be_read_once_are_used_by_the_next_run(
     assert not later.has_failures
     assert later.summary.refused == 0
     assert later.record is not None
-    for path, expected in _undisturbed(campaign, tmp_path).items():
-        # One that was made from part of its files is a version before.
-        grade = compare_products(expected, campaign.products_root / path).grade
-        assert grade is Grade.NONE
+    assert _is_undisturbed(campaign, tmp_path)
     assert reprocess(campaign) is None
 
 
@@ -74,6 +77,26 @@ def test_a_scene_whose_counts_could_not_be_read_is_tried_again(
     later = bring_up_to_date(campaign)
     assert not later.has_failures
     assert made(later.record)
+
+
+def test_a_forced_run_that_could_not_read_does_not_fail_the_runs_after_it(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its products of before are right."""
+    assert made(reprocess(campaign))
+    open_file = os.open
+
+    def failing(path: Any, *arguments: Any, **options: Any) -> int:
+        if str(path).endswith("h01"):
+            raise OSError(errno.EIO, "Input/output error")
+        return open_file(path, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", failing)
+        assert "h01" in str(bring_up_to_date(campaign, options=Options(force=True)).failures)
+    later = bring_up_to_date(campaign)
+    assert not later.failures
+    assert not later.has_failures
 
 
 def test_products_that_are_gone_when_their_scene_ends_are_made_again(
