@@ -291,3 +291,21 @@ class VisibilitySettings(SettingsModel):
     def resolved(self) -> Self:
         """The same definition, with the contrast as a number."""
         return self.model_copy(update={"contrast": self.threshold})
+
+
+class ReferenceSettings(SettingsModel):
+    """Limits of the reference window, and the scattering ratio there."""
+
+    lowest: Metres = quantity(3000.0, unit="m", description="above the station")
+    highest: Metres = quantity(12_000.0, unit="m", description="above the station")
+    width: float = quantity(1000.0, unit="m", ge=100, le=20_000)
+    scattering_ratio: float = quantity(1.0, unit="1", ge=1, le=10)
+    relative_error: float = quantity(
+        0.02, unit="1", ge=0, le=1, description="standard error of the scattering ratio, relative"
+    )
+
+    @model_validator(mode="after")
+    def _holds_a_window(self) -> Self:
+        if self.highest - self.lowest < self.width:
+            raise ValueError("highest must be at least width above lowest")
+        return self

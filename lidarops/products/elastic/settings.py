@@ -3,36 +3,17 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from lidarops.settings import (
     ChannelProduct,
-    Metres,
     PartOfDay,
-    SettingsModel,
+    ReferenceSettings,
     quantity,
     signal_to_noise_limit,
 )
-
-
-class ReferenceSettings(SettingsModel):
-    """Limits of the reference window, and the scattering ratio there."""
-
-    lowest: Metres = quantity(3000.0, unit="m", description="above the station")
-    highest: Metres = quantity(12_000.0, unit="m", description="above the station")
-    width: float = quantity(1000.0, unit="m", ge=100, le=20_000)
-    scattering_ratio: float = quantity(1.0, unit="1", ge=1, le=10)
-    relative_error: float = quantity(
-        0.02, unit="1", ge=0, le=1, description="standard error of the scattering ratio, relative"
-    )
-
-    @model_validator(mode="after")
-    def _holds_a_window(self) -> Self:
-        if self.highest - self.lowest < self.width:
-            raise ValueError("highest must be at least width above lowest")
-        return self
 
 
 class ElasticSettings(ChannelProduct):

@@ -11,29 +11,18 @@ from lidarops.settings import (
     ChannelProduct,
     Metres,
     PartOfDay,
-    SettingsModel,
+    ReferenceSettings,
     located_error,
     quantity,
     signal_to_noise_limit,
 )
 
 
-class RamanReferenceSettings(SettingsModel):
-    """Limits of the reference window of backscatter, and the scattering ratio there."""
+class RamanReferenceSettings(ReferenceSettings):
+    """The same, from higher up and wider: Raman signals are weak."""
 
     lowest: Metres = quantity(6000.0, unit="m", description="above the station")
-    highest: Metres = quantity(12_000.0, unit="m", description="above the station")
     width: float = quantity(2000.0, unit="m", ge=100, le=20_000)
-    scattering_ratio: float = quantity(1.0, unit="1", ge=1, le=10)
-    relative_error: float = quantity(
-        0.02, unit="1", ge=0, le=1, description="standard error of the scattering ratio, relative"
-    )
-
-    @model_validator(mode="after")
-    def _holds_a_window(self) -> Self:
-        if self.highest - self.lowest < self.width:
-            raise ValueError("highest must be at least width above lowest")
-        return self
 
 
 class RamanProductSettings(ChannelProduct):
