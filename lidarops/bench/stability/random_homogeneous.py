@@ -259,9 +259,10 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValue
 
 
 def _widening(bins: int) -> float:
-    """Return the factor on 4 standard errors where the noise is estimated from the bins."""
+    """Return the factor on standard errors where the noise is estimated from the bins."""
     freedom = 18.0 / 35.0 * (bins - 2)
-    return float(stats.t.isf(stats.norm.sf(4.0), freedom) / 4.0)
+    far = stats.t.isf(0.5 * THRESHOLDS.false_estimated, freedom) / 4.0
+    return float(max(far, stats.t.isf(0.025, freedom) / stats.norm.isf(0.025)))
 
 
 def _solved(

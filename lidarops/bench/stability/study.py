@@ -90,7 +90,7 @@ _NOTE: Final = (
     "everything drawn: to random errors alone where the model holds, else to values that are not "
     "uncertain, with the stated systematic errors. Undecided: the share exceeds it by less than "
     "2 Monte Carlo errors. Missed as declared: the share exceeds the target, but not the one that "
-    "docs/stability.md declares. Undetectable, which explains but does not excuse: the misfit of "
+    "the class declares. Undetectable, which explains but does not excuse: the misfit of "
     f"the violation is below {VISIBLE:g} standard deviations of the noise. Even the best test that "
     "knows the shape of the violation, but not its sign, misses 7 % or more of these at our rate "
     "of false alarms (half at 3.5 deviations). Share of the detectable: false values among those "

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.flags import Quality
 from lidarops.products.homogeneous.look import (
     LOOKED_AT,
@@ -299,7 +300,7 @@ class _Sections(WholeProduct):
         shots = profiles.shots(chunk.counts)
         parts = []
         if self._kept:
-            parts.append(self._retrieved(chunk.profiles(profiles)))
+            parts.append(self._retrieved(chunk.profiles(profiles), shots))
         if self._omitted:
             unit = channel_unit(self._data.source.archive, self._data.channel)
             parts.append(empty_sections(shots, unit, self._omitted))
@@ -310,7 +311,7 @@ class _Sections(WholeProduct):
         if len(self._parts) == _PARTS:
             self._parts = [self._joined()]
 
-    def _retrieved(self, conditioned: xr.Dataset) -> xr.Dataset:
+    def _retrieved(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.Dataset:
         quality = conditioned["quality"]
         overlap = self._data.get(OVERLAP)
         if overlap is not None:
@@ -329,7 +330,20 @@ class _Sections(WholeProduct):
             # An estimated variance scatters, which must not count as misfit.
             relative_variance=self._data[RELATIVE_VARIANCE],
             noise_correlation_length=conditioned[CORRELATION_LENGTH],
+            exposure=self._exposure(conditioned, shots),
         )
+
+    def _exposure(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.DataArray | None:
+        """Return the counts per MHz in a bin of each profile; None for analog detection.
+
+        Bins of a glued channel whose noise is analog seem to hold more counts than they do.
+        """
+        if conditioned["power"].attrs["units"] != "MHz" or self._data[RELATIVE_VARIANCE]:
+            return None
+        width = float(conditioned["range"][1] - conditioned["range"][0])
+        # A profile without shots has no power.
+        exposure: xr.DataArray = shots.clip(min=1) * (width / LICEL_RANGE_PER_MICROSECOND)
+        return exposure.astype(np.float64)
 
     def _joined(self) -> xr.Dataset:
         joined: xr.Dataset = xr.concat(

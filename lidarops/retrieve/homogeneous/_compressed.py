@@ -52,6 +52,8 @@ _FIRST_STEP: Final = 1.5
 _FARTHEST: Final = 3.0
 """Half widths that they may reach."""
 _LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
+_LARGEST_SHIFT: Final = THRESHOLDS.largest_shift
+"""See `lidarops.retrieve.homogeneous._fit_quality.background_widening`."""
 _EDGE: Final = 1.02
 """Half widths from the centre of a cell beyond which the polynomial of the next cell is used."""
 _MOVES: Final = 40
@@ -472,7 +474,9 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
         amplitude = size * results[2, p]
         results[0, p] = fit[_P, p]
         wide = root * widening
-        results[1, p] = fit[_P_ERROR, p] * wide
+        slope = (fit[_TAU, p] + tables.length / tables.mean_range) / (fit[_TAU_ERROR, p] * wide)
+        left = 1.0 - min(1.0 / slope, _LARGEST_SHIFT)
+        results[1, p] = fit[_P_ERROR, p] * wide / (left * left)
         results[2, p] = amplitude
         results[3, p] = abs(amplitude) * (fit[_B_ERROR, p] * wide)
         results[4, p] = fit[_TAU, p] / tables.length
@@ -486,12 +490,13 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
 
 
 @_compiled
-def _judge(tables: Tables, s: _Scratch, limits: CommonLimits) -> None:
+def _judge(tables: Tables, s: _Scratch, bins: int, limits: CommonLimits) -> None:
     """Fill the quality bits. Tests are for a pass, so that NaN fails."""
     fit, results = s.fit, s.results
-    steepest = 1.0 / tables.mean_range
+    # Where the signal dies within a bin, the error is that of the transmission of one bin.
+    steepest = 0.5 * (bins - 1) / tables.length
     for p in range(BLOCK):
-        relative = results[5, p] / (results[4, p] + steepest)
+        relative = results[5, p] / min(results[4, p] + 1.0 / tables.mean_range, steepest)
         determined = (relative >= 0.0) & (relative < limits.largest_relative_error)
         determined &= results[3, p] < HUGE * HUGE
         largest = limits.outlier * math.sqrt(fit[_NOISE, p])
@@ -535,7 +540,7 @@ def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: Co
     bins = block.shape[1]
     _set_noise(tables, s, bins, mode)
     _convert(tables, s, bins, limits.widening)
-    _judge(tables, s, limits)
+    _judge(tables, s, bins, limits)
     _settle_constant(tables, s, mode)
 
 

@@ -7,7 +7,7 @@ hardly affects; the tests allow for the scatter of that estimate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -29,6 +29,10 @@ _SECOND_DIFFERENCE: Final = 6.0
 _DIFFERENCE_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
 _INDEPENDENT: Final = np.ones(1)
+_OUTSIDE: Final = 0.025
+"""Probability beyond either end of an interval of 95 percent."""
+_FAR: Final = 4.0
+"""Standard errors beyond which the stability benchmark counts a value as false."""
 _RATIO: Final = 4.611
 """Quantile of the logarithm of the ratio of two estimates of one variance from the same residuals,
 3.353 sqrt(17 / 9), times the root of the number of bins."""
@@ -56,6 +60,18 @@ class _Limits:
     trend: Array
     outlier: Array
     widening: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CountMoments:
+    """Poisson noise of the bins of each profile, (profile,) each."""
+
+    fewest: Array
+    """Expected counts of the darkest bin."""
+    inverse: Array
+    """Mean of the inverse expected counts."""
+    inverse_square: Array
+    """Mean of their inverse squares."""
 
 
 class CommonLimits(NamedTuple):
@@ -108,10 +124,27 @@ def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[floa
     return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
 
+def background_widening(relative: Array) -> Array:
+    """Return the factor on the standard error of a background.
+
+    Background and signal separate by the bend of the signal, so that the error of the background
+    falls with the square of the slope. Noise that makes the slope too large makes its error too
+    small: it is that of a slope smaller by one of its standard errors.
+
+    Parameters
+    ----------
+    relative : (profile,) float
+        Standard error of extinction over extinction + 1 / mean range.
+    """
+    return np.asarray((1.0 - np.minimum(relative, THRESHOLDS.largest_shift)) ** -2)
+
+
 def judge_fit(
     fit: PathEstimate,
     *,
+    length: float,
     known_variance: bool,
+    counts: CountMoments | None = None,
     unknowns: int = 3,
     correlation_length: Array = _INDEPENDENT,
 ) -> Verdict:
@@ -120,8 +153,12 @@ def judge_fit(
     Parameters
     ----------
     fit : PathEstimate
+    length : float
+        Of the section, m.
     known_variance : bool
         Whether the weights are inverse variances.
+    counts : CountMoments, optional
+        Where the noise is that of few counts.
     unknowns : int
         Number of fitted parameters.
     correlation_length : (profile or 1,) float
@@ -135,9 +172,12 @@ def judge_fit(
         mean_noise = noise * correlation_length
         reduced = fit.misfit / _residual_dof(fit.bins, unknowns) / noise
         limits = _limits(fit, unknowns, known_variance=known_variance)
+        if counts is not None:
+            limits = _limits_of_counts(limits, fit.bins, counts, unknowns)
+        determined = _determined(fit, length, mean_noise, limits.widening)
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > THRESHOLDS.least_signal**2),
-            (HomogeneousQuality.POORLY_DETERMINED, _determined(fit, mean_noise, limits.widening)),
+            (HomogeneousQuality.POORLY_DETERMINED, determined),
             (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
             (HomogeneousQuality.AT_BOUND, fit.bounded == 0),
             (HomogeneousQuality.POOR_FIT, reduced <= limits.misfit),
@@ -167,9 +207,14 @@ def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
     return np.maximum(variance, fit.rounding)
 
 
-def _determined(fit: PathEstimate, noise: Array, widening: Array) -> npt.NDArray[np.bool_]:
+def _determined(
+    fit: PathEstimate, length: float, noise: Array, widening: Array
+) -> npt.NDArray[np.bool_]:
     error = np.sqrt(fit.extinction_variance * noise) * widening
-    largest = THRESHOLDS.largest_relative_error * (fit.extinction + 1.0 / fit.mean_range)
+    # Where the signal dies within a bin, the error is that of the transmission of one bin.
+    steepest = 0.5 * np.maximum(fit.bins - 1.0, 1.0) / length
+    slope = np.minimum(fit.extinction + 1.0 / fit.mean_range, steepest)
+    largest = THRESHOLDS.largest_relative_error * slope
     finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
     determined: npt.NDArray[np.bool_] = finite & (error < largest)
     return determined
@@ -188,6 +233,26 @@ def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limit
     return _Limits(*(limit[kind] for limit in limits))
 
 
+def _limits_of_counts(limits: _Limits, bins: Array, counts: CountMoments, unknowns: int) -> _Limits:
+    """Return limits with the same rates for Poisson noise, whose tail is longer than a normal one.
+
+    The largest residual has the quantile of the counts of the darkest bin. Chi-square has the
+    mean 1, the variance 2 + 1/N and the third cumulant 8 + 22/N + 1/N^2 of a bin with N counts,
+    and the quantile of the shifted gamma distribution with the same three.
+    """
+    rate, mean = 0.5 * _FALSE_ALARM, counts.fewest
+    highest = np.ceil(special.pdtrik(1.0 - rate / np.maximum(bins, 1.0), mean))
+    dof = _residual_dof(bins, unknowns)
+    variance = (2.0 + counts.inverse) * dof
+    shape = 4.0 * variance**3 / ((8.0 + 22.0 * counts.inverse + counts.inverse_square) * dof) ** 2
+    above = (special.gammaincinv(shape, 1.0 - rate) - shape) / np.sqrt(shape)
+    return replace(
+        limits,
+        outlier=np.fmax(limits.outlier, (highest - mean) / np.sqrt(mean)),
+        misfit=np.fmax(limits.misfit, 1.0 + above * np.sqrt(variance) / dof),
+    )
+
+
 def _outlier_limit(quantile: Array) -> Array:
     return np.maximum(THRESHOLDS.outlier, quantile)
 
@@ -202,6 +267,17 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
     )
 
 
+def _widening(dof: Array) -> Array:
+    """Return the factor on standard errors of which the noise is estimated.
+
+    An error over its estimate follows Student's distribution. 1.96 of them hold 95 percent, or
+    more where few bins would otherwise put too many values beyond 4 of them.
+    """
+    inside = -special.stdtrit(dof, _OUTSIDE) / -special.ndtri(_OUTSIDE)
+    far = -special.stdtrit(dof, 0.5 * THRESHOLDS.false_estimated) / _FAR
+    return np.asarray(np.maximum(inside, far))
+
+
 def _estimated_limits(
     bins: Array, differences: Array, shapes: Array, unknowns: int
 ) -> tuple[Array, ...]:
@@ -213,6 +289,5 @@ def _estimated_limits(
         np.where(independent, ratio, np.inf),
         np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - _FALSE_ALARM), np.inf),
         _outlier_limit(-special.stdtrit(dof, 0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
-        # An error over its estimate follows Student's distribution.
-        -special.stdtrit(dof, special.ndtr(-THRESHOLDS.covered)) / THRESHOLDS.covered,
+        _widening(dof),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, cast
@@ -14,7 +15,12 @@ from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.homogeneous import _compressed, _direct, _given, _linearized, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
-from lidarops.retrieve.homogeneous._fit_quality import common_limits, judge_fit
+from lidarops.retrieve.homogeneous._fit_quality import (
+    CountMoments,
+    background_widening,
+    common_limits,
+    judge_fit,
+)
 from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
 from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
 from lidarops.retrieve.homogeneous._projection import make_grid
@@ -60,7 +66,9 @@ def solve_by_compression(problem: PathProblem) -> PathSolution:
         valid_bins=np.full(count, bins, np.int32),
         quality=quality,
     )
-    routed = np.flatnonzero(state == _compressed.ROUTED)
+    # The limits of the kernel are those of normal noise.
+    few = np.nanmin(problem.counts(), axis=1, initial=np.inf) < THRESHOLDS.many_counts
+    routed = np.flatnonzero((state == _compressed.ROUTED) | few)
     if routed.size == 0:
         return solution
     return solution.updated(routed, solve_by_direct_fit(problem.select(routed)))
@@ -191,6 +199,20 @@ def _noise_spacing(problem: PathProblem) -> npt.NDArray[np.int64]:
     return np.where(length > 1.0, max(widest, 1), 1).astype(np.int64)
 
 
+def _count_moments(problem: PathProblem) -> CountMoments | None:
+    """Return the moments of the counts of the used bins; None where the noise is normal."""
+    if problem.exposure is None:
+        return None
+    counts = np.where(np.isfinite(problem.power), problem.counts(), np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        # Profiles without bins have no moments.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        counts[~(counts > 0.0)] = np.nan
+        return CountMoments(
+            np.nanmin(counts, axis=1), np.nanmean(1.0 / counts, 1), np.nanmean(counts**-2.0, 1)
+        )
+
+
 def _solution(
     fit: PathEstimate,
     problem: PathProblem,
@@ -204,12 +226,20 @@ def _solution(
         added = _AddedVariances(np.zeros(1), np.zeros(1), np.zeros(1))
     length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
     verdict = judge_fit(
-        fit, known_variance=problem.known_variance, unknowns=unknowns, correlation_length=length
+        fit,
+        length=problem.length,
+        known_variance=problem.known_variance,
+        counts=_count_moments(problem),
+        unknowns=unknowns,
+        correlation_length=length,
     )
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         level = verdict.noise * verdict.widening**2 * length
-        background_error = np.sqrt(fit.background_variance * level + added.background)
+        slope = fit.extinction + 1.0 / fit.mean_range
+        relative = np.sqrt(fit.extinction_variance * level) / slope
+        background_variance = fit.background_variance * level * background_widening(relative) ** 2
+        background_error = np.sqrt(background_variance + added.background)
         relative_error = np.sqrt(fit.amplitude_relative_variance * level + added.amplitude_relative)
         extinction_error = np.sqrt(fit.extinction_variance * level + added.extinction)
         signal_to_noise = np.copysign(

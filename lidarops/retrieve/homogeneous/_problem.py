@@ -42,11 +42,18 @@ class PathProblem:
     """(profile or 1,): the known background."""
     background_variance: Array | None = None
     """(profile or 1,): variance of the known background."""
+    exposure: Array | None = None
+    """(profile or 1,): counts per unit of power; None where the noise is not that of counts."""
 
     @property
     def rounding(self) -> float:
         """Relative rounding error of the power and the kernels, as a standard deviation."""
         return 0.3 * float(np.finfo(self.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
+
+    @property
+    def length(self) -> float:
+        """Length of the section, m; 1 for a single bin."""
+        return float(self.range[-1] - self.range[0]) if self.range.size > 1 else 1.0
 
     @property
     def common_weights(self) -> Array:
@@ -55,10 +62,19 @@ class PathProblem:
             weights: Array = 1.0 / self.noise[0] if self.known_variance else self.noise[0]
         return weights
 
+    def counts(self) -> Array:
+        """Return (profile or 1, bin) expected counts, infinite where the noise is normal."""
+        if self.exposure is None:
+            return np.full((1, 1), np.inf)
+        return np.asarray(self.noise * self.exposure[:, np.newaxis] ** 2)
+
     def select(self, rows: npt.NDArray[np.intp]) -> PathProblem:
         """Return the problem of the selected profiles, for methods that need the power alone."""
         noise = self.noise if self.noise.shape[0] == 1 else self.noise[rows]
-        return replace(self, power=self.power[rows], noise=noise)
+        exposure = self.exposure
+        if exposure is not None and exposure.shape[0] > 1:
+            exposure = exposure[rows]
+        return replace(self, power=self.power[rows], noise=noise, exposure=exposure)
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,6 +49,7 @@ def fit_homogeneous_path(
     noise_correlation_length: xr.DataArray | None = None,
     background_range: tuple[float, float] | None = None,
     extinction: xr.DataArray | float | None = None,
+    exposure: xr.DataArray | None = None,
 ) -> xr.Dataset:
     """Return background, amplitude and extinction of sections of range.
 
@@ -82,6 +83,9 @@ def fit_homogeneous_path(
     extinction : xr.DataArray or float, optional
         m-1, of molecules and particles, over the dimensions of `power` but range: the prior of
         "linearized", which must be known to some percent, and exact for "known_extinction".
+    exposure : xr.DataArray, optional
+        Of Poisson counts: counts per unit of power, over the dimensions of `power` but range; not
+        with `relative_variance`.
 
     Returns
     -------
@@ -108,6 +112,9 @@ def fit_homogeneous_path(
         given = xr.DataArray(extinction)
         _check_dimensions(given, power, "extinction")
         inputs["extinction"] = given
+    if exposure is not None:
+        _check_dimensions(exposure, power, "exposure")
+        inputs["exposure"] = exposure
     if background_range is not None:
         inputs |= _far_background(checked, distance, background_range)
     outputs = xr.apply_ufunc(
@@ -314,6 +321,7 @@ def _solve_section(
     background_error: _Block | None = None,
     background_bits: _Block | None = None,
     extinction: _Block | None = None,
+    exposure: _Block | None = None,
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
@@ -328,8 +336,10 @@ def _solve_section(
         with np.errstate(divide="ignore"):
             weights = 1.0 / variance
         variance = None
-    whole = (correlation_length, background, background_error, background_bits, extinction)
-    length, level, error, doubt, prior = (
+    whole = (
+        correlation_length, background, background_error, background_bits, extinction, exposure,
+    )  # fmt: skip
+    length, level, error, doubt, prior, counted = (
         None if values is None else values[..., 0] for values in whole
     )
     fit = _homogeneous.fit_homogeneous_path(
@@ -342,6 +352,7 @@ def _solve_section(
         background=level,
         background_standard_error=error,
         extinction=prior,
+        exposure=counted,
     )
     values = tuple(getattr(fit, name.removeprefix("total_")) for name in _VALUES)
     bits = fit.quality | carried

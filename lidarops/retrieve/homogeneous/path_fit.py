@@ -107,6 +107,7 @@ def fit_homogeneous_path(
     background: npt.ArrayLike | None = None,
     background_standard_error: npt.ArrayLike | None = None,
     noise_correlation_length: npt.ArrayLike | None = None,
+    exposure: npt.ArrayLike | None = None,
 ) -> HomogeneousResult:
     r"""Return background, amplitude and extinction of a homogeneous path.
 
@@ -137,15 +138,20 @@ def fit_homogeneous_path(
     noise_correlation_length : (...) float, optional
         Bins, at least 1; the integral correlation length of the noise
         (`lidarops.retrieve.signal.noise_correlation`). Bins are independent where not given.
+    exposure : (...) float, optional
+        For Poisson counts: counts per unit of power, as for
+        `lidarops.retrieve.background.known_shape.fit_known_shape`. With few counts, the limits of
+        OUTLIER and POOR_FIT are those of Poisson noise of the given variance, which is required.
 
     Returns
     -------
     HomogeneousResult
         Without `variance`, the noise is estimated from second differences of the residuals
         along range and scales the standard errors; with n bins they have 0.51 (n - 2) degrees
-        of freedom. They are widened by Student's distribution, so that 4 standard errors have the
-        coverage of a known variance: by 4 percent at 225 bins, 20 at 50, 70 at 20, and by a factor
-        of 7.6 at 8.
+        of freedom. They are widened by Student's distribution, so that 1.96 of them hold 95 percent
+        and at most 0.05 percent of the values are beyond 4: by 1 percent at 225 bins, 5 at 50, 31
+        at 20, and by a factor of 3.9 at 8. The second condition makes the intervals of fewer than
+        20 bins too wide: those of 8 bins hold 99.6 percent.
 
         With a correlation length s, standard errors are sqrt(s) times those of independent bins,
         and where s exceeds 1, noise is estimated from second differences of bins a twentieth of
@@ -230,6 +236,13 @@ def fit_homogeneous_path(
     )
     if correlated is not None and np.any(correlated < 1):
         raise RetrievalInputError("is less than 1 bin", field="noise_correlation_length")
+    counted = inputs.profile_values(exposure, "exposure", leading)
+    if counted is not None and not (known_variance and np.all(counted > 0)):
+        raise RetrievalInputError(
+            "is not positive, or given without variance",
+            field="exposure",
+            remedy="give counts per unit of power with the variance of the counts",
+        )
     length = float(grid.values[-1] - grid.values[0]) if grid.size > 1 else 1.0
     problem = PathProblem(
         power=rows,
@@ -245,6 +258,7 @@ def fit_homogeneous_path(
         extinction=_prior(extinction, length, leading),
         background=inputs.profile_values(background, "background", leading),
         background_variance=None if error is None else error**2,
+        exposure=counted,
     )
     return _result(_SOLVERS[chosen_method](problem), leading)
 

@@ -27,8 +27,13 @@ class Thresholds:
     """Amplitude over its standard error at known extinction. Simulations: with
     `largest_relative_error`, none of 100,000 profiles of noise is accepted."""
     largest_relative_error: float = 0.15
-    """Standard error of extinction over extinction + 1 / mean range. Simulations: above, coverage
-    of the accepted values falls below 0.93."""
+    """Standard error of extinction over extinction + 1 / mean range, and over 1 / (2 bin widths).
+    Simulations: above the first, coverage of the accepted values falls below 0.93; without the
+    second, 42 % of the values are false where the signal falls by a factor of 1e4 to 1e6 in a bin.
+    """
+    largest_shift: float = 0.5
+    """Relative standard error of the slope by which it is shifted at most for the error of the
+    background; such a value is rejected by `largest_relative_error`."""
     false_alarm: float = 4e-4
     """Rate at which one test of residuals flags a profile that obeys the model. Assumed: half of
     the target of 1e-3 for needless flags."""
@@ -41,9 +46,13 @@ class Thresholds:
     """With fewer, there are no more values than unknowns."""
     fewest_differences: int = 5
     """Second differences; with fewer, the noise is estimated from the residuals. Assumed."""
-    covered: float = 4.0
-    """Standard errors at which intervals from an estimated noise have the coverage of a known one:
-    the distance beyond which the stability benchmark counts a value as false."""
+    many_counts: float = 1e4
+    """Counts of a bin from which Poisson noise is normal: its skewness moves a deviation of 5
+    standard deviations by 0.04. Calculated."""
+    false_estimated: float = 5e-4
+    """Share of the values from an estimated noise that may be beyond 4 standard errors, where the
+    stability benchmark counts them as false: half of its target. Assumed; with few bins, intervals
+    hold more than they state."""
     independent: float = 1e-9
     """Squared share of a shape outside the span of others, above which it is tested. Rounding."""
     model_error: float = 0.05

@@ -1,0 +1,102 @@
+"""Paths at the limit of what a signal determines: no value there is false."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.homogeneous import labeled
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
+
+
+@pytest.mark.parametrize("variance", [1.0, None], ids=["known noise", "estimated noise"])
+def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance):
+    """The second bin then holds noise, which looks like the transmission of the first."""
+    rng = np.random.default_rng(31)
+    r = 500.0 + 15.0 * np.arange(16)
+    fall = rng.uniform(6.0, 14.0, (20_000, 1))
+    extinction = fall[:, 0] / 30.0
+    height = np.exp(rng.uniform(np.log(10.0), np.log(1e6), fall.shape))
+    signal = height * (r[0] / r) ** 2 * np.exp(-fall * (r - r[0]) / 15.0)
+    fit = fit_homogeneous_path(100.0 + signal + rng.normal(size=signal.shape), r, variance=variance)
+    kept = (fit.quality & rejecting((*Quality, *HomogeneousQuality))) == 0
+    false = np.abs(fit.extinction - extinction) > 4.0 * fit.extinction_standard_error
+    assert kept.sum() > 300
+    assert np.sum(false & kept) <= 1
+
+
+def test_backgrounds_near_the_limit_of_the_error_are_not_false():
+    """Noise that makes the slope too large makes the stated error of the background too small."""
+    rng = np.random.default_rng(32)
+    r = np.linspace(5000.0, 5400.0, 60)
+    height = np.exp(rng.uniform(np.log(300.0), np.log(1200.0), (40_000, 1)))
+    signal = height * (r[0] / r) ** 2 * np.exp(-2.0 * 1e-4 * (r - r[0]))
+    fit = fit_homogeneous_path(50.0 + signal + rng.normal(size=signal.shape), r, variance=1.0)
+    slope = fit.extinction + 1.0 / r.mean()
+    near = (fit.quality == 0) & (fit.extinction_standard_error > 0.09 * slope)
+    off = np.abs(fit.background - 50.0) / fit.background_standard_error
+    assert near.sum() > 3000
+    assert np.mean(off[near] > 4.0) < 4e-3
+    assert 0.94 < np.mean(off[near] < 1.96) < 0.975
+
+
+@pytest.mark.parametrize("counts", [1.0, 0.1, 0.02])
+def test_few_counts_are_neither_outlying_nor_a_poor_fit(counts):
+    """One count in a bin that expects 0.02 is 7 standard deviations."""
+    rng = np.random.default_rng(33)
+    exposure, profiles = 0.2, 4_000
+    r = np.linspace(500.0, 3500.0, 200)
+    near = 400.0 * (r[0] / r) ** 2 * np.exp(-2.0 * 2e-3 * (r - r[0]))
+    mean = (counts + near) / exposure
+    power = rng.poisson(mean * exposure, (profiles, r.size)) / exposure
+    tests = int(Quality.OUTLIER | HomogeneousQuality.POOR_FIT)
+    flagged = {
+        name: np.mean(fit_homogeneous_path(power, r, variance=mean / exposure, **given).quality
+                      & tests != 0)
+        for name, given in (("normal", {}), ("counts", {"exposure": exposure}))
+    }  # fmt: skip
+    assert flagged["normal"] > 0.02
+    assert flagged["counts"] < 2e-3
+    # An outlier is still found.
+    power[:, 150] += 30.0 / exposure
+    fit = fit_homogeneous_path(power, r, variance=mean / exposure, exposure=exposure)
+    assert np.all(fit.quality & int(Quality.OUTLIER))
+
+
+def test_many_counts_have_the_limits_of_normal_noise():
+    rng = np.random.default_rng(34)
+    r = np.linspace(500.0, 3500.0, 200)
+    mean = 1e5 + 1e6 * (r[0] / r) ** 2
+    power = rng.poisson(mean, (200, r.size)).astype(float)
+    fits = [fit_homogeneous_path(power, r, variance=mean, **g) for g in ({}, {"exposure": 1.0})]
+    assert np.array_equal(fits[0].extinction, fits[1].extinction)
+    assert np.array_equal(fits[0].quality, fits[1].quality)
+    with pytest.raises(RetrievalInputError, match="exposure"):
+        fit_homogeneous_path(power, r, exposure=1.0)
+
+
+def test_labeled_profiles_take_their_exposures():
+    rng = np.random.default_rng(35)
+    r = np.linspace(500.0, 3500.0, 200)
+    exposure = np.array([0.5, 2.0, 8.0])
+    mean = 0.2 + 40.0 * (r[0] / r) ** 2
+    power = rng.poisson(mean * exposure[:, np.newaxis]) / exposure[:, np.newaxis]
+    variance = mean / exposure[:, np.newaxis]
+    fit = fit_homogeneous_path(power, r, variance=variance, exposure=exposure)
+    result = labeled.fit_homogeneous_path(
+        xr.DataArray(
+            power,
+            dims=("time", "range"),
+            coords={"range": ("range", r, {"units": "m"})},
+            attrs={"units": "MHz"},
+        ),
+        sections=[(0.0, 4000.0)],
+        variance=xr.DataArray(variance, dims=("time", "range")),
+        exposure=xr.DataArray(exposure, dims="time"),
+    )
+    assert np.array_equal(result["quality_flag"][:, 0], fit.quality)
+    assert np.array_equal(result["extinction"][:, 0], fit.extinction, equal_nan=True)
