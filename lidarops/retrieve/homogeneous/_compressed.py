@@ -52,8 +52,6 @@ _FIRST_STEP: Final = 1.5
 _FARTHEST: Final = 3.0
 """Half widths that they may reach."""
 _LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
-_LARGEST_SHIFT: Final = THRESHOLDS.largest_shift
-"""See `lidarops.retrieve.homogeneous._fit_quality.background_widening`."""
 _EDGE: Final = 1.02
 """Half widths from the centre of a cell beyond which the polynomial of the next cell is used."""
 _MOVES: Final = 40
@@ -474,9 +472,7 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
         amplitude = size * results[2, p]
         results[0, p] = fit[_P, p]
         wide = root * widening
-        slope = (fit[_TAU, p] + tables.length / tables.mean_range) / (fit[_TAU_ERROR, p] * wide)
-        left = 1.0 - min(1.0 / slope, _LARGEST_SHIFT)
-        results[1, p] = fit[_P_ERROR, p] * wide / (left * left)
+        results[1, p] = fit[_P_ERROR, p] * wide
         results[2, p] = amplitude
         results[3, p] = abs(amplitude) * (fit[_B_ERROR, p] * wide)
         results[4, p] = fit[_TAU, p] / tables.length

@@ -124,21 +124,6 @@ def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[floa
     return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
 
-def background_widening(relative: Array) -> Array:
-    """Return the factor on the standard error of a background.
-
-    Background and signal separate by the bend of the signal, so that the error of the background
-    falls with the square of the slope. Noise that makes the slope too large makes its error too
-    small: it is that of a slope smaller by one of its standard errors.
-
-    Parameters
-    ----------
-    relative : (profile,) float
-        Standard error of extinction over extinction + 1 / mean range.
-    """
-    return np.asarray((1.0 - np.minimum(relative, THRESHOLDS.largest_shift)) ** -2)
-
-
 def judge_fit(
     fit: PathEstimate,
     *,

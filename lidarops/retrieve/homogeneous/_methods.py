@@ -17,7 +17,6 @@ from lidarops.retrieve.homogeneous import _compressed, _direct, _given, _lineari
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
 from lidarops.retrieve.homogeneous._fit_quality import (
     CountMoments,
-    background_widening,
     common_limits,
     judge_fit,
 )
@@ -236,10 +235,7 @@ def _solution(
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         level = verdict.noise * verdict.widening**2 * length
-        slope = fit.extinction + 1.0 / fit.mean_range
-        relative = np.sqrt(fit.extinction_variance * level) / slope
-        background_variance = fit.background_variance * level * background_widening(relative) ** 2
-        background_error = np.sqrt(background_variance + added.background)
+        background_error = np.sqrt(fit.background_variance * level + added.background)
         relative_error = np.sqrt(fit.amplitude_relative_variance * level + added.amplitude_relative)
         extinction_error = np.sqrt(fit.extinction_variance * level + added.extinction)
         signal_to_noise = np.copysign(

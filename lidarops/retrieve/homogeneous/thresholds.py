@@ -31,9 +31,6 @@ class Thresholds:
     Simulations: above the first, coverage of the accepted values falls below 0.93; without the
     second, 42 % of the values are false where the signal falls by a factor of 1e4 to 1e6 in a bin.
     """
-    largest_shift: float = 0.5
-    """Relative standard error of the slope by which it is shifted at most for the error of the
-    background; such a value is rejected by `largest_relative_error`."""
     false_alarm: float = 4e-4
     """Rate at which one test of residuals flags a profile that obeys the model. Assumed: half of
     the target of 1e-3 for needless flags."""
