@@ -482,7 +482,7 @@ class Unmade:
 
 @dataclass(frozen=True, slots=True)
 class IdleFacts:
-    """Facts that no file or product uses."""
+    """Facts that no file or product uses, or that lack what products need."""
 
     instrument: str
     subject: str
@@ -513,6 +513,7 @@ class Findings:
     unusable_files: tuple[UnusableFile, ...] = ()
     unmade: tuple[Unmade, ...] = ()
     idle_facts: tuple[IdleFacts, ...] = ()
+    incomplete_facts: tuple[IdleFacts, ...] = ()
 
     @property
     def failed(self) -> bool:

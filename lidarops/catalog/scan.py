@@ -324,6 +324,17 @@ class _Scan:
         return moved
 
 
+def _likeness(pattern: str, path: str) -> float:
+    """Return the share of equal characters of a pattern and the begin of a path.
+
+    Folders and names are compared apart: a name is often longer than its pattern.
+    """
+    folder, _, name = pattern.replace("*", "").replace("?", "").rpartition("/")
+    of_file, _, file = path.rpartition("/")
+    begin = f"{of_file}/{file[: len(name)]}"
+    return difflib.SequenceMatcher(None, f"{folder}/{name}", begin).ratio()
+
+
 class _Unclaimed:
     """The names of files without claim that resemble patterns without file."""
 
@@ -338,7 +349,7 @@ class _Unclaimed:
         self._names = self._names + 1 if folder == self._folder else 1
         self._folder = folder
         for pattern in patterns if self._names <= _NAMES_OF_FOLDER else ():
-            likeness = difflib.SequenceMatcher(None, pattern.lower(), path.lower()).ratio()
+            likeness = _likeness(pattern.lower(), path.lower())
             if likeness >= _LEAST_LIKENESS:
                 best = sorted({*self._best[pattern], (-likeness, path)})
                 self._best[pattern] = best[:_NAMES_SHOWN]

@@ -18,6 +18,7 @@ def findings_document(findings: Findings) -> dict[str, Any]:
         "patterns_without_file": [asdict(idle) for idle in findings.idle_patterns],
         "file_notes": [asdict(note) for note in findings.file_notes],
         "unusable_files": [asdict(unusable) for unusable in findings.unusable_files],
+        "incomplete_facts": [asdict(facts) for facts in findings.incomplete_facts],
         "unused_facts": [asdict(idle) for idle in findings.idle_facts],
         "never_made": [asdict(unmade) for unmade in findings.unmade],
     }

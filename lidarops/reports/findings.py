@@ -60,7 +60,7 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
         near = f"; unclaimed files with similar names: {', '.join(idle.near)}" if idle.near else ""
         problem = f"matches no file of the archive{near}"
         yield FindingRow(idle.instrument, f"{idle.key}: {idle.pattern}", problem, fails=True)
-    for facts in findings.idle_facts:
+    for facts in (*findings.idle_facts, *findings.incomplete_facts):
         yield FindingRow(facts.instrument, facts.subject, facts.reason, fails=False)
     for note in findings.file_notes:
         files = counted(note.files, "file")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
@@ -14,6 +15,11 @@ from lidarops.steps import dependence
 from lidarops.steps.channels import READ_STEP
 from lidarops.steps.dependence import ProductKey
 from lidarops.steps.step import REQUEST
+
+_NO_OVERLAP: Final = (
+    "give neither full_overlap_range nor overlap_profile: bins near the lidar are used as they are,"
+    " and a cloud below the reference window may be an overlap that becomes full"
+)
 
 
 def find(
@@ -50,6 +56,7 @@ def find(
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
         unmade=tuple(_unmade(judge, store, selection, owners, orphans)),
+        incomplete_facts=tuple(_incomplete_facts(campaign, store, sorted(instruments))),
         idle_facts=tuple(_idle_facts(campaign, store, sorted(instruments))),
     )
 
@@ -78,6 +85,17 @@ def _unmet(
         since=selection.since,
         until=selection.until,
     )
+
+
+def _incomplete_facts(
+    campaign: Campaign, store: Store, instruments: Iterable[str]
+) -> Iterator[IdleFacts]:
+    """Yield the facts of instruments with files that state no overlap."""
+    for name in instruments:
+        for facts in campaign.instruments[name].facts:
+            stated = facts.full_overlap_range or facts.overlap_profile
+            if not stated and store.has_files(name, facts.valid_from, facts.valid_to):
+                yield IdleFacts(name, availability.period_of(facts), _NO_OVERLAP)
 
 
 def _idle_facts(

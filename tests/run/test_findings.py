@@ -114,6 +114,23 @@ def test_a_pattern_without_file_is_named_with_similar_names(
     assert invoke(archive, "reprocess", "--instrument", "rich").exit_code == 0
 
 
+@pytest.mark.parametrize("pattern", ["pillar/h*", "pilar/k*", "pilar/h25*", "Pilar/H24A0*"])
+def test_patterns_are_compared_with_the_begin_of_long_names(archive: Archive, pattern: str) -> None:
+    for name in ("h24A0217.364914", "h24A0217.365919"):
+        raw_archives.write(archive.folder / "raw/pilar" / name, b"")
+    archive.tree["instruments"]["poor"]["files"] = pattern
+    assert "pilar/h24A0217.364914" in invoke(archive, "catalog").output
+
+
+def test_facts_without_an_overlap_are_noted(archive: Archive) -> None:
+    for facts in archive.tree["instruments"]["rich"]["facts"]:
+        facts.pop("full_overlap_range", None)
+    for command in ("plan", "reprocess"):
+        shown = invoke(archive, command)
+        assert shown.exit_code == 0
+        assert "give neither full_overlap_range nor overlap_profile" in shown.output
+
+
 def test_a_product_that_no_scene_gives_is_named_in_the_last_line_and_the_report(
     archive: Archive,
 ) -> None:

@@ -12,11 +12,11 @@ from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.harness.rows import Array, Mask
 from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
 from lidarops.flags import Quality
-from lidarops.products.elastic.settings import ReferenceSettings
 from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.background import known_shape
 from lidarops.retrieve.elastic import inversion, layers, outlying_bins
 from lidarops.retrieve.elastic.flags import ElasticQuality
+from lidarops.settings import ReferenceSettings
 
 Random = np.random.Generator
 

@@ -46,6 +46,7 @@ _WITHHELD: Final = int(
     Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
 )
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
+_UNKNOWN_OVERLAP: Final = np.int32(ElasticQuality.UNKNOWN_OVERLAP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +255,12 @@ class _Means:
         self.noise = np.where(bridged.outlying, bridged.variance, self.noise)
         self.quality = self.quality | np.where(bridged.outlying, _OUTLIER, np.int32(0))
 
+    @property
+    def overlap_is_stated(self) -> Mask:
+        """Whether the campaign states where the overlap is full, or the overlap, (time,)."""
+        stated = (self.quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
+        return np.asarray(stated.any(axis=-1) | np.any(self.overlap != 1.0))
+
     def minus(self, background: Array) -> Array:
         """Return the signal without background, corrected for overlap."""
         power = (self.raw - background[:, np.newaxis]) / self.overlap
@@ -290,11 +297,18 @@ def _signal_and_clouds(
 ) -> tuple[_Signal, _layers.Layers]:
     """Return signals without background, and their clouds, with incomplete overlap flagged."""
     signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
-    partial = _overlap_bits(means, signal, clouds.mask, reference)
-    if not partial.any():
+    near = clouds.mask & _begin_before(clouds.mask, means.distance < reference.lowest)
+    if not near.any():
         return signal, clouds
-    means.quality = means.quality | partial
-    return _signal_beyond_clouds(means, known_shape=known_shape)
+    window = _window(signal, means, reference, clouds.mask & ~near)
+    # Without clean air to compare with, a rise is as well that of an overlap that is not stated.
+    doubtful = near & ~(window.chosen | means.overlap_is_stated)[:, np.newaxis]
+    partial = _overlap_bits(means, signal, near, window)
+    if partial.any():
+        means.quality = means.quality | partial
+        signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
+    means.quality = means.quality | np.where(doubtful, _UNKNOWN_OVERLAP, np.int32(0))
+    return signal, clouds.without(doubtful, means.distance)
 
 
 def _signal_beyond_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _layers.Layers]:
@@ -316,17 +330,15 @@ def _signal_beyond_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal,
     return signal, means.find_clouds(signal.power)
 
 
-def _overlap_bits(means: _Means, signal: _Signal, layers: Mask, reference: Reference) -> Flags:
+def _overlap_bits(
+    means: _Means, signal: _Signal, near: Mask, window: _reference.ReferenceWindow
+) -> Flags:
     """Return the bits of overlap where the signal rises from less than clean air gives.
 
     A layer that begins before the search range of the window is no cloud if the ratio to air below
     it is less than in the window. The overlap is incomplete up to the largest ratio to air,
     and may be so farther away, where particles decrease.
     """
-    near = layers & _begin_before(layers, means.distance < reference.lowest)
-    if not near.any():
-        return np.zeros(layers.shape, np.int32)
-    window = _window(signal, means, reference, layers & ~near)
     ratio, error = means.ratio_to_air(signal.power)
     scale, scale_error = (
         values[:, np.newaxis] for values in (window.scale, window.scale_standard_error)
@@ -338,7 +350,7 @@ def _overlap_bits(means: _Means, signal: _Signal, layers: Mask, reference: Refer
     before = means.distance < np.nan_to_num(window.bottom)[:, np.newaxis]
     highest = np.where(before, np.nan_to_num(ratio, nan=-np.inf), -np.inf).argmax(axis=-1)
     partial = np.arange(means.distance.size) < highest[:, np.newaxis]
-    bits = np.where(partial, int(Quality.INCOMPLETE_OVERLAP), int(ElasticQuality.UNKNOWN_OVERLAP))
+    bits = np.where(partial, np.int32(Quality.INCOMPLETE_OVERLAP), _UNKNOWN_OVERLAP)
     return np.where(before & has_rise, bits, 0).astype(np.int32)
 
 

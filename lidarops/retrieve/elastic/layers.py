@@ -43,6 +43,12 @@ class Layers:
     top."""
     cloudy: Mask
 
+    def without(self, bins: Mask, distance: Array) -> Layers:
+        """Return the layers without those in some bins, (..., range), of a range grid in m."""
+        mask = self.mask & ~bins
+        cloudy = np.asarray(mask.any(axis=-1))
+        return Layers(np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan), mask, cloudy)
+
 
 def find_layers(
     power: npt.ArrayLike,

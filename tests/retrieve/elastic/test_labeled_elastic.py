@@ -547,7 +547,6 @@ def test_a_cloud_at_the_end_of_a_profile_is_no_overlap():
     data = counted(signal, 10, r=distance[near], exposure=100 * EXPOSURE)
     retrieved = solved(data, reference=Reference(5000.0, 7300.0, 1000.0, 1.0, 0.0))
     assert has(retrieved, ElasticQuality.CLOUD)[:, distance[near] > 7950.0].all()
-    assert not has(retrieved, ElasticQuality.UNKNOWN_OVERLAP).any()
     assert not has(retrieved, Quality.INCOMPLETE_OVERLAP).any()
 
 
@@ -555,9 +554,19 @@ def test_noise_is_no_negative_backscatter():
     assert not has(many(), ElasticQuality.NEGATIVE_BACKSCATTER).any()
 
 
-def test_an_opaque_cloud_leaves_no_reference():
+def test_a_rise_without_clean_air_beyond_is_no_cloud_unless_the_overlap_is_stated():
     signal = light(distance, backscatter=cloud(2500.0, 2e-3, 100.0))
     retrieved = solved(counted(signal, 10))
+    assert has(retrieved, ElasticQuality.NO_REFERENCE).all()
+    assert has(retrieved, ElasticQuality.UNKNOWN_OVERLAP).any(axis=1).all()
+    assert not has(retrieved, ElasticQuality.CLOUD).any()
+    assert np.isnan(retrieved["cloud_base_range"]).all()
+
+
+def test_an_opaque_cloud_leaves_no_reference():
+    signal = light(distance, backscatter=cloud(2500.0, 2e-3, 100.0))
+    near = np.where(distance < 100.0, int(Quality.INCOMPLETE_OVERLAP), 0)
+    retrieved = solved(counted(signal, 10, quality=np.tile(near, (10, 1))))
     assert has(retrieved, ElasticQuality.NO_REFERENCE).all()
     assert has(retrieved, ElasticQuality.CLOUD)[:, between(2500.0, 12_000.0)].all()
     assert np.isnan(retrieved["aerosol_backscatter"]).all()
