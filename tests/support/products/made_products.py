@@ -34,6 +34,10 @@ METADATA = Metadata(
     institution="Université d'Été",
     creator_name="A. Person",
     creator_email="a.person@example.org",
+    creator_url="https://example.org",
+    project="Demo",
+    naming_authority="org.example",
+    acknowledgement="Those who swept the dome.",
     license="CC-BY-4.0",
     comment="A comment of the campaign.",
 )
