@@ -25,6 +25,7 @@ from lidarops.cli.app import (
     exit_with_status,
     say,
     show_rows,
+    wrapped,
 )
 from lidarops.cli.findings import findings_document, show_findings
 from lidarops.cli.plan_summary import grouped, scene_title, show_scene, show_times
@@ -154,7 +155,8 @@ def _plan(
         show_findings(findings)
         if settings.metadata.lacking:
             names = ", ".join(settings.metadata.lacking)
-            say(f"metadata of the campaign: products will lack {names}")
+            for line in wrapped(f"metadata of the campaign: products will lack {names}", ""):
+                say(line)
         _show_earlier(earlier)
         (_show_times if everything else show_times)(runs)
     exit_with_status(failed=failed or any(earlier) or findings.failed)

@@ -34,8 +34,9 @@ class VisibilityProductSettings(NetworkProduct):
         default=timedelta(hours=6), description="interval of averages that share one prior"
     )
     prior: PriorName = "block"
-    multiplier: MultiplierValue | None = Field(
-        default=None,
+    multiplier: MultiplierValue | None = quantity(
+        None,
+        unit="1",
         description="lambda of Drabenko et al., 0 to 1 or chosen: solve one triangle of beams at"
         " each crossing instead of all beams together",
     )
