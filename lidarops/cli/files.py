@@ -125,7 +125,7 @@ def compare(
     none: the same values and texts; minor: other texts, or values within a tenth of their stated
     errors; major: all else.
 
-    Example: lidarops compare demo/superseded/OLD.nc demo/products/NEW.nc
+    Example: lidarops compare OLD.nc NEW.nc
     """
     from lidarops.netcdf.comparison import compare_products
     from lidarops.records import Grade

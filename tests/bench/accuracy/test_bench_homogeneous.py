@@ -270,7 +270,7 @@ def test_the_pareto_front_holds_the_unbeaten_points():
     ("quantity", "case", "files", "error", "message"),
     [
         ("luck", None, [], CampaignError, "throughput"),
-        ("accuracy", "weather", [], CampaignError, "network or reader"),
+        ("accuracy", "weather", [], CampaignError, "network or raman or reader"),
         ("accuracy", "reader", ["file"], CampaignError, "no accuracy"),
         ("accuracy", "archive", [], CampaignError, "'archive' has no accuracy"),
         ("accuracy", "campaigns", [], CampaignError, "'campaigns' has no accuracy"),

@@ -84,4 +84,4 @@ def test_labeled_profiles_take_their_exposures():
         exposure=xr.DataArray(exposure, dims="time"),
     )
     assert np.array_equal(result["quality_flag"][:, 0], fit.quality)
-    assert np.array_equal(result["extinction"][:, 0], fit.extinction, equal_nan=True)
+    assert np.array_equal(result["total_extinction"][:, 0], fit.extinction, equal_nan=True)

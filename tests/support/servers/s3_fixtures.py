@@ -29,6 +29,8 @@ def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         patch.setenv("AWS_ENDPOINT_URL", endpoint)
         try:
             wait_for(port, process)
+            # One of an earlier test may be connected elsewhere.
+            s3fs.S3FileSystem.clear_instance_cache()
             s3fs.S3FileSystem().mkdir("archive")
             yield "s3://archive"
         finally:
