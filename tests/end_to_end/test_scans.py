@@ -12,6 +12,7 @@ import yaml
 from support.archives.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.flags import Quality
 from lidarops.reports.findings import disagreement_rows
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
@@ -47,7 +48,9 @@ def scores(settings: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarra
                 product["altitude"].values - ALTITUDE, ends, np.append(0.0, depth[nearest])
             )
             score = (product["vertical_optical_depth"].values[cycle] - true) / error[cycle]
-            found.append(score[product["quality_flag"].values[cycle] == 0])
+            # Values below their noise are right within their errors, too.
+            bits = product["quality_flag"].values[cycle] & ~int(Quality.LOW_SIGNAL_TO_NOISE)
+            found.append(score[bits == 0])
     return np.concatenate(found)
 
 
