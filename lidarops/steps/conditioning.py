@@ -63,8 +63,8 @@ class Overlap(Step[ChannelCase, OverlapSettings]):
         full, profile = case.facts.full_overlap_range, case.facts.overlap_profile
         if not profile and full <= 0:
             yield Leave(
-                "the campaign gives no full_overlap_range: near bins are used as they are, and the"
-                " rise of the signal to full overlap may be flagged as a cloud"
+                "the campaign gives no full_overlap_range: near bins are used as they are, and"
+                " those whose signal shows no full overlap are rejected or to be used with care"
             )
             return
         reason = "bins nearer than full overlap are flagged and excluded"

@@ -75,8 +75,8 @@ bit: that needs a new version of the layout."""
 VERSION = {
     "signal": 2,
     "homogeneous": 2,
-    "elastic": 4,
-    "raman": 2,
+    "elastic": 3,
+    "raman": 1,
     "multiangle": 3,
     "visibility": 2,
 }

@@ -7,5 +7,5 @@ from typing import Final
 from lidarops.flags import SIGNAL_BITS, Flags
 from lidarops.retrieve.elastic.flags import ElasticQuality
 
-FLAGS: Final = Flags(kind="elastic", version=4, bits=(*SIGNAL_BITS, *ElasticQuality))
+FLAGS: Final = Flags(kind="elastic", version=3, bits=(*SIGNAL_BITS, *ElasticQuality))
 """Published places are in `tests/products/test_flags.py`."""

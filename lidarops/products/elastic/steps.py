@@ -19,7 +19,7 @@ from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
-from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.conditioning import FULL_OVERLAP_RANGE, OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct, Source
 from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
@@ -168,7 +168,10 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
 
     name = "elastic"
     settings = InversionSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, AVERAGE, MOLECULES, KNOWN_SHAPE, REFERENCE)
+    inputs = (
+        PROFILES, WAVELENGTH, FULL_OVERLAP_RANGE, OVERLAP, AVERAGE, MOLECULES, KNOWN_SHAPE,
+        REFERENCE,
+    )  # fmt: skip
     parts = (_AVERAGE, KnownShape(), ReferenceWindow())
 
     def decide(self, case: Case) -> Decisions:
@@ -252,6 +255,7 @@ class _Inversion(RowProduct):
             reference=data[REFERENCE],
             known_shape=data.get(KNOWN_SHAPE) is True,
             overlap=None if overlap is None else overlap(averages["range"].to_numpy()),
+            overlap_is_stated=data.get(FULL_OVERLAP_RANGE) is not None,
         )
         least = settings.least_signal_to_noise
         return with_low_signal_to_noise(inverted, LAYOUT.weighed, least).assign(gluing(averages))

@@ -253,9 +253,9 @@ LAYOUT: Final = Layout(
             long_name="least ratio of backscatter of particles to that of molecules in the"
             " reference window that other windows show with a probability of 0.95",
             coverage=Coverage.AUXILIARY,
-            comment="Fewer particles may remain undetected: backscatter_error_reference includes"
-            " them. Missing where no window passed the tests, or none beside it is"
-            f" comparable. {NO_STANDARD_NAME}",
+            comment="Fewer particles may remain undetected: aerosol_backscatter_error_reference"
+            " states 1.5 standard errors of the comparison for them. Missing where no window passed"
+            f" the tests, or none beside it is comparable. {NO_STANDARD_NAME}",
         ),
         Row(
             name="reference_rejections",

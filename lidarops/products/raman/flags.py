@@ -9,7 +9,7 @@ from lidarops.retrieve.raman.flags import RamanQuality
 
 FLAGS: Final = Flags(
     kind="raman",
-    version=2,
+    version=1,
     bits=(
         Quality.INPUT_MISSING,
         Quality.SATURATED,

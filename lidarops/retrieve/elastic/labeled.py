@@ -46,6 +46,7 @@ _WITHHELD: Final = int(
     Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
 )
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
+_INCOMPLETE_OVERLAP: Final = np.int32(Quality.INCOMPLETE_OVERLAP)
 _UNKNOWN_OVERLAP: Final = np.int32(ElasticQuality.UNKNOWN_OVERLAP)
 
 
@@ -106,6 +107,7 @@ def invert_elastic(
     reference: Reference,
     known_shape: bool = True,
     overlap: Array | None = None,
+    overlap_is_stated: bool = True,
 ) -> xr.Dataset:
     """Return aerosol backscatter and extinction of mean profiles.
 
@@ -133,6 +135,9 @@ def invert_elastic(
         bins.
     overlap : (range,) float, optional
         Overlap function, by which the signal is divided; NaN where it is not known.
+    overlap_is_stated : bool
+        If false, a layer that begins before the search range of the reference window is a cloud
+        only where clean air beyond shows that the overlap is full below it.
 
     Returns
     -------
@@ -155,7 +160,9 @@ def invert_elastic(
     ratio, ratio_error = lidar_ratio(station_altitude + climb * distance)
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
     means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
-    signal, clouds = _signal_and_clouds(means, reference, known_shape=known_shape)
+    signal, clouds = _signal_and_clouds(
+        means, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
+    )
     window = _window(signal, means, reference, clouds.mask)
     solution = _elastic.invert_elastic(
         signal.power,
@@ -255,12 +262,6 @@ class _Means:
         self.noise = np.where(bridged.outlying, bridged.variance, self.noise)
         self.quality = self.quality | np.where(bridged.outlying, _OUTLIER, np.int32(0))
 
-    @property
-    def overlap_is_stated(self) -> Mask:
-        """Whether the campaign states where the overlap is full, or the overlap, (time,)."""
-        stated = (self.quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
-        return np.asarray(stated.any(axis=-1) | np.any(self.overlap != 1.0))
-
     def minus(self, background: Array) -> Array:
         """Return the signal without background, corrected for overlap."""
         power = (self.raw - background[:, np.newaxis]) / self.overlap
@@ -293,7 +294,7 @@ class _Means:
 
 
 def _signal_and_clouds(
-    means: _Means, reference: Reference, *, known_shape: bool
+    means: _Means, reference: Reference, *, known_shape: bool, overlap_is_stated: bool
 ) -> tuple[_Signal, _layers.Layers]:
     """Return signals without background, and their clouds, with incomplete overlap flagged."""
     signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
@@ -301,14 +302,19 @@ def _signal_and_clouds(
     if not near.any():
         return signal, clouds
     window = _window(signal, means, reference, clouds.mask & ~near)
-    # Without clean air to compare with, a rise is as well that of an overlap that is not stated.
-    doubtful = near & ~(window.chosen | means.overlap_is_stated)[:, np.newaxis]
-    partial = _overlap_bits(means, signal, near, window)
+    ratio, error = means.ratio_to_air(signal.power)
+    partial = _less_than_air(ratio, error, near, window, means.distance)
     if partial.any():
-        means.quality = means.quality | partial
+        means.quality = means.quality | np.where(partial, _INCOMPLETE_OVERLAP, np.int32(0))
+        clouds = _signal_beyond_clouds(means, known_shape=known_shape)[1]
+        means.quality = means.quality | _overlap_bits(ratio, partial, clouds.mask, window, means)
         signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
+    if overlap_is_stated:
+        return signal, clouds
+    # Without clean air to compare with, a rise may as well be that of the overlap.
+    doubtful = near & ~window.chosen[:, np.newaxis]
     means.quality = means.quality | np.where(doubtful, _UNKNOWN_OVERLAP, np.int32(0))
-    return signal, clouds.without(doubtful, means.distance)
+    return signal, _layers.Layers.of(clouds.mask & ~doubtful, means.distance)
 
 
 def _signal_beyond_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _layers.Layers]:
@@ -330,35 +336,49 @@ def _signal_beyond_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal,
     return signal, means.find_clouds(signal.power)
 
 
-def _overlap_bits(
-    means: _Means, signal: _Signal, near: Mask, window: _reference.ReferenceWindow
-) -> Flags:
-    """Return the bits of overlap where the signal rises from less than clean air gives.
+def _less_than_air(
+    ratio: Array, error: Array, near: Mask, window: _reference.ReferenceWindow, distance: Array
+) -> Mask:
+    """Return the bins up to the last one before the window with less light than its air gives.
 
-    A layer that begins before the search range of the window is no cloud if the ratio to air below
-    it is less than in the window. The overlap is incomplete up to the largest ratio to air,
-    and may be so farther away, where particles decrease.
+    Empty where no layer of `near` begins beyond such a bin: other causes lessen the signal, too.
     """
-    ratio, error = means.ratio_to_air(signal.power)
-    scale, scale_error = (
-        values[:, np.newaxis] for values in (window.scale, window.scale_standard_error)
+    level, level_error, bottom = (
+        values[:, np.newaxis]
+        for values in (window.scale, window.scale_standard_error, window.bottom)
     )
-    deficit = scale - ratio > THRESHOLDS.negative * np.hypot(error, scale_error)
-    bases = np.diff(near.astype(np.int8), axis=-1, prepend=0) == 1
-    below = np.logical_or.accumulate(deficit, axis=-1)
-    has_rise = np.any(bases & below, axis=-1, keepdims=True)
+    less = level - ratio > THRESHOLDS.negative * np.hypot(error, level_error)
+    less &= distance < bottom
+    nearer = np.logical_or.accumulate(less, axis=-1)
+    rises = np.any(_begins(near) & nearer, axis=-1, keepdims=True)
+    return np.asarray(rises & np.logical_or.accumulate(less[:, ::-1], axis=-1)[:, ::-1])
+
+
+def _overlap_bits(
+    ratio: Array, partial: Mask, clouds: Mask, window: _reference.ReferenceWindow, means: _Means
+) -> Flags:
+    """Return the bits of overlap of profiles in which it is partial.
+
+    It is incomplete up to the largest ratio to air below the first cloud, and may be so farther
+    away, where particles decrease.
+    """
     before = means.distance < np.nan_to_num(window.bottom)[:, np.newaxis]
-    highest = np.where(before, np.nan_to_num(ratio, nan=-np.inf), -np.inf).argmax(axis=-1)
-    partial = np.arange(means.distance.size) < highest[:, np.newaxis]
-    bits = np.where(partial, np.int32(Quality.INCOMPLETE_OVERLAP), _UNKNOWN_OVERLAP)
-    return np.where(before & has_rise, bits, 0).astype(np.int32)
+    clear = before & ~np.logical_or.accumulate(clouds, axis=-1)
+    highest = np.where(clear, np.nan_to_num(ratio, nan=-np.inf), -np.inf).argmax(axis=-1)
+    nearer = np.arange(ratio.shape[-1]) < highest[:, np.newaxis]
+    bits = np.where(nearer, _INCOMPLETE_OVERLAP, _UNKNOWN_OVERLAP)
+    return np.where(before & partial.any(axis=-1, keepdims=True), bits, 0).astype(np.int32)
 
 
 def _begin_before(mask: Mask, near: Mask) -> Mask:
     """Return whether the last run of a mask that began up to a bin began near."""
-    begins = np.diff(mask.astype(np.int8), axis=-1, prepend=0) == 1
-    begin = np.maximum.accumulate(np.where(begins, np.arange(near.size), 0), axis=-1)
-    return np.asarray(near[begin])
+    begin = np.where(_begins(mask), np.arange(near.size), 0)
+    return np.asarray(near[np.maximum.accumulate(begin, axis=-1)])
+
+
+def _begins(mask: Mask) -> Mask:
+    """Return the first bins of the runs of a mask."""
+    return np.asarray(np.diff(mask.astype(np.int8), axis=-1, prepend=0) == 1)
 
 
 def _subtract_background(means: _Means, usable: Mask, *, known_shape: bool) -> _Signal:

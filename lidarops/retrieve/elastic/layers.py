@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numba
@@ -43,11 +43,11 @@ class Layers:
     top."""
     cloudy: Mask
 
-    def without(self, bins: Mask, distance: Array) -> Layers:
-        """Return the layers without those in some bins, (..., range), of a range grid in m."""
-        mask = self.mask & ~bins
+    @classmethod
+    def of(cls, mask: Mask, distance: Array) -> Layers:
+        """Return the layers that a mask marks, (..., range), along an ascending distance in m."""
         cloudy = np.asarray(mask.any(axis=-1))
-        return Layers(np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan), mask, cloudy)
+        return cls(np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan), mask, cloudy)
 
 
 def find_layers(
@@ -133,13 +133,8 @@ def find_layers(
         frozen(-float(ndtri(rate)) * _excess_noise(values, noise, lengths)),
         mask,
     )
-    cloudy = mask.any(axis=-1)
-    base = np.where(cloudy, grid.values[np.argmax(mask, axis=-1)], np.nan)
-    return Layers(
-        cloud_base_range=base.reshape(leading),
-        mask=grid.turn(mask.reshape(*leading, grid.size)),
-        cloudy=cloudy.reshape(leading),
-    )
+    layers = Layers.of(mask.reshape(*leading, grid.size), grid.values)
+    return replace(layers, mask=grid.turn(layers.mask))
 
 
 def _excess_noise(power: Array, variance: Array, lengths: Array) -> Array:
