@@ -481,7 +481,7 @@ class Unmade:
 
 
 @dataclass(frozen=True, slots=True)
-class IdleFacts:
+class FactsNote:
     """Facts that no file or product uses, or that lack what products need."""
 
     instrument: str
@@ -512,8 +512,8 @@ class Findings:
     idle_patterns: tuple[IdlePattern, ...] = ()
     unusable_files: tuple[UnusableFile, ...] = ()
     unmade: tuple[Unmade, ...] = ()
-    idle_facts: tuple[IdleFacts, ...] = ()
-    incomplete_facts: tuple[IdleFacts, ...] = ()
+    idle_facts: tuple[FactsNote, ...] = ()
+    incomplete_facts: tuple[FactsNote, ...] = ()
 
     @property
     def failed(self) -> bool:

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.records import ChannelLayout, Holding, IdleFacts, LeftOut, Unmet, is_glued
+from lidarops.records import ChannelLayout, FactsNote, Holding, LeftOut, Unmet, is_glued
 from lidarops.steps.channels import LAG_STEP, READ_STEP, glued_parts, joined_layout
 
 FACTS: Final = "facts"
@@ -68,7 +68,7 @@ def missing_channels(
 
 def unused_lidar_ratios(
     name: str, facts: InstrumentFacts, instrument: Instrument
-) -> Iterator[IdleFacts]:
+) -> Iterator[FactsNote]:
     """Yield the lidar ratios of analog channels that a glued channel does not take.
 
     Parameters
@@ -84,7 +84,7 @@ def unused_lidar_ratios(
         of_analog, of_photon = (_has_lidar_ratio(facts, part) for part in (analog, photon))
         if of_analog and not of_photon and analog not in named:
             reason = f"not used: {glued} takes the lidar ratio of {photon}"
-            yield IdleFacts(name, f"lidar ratio of {analog}", reason)
+            yield FactsNote(name, f"lidar ratio of {analog}", reason)
 
 
 def _has_lidar_ratio(facts: InstrumentFacts, channel: str) -> bool:

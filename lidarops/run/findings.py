@@ -8,7 +8,7 @@ from typing import Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan import availability
-from lidarops.records import Findings, IdleFacts, IdlePattern, Role, Unmade, Unmet, UnusableFile
+from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, Unmet, UnusableFile
 from lidarops.run.selection import Selection, station_of
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps import dependence
@@ -18,7 +18,7 @@ from lidarops.steps.step import REQUEST
 
 _NO_OVERLAP: Final = (
     "give neither full_overlap_range nor overlap_profile: bins near the lidar are used as they are,"
-    " and a cloud below the reference window may be an overlap that becomes full"
+    " and a rise of the signal there is no cloud unless clean air beyond shows that"
 )
 
 
@@ -89,18 +89,18 @@ def _unmet(
 
 def _incomplete_facts(
     campaign: Campaign, store: Store, instruments: Iterable[str]
-) -> Iterator[IdleFacts]:
+) -> Iterator[FactsNote]:
     """Yield the facts of instruments with files that state no overlap."""
     for name in instruments:
         for facts in campaign.instruments[name].facts:
             stated = facts.full_overlap_range or facts.overlap_profile
             if not stated and store.has_files(name, facts.valid_from, facts.valid_to):
-                yield IdleFacts(name, availability.period_of(facts), _NO_OVERLAP)
+                yield FactsNote(name, availability.period_of(facts), _NO_OVERLAP)
 
 
 def _idle_facts(
     campaign: Campaign, store: Store, instruments: Iterable[str]
-) -> Iterator[IdleFacts]:
+) -> Iterator[FactsNote]:
     """Yield the facts that no file or product uses, of instruments with files."""
     for name in instruments:
         instrument = campaign.instruments[name]
@@ -111,7 +111,7 @@ def _idle_facts(
                 yield from availability.unused_lidar_ratios(name, facts, instrument)
             else:
                 reason = "hold for no file: their period and the times of the files do not overlap"
-                yield IdleFacts(name, availability.period_of(facts), reason)
+                yield FactsNote(name, availability.period_of(facts), reason)
 
 
 def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[UnusableFile]:
