@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -11,42 +12,58 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
+from scipy.special import ndtri
 
+from lidarops.errors import ProductError
+from lidarops.flags import Severity
 from lidarops.kinds import kinds
 from lidarops.netcdf.read import open_product
 from lidarops.records import Disagreement, ProductRecord
 
-_MOST_DEVIATION: Final = 4.0
-"""Standard errors of a difference beyond which noise does not explain it: 6e-5 of normal ones."""
-_REJECTED: Final = 2
-"""Value of ``usable``."""
+_FALSE_ALARM: Final = 1e-3
+"""Probability that noise makes a pair of channels disagree, at all places of a profile together."""
 
 
 def find_disagreements(products: Sequence[ProductRecord], root: Path) -> tuple[Disagreement, ...]:
     """Return the channels of a scene whose products disagree about what they measure alike.
 
-    Differences are averaged over the times of the scene at which both values are usable. So are
-    their errors, because those of inhomogeneous air are common to all times.
+    New products are compared with each other and with those of other channels of the scene, which
+    may be older. Differences are averaged over the times at which both values are usable. So are
+    their errors, because those of inhomogeneous air are common to all times. Files that cannot be
+    read are left out.
 
     Parameters
     ----------
     products : sequence of ProductRecord
-        Of one scene.
+        New products of one scene.
     root : Path
         Of all products.
     """
     disagreements: list[Disagreement] = []
     for kind in kinds().values():
-        of_kind = {p.channel: root / p.path for p in products if p.kind == kind.name}
-        if kind.common and len(of_kind) > 1:
-            disagreements += _name_outliers(list(_compare(kind.name, kind.common, of_kind)))
+        new = [product for product in products if product.kind == kind.name]
+        if kind.common and new:
+            paths = _of_all_channels(new[0], root)
+            disagreements += _name_outliers(list(_compare(kind.name, kind.common, paths)))
     return tuple(disagreements)
+
+
+def _of_all_channels(product: ProductRecord, root: Path) -> dict[str, Path]:
+    """Return channel -> file of the products of the scene and kind of a product."""
+    path = root / product.path
+    begin, end = path.name.split(f"{product.kind}_{product.channel}", 1)
+    begin += f"{product.kind}_"
+    files = sorted(path.parent.glob(f"{begin}*{end}"))
+    return {file.name.removeprefix(begin).removesuffix(end): file for file in files}
 
 
 def _compare(kind: str, common: tuple[str, str], paths: dict[str, Path]) -> Iterator[Disagreement]:
     """Yield the pairs of channels of a wavelength that disagree."""
     variable, along = common
-    profiles = {channel: _usable_values(path, variable, along) for channel, path in paths.items()}
+    profiles = {}
+    for channel, path in paths.items():
+        with suppress(ProductError):
+            profiles[channel] = _usable_values(path, variable, along)
     for pair in combinations(profiles, 2):
         first, second = xr.align(*(profiles[channel] for channel in pair), join="inner")
         if first["wavelength"] != second["wavelength"] or not first[along].size:
@@ -55,14 +72,16 @@ def _compare(kind: str, common: tuple[str, str], paths: dict[str, Path]) -> Iter
         error = ((first["error"] ** 2 + second["error"] ** 2) ** 0.5).where(difference.notnull())
         deviation = abs(difference.mean("time") / error.mean("time")).fillna(0.0)
         largest = deviation[int(deviation.to_numpy().argmax())]
-        if largest > _MOST_DEVIATION:
+        if largest > -ndtri(0.5 * _FALSE_ALARM / deviation.size):
             yield Disagreement(kind, pair, "", float(largest[along]), float(largest))
 
 
 def _usable_values(path: Path, variable: str, along: str) -> xr.Dataset:
     names = (variable, f"{variable}_standard_error")
     with open_product(path, (*names, along, "time", "usable", "wavelength")) as product:
-        usable = product["usable"].load() < _REJECTED
+        if not {*names, along, "usable", "wavelength"} <= set(product.variables):
+            raise ProductError("lacks variables", file=path, field=variable)
+        usable = product["usable"].load() < Severity.REJECT
         value, error = (product[name].astype(np.float64).where(usable) for name in names)
         wavelength = float(product["wavelength"])
         return xr.Dataset({"value": value, "error": error, "wavelength": wavelength}).load()

@@ -257,8 +257,12 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     from lidarops.run.agreement import find_disagreements  # noqa: PLC0415
 
     outcome, final = scene.attempt(job)
-    disagreements = find_disagreements(outcome.products, job.campaign.products_root)
-    return replace(outcome, disagreements=disagreements), final
+    products, root = outcome.products, job.campaign.products_root
+    compared = guarded(lambda: find_disagreements(products, root))
+    if isinstance(compared, Failure):
+        # The products are written and stay recorded.
+        return replace(outcome, error=compared.error, internal=compared.internal), compared.final
+    return replace(outcome, disagreements=compared), final
 
 
 def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:

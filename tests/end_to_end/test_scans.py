@@ -127,7 +127,7 @@ def test_a_fixed_beam_is_not_a_scan(tmp_path):
 
 
 def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
-    """The dead time of one polarisation is stated wrongly, as if it were known well."""
+    """The range offset of one channel is stated wrongly."""
     lidar, scanner = TREE["instruments"]["scanner"], TREE["simulation"]["instruments"]["scanner"]
     (detector,) = scanner["detectors"]
     analog = {"analog": {"gain": 0.5, "noise": 0.02, "dark_offset": 2.0}}
@@ -137,11 +137,11 @@ def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
     ]
     names = ["photon_532p", "analog_532p", "photon_532s"]
 
-    def tree(dead_time: float) -> dict[str, Any]:
-        channels = {"photon_532p": 3e-9, "photon_532s": dead_time}
+    def tree(range_offset: float) -> dict[str, Any]:
+        counting = {"dead_time": 3e-9, "dead_time_uncertainty": 0.01}
         facts = {
-            name: {"dead_time": seconds, "dead_time_uncertainty": 0.01}
-            for name, seconds in channels.items()
+            "photon_532p": counting,
+            "photon_532s": counting | {"range_offset": range_offset},
         }
         products = {"multiangle": lidar["products"]["multiangle"] | {"channels": names}}
         changed = lidar | {
@@ -151,16 +151,19 @@ def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
         instruments = {"scanner": scanner | {"detectors": detectors}}
         return TREE | {
             "instruments": {"scanner": changed},
-            "output": f"out-{dead_time}",
             "simulation": TREE["simulation"] | {"duration": 600, "instruments": instruments},
         }
 
     path = tmp_path / "scans.yaml"
-    for dead_time, outliers in ((3e-9, set()), (9e-9, {"photon_532s"})):
-        path.write_text(yaml.safe_dump(tree(dead_time)), encoding="utf-8")
+    for range_offset, outliers in ((0.0, set()), (40.0, {"photon_532s"})):
+        path.write_text(yaml.safe_dump(tree(range_offset)), encoding="utf-8")
         settings = load_campaign(path)
         if not outliers:
             simulate_campaign(settings)
+        else:
+            # What is no product is no witness.
+            (product,) = settings.products_root.rglob("*photon_532p*.nc")
+            product.with_name(product.name.replace("532p", "532o")).write_bytes(b"")
         run = reprocess(settings)
         pairs = run.scenes[0].disagreements
         assert {pair.outlier for pair in pairs} == outliers
@@ -169,6 +172,20 @@ def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
         rows = list(disagreement_rows(run.scenes))
         assert len(rows) == len(pairs)
         assert all("photon_532s disagrees with the others too" in row.problem for row in rows)
+    # Only the channel of the changed fact was made again.
+    assert [product.channel for product in run.scenes[0].products] == ["photon_532s"]
+
+
+def test_products_stay_recorded_where_their_comparison_fails(tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("lidarops.run.agreement.find_disagreements", fail)
+    settings, _ = campaign(tmp_path, duration=400)
+    (outcome,) = reprocess(settings).scenes
+    assert "ZeroDivisionError" in outcome.internal
+    (product,) = outcome.products
+    assert (settings.products_root / product.path).is_file()
 
 
 @pytest.mark.slow
