@@ -144,6 +144,9 @@ def _difference(old: Values, new: Values, error: Values | None, fill: object) ->
         # Bits and counts have no size; values came or went.
         return math.inf, count
     before, after = (np.float64(values[differs]) for values in (old, new))
+    if not (np.isfinite(before) & np.isfinite(after)).all():
+        # The distance from an infinite bound has no size: inf / inf is NaN.
+        return math.inf, count
     scale = np.abs(before)
     if error is not None:
         scale = np.where(_missing(error, fill)[differs], scale, np.float64(error[differs]))

@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
 from support.products.encoded_products import build_product
-from support.products.made_products import context, homogeneous, provenance
+from support.products.made_products import context, homogeneous, provenance, visibility
 
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.write import write_product
@@ -73,6 +74,23 @@ def test_a_value_that_goes_is_major(tmp_path: Path):
     assert change.grade is Grade.MAJOR
     assert math.isinf(change.largest)
     assert change.as_dict()["largest"] is None
+
+
+@pytest.mark.parametrize("bound", [math.inf, -math.inf])
+@pytest.mark.parametrize("changed", [0, 1])
+def test_a_bound_that_becomes_infinite_or_finite_is_major(
+    bound: float, changed: int, tmp_path: Path
+):
+    """An interval may be unbounded, as that of visibility in clear air."""
+    name = "visibility_in_air_upper"
+    files = [
+        written(tmp_path / file, visibility(), kind="visibility") for file in ("old.nc", "new.nc")
+    ]
+    with netCDF4.Dataset(files[changed], "a") as product:
+        product[name][2, 1] = bound
+    change = compare_products(*files)
+    assert (change.grade, change.variable) == (Grade.MAJOR, name)
+    assert math.isinf(change.largest)
 
 
 def test_another_text_is_minor(tmp_path: Path):
