@@ -241,7 +241,8 @@ def reprocess(
     try:
         if result.record is not None:
             page = _page(settings, result.record, options.workers)
-        earlier = _earlier_pages(settings, result.record, options.workers)
+        own = "" if result.record is None else result.record.id
+        earlier = pipeline.report_earlier_runs(settings, without=own, workers=options.workers)
         report_note = missing_report(settings) if result.record is None else ""
         if remove_orphans:
             removed = pipeline.remove_orphans(settings, result, wait=wait)
@@ -275,21 +276,6 @@ def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
     except LidarOpsError as error:
         show_error(error)
         return None
-
-
-def _earlier_pages(campaign: Campaign, run: RunRecord | None, workers: int) -> list[Path]:
-    """Build the missing pages of earlier runs; if that fails, show the error."""
-    from lidarops.run.archive import report_earlier_runs
-
-    pages: list[Path] = []
-    try:
-        for page in report_earlier_runs(
-            campaign, without="" if run is None else run.id, workers=workers
-        ):
-            pages.append(page)  # noqa: PERF402 - those before an error count
-    except LidarOpsError as error:
-        show_error(error)
-    return pages
 
 
 def _cluster(

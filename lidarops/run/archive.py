@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -17,11 +18,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import versions
-from lidarops.catalog.ledger import RunStatus, Verdict
+from lidarops.catalog.ledger import Run, RunStatus, Verdict
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, LidarOpsError
 from lidarops.process.job import Job
 from lidarops.records import Findings, Granule, RunRecord
 from lidarops.reports import run_record
@@ -69,6 +70,8 @@ other days are only counted."""
 
 MOST_RUNS_REPORTED: Final = 20
 """Last runs whose missing reports are made; older ones are left to ``lidarops report``."""
+DRAWING: Final = timedelta(hours=1)
+"""Time after its end in which the page of a run is left to the process of that run; assumed."""
 
 _WORKER_MODULES: Final = (
     "distributed.nanny",
@@ -665,10 +668,11 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> RunRe
     return run_page.build_report(run, folder, workers=workers)
 
 
-def report_earlier_runs(
-    campaign: Campaign, *, without: str = "", workers: int = 1
-) -> Iterator[Path]:
-    """Build the missing report pages of runs that were killed or met a full disk; yield them.
+def report_earlier_runs(campaign: Campaign, *, without: str = "", workers: int = 1) -> list[Path]:
+    """Build the missing report pages of runs that were killed or met a full disk; return them.
+
+    A record that cannot be read, and a page that cannot be made, is logged and left. While another
+    run holds the catalog, nothing is built.
 
     Parameters
     ----------
@@ -678,10 +682,40 @@ def report_earlier_runs(
         Id of a run that is left out.
     workers : int, optional
     """
-    with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        runs = store.runs(limit=MOST_RUNS_REPORTED)
-    for run in runs:
-        folder = campaign.report_root / run.id
-        unreported = run_record.exists(folder) and not (folder / run_record.INDEX).exists()
-        if unreported and run.id != without and run.status is not RunStatus.RUNNING:
-            yield report_run(campaign, run_record.load_run_record(folder), workers=workers).page
+    pages = []
+    with Store(campaign.catalog_url, campaign.name, create=False) as store, Lock(store) as lock:
+        runs = [
+            run
+            for run in store.runs(limit=MOST_RUNS_REPORTED)
+            if run.id != without and not _is_at_work(run) and _lacks_page(campaign, run)
+        ]
+        if not runs:
+            return []
+        try:
+            lock.acquire()
+        except CatalogError as error:
+            _LOG.info("the next run reports earlier ones: %s", error)
+            return []
+        for run in runs:
+            try:
+                # Another process may have reported it before this one had the lock.
+                if _lacks_page(campaign, run):
+                    record = run_record.load_run_record(campaign.report_root / run.id)
+                    pages.append(report_run(campaign, record, workers=workers).page)
+            except LidarOpsError as error:
+                _LOG.warning("run %s has no report: %s", run.id, error)
+    return pages
+
+
+def _lacks_page(campaign: Campaign, run: Run) -> bool:
+    """Return whether a run has a record and no page."""
+    folder = campaign.report_root / run.id
+    return run_record.exists(folder) and not (folder / run_record.INDEX).exists()
+
+
+def _is_at_work(run: Run) -> bool:
+    """Return whether the process of a run works on it, or may yet draw its page."""
+    if run.status is RunStatus.RUNNING:
+        return True
+    recent = run.finished is not None and datetime.now(UTC) - run.finished < DRAWING
+    return recent and run.holder != Lock.holder_name()

@@ -17,6 +17,7 @@ from lidarops.catalog import versions
 from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
 from lidarops.records import (
     Findings,
     Granule,
@@ -27,6 +28,7 @@ from lidarops.records import (
     SceneOutcome,
 )
 from lidarops.reports.run_journal import Journal
+from lidarops.reports.run_record import save_run_record
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps.dependence import ProductKey
 from lidarops.system.code_version import joint_code_version
@@ -188,15 +190,25 @@ class Session:
         # A worker may have been killed, too.
         self._sweep()
         refused = (*self._store.refused(), *set_aside)
-        self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
-        _LOG.info("run %s %s: %d scenes", self.id, status.value, len(self._outcomes))
         listed = dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES))
-        return replace(
+        record = replace(
             self._record(refused, findings),
             scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
             empty_scenes=listed,
             more_empty_scenes=len(empty_scenes or {}) - len(listed),
         )
+        if self._journal:
+            self._save(record)
+        self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
+        _LOG.info("run %s %s: %d scenes", self.id, status.value, len(self._outcomes))
+        return record
+
+    def _save(self, record: RunRecord) -> None:
+        """Save the record before the run has ended: another process may then report it."""
+        try:
+            save_run_record(record, self._campaign.report_root / self.id)
+        except CatalogError as error:
+            _LOG.warning("the journal of the run stays: %s", error)
 
     def _record(self, refused: tuple[Granule, ...], findings: Findings) -> RunRecord:
         """Return the record of the run without its scenes."""

@@ -7,7 +7,7 @@ import json
 import os
 import sqlite3
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import NoReturn
 
 import pytest
@@ -550,6 +550,61 @@ def test_a_killed_run_is_reported_by_the_next_one(archive: Archive) -> None:
     (page,) = (archive.folder / "out/report").glob("*/index.html")
     assert f"report of an earlier run: {page}" in shown.stdout
     assert "poor_20260301T000000" in page.read_text()
+
+
+def test_a_record_that_cannot_be_read_keeps_no_other_page_from_being_made(
+    archive: Archive,
+) -> None:
+    for day in range(3):
+        archive.raw(f"poor/h{day}9", day * DAY + 630, seed=9)
+        _reprocess_without_page(archive)
+    old, empty, foreign = sorted((archive.folder / "out/report").glob("*"))
+    for record in (empty / run_record.FILE_NAME, foreign / run_record.FILE_NAME):
+        record.unlink()
+    (empty / run_journal.FILE_NAME).touch()
+    document = {"format": "lidarops run record", "version": 3}
+    (foreign / run_record.FILE_NAME).write_text(json.dumps(document))
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
+    assert shown.exit_code == 0
+    assert json.loads(shown.stdout)["earlier_reports"] == [str(old / "index.html")]
+    for folder in (empty, foreign):
+        assert f"run {folder.name} has no report" in shown.stderr
+
+
+def _reprocess_without_page(archive: Archive) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gallery, "fill", _full)
+        CliRunner().invoke(app, ["reprocess", str(archive.file)])
+
+
+def test_the_record_of_a_run_is_saved_before_others_see_that_it_has_ended(
+    archive: Archive,
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Store, "end_run", _stopped)
+        with pytest.raises(KeyboardInterrupt):
+            bring_up_to_date(archive.write(), options=Options(journal=True))
+    (folder,) = (archive.folder / "out/report").glob("*")
+    record = run_record.load_run_record(folder)
+    assert not record.cut_short
+    assert [scene.scene for scene in record.scenes] == ["poor_20260301T000000"]
+
+
+def test_a_page_that_another_process_may_draw_is_left_to_it(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    campaign = archive.write()
+    with monkeypatch.context() as patch:
+        patch.setattr(Lock, "holder_name", staticmethod(lambda: "me@elsewhere process 1"))
+        _reprocess_without_page(archive)
+    assert pipeline.report_earlier_runs(campaign) == []
+    monkeypatch.setattr(pipeline, "DRAWING", timedelta())
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        assert pipeline.report_earlier_runs(campaign) == []
+    assert len(pipeline.report_earlier_runs(campaign)) == 1
 
 
 def test_temporary_files_of_a_killed_run_are_named_by_verify_and_removed_by_the_next_run(
