@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,9 @@ from lidarops.errors import CatalogError
 
 FOLDER: Final = "superseded"
 """Folder of kept versions, below the output folder."""
+BUILDING: Final = 3600.0
+"""s for which a temporary file of a report is left alone: reports are built outside the lock, and
+one of their files is written within seconds; assumed."""
 
 _NO_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.EXDEV, errno.EMLINK, errno.ENOSYS})
 
@@ -94,9 +98,21 @@ def sweep(output: Path) -> list[str]:
 
 
 def temporary_files(output: Path) -> Iterator[Path]:
-    """Yield the hidden temporary files among products and reports."""
+    """Yield the hidden temporary files among products and reports that no living process writes.
+
+    A run must not be at work, but somebody may build a report.
+    """
     for kept in ("products", FOLDER, "report"):
         for folder, _, names in os.walk(output / kept):
             for name in names:
-                if name.startswith(".") and name.endswith(".tmp"):
-                    yield Path(folder, name)
+                path = Path(folder, name)
+                temporary = name.startswith(".") and name.endswith(".tmp")
+                if temporary and (kept != "report" or _is_old(path)):
+                    yield path
+
+
+def _is_old(path: Path) -> bool:
+    try:
+        return time.time() - path.stat().st_mtime > BUILDING
+    except OSError:
+        return False

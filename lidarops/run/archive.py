@@ -139,6 +139,9 @@ def bring_up_to_date(
         Lock(store, wait=options.wait) as lock,
         objects_frozen(),
     ):
+        if not options.wait and store.in_use():
+            # At once: "nothing to do" would not count what the other run is about to do.
+            raise lock.refusal()
         while True:
             try:
                 return _Pass(campaign, store, lock, selection, options).carry_out(client)
@@ -291,6 +294,8 @@ class _Pass:
     """Of the scenes that are yet to end."""
     suspects: list[Job] = field(default_factory=list)
     session: Session | None = None
+    lost_worker: bool = False
+    """Whether a worker died, or was abandoned at a stop."""
     failing: int = 0
     """Number of scenes in a row that failed for a cause that may pass."""
 
@@ -318,6 +323,7 @@ class _Pass:
                 caught = stop.signal
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
+                    self.lost_worker = True
             self._settle(signatures)
         self._clear_up()
         orphans = {orphan.path for orphan in self.gathered.orphans}
@@ -418,6 +424,7 @@ class _Pass:
         for scene in ended:
             judged = self.judgements.pop(scene.outcome.scene)
             outcome = session.end(judged, scene.outcome, final=scene.final)
+            self.lost_worker = self.lost_worker or scene.lost_worker
             if not scene.refused:
                 self.failing = self.failing + 1 if outcome.error and not scene.final else 0
             if self.failing >= MOST_FAILURES_IN_A_ROW:
@@ -567,7 +574,11 @@ class _Pass:
             judged.scene.id: judged.empty_reason for judged in self.gathered.empty_scenes
         }
         return self.session.finish(
-            status, self.gathered.set_aside, findings, empty_scenes=empty_scenes
+            status,
+            self.gathered.set_aside,
+            findings,
+            empty_scenes=empty_scenes,
+            lost_worker=self.lost_worker,
         )
 
 

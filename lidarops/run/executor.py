@@ -75,6 +75,8 @@ class EndedScene:
     """Whether another try on the same inputs would end the same way."""
     refused: bool = False
     """Whether it was not read, because it does not fit into the memory limit."""
+    lost_worker: bool = False
+    """Whether a worker died of it, which may have left half a file."""
 
     @classmethod
     def failed(cls, failure: Failure, scene: Scene, plan: Plan) -> Self:
@@ -292,7 +294,7 @@ def process_one_by_one(
     """
     workers = _Workers(client)
     for job in jobs:
-        for _ in range(MOST_TRIES):
+        for tries in range(MOST_TRIES):
             workers.ready(stop)
             if stop:
                 return
@@ -301,11 +303,12 @@ def process_one_by_one(
             ended = _outcome_of(future, job)
             future.release()
             if ended is not None:
-                yield ended
+                yield replace(ended, lost_worker=tries > 0)
                 break
         else:
             reason = f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
-            yield EndedScene.failed(Failure(reason), job.scene, job.plan)
+            failed = EndedScene.failed(Failure(reason), job.scene, job.plan)
+            yield replace(failed, lost_worker=True)
 
 
 def _submit(client: Client, job: Job) -> Future:
@@ -423,7 +426,8 @@ class _ClusterQueue:
                 self._suspects.append(job)
             else:
                 yield ended
-        yield from process_one_by_one(self._suspects, client=self._client, stop=self._stop)
+        for ended in process_one_by_one(self._suspects, client=self._client, stop=self._stop):
+            yield replace(ended, lost_worker=True)
 
     def _fill(self, source: Iterator[Job]) -> None:
         room = max(LEAST_SCENES_AHEAD, SCENES_PER_THREAD * self._workers.count())

@@ -175,6 +175,7 @@ class Session:
         findings: Findings,
         *,
         empty_scenes: Mapping[str, str] | None = None,
+        lost_worker: bool = False,
     ) -> RunRecord:
         """Close the run in the ledger and return its record.
 
@@ -186,9 +187,11 @@ class Session:
         findings : Findings
         empty_scenes : mapping of str to str, optional
             Scene -> why it can give no product.
+        lost_worker : bool, optional
+            Whether a worker may have left half a file.
         """
-        # A worker may have been killed, too.
-        self._sweep()
+        if lost_worker:
+            self._sweep()
         refused = (*self._store.refused(), *set_aside)
         listed = dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES))
         record = replace(

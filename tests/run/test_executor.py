@@ -15,7 +15,7 @@ from distributed.core import Status
 from distributed.deploy.spec import SpecCluster
 from support.archives.scene_jobs import catalogued_scenes, scene_jobs
 from support.archives.small_archive import Archive, made
-from support.poison import Poison
+from support.poison import HALF, Poison
 
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -106,6 +106,7 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
     assert set(result.failures) == {scene}
     assert "died 3 times" in result.failures[scene]
     assert "its worker died" in caplog.text
+    assert not (campaign.products_root / HALF).exists()
     # lidarops tried the scene again; it had not failed yet.
     assert "marked as failed" not in caplog.text
     assert logging.getLogger("distributed.scheduler").level == before

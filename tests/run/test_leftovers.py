@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import sqlite3
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from typing import NoReturn
@@ -14,6 +15,7 @@ import pytest
 from support.archives.small_archive import DAY, Archive
 from typer.testing import CliRunner
 
+from lidarops.catalog import versions
 from lidarops.catalog.ledger import Run, RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
@@ -631,9 +633,31 @@ def test_temporary_files_of_a_run_at_work_are_left_alone(archive: Archive) -> No
         lock.acquire()
         run = Run("works", FIRST, None, RunStatus.RUNNING, "me", "0", "0", "", "")
         store.begin_run(run, lock.token)
-        assert reprocess(campaign) is None
+        assert reprocess(campaign, options=Options(wait=0.1)) is None
         assert CliRunner().invoke(app, ["verify", str(archive.file)]).exit_code == 0
     assert left.exists()
+
+
+def test_a_run_that_another_one_precludes_says_so_at_once(archive: Archive) -> None:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        with pytest.raises(CatalogError, match="held by"):
+            reprocess(campaign)
+
+
+def test_a_report_that_somebody_builds_keeps_its_temporary_files(archive: Archive) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    folder = archive.folder / "out/report/20260301T000000-abc"
+    folder.mkdir(parents=True)
+    half, old = (folder / f".index.html.{name}.tmp" for name in ("half", "old"))
+    for file in (half, old):
+        file.write_bytes(b"half of a page")
+    long_ago = time.time() - 2 * versions.BUILDING
+    os.utime(old, (long_ago, long_ago))
+    assert reprocess(archive.write()) is not None
+    assert (half.exists(), old.exists()) == (True, False)
+    assert CliRunner().invoke(app, ["verify", str(archive.file)]).exit_code == 0
 
 
 def test_a_failed_removal_does_not_hide_the_products(archive: Archive) -> None:

@@ -11,6 +11,8 @@ from distributed import WorkerPlugin
 from lidarops.run import executor
 
 _attempt = executor.attempt
+HALF = ".half.nc.0123.tmp"
+"""The file that it leaves among the products."""
 
 
 class Poison(WorkerPlugin):
@@ -26,6 +28,9 @@ class Poison(WorkerPlugin):
 
         def attempt(job: Any) -> Any:
             if job.scene.id == self.scene:
+                half = job.campaign.products_root / HALF
+                half.parent.mkdir(parents=True, exist_ok=True)
+                half.write_bytes(b"half of a product")
                 os.kill(os.getpid(), signal.SIGKILL)
             return _attempt(job)
 
