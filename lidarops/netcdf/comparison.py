@@ -57,7 +57,7 @@ def compare_products(old: Path, new: Path) -> Change:
     ProductError
         If a file cannot be read, or is no product.
     """
-    causes = tuple(_causes(read_provenance(old), read_provenance(new)))
+    causes = tuple(_causes(_making(old), _making(new)))
     try:
         with (
             xr.open_dataset(old, engine="netcdf4", decode_cf=False, cache=False) as before,
@@ -66,8 +66,9 @@ def compare_products(old: Path, new: Path) -> Change:
             differences = dict(_differences(before, after))
             same_texts = _texts(before) == _texts(after)
             values = sum(before[name].size for name in _measured(before))
-    except (OSError, ValueError) as error:
-        raise ProductError(f"cannot be compared: {error}", file=new) from error
+    # The type of HDF5's error depends on the place of the damage.
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ProductError(f"cannot be compared with {old}: {error}", file=new) from error
     largest = max((size for size, _ in differences.values()), default=0.0)
     variable = next((name for name, (size, _) in differences.items() if size == largest), "")
     changed = sum(count for _, count in differences.values())
@@ -159,14 +160,30 @@ def _missing(values: Values, fill: object) -> NDArray[np.bool_]:
     return unknown if fill is None else unknown | (values == fill)
 
 
-def _causes(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what differs in the making of two products, by their provenance."""
-    causes = [
-        *_changes("input", _inputs(old), _inputs(new)),
-        *_changes("setting", _settings(old), _settings(new)),
-        *_changes("step", _steps(old), _steps(new)),
-        *_changes("software", _software(old), _software(new)),
-    ]
+def _making(file: Path) -> dict[str, dict[str, str]]:
+    """Return what a product was made from and with, by its provenance."""
+    document = read_provenance(file)
+    try:
+        return {
+            "input": _inputs(document),
+            "setting": _settings(document),
+            "step": _steps(document),
+            "software": _software(document),
+        }
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ProductError(
+            f"does not say how it was made: {error!r}",
+            file=file,
+            field="provenance",
+            remedy="compare products of lidarops",
+        ) from error
+
+
+def _causes(
+    old: Mapping[str, Mapping[str, str]], new: Mapping[str, Mapping[str, str]]
+) -> Iterator[str]:
+    """Yield what differs in the making of two products."""
+    causes = [cause for what in old for cause in _changes(what, old[what], new[what])]
     yield from causes[:_MOST_CAUSES]
     if len(causes) > _MOST_CAUSES:
         yield f"and {len(causes) - _MOST_CAUSES} more"

@@ -18,7 +18,7 @@ from uuid import NAMESPACE_URL, uuid5
 import xarray as xr
 
 from lidarops.errors import NO_FILE, ProductError
-from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf.sizes import check_contents
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 RELEASE_DATE: Final = date(2026, 11, 21)
@@ -181,14 +181,15 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
         If the file cannot be read or holds no provenance.
     """
     try:
-        check_sizes(path)
+        check_contents(path)
         with xr.open_dataset(path, engine="netcdf4", decode_times=False) as product:
             if "provenance" not in product:
                 raise ProductError(
                     "has no such variable", file=path, field="provenance", wrong_use=True
                 )
             text = str(product["provenance"].item())
-    except (OSError, ValueError) as error:
+    # The type of HDF5's error depends on the place of the damage.
+    except (OSError, RuntimeError, ValueError) as error:
         raise ProductError(
             f"cannot be read: {error}",
             file=path,

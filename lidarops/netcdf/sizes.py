@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,7 +29,7 @@ _NO_VARIABLE: Final = b"This is a netCDF dimension but not a netCDF variable"
 def check_sizes(path: str | Path) -> None:
     """Refuse a NetCDF-4 file whose variables cannot be in it, or do not fit into memory.
 
-    Other files pass: those of NetCDF-3 are no larger in memory than on disk.
+    For readers that load whole variables; see `check_contents`.
 
     Parameters
     ----------
@@ -41,10 +42,37 @@ def check_sizes(path: str | Path) -> None:
     OSError
         If the file cannot be read.
     """
+    stated = check_contents(path)
+    largest = _largest(stated)
+    most = _MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    _refuse_more(stated.get(largest, 0), most, Path(path), largest, "be read on this machine")
+
+
+def check_contents(path: str | Path) -> dict[str, int]:
+    """Refuse a NetCDF-4 file whose variables cannot be in it.
+
+    Other files pass: those of NetCDF-3 are no larger in memory than on disk.
+
+    Parameters
+    ----------
+    path : path or str
+
+    Returns
+    -------
+    dict of str to int
+        Variable -> its bytes in memory; empty for other files.
+
+    Raises
+    ------
+    ProductError
+        Naming the variable.
+    OSError
+        If the file cannot be read.
+    """
     file = Path(path)
     with file.open("rb") as stream:
         if stream.read(len(_HDF5)) != _HDF5:
-            return
+            return {}
         size = os.fstat(stream.fileno()).st_size
     try:
         with h5py.File(file, "r") as opened:
@@ -52,10 +80,13 @@ def check_sizes(path: str | Path) -> None:
     # The type of HDF5's error depends on the place of the damage.
     except (RuntimeError, KeyError, ValueError) as error:
         raise ProductError(f"cannot be read: {error}", file=file) from error
-    largest = max(stated, key=lambda name: stated[name], default="")
-    _refuse_more(sum(stated.values()), _DEFLATE_LIMIT * size + _UNWRITTEN, file, largest, "hold")
-    most = _MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    _refuse_more(stated.get(largest, 0), most, file, largest, "be read on this machine")
+    most = _DEFLATE_LIMIT * size + _UNWRITTEN
+    _refuse_more(sum(stated.values()), most, file, _largest(stated), "hold")
+    return stated
+
+
+def _largest(stated: Mapping[str, int]) -> str:
+    return max(stated, key=lambda name: stated[name], default="")
 
 
 def is_bare_dimension(stored: h5py.h5d.DatasetID) -> bool:

@@ -38,8 +38,10 @@ from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 from lidarops.system.stores import without_keys
 
-_UNREADABLE: Final = (ProductError, OSError, ValueError, KeyError, IndexError, TypeError)
-"""Exceptions of damaged and foreign files."""
+_UNREADABLE: Final = (
+    ProductError, OSError, RuntimeError, ValueError, KeyError, IndexError, TypeError,
+)  # fmt: skip
+"""Exceptions of damaged and foreign files; that of HDF5 depends on the place of the damage."""
 
 
 @dataclass(slots=True)

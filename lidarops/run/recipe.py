@@ -69,7 +69,7 @@ class Recipe:
                 versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
                 stamp=_stamp(file),
             )
-        except (KeyError, ValueError, TypeError, RecursionError) as error:
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise _insufficient(file, repr(error)) from error
         for record in recipe.inputs:
             # It is read, and copies are written under it: a forged product could choose it freely.

@@ -7,8 +7,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import pytest
 from support.archives.small_archive import Archive, made
+from support.products.damaged_products import damage_values
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign
@@ -92,11 +94,17 @@ def test_products_whose_raw_files_are_gone_are_known(archive: Archive) -> None:
 def test_files_that_are_not_products_of_the_campaign_are_named(archive: Archive) -> None:
     _lose(archive)
     products = archive.folder / "out/products"
-    first, second, *_ = sorted(products.rglob("*poor*.nc"))
+    first, second, third, fourth = sorted(products.rglob("*poor*.nc"))
     first.write_bytes(first.read_bytes()[:2000])
     shutil.copy(second, products / "copy.nc")
+    damage_values(third, "quality_flag")
+    with netCDF4.Dataset(fourth, "a") as product:
+        product["provenance"][...] = '{"entity": {"lidarops:product": []}}'
     shown = CliRunner().invoke(app, ["catalog", str(archive.file), "--rebuild"])
+    assert isinstance(shown.exception, SystemExit)
     assert shown.exit_code == 1
-    for words in (first.name, "copy.nc", "should have the name"):
+    for words in (first.name, "copy.nc", "should have the name", third.name, fourth.name):
         assert words in shown.stdout
-    assert made(reprocess(archive.write())) == {"poor 1 signal analog"}
+    assert made(reprocess(archive.write())) == {
+        "poor 1 signal analog", "poor 1 signal photon", "poor 2 signal photon",
+    }  # fmt: skip

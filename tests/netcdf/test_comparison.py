@@ -12,9 +12,12 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
+from support.products.damaged_products import damage_values
 from support.products.encoded_products import build_product
 from support.products.made_products import context, homogeneous, provenance, visibility
 
+from lidarops.errors import ProductError
+from lidarops.netcdf import sizes
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.write import write_product
 from lidarops.records import Change, Grade, InputRecord, Role, Stamp
@@ -91,6 +94,29 @@ def test_a_bound_that_becomes_infinite_or_finite_is_major(
     change = compare_products(*files)
     assert (change.grade, change.variable) == (Grade.MAJOR, name)
     assert math.isinf(change.largest)
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '{"entity": []}', '{"entity": {"a": "b"}}'])
+def test_a_product_without_its_making_is_one_error(text: str, tmp_path: Path):
+    files = [written(tmp_path / name, homogeneous()) for name in ("old.nc", "new.nc")]
+    with netCDF4.Dataset(files[1], "a") as product:
+        product["provenance"][...] = text
+    with pytest.raises(ProductError, match=r"new\.nc: provenance: does not say how"):
+        compare_products(*files)
+
+
+@pytest.mark.parametrize("name", [NAME, "provenance"])
+@pytest.mark.parametrize("damaged", [0, 1])
+def test_a_damaged_product_is_one_error(name: str, damaged: int, tmp_path: Path):
+    files = [written(tmp_path / file, homogeneous()) for file in ("old.nc", "new.nc")]
+    damage_values(files[damaged], name)
+    with pytest.raises(ProductError, match=files[damaged].name):
+        compare_products(*files)
+
+
+def test_a_product_larger_than_memory_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sizes, "_MEMORY_SHARE", 1e-12)
+    assert compared(tmp_path).grade is Grade.NONE
 
 
 def test_another_text_is_minor(tmp_path: Path):
