@@ -23,7 +23,7 @@ from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdic
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import AncillaryError, LidarOpsError
+from lidarops.errors import AncillaryError, RawFormatError
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.outlying_headers import NEAR_DAYS, without_outlying
 from lidarops.plan.scene_plan import plan_scene
@@ -357,13 +357,14 @@ class Judge:
         return replace(cut, set_aside=(*cut.set_aside, *aside))
 
     def _header(self, granule: Granule) -> RawHeader | None:
-        """Return the header of a file; None where it cannot be read now."""
+        """Return the header of a file; None where this file cannot be read now."""
         try:
             head = self._source.head(granule.path, HEADER_BYTES)
             return parse_raw_header(
                 head, file=granule.path, size=granule.size, known=granule.format
             )
-        except (OSError, LidarOpsError):
+        # Not the error of a lost store: headers that are damaged would be accepted for good.
+        except (OSError, RawFormatError):
             return None
 
     # One scene

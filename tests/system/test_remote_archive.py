@@ -6,6 +6,7 @@ import functools
 import http.server
 import threading
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Status
+from lidarops.run.archive import assess, update_catalog
 from lidarops.system.stores import RemoteStore
 
 
@@ -97,6 +99,27 @@ def test_a_denied_file_is_refused_but_a_lost_connection_ends_the_scan(
         # The next scan tries it again although it is unchanged.
         assert scan_archive(campaign, store).refused == 0
         assert len(store.granules(status=Status.GOOD)) == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "ends"), [(PermissionError("denied"), False), (ConnectionResetError("cut"), True)]
+)
+def test_a_store_that_is_lost_while_headers_are_compared_ends_the_run(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: OSError, ends: bool
+) -> None:
+    """Otherwise the header that all others contradict would pass as good."""
+    for minute in range(2, 6):
+        content = raw_archives.content(minute, bins=900 if minute == 4 else 600)
+        raw_archives.write(tmp_path / "raw" / "coast" / f"h{minute}", content)
+    update_catalog(campaign)
+
+    def lost(self: RemoteStore, path: str, _size: int) -> bytes:
+        with self._errors_as(CatalogError, f"{path} cannot be read"):
+            raise error
+
+    monkeypatch.setattr(RemoteStore, "head", lost)
+    with pytest.raises(CatalogError, match="cut") if ends else nullcontext():
+        assert list(assess(campaign, update=False, everything=True))
 
 
 ESCAPES = ["../../x", "%2e%2e/x", "coast/../../x", "..%5Cx", "coast//x"]
