@@ -6,17 +6,19 @@ import os
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
 from lidarops.errors import CatalogError, LidarOpsError
+
+_T = TypeVar("_T")
 
 BATCH = 1000
 """Largest number of values in the list of one statement."""
@@ -81,7 +83,7 @@ class Database:
     def transaction(self) -> Iterator[sa.Connection]:
         """Yield a connection; commit all its changes at the end, or none if an error is raised."""
         try:
-            with self.decoded(), self._engine.begin() as connection:
+            with self._engine.begin() as connection:
                 yield connection
         except sa.exc.SQLAlchemyError as error:
             raise self._catalog_error(error) from error
@@ -92,18 +94,23 @@ class Database:
         try:
             with self._engine.connect() as connection:
                 options = {"stream_results": True, "yield_per": 5000}
-                yield iter(connection.execution_options(**options).execute(query))
+                yield self.decoded(connection.execution_options(**options).execute(query))
         except sa.exc.SQLAlchemyError as error:
             raise self._catalog_error(error) from error
 
-    @contextmanager
-    def decoded(self) -> Iterator[None]:
-        """Raise a CatalogError where a stored value is not what lidarops stores."""
+    def decoded(self, records: Iterable[_T]) -> Iterator[_T]:
+        """Yield rows, or what is made of them as they are read.
+
+        Raises
+        ------
+        CatalogError
+            Where a stored value is not what lidarops stores.
+        """
         try:
-            yield
+            yield from records
         except LidarOpsError:
             raise
-        except (ValueError, KeyError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CatalogError(
                 f"the catalog cannot be used: it holds {error!r}",
                 file=self.place,
@@ -145,15 +152,22 @@ class Database:
         file = Path(self._url.database or "")
         if not self._sqlite or not self._url.database or os.access(file.parent, os.W_OK):
             return self._url
-        journal = Path(f"{file}-wal")
-        if not journal.exists() or not journal.stat().st_size:
-            # SQLite would make files beside it.
-            query = {"uri": "true", "immutable": "1"}
-            return self._url.set(database=file.absolute().as_uri(), query=query)
+        journal, index = Path(f"{file}-wal"), Path(f"{file}-shm")
+        has_journal = journal.exists()
+        if has_journal and index.exists():
+            # Another user may write now.
+            return self._as_uri(file, mode="ro")
+        if not has_journal or not journal.stat().st_size:
+            # Nobody has it open. SQLite would make files beside it.
+            return self._as_uri(file, immutable="1")
+        # Left by a killed process; SQLite would make its index.
         folder = self._copied.enter_context(tempfile.TemporaryDirectory(prefix="lidarops-"))
         for part in (file, journal):
             shutil.copy(part, folder)
         return self._url.set(database=str(Path(folder, file.name)))
+
+    def _as_uri(self, file: Path, **query: str) -> sa.URL:
+        return self._url.set(database=file.absolute().as_uri(), query={"uri": "true", **query})
 
     def _settle_schema(self, connection: sa.Connection) -> None:
         inspector = sa.inspect(connection)

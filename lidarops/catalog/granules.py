@@ -143,12 +143,10 @@ class Granules(Database):
         query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
         query = query.order_by(_C.instrument, _C.start, _C.path)
         with self.transaction() as connection:
-            layouts = {
-                row.hash: _layout_from(row.channels)
-                for row in connection.execute(sa.select(LAYOUT))
-            }
-        with self.decoded(), self.stream(query) as rows:
-            return [_granule_from(row, layouts) for row in rows]
+            stored = connection.execute(sa.select(LAYOUT))
+            layouts = dict(self.decoded((row.hash, _layout_from(row.channels)) for row in stored))
+        with self.stream(query) as rows:
+            return list(self.decoded(_granule_from(row, layouts) for row in rows))
 
     def refused(self) -> list[Granule]:
         """Return the granules that the catalog refuses."""
@@ -176,10 +174,13 @@ class Granules(Database):
             .order_by(_C.day, _C.role)
         )
         with self.transaction() as connection:
-            return [
-                DaySum(day, Role(role), count, int(low), int(high))
-                for day, role, count, low, high in connection.execute(query)
-            ]
+            rows = connection.execute(query)
+            return list(
+                self.decoded(
+                    DaySum(day, Role(role), count, int(low), int(high))
+                    for day, role, count, low, high in rows
+                )
+            )
 
     def layouts(self) -> list[tuple[str, tuple[ChannelLayout, ...]]]:
         """Return pairs of instrument and layout of channels that occur in good signal granules."""
@@ -190,8 +191,10 @@ class Granules(Database):
             .order_by(inner.c.instrument, inner.c.layout)
         )
         with self.transaction() as connection:
-            rows = connection.execute(query).all()
-        return [(instrument, _layout_from(channels)) for instrument, channels in rows]
+            rows = connection.execute(query)
+            return list(
+                self.decoded((instrument, _layout_from(channels)) for instrument, channels in rows)
+            )
 
     def _signals(self) -> tuple[sa.ColumnElement[bool], ...]:
         good, signal = Status.GOOD.value, Role.SIGNAL.value
@@ -226,10 +229,13 @@ class Granules(Database):
             .order_by(*columns)
         )
         with self.transaction() as connection:
-            return [
-                Holding(instrument, begins[index], _layout_from(channels), files)
-                for instrument, index, _, files, channels in connection.execute(query)
-            ]
+            rows = connection.execute(query)
+            return list(
+                self.decoded(
+                    Holding(instrument, begins[index], _layout_from(channels), files)
+                    for instrument, index, _, files, channels in rows
+                )
+            )
 
     def days_of_instruments(
         self, first: int | None = None, last: int | None = None
@@ -280,9 +286,14 @@ class Granules(Database):
         )
         files: Counter[tuple[bool, str, str]] = Counter()
         with self.transaction() as connection:
-            for instrument, notes, contradictions, count in connection.execute(query):
-                for stored, contradicts in ((notes, False), (contradictions, True)):
-                    for text in _sentences(stored) if instrument in instruments else ():
+            rows = connection.execute(query)
+            known = (row for row in rows if row.instrument in instruments)
+            sentences = self.decoded(
+                (row, _sentences(row.notes), _sentences(row.contradictions)) for row in known
+            )
+            for (instrument, *_, count), *stored in sentences:
+                for texts, contradicts in zip(stored, (False, True), strict=True):
+                    for text in texts:
                         files[contradicts, instrument, text] += count
         by_wording = _by_wording(files).items()
         ordered = sorted(by_wording, key=lambda item: (not item[0][0], -item[1], item[0]))

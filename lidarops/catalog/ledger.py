@@ -241,8 +241,8 @@ class Ledger(Granules):
             .limit(limit)
         )
         with self.transaction() as connection:
-            rows = list(connection.execute(query))
-            return [_run_from(row, _stages(connection, row.id)) for row in rows]
+            rows = list(self.decoded(connection.execute(query)))
+            return list(self.decoded(_run_from(row, _stages(connection, row.id)) for row in rows))
 
     # Outcomes
 
@@ -398,14 +398,15 @@ class Ledger(Granules):
         """Return the products of scenes that start on days `first` to `last`."""
         query = sa.select(*_MADE).where(_P.campaign == self.campaign, _P.day.between(first, last))
         with self.transaction() as connection:
-            return [_made_from(row) for row in connection.execute(query)]
+            rows = connection.execute(query)
+            return list(self.decoded(_made_from(row) for row in rows))
 
     @contextmanager
     def all_products(self) -> Iterator[Iterator[RecordedProduct]]:
         """Yield every product, ordered by path, without holding them all."""
         query = sa.select(*_MADE).where(_P.campaign == self.campaign).order_by(_P.path)
         with self.stream(query) as rows:
-            yield (_made_from(row) for row in rows)
+            yield self.decoded(_made_from(row) for row in rows)
 
     def made_by_any_campaign(self, paths: Collection[str]) -> set[str]:
         """Return those of some paths that are products of any campaign of the database."""
@@ -460,10 +461,10 @@ class Ledger(Granules):
             .order_by(link.role, FILE_SET.c.path)
         )
         with self.transaction() as connection:
-            return [
-                InputRecord(path, Role(role), sha256)
-                for path, role, sha256 in connection.execute(query)
-            ]
+            rows = connection.execute(query)
+            return list(
+                self.decoded(InputRecord(path, Role(role), sha256) for path, role, sha256 in rows)
+            )
 
     @contextmanager
     def all_inputs(self) -> Iterator[Iterator[tuple[str, str, str]]]:
@@ -597,10 +598,8 @@ class Ledger(Granules):
             VERDICT.c.campaign == self.campaign
         )
         with self.transaction() as connection:
-            return {
-                day: Verdict(signature, empty_scenes, set_aside, json.loads(files))
-                for day, signature, empty_scenes, set_aside, files in connection.execute(query)
-            }
+            rows = connection.execute(query)
+            return dict(self.decoded((row.day, _verdict_from(row)) for row in rows))
 
     def store_verdicts(self, verdicts: Mapping[int, Verdict]) -> None:
         """Note that all requested products of these days are fresh."""
@@ -630,6 +629,10 @@ def _made_from(row: Any) -> RecordedProduct:
     # In the order of `_MADE`.
     stamp = Stamp(row.version, None if row.written is None else aware(row.written))
     return RecordedProduct(*(*row[:8], Dependence(*row[8:12]), row.run, stamp))
+
+
+def _verdict_from(row: Any) -> Verdict:
+    return Verdict(row.signature, row.empty_scenes, row.set_aside, json.loads(row.files))
 
 
 def _stages(connection: sa.Connection, run: str) -> dict[str, float]:

@@ -7,12 +7,15 @@ import shutil
 import sqlite3
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
+from lidarops.campaign.model import load_campaign
+from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.run.archive import reprocess
 
@@ -78,6 +81,45 @@ def test_an_archive_that_cannot_be_written_is_verified_and_planned(
     assert (code, [scene["fresh"] for scene in json.loads(output)["scenes"]]) == (0, [2])
 
 
+def test_a_catalog_is_read_beside_its_living_writer(read_only: Archive, tmp_path: Path) -> None:
+    """A user who may read the folder sees what another one writes now."""
+    (tmp_path / "readable").mkdir()
+    command = ["mount", "--bind", read_only.folder.parent, tmp_path / "readable"]
+    subprocess.run(command, check=True)
+    try:
+        subprocess.run(["mount", "-o", "remount,ro,bind", tmp_path / "readable"], check=True)
+        _read_beside_a_writer(read_only, Archive(tmp_path / "readable/archive"))
+    finally:
+        subprocess.run(["umount", "--lazy", tmp_path / "readable"], check=False)
+
+
+def _read_beside_a_writer(own: Archive, readable: Archive) -> None:
+    campaign = load_campaign(readable.file)
+    with closing(sqlite3.connect(own.folder / "out/catalog.sqlite")) as writer:
+        writer.execute("select * from run").fetchall()
+        with Store(campaign.catalog_url, campaign.name, create=False) as store:
+            before = store.runs()[0].version
+            writer.execute("update run set version = 'written since'")
+            writer.commit()
+            assert store.runs()[0].version == "written since" != before
+            writer.execute("update run set version = 'checkpointed'")
+            writer.commit()
+            writer.execute("pragma wal_checkpoint(truncate)")
+            assert store.runs()[0].version == "checkpointed"
+        code, output = _run("runs", readable.file, "--json")
+        assert (code, json.loads(output)[0]["version"]) == (0, "checkpointed")
+
+
+def test_a_bug_within_a_transaction_is_not_blamed_on_the_catalog(made: Archive) -> None:
+    campaign = load_campaign(made.file)
+    with (
+        Store(campaign.catalog_url, campaign.name) as store,
+        pytest.raises(KeyError, match="a bug"),
+        store.transaction(),
+    ):
+        raise KeyError("a bug")
+
+
 def test_what_cannot_be_written_is_one_line(read_only: Archive) -> None:
     _closed(read_only)
     for command in (
@@ -104,6 +146,9 @@ def test_a_plan_makes_no_folder(made: Archive, tmp_path: Path) -> None:
         ("granule", "path", b"\xc3(\xff"),
         ("product", "path", b"\xc3(\xff"),
         ("granule", "notes", b"no JSON"),
+        ("granule", "start", b"no time"),
+        ("product", "written", b"no time"),
+        ("verdict", "files", b"[1"),
         ("granule", "role", b"no role"),
         ("run", "status", b"no status"),
     ],
