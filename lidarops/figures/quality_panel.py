@@ -10,9 +10,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import Axis, Band, Figure, Panel, time_panel_axis
-from lidarops.figures.raster import column_edges, profile_bounds
+from lidarops.figures.raster import column_edges, column_starts, profile_bounds
 from lidarops.figures.series_data import quality_bits
-from lidarops.figures.time_axis import Tick, Times, segments, time_axis
+from lidarops.figures.time_axis import Tick, Times, time_axis
 from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -62,9 +62,7 @@ def read_quality(product: xr.Dataset) -> QualityOverTime | None:
         bits = quality_bits(flags.isel(time=slice(first, first + step)))
         bits = bits.reshape(bits.shape[0], -1)
         counts[:, first : first + step] = (bits == 0).mean(1), ((bits & rejecting) != 0).mean(1)
-    middle = start + (stop - start) / 2
-    size = -(-order.size // _COLUMNS)
-    columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(middle)])
+    columns = column_starts(start, stop, -(-order.size // _COLUMNS))
     profiles = np.diff([*columns, order.size])
     good, rejected = np.add.reduceat(counts[:, order], columns, axis=1) / profiles
     return QualityOverTime(*column_edges(start, stop, columns), good, rejected)

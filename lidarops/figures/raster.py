@@ -30,8 +30,8 @@ ROWS: Final = 200
 _ALONG_TIME: Final = ("time", "background", "background_standard_error")
 TIME_BOUNDS: Final = "time_bnds"
 _TOUCHING: Final = 10.0
-"""Columns touch across a pause of at most this many of their profiles: one minute measured in ten
-is shown as one area, but not five seconds in an hour."""
+"""Columns touch across a pause of at most this many of their profiles that is no gap: one minute
+measured in every ten is shown as one area, but not five seconds in an hour."""
 _READ_ROWS: Final = 4096
 """Most rows while reading, because the range to show is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
@@ -157,8 +157,8 @@ def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int 
     kind : str
         Kind of the product, whose quality bits it has.
     profiles : int, optional
-        Profiles per column; 0 for about `COLUMNS` columns. Columns do not extend across gaps in
-        time.
+        Profiles per column; 0 for about `COLUMNS` columns. Columns neither extend across gaps in
+        time nor touch there.
 
     Returns
     -------
@@ -177,12 +177,12 @@ def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int 
         product, time = product.isel(time=order), time[order]
     ranges = product["range"].values.astype(np.float64)
     size = profiles or -(-time.size // COLUMNS)
-    columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(time)])
+    starts, stops = profile_bounds(product)
+    columns = column_starts(starts, stops, size)
     rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
     flags = flags_of(kind)
     blocks = list(_reduced(product, quantity, flags, columns, rows))
     background, background_error = _background(product, columns)
-    starts, stops = profile_bounds(product)
     start, stop = column_edges(starts, stops, columns)
     return Raster(
         start=start,
@@ -307,13 +307,20 @@ def profile_bounds(product: xr.Dataset) -> tuple[Times, Times]:
     return np.asarray(time - half), np.asarray(time + half)
 
 
+def column_starts(start: Times, stop: Times, size: int) -> NDArray[np.intp]:
+    """Return the first profile of each column of `size` profiles; none extends across a gap."""
+    stretches = segments(start + (stop - start) / 2)
+    return np.concatenate([np.arange(s.start, s.stop, size) for s in stretches])
+
+
 def column_edges(start: Times, stop: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]:
-    """Return the edges of columns; they touch where the pause between them is short."""
+    """Return the edges of columns; they touch where the pause between them is short and no gap."""
     last = np.append(columns[1:], start.size) - 1
     left, right = start[columns], stop[last]
     length = np.median(stop - start)
     pause = left[1:] - right[:-1]
-    touching = np.flatnonzero(np.abs(pause) <= _TOUCHING * length)
+    gaps = [stretch.start for stretch in segments(start + (stop - start) / 2)]
+    touching = np.flatnonzero((np.abs(pause) <= _TOUCHING * length) & ~np.isin(columns[1:], gaps))
     middle = right[touching] + pause[touching] / 2
     left[touching + 1], right[touching] = middle, middle
     return left, right

@@ -95,6 +95,29 @@ def test_columns_touch_except_at_gaps():
     assert image.start[0] == np.datetime64("2024-03-01T00:00:00")
 
 
+@pytest.mark.parametrize(
+    ("missing", "gap"),
+    [(1, 0.0), (9, 9.0)],
+    ids=["one profile is no gap", "an outage"],
+)
+def test_columns_do_not_touch_across_an_outage(missing, gap):
+    time = np.concatenate(
+        [times(START, 10, 60.0), times(START + timedelta(minutes=10 + missing), 10, 60.0)]
+    )
+    image = read(signal(time), profiles=1)
+    gaps = (image.start[1:] - image.stop[:-1]) / np.timedelta64(1, "m")
+    np.testing.assert_allclose(gaps, [*[0.0] * 9, gap, *[0.0] * 9], atol=1e-9)
+
+
+def test_columns_touch_where_one_minute_in_ten_is_measured():
+    product = signal(times(START, 12, 600.0))
+    middle = product["time"].values
+    half = np.timedelta64(30, "s")
+    product["time_bnds"] = ("time", "bound"), np.stack([middle - half, middle + half], axis=-1)
+    image = read(product, profiles=1)
+    np.testing.assert_array_equal(image.start[1:], image.stop[:-1])
+
+
 def test_background_is_the_mean_with_its_error():
     product = signal(times(START, 6, 60.0))
     product["background"].values[4:] = np.nan
