@@ -22,7 +22,7 @@ from lidarops.figures.panels import (
     time_panel_axis,
     units,
 )
-from lidarops.figures.raster import COLUMNS, Raster, colour_limits, share_with_care
+from lidarops.figures.raster import BEYOND, COLUMNS, Raster, colour_limits, share_with_care
 from lidarops.figures.series_panels import Quantity, background_panel
 from lidarops.figures.time_axis import TimeAxis, time_axis
 from lidarops.figures.wording import percent
@@ -32,8 +32,6 @@ Floats = NDArray[np.float64]
 
 _HEIGHT: Final = 306
 """Height of a panel in units of the figure, and of its image in pixels."""
-_BEYOND: Final = 1.2
-"""A signal is shown to this many times its reach."""
 _HALF: Final = 0.5
 """Share of the filled time that was measured, below which the words state it."""
 _NO_TIME: Final = np.timedelta64(0, "ns")
@@ -79,7 +77,7 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     x = time_panel_axis(axis)
     full = max(float(raster.edges[-1]) for raster in rasters)
     reach = max(raster.reach for raster in rasters)
-    far = min(full, _BEYOND * reach) if reach > 0 else full
+    far = min(full, BEYOND * reach) if reach > 0 else full
     shown = [raster.shown_to(far) for raster in rasters]
     near = min(float(raster.edges[0]) for raster in shown)
     far = max(float(raster.edges[-1]) for raster in shown)

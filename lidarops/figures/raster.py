@@ -41,6 +41,10 @@ _VISIBLE: Final = 1.0
 _SOMETIMES: Final = 90.0, 3.0
 """It also goes on where this percentile over time exceeds this many, as in a cloud that passes; of
 noise alone it is 1.3."""
+_SMOOTH: Final = 25
+"""Places of the running mean along range, so that a single noisy one does not count as signal."""
+BEYOND: Final = 1.2
+"""A signal is shown to this many times its reach."""
 _DECADES: Final = 4.0
 """Most decades of a colour scale."""
 
@@ -105,16 +109,7 @@ class Raster:
         """Range up to which the signal exceeds its noise, m; 0 if it never does."""
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.where(self.used > 0, self.total / np.sqrt(self.variance), 0.0)
-        ratio = np.where(np.isfinite(ratio), ratio, 0.0)
-        width = min(25, ratio.shape[1])
-        often, many = _SOMETIMES
-        # Smoothed along range, so that a single noisy row does not count as signal.
-        usual, best = (
-            np.convolve(level, np.full(width, 1.0 / width), mode="same")
-            for level in np.percentile(ratio, [50.0, often], axis=0)
-        )
-        rows = np.flatnonzero((usual > _VISIBLE) | (best > many))
-        return float(self.edges[rows[-1] + 1]) if rows.size else 0.0
+        return signal_reach(ratio, self.edges[1:])
 
     def shown_to(self, far: float) -> Raster:
         """Return the rows up to `far` (m), merged to at most `ROWS` rows."""
@@ -133,6 +128,27 @@ class Raster:
             rejected=merged(self.rejected),
             bins=np.add.reduceat(self.bins[:rows], starts),
         )
+
+
+def signal_reach(ratio: Floats, places: Floats) -> float:
+    """Return the last place at which a signal exceeds its noise; 0 if it never does.
+
+    Parameters
+    ----------
+    ratio : ndarray, shape (time, place)
+        Value over standard error; 0 is taken where it is not finite.
+    places : ndarray, shape (place,)
+        Rising.
+    """
+    ratio = np.where(np.isfinite(ratio), ratio, 0.0)
+    width = min(_SMOOTH, ratio.shape[1])
+    often, many = _SOMETIMES
+    usual, best = (
+        np.convolve(level, np.full(width, 1.0 / width), mode="same")
+        for level in np.percentile(ratio, [50.0, often], axis=0)
+    )
+    visible = np.flatnonzero((usual > _VISIBLE) | (best > many))
+    return float(places[visible[-1]]) if visible.size else 0.0
 
 
 def raster_variables(quantity: str) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarops.figures.any_kind import main_name
 from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import number, units
-from lidarops.figures.raster import profile_bounds
+from lidarops.figures.raster import BEYOND, profile_bounds, signal_reach
 from lidarops.figures.series_data import quality_bits
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import counted
@@ -29,10 +29,6 @@ ROWS: Final = 20_000
 """Most rows of a CSV file of retrieved quantities, about 1.5 MB."""
 _SIGNAL_ROWS: Final = 4_000
 """Most rows of a CSV file of signals, which few read as text."""
-_SMOOTH: Final = 25
-"""Bins of the running mean of value over error, so that one noisy bin is not taken for signal."""
-_BEYOND: Final = 1.2
-"""Values are shown to this many times the reach of the signal, as in figures."""
 _TIMES: Final = 300
 """Most times of a table of few columns."""
 _CELLS: Final = 320
@@ -242,13 +238,8 @@ def _reach(ratio: Floats, grid: _Grid) -> int:
     count = grid.place.size
     if grid.labels or count <= _COLUMNS:
         return count
-    known = np.where(np.isfinite(ratio), ratio, 0.0)
-    width = min(_SMOOTH, count)
-    smooth = np.convolve(np.median(known, axis=0), np.full(width, 1.0 / width), mode="same")
-    clear = np.flatnonzero(smooth > 1.0)
-    if not clear.size:
-        return count
-    return min(count, int(np.searchsorted(grid.place, _BEYOND * grid.place[clear[-1]])) + 1)
+    far = BEYOND * signal_reach(ratio, grid.place)
+    return min(count, int(np.searchsorted(grid.place, far)) + 1) if far > 0.0 else count
 
 
 def _chosen_places(grid: _Grid, reach: int) -> Indices:

@@ -15,6 +15,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.archives.site_archive import add, contents, small_archive
+from support.products.drawn import figures
+from support.products.fabricated import START as FIRST
+from support.products.fabricated import signal, times
 from typer.testing import CliRunner
 
 from lidarops.cli import app
@@ -122,6 +125,19 @@ def test_long_products_are_thinned_to_round_times_and_said() -> None:
     assert table.note.startswith(f"{len(table.rows)} of 144 times, nearest to round times")
     assert "up to 7.2" in values.note
     assert values.csv.count(b"\n") <= 4_001
+
+
+def test_values_reach_as_far_as_the_figure() -> None:
+    product = signal(times(FIRST, 60, 60.0), bins=1000, bin_width=15.0)
+    product["quality_flag"][:] = 0
+    product["signal_standard_error"][:] = 1.0
+    noise = np.random.default_rng(0).standard_normal((60, 1000))
+    product["signal"][:] = noise + 10.0 * (product["range"].values < 3000.0)
+    product["signal"].values[20:30, 600:640] += 30.0
+    (figure,) = figures("signal", "signal", [product])
+    stated = float(read_values(product, "signal").note.partition("up to ")[2].removesuffix(" km"))
+    # The note has three digits.
+    assert stated == pytest.approx(figure.panels[0].y.high, abs=0.05)
 
 
 def test_a_product_leads_to_the_previous_the_next_and_its_siblings(output: Path) -> None:
