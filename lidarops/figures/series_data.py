@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -90,7 +90,12 @@ class Section(TimeSeries):
     @property
     def label(self) -> str:
         """Range of the section in km."""
-        return f"{self.near / 1e3:g}\N{EN DASH}{self.far / 1e3:g} km"
+        return section_label(self.near, self.far)
+
+
+def section_label(near: float, far: float) -> str:
+    """Return the range of a section (m) in km."""
+    return f"{near / 1e3:g}\N{EN DASH}{far / 1e3:g} km"
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,7 +343,11 @@ def float_values(product: xr.Dataset, name: str) -> Floats:
 
 def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
     """Return quality flags as integers; missing flags become `Quality.INPUT_MISSING`."""
-    values = flags.values
+    return as_bits(flags.values)
+
+
+def as_bits(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Return values of quality flags as integers, as `quality_bits` does."""
     if values.dtype.kind == "f":
         # Where there are fill values, xarray decodes integers as floats with NaN.
         values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))

@@ -15,7 +15,7 @@ from functools import cache
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import xarray as xr
 
@@ -43,7 +43,7 @@ from lidarops.site.paths import (
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
-from lidarops.site.values import read_values
+from lidarops.site.values import NO_VALUES, read_values
 from lidarops.system.files import sha256_of, within, write_atomically
 from lidarops.system.processes import end_with_parent
 
@@ -55,6 +55,9 @@ _OURS: Final = ("product", "station", COPIES)
 """Folders that only the site writes to."""
 _UNREADABLE: Final = (*UNREADABLE, TypeError, ArithmeticError, MemoryError)
 """Exceptions observed when damaged or foreign files are read and drawn."""
+
+
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +230,12 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         kind = product_contents.attribute(opened, "lidarops_kind")
         figures, problem = _draw(opened, kind)
         page = product_page(task.path)
-        values = read_values(opened, kind)
+        values, no_values = _guarded(
+            lambda: read_values(opened, kind), "its values cannot be shown"
+        )
+        over_time, no_quality = _guarded(
+            lambda: _quality_figures(opened), "its quality over time cannot be drawn"
+        )
         station = product_contents.attribute(opened, "lidarops_station")
         instrument = product_contents.attribute(opened, "lidarops_instrument")
         entry = Entry(
@@ -255,23 +263,38 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             usable=quality.usable,
             unflagged=quality.unflagged,
             alt=figures[0].text if figures else _EMPTY.capitalize(),
-            problem=_joined(problem, origin.problem, _missing_flags(opened)),
+            problem=_joined(problem, no_values, no_quality, origin.problem, _missing_flags(opened)),
         )
         contents = (
-            pages.product(entry, opened, quality, origin, _with_quality(opened, figures), values),
+            pages.product(
+                entry,
+                opened,
+                quality,
+                origin,
+                [*figures[:1], *(over_time or ()), *figures[1:]],
+                values or NO_VALUES,
+            ),
             svg.thumbnail(figures[0] if figures else None, _EMPTY),
             origin.text.encode(),
-            values.csv,
+            (values or NO_VALUES).csv,
         )
     for name, content in zip(entry.files, contents, strict=True):
         _write(task.site, name, content)
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
-def _with_quality(opened: xr.Dataset, figures: Sequence[Figure]) -> list[Figure]:
-    """Return the figures with that of quality over time as the second."""
+def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
+    """Return a part of a page, or why there is none."""
+    try:
+        return make(), ""
+    except _UNREADABLE as error:
+        return None, f"{failure}: {error}"
+
+
+def _quality_figures(opened: xr.Dataset) -> list[Figure]:
+    """Return the figure of quality over time, if there are flags."""
     quality = read_quality(opened)
-    return [*figures[:1], *([quality_figure(quality)] if quality else []), *figures[1:]]
+    return [] if quality is None else [quality_figure(quality)]
 
 
 def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:

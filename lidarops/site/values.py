@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -16,8 +15,9 @@ from lidarops.figures.any_kind import main_name
 from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import number, units
 from lidarops.figures.raster import BEYOND, profile_bounds, signal_reach
-from lidarops.figures.series_data import quality_bits
+from lidarops.figures.series_data import as_bits, section_label
 from lidarops.figures.series_panels import Quantity
+from lidarops.figures.svg import round_steps
 from lidarops.figures.wording import counted
 from lidarops.netcdf.stored_flags import StoredBit, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG, is_retrieved
@@ -37,18 +37,11 @@ _COLUMNS: Final = 12
 """Most columns of a table."""
 _STEPS: Final = (1, 2, 5, 10, 15, 20, 30, 60, 120, 180, 360, 720, 1440)
 """Minutes between the times of a table."""
-_ROUND: Final = (1.0, 2.0, 5.0, 10.0)
+_READ_BYTES: Final = 16_000_000
+"""Most bytes of a variable that are read for the choice of places. A variable of fewer is read as
+a whole, which is faster than single rows."""
 _ACROSS: Final = 2
 """Dimensions of a variable over time and another dimension."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One value in words."""
-
-    text: str
-    css: str
-    """``good``, ``care`` or ``reject``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +50,8 @@ class ValueTable:
 
     title: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
+    rows: tuple[tuple[str, tuple[str, ...]], ...]
+    """Interval, and values in words."""
     note: str
     """Which values are shown; empty if all are."""
 
@@ -73,17 +67,100 @@ class Values:
     """What the CSV file holds."""
 
 
+NO_VALUES: Final = Values((), b"", "")
+
+
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Times, and places along the other dimension."""
+    """Times, and places along the other dimension, both rising."""
 
+    dims: tuple[str, ...]
     start: NDArray[np.datetime64]
     stop: NDArray[np.datetime64]
     place: Floats
-    """km where `name` has a unit, else the number of the place."""
-    name: str
+    """km where `labels` are empty, else the number of the place."""
     labels: tuple[str, ...]
     """Of the places; empty where they are numbers along a line."""
+    order: tuple[Indices, Indices]
+    """Of times and places in the file."""
+
+    @property
+    def name(self) -> str:
+        """Dimension of the places; empty without any."""
+        return self.dims[1] if len(self.dims) == _ACROSS else ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """A quantity at some times and places, in the displayed unit."""
+
+    quantity: Quantity
+    values: Floats
+    errors: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class _Quality:
+    """Quality bits at some times and places."""
+
+    bits: tuple[StoredBit, ...]
+    flags: NDArray[np.int64]
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """Whether a value must not be used."""
+        return np.asarray((self.flags & rejecting_mask(self.bits)) != 0)
+
+    def words(self, row: int, place: int) -> tuple[str, str]:
+        """Return the grade of a value, and its bits."""
+        carried = [bit for bit in self.bits if self.flags[row, place] & bit.mask]
+        grade = "reject" if any(bit.rejects for bit in carried) else "care" if carried else "good"
+        return grade, " ".join(bit.word for bit in carried)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Some times and places of a product."""
+
+    rows: Indices
+    places: Indices
+    columns: tuple[_Column, ...]
+    quality: _Quality | None
+    """None without flags of these values."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A product with the quantities that are shown."""
+
+    product: xr.Dataset
+    kind: str
+    quantities: tuple[Quantity, ...]
+    grid: _Grid
+
+    def part(self, rows: Indices, places: Indices) -> _Part:
+        """Read some times and places."""
+
+        def read(name: str) -> NDArray[Any] | None:
+            if name not in self.product or self.product[name].dims != self.grid.dims:
+                return None
+            time, along = self.grid.order
+            return _at(self.product[name], time[rows], along[places])
+
+        def floats(name: str, factor: float) -> Floats:
+            values = read(name)
+            missing = np.full((rows.size, places.size), np.nan)
+            return missing if values is None else factor * values.astype(np.float64)
+
+        columns = tuple(
+            _Column(q, floats(q.name, q.factor), floats(f"{q.name}_standard_error", q.factor))
+            for q in self.quantities
+        )
+        flags = read(QUALITY_FLAG)
+        if flags is None:
+            return _Part(rows, places, columns, None)
+        bits = stored_bits(self.product[QUALITY_FLAG].attrs, self.kind)
+        return _Part(rows, places, columns, _Quality(bits, as_bits(flags)))
 
 
 def read_values(product: xr.Dataset, kind: str) -> Values:
@@ -92,34 +169,25 @@ def read_values(product: xr.Dataset, kind: str) -> Values:
     Parameters
     ----------
     product : Dataset
-        Of any kind.
+        Of any kind; may be lazy, because only the times and places that are shown are read.
     kind : str
         Kind of the product, which states its main quantities; may be unknown.
     """
     quantities = _quantities(product, kind)
     if not quantities:
-        return Values((), b"", "")
-    product = product.isel(time=np.argsort(product["time"].values, kind="stable"))
+        return NO_VALUES
     grid = _grid(product, quantities[0].name)
-    shape = (grid.start.size, grid.place.size)
-    bits = _stored(product, kind)
-    flags = _flags(product, quantities[0].name).reshape(shape)
-    rejected = (flags & rejecting_mask(bits)) != 0
-    arrays = {q.name: _array(product, q.name).reshape(shape) for q in quantities}
-    errors = {
-        q.name: _array(product, f"{q.name}_standard_error", q.name).reshape(shape)
-        for q in quantities
-    }
-    main = quantities[0].name
-    reach = _reach(np.where(rejected, np.nan, arrays[main]) / errors[main], grid)
-    tables = tuple(
-        _table(q, grid, arrays[q.name], errors[q.name], (flags, rejected), reach)
-        for q in quantities
-    )
+    source = _Source(product, kind, quantities, grid)
+    reach = _reach(source)
+    places = _chosen_places(grid, reach)
+    few = places.size * grid.start.size <= _CELLS or grid.place.size <= _ACROSS
+    rows = _near_round_times(grid, _TIMES if few else max(1, _CELLS // places.size))
+    shown = source.part(rows, places)
     most = ROWS if is_retrieved(kind) else _SIGNAL_ROWS
     rows = _near_round_times(grid, max(1, most // reach))
-    text = _csv(grid, quantities, arrays, errors, (flags, rejected), bits, (rows, reach))
-    return Values(tables, text, _csv_note(grid, rows, reach))
+    listed = source.part(rows, np.arange(reach, dtype=np.intp))
+    tables = tuple(_table(grid, shown, column) for column in shown.columns)
+    return Values(tables, _csv(grid, listed), _csv_note(grid, listed))
 
 
 def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
@@ -131,8 +199,8 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
         name = main_name(product)
         if name is None:
             return ()
-        known = (Quantity(name, 1.0, str(product[name].attrs.get("units", ""))),)
-    if product["time"].dtype.kind != "M" or product.sizes["time"] == 0:
+        known = (Quantity(name, 1.0, units(str(product[name].attrs.get("units", "")))),)
+    if product["time"].dtype.kind != "M" or product[known[0].name].size == 0:
         return ()
     dims = product[known[0].name].dims
     if dims[:1] != ("time",) or len(dims) > _ACROSS:
@@ -141,86 +209,72 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
 
 
 def _grid(product: xr.Dataset, name: str) -> _Grid:
-    start, stop = profile_bounds(product)
-    dims = product[name].dims
-    if len(dims) < _ACROSS:
-        return _Grid(start, stop, np.zeros(1), "", ("value",))
-    along = str(dims[1])
-    count = product.sizes[along]
+    order = np.argsort(product["time"].values, kind="stable")
+    start, stop = (edge[order] for edge in profile_bounds(product))
+    dims = tuple(map(str, product[name].dims))
+    place, labels = _places(product, dims[1]) if len(dims) == _ACROSS else (np.zeros(1), ("value",))
+    along = np.arange(place.size) if labels else np.argsort(place, kind="stable")
+    return _Grid(dims, start, stop, place[along], labels, (order, along))
+
+
+def _places(product: xr.Dataset, along: str) -> tuple[Floats, tuple[str, ...]]:
+    """Return km along a dimension, or numbers with labels where it has sections or no length."""
+    numbers = np.arange(product.sizes[along], dtype=np.float64)
     bounds = f"{along}_bounds"
     if bounds in product.variables and product[bounds].dims[:1] == (along,):
-        edges = product[bounds].values.astype(np.float64) / 1e3
-        labels = tuple(f"{low:g}\N{EN DASH}{high:g} km" for low, high in edges)
-        return _Grid(start, stop, np.arange(count, dtype=np.float64), along, labels)
+        edges = product[bounds].values.astype(np.float64)
+        return numbers, tuple(section_label(near, far) for near, far in edges)
     if along in product.variables and product[along].attrs.get("units") == "m":
-        return _Grid(start, stop, product[along].values.astype(np.float64) / 1e3, along, ())
-    numbers = tuple(f"{along} {place}" for place in range(count))
-    return _Grid(start, stop, np.arange(count, dtype=np.float64), along, numbers)
+        place = product[along].values.astype(np.float64) / 1e3
+        if np.isfinite(place).all() and np.unique(place).size == place.size:
+            return place, ()
+    return numbers, tuple(f"{along} {number:.0f}" for number in numbers)
 
 
-def _stored(product: xr.Dataset, kind: str) -> tuple[StoredBit, ...]:
-    return stored_bits(product[QUALITY_FLAG].attrs, kind) if QUALITY_FLAG in product else ()
+def _at(variable: xr.DataArray, rows: Indices, places: Indices) -> NDArray[Any]:
+    """Return a variable as a table of some times and places."""
+    if variable.nbytes <= _READ_BYTES:
+        table = variable.values.reshape(variable.shape[0], -1)
+        return np.asarray(table[np.ix_(rows, places)])
+    part = dict(zip(variable.dims, (rows, places), strict=False))
+    return variable.isel(part).values.reshape(rows.size, -1)
 
 
-def _flags(product: xr.Dataset, name: str) -> NDArray[np.int64]:
-    if QUALITY_FLAG in product and product[QUALITY_FLAG].dims == product[name].dims:
-        return quality_bits(product[QUALITY_FLAG])
-    return np.zeros(product[name].shape, dtype=np.int64)
-
-
-def _array(product: xr.Dataset, name: str, like: str = "") -> Floats:
-    if name not in product:
-        return np.full(product[like].shape, np.nan)
-    return product[name].values.astype(np.float64)
-
-
-def _table(
-    quantity: Quantity,
-    grid: _Grid,
-    values: Floats,
-    errors: Floats,
-    quality: tuple[NDArray[np.int64], NDArray[np.bool_]],
-    reach: int,
-) -> ValueTable:
-    columns = _chosen_places(grid, reach)
-    few = columns.size * grid.start.size <= _CELLS or grid.place.size <= _ACROSS
-    most = _TIMES if few else max(1, _CELLS // columns.size)
-    rows = _near_round_times(grid, most)
-    flags, rejected = quality
-    cells = tuple(
+def _table(grid: _Grid, part: _Part, column: _Column) -> ValueTable:
+    flags = None if part.quality is None else part.quality.flags
+    rejected = False if part.quality is None else part.quality.rejected
+    shown = np.isfinite(column.values) & ~np.asarray(rejected)
+    rows = tuple(
         (
             _clock(grid, int(row)),
             tuple(
-                _cell(
-                    quantity.factor * float(values[row, column]),
-                    quantity.factor * float(errors[row, column]),
-                    bool(rejected[row, column]),
-                    bool(flags[row, column]),
-                )
-                for column in columns
+                _words(column.values[i, k], column.errors[i, k], flags is not None and flags[i, k])
+                if shown[i, k]
+                else "\N{EN DASH}"
+                for k in range(part.places.size)
             ),
         )
-        for row in rows
+        for i, row in enumerate(part.rows)
     )
-    heads = grid.labels or tuple(f"{grid.place[k]:.3g} km" for k in columns)
-    shown = [heads[k] for k in columns] if grid.labels else heads
+    heads = [
+        grid.labels[k] if grid.labels else f"{grid.place[k]:.3g} km" for k in part.places.tolist()
+    ]
     some = []
-    if rows.size < grid.start.size:
-        some.append(f"{rows.size} of {counted(grid.start.size, 'time')}, nearest to round times")
-    if columns.size < grid.place.size:
-        some.append(f"single values at {columns.size} of {grid.place.size:,} {grid.name} bins")
-    unit = units(quantity.units)
-    title = quantity.name.replace("_", " ") + (f" ({unit})" if unit not in ("", "1") else "")
-    return ValueTable(f"{title[:1].upper()}{title[1:]}", tuple(shown), cells, "; ".join(some))
+    if part.rows.size < grid.start.size:
+        some.append(
+            f"{part.rows.size} of {counted(grid.start.size, 'time')}, nearest to round times"
+        )
+    if part.places.size < grid.place.size:
+        some.append(f"single values at {part.places.size} of {grid.place.size:,} {grid.name} bins")
+    title = column.quantity.label
+    return ValueTable(f"{title[:1].upper()}{title[1:]}", tuple(heads), rows, "; ".join(some))
 
 
-def _cell(value: float, error: float, rejected: bool, flagged: bool) -> Cell:  # noqa: FBT001
-    if rejected or not np.isfinite(value):
-        return Cell("\N{EN DASH}", "reject")
+def _words(value: float, error: float, flagged: object) -> str:
     words = number(float(f"{value:.3g}"))
     if np.isfinite(error):
         words += f" \N{PLUS-MINUS SIGN} {number(float(f'{error:.2g}'))}"
-    return Cell(f"{words}{' *' if flagged else ''}", "care" if flagged else "good")
+    return f"{words} *" if flagged else words
 
 
 def _clock(grid: _Grid, row: int) -> str:
@@ -233,11 +287,19 @@ def _clock(grid: _Grid, row: int) -> str:
     return f"{start.replace('T', ' ')}\N{EN DASH}{end}"
 
 
-def _reach(ratio: Floats, grid: _Grid) -> int:
+def _reach(source: _Source) -> int:
     """Return the number of places to show: up to somewhat beyond where noise dominates."""
-    count = grid.place.size
+    grid, count = source.grid, source.grid.place.size
     if grid.labels or count <= _COLUMNS:
         return count
+    every = -(-8 * count * grid.start.size // _READ_BYTES)
+    only = replace(source, quantities=source.quantities[:1])
+    part = only.part(np.arange(0, grid.start.size, every), np.arange(count))
+    (main,) = part.columns
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = main.values / main.errors
+    if part.quality is not None:
+        ratio[part.quality.rejected] = np.nan
     far = BEYOND * signal_reach(ratio, grid.place)
     return min(count, int(np.searchsorted(grid.place, far)) + 1) if far > 0.0 else count
 
@@ -247,10 +309,7 @@ def _chosen_places(grid: _Grid, reach: int) -> Indices:
     if reach <= _COLUMNS or grid.labels:
         return np.arange(min(reach, _COLUMNS), dtype=np.intp)
     place = grid.place[:reach]
-    rough = (place[-1] - place[0]) / _COLUMNS
-    power = 10.0 ** np.floor(np.log10(rough))
-    step = next(power * s for s in _ROUND if power * s >= rough)
-    wanted = np.arange(np.ceil(place[0] / step), np.floor(place[-1] / step) + 1) * step
+    wanted = np.array(round_steps(float(place[0]), float(place[-1]), _COLUMNS - 1))
     return np.unique(np.abs(place[None, :] - wanted[:, None]).argmin(axis=1))
 
 
@@ -268,52 +327,36 @@ def _near_round_times(grid: _Grid, at_most: int) -> Indices:
     return np.unique(np.linspace(0, grid.start.size - 1, at_most).astype(np.intp))
 
 
-def _csv(
-    grid: _Grid,
-    quantities: Sequence[Quantity],
-    values: dict[str, Floats],
-    errors: dict[str, Floats],
-    quality: tuple[NDArray[np.int64], NDArray[np.bool_]],
-    bits: Sequence[StoredBit],
-    chosen: tuple[Indices, int],
-) -> bytes:
+def _csv(grid: _Grid, part: _Part) -> bytes:
     """Return values with errors and quality, one row for each time and place."""
-    flags, rejected = quality
-    rows, reach = chosen
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     head = ["time_start", "time_end"]
     if grid.name:
         head.append(grid.name if grid.labels else f"{grid.name} (km)")
-    for q in quantities:
-        unit = f" ({q.units})" if q.units else ""
-        head += [f"{q.name}{unit}", f"{q.name}_standard_error{unit}"]
+    for column in part.columns:
+        unit = f" ({column.quantity.units})" if column.quantity.units else ""
+        head += [f"{column.quantity.name}{unit}", f"{column.quantity.name}_standard_error{unit}"]
     writer.writerow([*head, "quality", "flags"])
-    words: dict[int, str] = {}
-    for row in rows.tolist():
+    for i, row in enumerate(part.rows.tolist()):
         interval = [str(e[row].astype("datetime64[s]")) + "Z" for e in (grid.start, grid.stop)]
-        for k in range(reach):
-            flag = int(flags[row, k])
-            if flag not in words:
-                words[flag] = " ".join(bit.word for bit in bits if flag & bit.mask)
+        for k in part.places.tolist():
             label = grid.labels[k] if grid.labels else f"{grid.place[k]:.7g}"
             numbers = [
-                f"{q.factor * array[q.name][row, k]:.6g}"
-                for q in quantities
-                for array in (values, errors)
+                f"{values[i, k]:.6g}"
+                for column in part.columns
+                for values in (column.values, column.errors)
             ]
-            grade = "reject" if rejected[row, k] else "care" if flag else "good"
             place = [label] if grid.name else []
-            writer.writerow([*interval, *place, *numbers, grade, words[flag]])
+            quality = part.quality.words(i, k) if part.quality else ("", "")
+            writer.writerow([*interval, *place, *numbers, *quality])
     return out.getvalue().encode()
 
 
-def _csv_note(grid: _Grid, rows: Indices, reach: int) -> str:
-    every = rows.size == grid.start.size
-    profiles = (
-        f"all {counted(grid.start.size, 'time')}"
-        if every
-        else f"{rows.size} of {counted(grid.start.size, 'time')}, nearest to round times"
-    )
+def _csv_note(grid: _Grid, part: _Part) -> str:
+    count, reach = counted(grid.start.size, "time"), part.places.size
+    every = part.rows.size == grid.start.size
+    profiles = f"all {count}" if every else f"{part.rows.size} of {count}, nearest to round times"
     beyond = "" if reach == grid.place.size else f", up to {grid.place[reach - 1]:.3g} km"
-    return f"{profiles}{beyond}"
+    without = "" if part.quality else "; these values have no quality flags"
+    return f"{profiles}{beyond}{without}"

@@ -7,6 +7,7 @@ import io
 import json
 import re
 import shutil
+import tracemalloc
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -14,7 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 import xarray as xr
-from support.archives.site_archive import add, contents, small_archive
+from support.archives.site_archive import add, add_unknown, contents, small_archive
 from support.products.drawn import figures
 from support.products.fabricated import START as FIRST
 from support.products.fabricated import signal, times
@@ -22,6 +23,8 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CatalogError
+from lidarops.flags import Quality
+from lidarops.site import build, values
 from lidarops.site.build import build_site
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import read_values
@@ -74,11 +77,11 @@ def test_the_csv_holds_the_values_of_the_file(output: Path, kind: str) -> None:
     with xr.open_dataset(file, decode_timedelta=False) as product:
         along, name = (list(rows[0])[place].partition(" (")[0] for place in (2, 3))
         factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
-        values = product[name].values.astype(float)
-        assert len(rows) == values.size
+        expected = product[name].values.astype(float)
+        assert len(rows) == expected.size
         column = next(key for key in rows[0] if key.startswith(name))
-        stated = np.array([float(row[column]) for row in rows]).reshape(values.shape)
-        np.testing.assert_allclose(stated, factor * values, rtol=1e-5)
+        stated = np.array([float(row[column]) for row in rows]).reshape(expected.shape)
+        np.testing.assert_allclose(stated, factor * expected, rtol=1e-5)
         flags = product["quality_flag"].values.ravel()
         usable = product["usable"].values.ravel()
     for row, flag, grade in zip(rows, flags, usable, strict=True):
@@ -118,13 +121,78 @@ def test_long_products_are_thinned_to_round_times_and_said() -> None:
         },
         coords={"time": time, "range": ("range", height, {"units": "m"})},
     )
-    values = read_values(product, "signal")
-    (table,) = values.tables
+    made = read_values(product, "signal")
+    (table,) = made.tables
     assert [clock[11:16] for clock, _ in table.rows][1:4] == ["00:58", "01:58", "02:58"]
     assert len(table.columns) <= 12
     assert table.note.startswith(f"{len(table.rows)} of 144 times, nearest to round times")
-    assert "up to 7.2" in values.note
-    assert values.csv.count(b"\n") <= 4_001
+    assert "up to 7.2" in made.note
+    assert made.csv.count(b"\n") <= 4_001
+
+
+@pytest.mark.parametrize("limit", [1, 10**9], ids=["single rows are read", "all is read"])
+def test_values_along_a_falling_altitude_rise(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
+    monkeypatch.setattr(values, "_READ_BYTES", limit)
+    product = fields(6, 40)
+    falling = product.isel(time=slice(None, None, -1), range=slice(None, None, -1))
+    assert read_values(falling, "signal") == read_values(product, "signal")
+
+
+@pytest.mark.parametrize("places", [[np.nan, *range(39)], [1.0] * 40], ids=["NaN", "one place"])
+def test_places_without_an_order_are_numbered(places: list[float]) -> None:
+    product = fields(6, 40).assign_coords(range=("range", places, {"units": "m"}))
+    (table,) = read_values(product, "signal").tables
+    assert table.columns[:2] == ("range 0", "range 1")
+
+
+@pytest.mark.parametrize("other", [None, "time"], ids=["none", "of other dimensions"])
+def test_values_without_flags_have_no_quality(tmp_path: Path, other: str | None) -> None:
+    product = xr.load_dataset(add_unknown(tmp_path)).drop_vars("quality_flag")
+    if other:
+        product["quality_flag"] = other, np.zeros(product.sizes[other], np.int32)
+    made = read_values(product, "wind")
+    rows = list(csv.DictReader(io.StringIO(made.csv.decode())))
+    assert len(rows) == 48
+    assert {(row["quality"], row["flags"]) for row in rows} == {("", "")}
+    assert made.note.endswith("these values have no quality flags")
+
+
+def test_only_values_that_are_shown_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(values, "_READ_BYTES", 1_000_000)
+    fields(600, 4000).astype(np.float32).to_netcdf(tmp_path / "long.nc")
+    with xr.open_dataset(tmp_path / "long.nc") as product:
+        tracemalloc.start()
+        read_values(product, "signal")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 8 * 600 * 4000, "less than one variable"
+
+
+@pytest.mark.parametrize("part", ["read_values", "read_quality"])
+def test_what_cannot_be_shown_does_not_cost_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError("no memory")
+
+    monkeypatch.setattr(build, part, fail)
+    output = tmp_path / "out"
+    add(output, "signal")
+    made = build_site(output)
+    assert made.products == 1
+    assert made.problems[0].reason.endswith(": no memory")
+    assert "no memory" in page_of(output, "signal").read_text("utf-8")
+
+
+def fields(profiles: int, bins: int) -> xr.Dataset:
+    """Return a product with values in all bins, that differ."""
+    product = signal(times(FIRST, profiles, 60.0), bins=bins)
+    product["signal"][:] = 1.0 + np.arange(profiles * bins).reshape(profiles, bins)
+    product["signal_standard_error"][:] = 0.5
+    product["quality_flag"][:] = np.arange(bins) % 2 * int(Quality.PILE_UP)
+    return product
 
 
 def test_values_reach_as_far_as_the_figure() -> None:
