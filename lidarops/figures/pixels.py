@@ -54,6 +54,17 @@ def striped(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(image == REJECTED, REJECTED + stripes, image).astype(np.uint8)
 
 
+def narrowed(image: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
+    """Return an image of at most `most` columns: of those merged, the first pixel that has data."""
+    merged = -(-image.shape[1] // most)
+    parts = [image[:, start::merged] for start in range(merged)]
+    narrow = parts[0].copy()
+    for part in parts[1:]:
+        left = narrow[:, : part.shape[1]]
+        np.copyto(left, part, where=left == BLANK)
+    return narrow
+
+
 def png(pixels: NDArray[np.uint8], palette: Palette) -> bytes:
     """Return an indexed image as PNG.
 

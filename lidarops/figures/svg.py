@@ -56,6 +56,8 @@ _LOWER: Final = 0.6
 """Height of panels that are below each other in a narrow figure, but side by side in a wide one."""
 _TICK: Final = 16
 """Least space between the labels of ticks along the horizontal axis of a narrow figure."""
+_NARROW_PIXELS: Final = 390
+"""Most columns of an image in a narrow figure."""
 _FEW: Final = 150
 """Most points of a curve in a thumbnail."""
 
@@ -158,11 +160,8 @@ def _small(layer: Layer) -> Layer | None:
     """Return a layer with few points or pixels; None if a thumbnail does not show it."""
     match layer:
         case Image():
-            rows, columns = (
-                -(-layer.pixels.shape[0] // THUMB[1]),
-                -(-layer.pixels.shape[1] // THUMB[0]),
-            )
-            return Image(layer.pixels[::rows, ::columns], layer.palette)
+            rows = -(-layer.pixels.shape[0] // THUMB[1])
+            return Image(pixels.narrowed(layer.pixels[::rows], THUMB[0]), layer.palette)
         case Curve():
             few = slice(None, None, -(-layer.x.size // _FEW) or 1)
             return Curve(layer.x[few], layer.y[few], layer.style, layer.mark, layer.joined)
@@ -193,12 +192,14 @@ def _content(figure: Figure, width: int) -> tuple[str, float]:
 
 
 def _narrowed(panel: Panel, width: int, lower: float) -> Panel:
-    """Return a panel without its second axis, and with half of the pixels of images."""
+    """Return a panel without its second axis, and with fewer pixels of images."""
     if panel.to_scale:
         left, right = _margins([panel])
         lower = (width - left - right) / (WIDTH - left - right)
     layers = tuple(
-        Image(layer.pixels[:, ::2], layer.palette) if isinstance(layer, Image) else layer
+        Image(pixels.narrowed(layer.pixels, _NARROW_PIXELS), layer.palette)
+        if isinstance(layer, Image)
+        else layer
         for layer in panel.layers
     )
     return replace(panel, layers=layers, right=None, height=lower * panel.height)

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import re
 from datetime import timedelta
+from functools import partial
 
 import numpy as np
 import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image as Pictures
 from support.products.drawn import figures, image, labelled
 from support.products.encoded_products import build_product
 from support.products.fabricated import START, signal, times
 from support.products.made_products import MAKERS, context
 
+from lidarops.figures import svg
 from lidarops.figures.pixels import BLANK, NEGATIVE, REJECTED
 from lidarops.figures.raster import COLUMNS, colour_limits
 from lidarops.flags import Quality
@@ -141,6 +147,16 @@ def test_time_without_measurement_is_blank():
     assert filled(panel).sum() == 12
     start, stop = product["time_bnds"].values[[0, -1], [0, 1]]
     assert panel.x.high - panel.x.low == pytest.approx((stop - start) / np.timedelta64(1, "D"))
+
+
+@pytest.mark.parametrize(
+    "drawing", [partial(svg.file, width=svg.NARROW), svg.thumbnail], ids=["narrow", "thumbnail"]
+)
+def test_small_figures_show_every_measurement(drawing):
+    figure = drawn(measured(signal(times(START, 12, 2520.0), bins=100), 5.0))
+    encoded = re.search(rb"base64,([^\"]*)", drawing(figure))[1]
+    shown = np.asarray(Pictures.open(io.BytesIO(base64.b64decode(encoded))))
+    assert (shown != BLANK).any(axis=0).sum() == 12
 
 
 def test_short_pauses_between_profiles_are_filled_and_said():

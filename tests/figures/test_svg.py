@@ -9,6 +9,8 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image as Pictures
 
 from lidarops.figures import pixels, svg
@@ -154,6 +156,17 @@ def test_images_hold_their_pixels_and_the_scale_becomes_lighter(palette):
     # Stripes of rejected blocks are darker than the scale.
     assert luminance[-1] > 25
     assert "bar" in texts(encoded)
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 99))
+def test_narrow_images_lose_no_data(columns, most, seed):
+    image = np.random.default_rng(seed).choice([pixels.BLANK, 7, 8], (3, columns)).astype(np.uint8)
+    narrow = pixels.narrowed(image, most)
+    size = -(-columns // most)
+    assert narrow.shape == (3, -(-columns // size))
+    for place in range(narrow.shape[1]):
+        for row, pixel in zip(image[:, place * size :][:, :size], narrow[:, place], strict=True):
+            assert pixel == next((value for value in row if value != pixels.BLANK), pixels.BLANK)
 
 
 def test_a_second_axis_stands_at_the_right():
