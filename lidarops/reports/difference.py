@@ -1,89 +1,95 @@
-"""What a run did otherwise than the runs before it, from their records."""
+"""What a run did otherwise than the run before it, from their records."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
-from typing import Final
 
 from lidarops.errors import CatalogError
 from lidarops.figures.wording import counted
-from lidarops.records import ProductRecord, RunRecord
+from lidarops.records import Grade, ProductRecord, RunRecord
 from lidarops.reports.run_record import FILE_NAME, load_run_record
-
-_LOOK_BACK: Final = 20
-"""Most earlier runs that are read."""
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """Comparison of a run with those before it."""
+class RunDifference:
+    """Comparison of a run with the one before it."""
 
     previous: str
-    """Identifier of the run before; empty for the first."""
+    """Identifier of the run before; empty for the first, and where it cannot be read."""
     sentences: tuple[str, ...]
     newly_refused: tuple[str, ...] = ()
 
 
-def difference(record: RunRecord, folder: Path) -> Difference:
-    """Compare a run with the earlier runs whose reports are beside its own.
+class _Fate(Enum):
+    """What a run made of a product."""
+
+    NEW = auto()
+    """Made for the first time, or a first version whose file was missing."""
+    SAME = auto()
+    CHANGED = auto()
+    UNCOMPARED = auto()
+    """Made again, while the file that it replaces was missing or altered."""
+
+
+def difference(record: RunRecord, folder: Path) -> RunDifference:
+    """Compare products with the files that they replace, the rest with the run before.
 
     Parameters
     ----------
     record : RunRecord
     folder : Path
-        Report folder of the run. Records that cannot be read are passed over.
+        Report folder of the run. Those of earlier runs are beside it.
     """
-    earlier = list(_earlier(record, folder))
-    if not earlier:
-        return Difference("", ("This is the first run with a report here.",))
-    known: dict[str, ProductRecord] = {}
-    for other in earlier:
-        for scene in other.scenes:
-            for product in scene.products:
-                known.setdefault(product.path, product)
-    new = same = changed = 0
-    for scene in record.scenes:
-        for product in scene.products:
-            old = known.get(product.path)
-            if old is None:
-                new += 1
-            elif old.sha256 == product.sha256:
-                same += 1
-            else:
-                changed += 1
-    before, now = _refused(earlier[:1]), _refused([record])
-    newly = tuple(sorted(now - before))
-    made = f"{counted(new, 'product')} new, {changed:,} with other content"
+    fates = Counter(_fate(product) for scene in record.scenes for product in scene.products)
+    uncompared = fates[_Fate.UNCOMPARED]
+    products = (
+        f"{counted(fates[_Fate.NEW], 'product')} new,"
+        f" {fates[_Fate.CHANGED]:,} with other content,"
+        f" {fates[_Fate.SAME]:,} made again with the same content"
+        + (f", {uncompared:,} made again without a file to compare with." if uncompared else ".")
+    )
+    try:
+        before = _before(record, folder)
+    except CatalogError:
+        return RunDifference("", (products, "The report of the run before cannot be read."))
+    if before is None:
+        return RunDifference("", (products, "This is the first run with a report here."))
+    then, now = _refused(before), _refused(record)
+    newly = tuple(sorted(now - then))
     words = [
-        f"{made}, {same:,} made again with the same content",
-        f"{counted(len(newly), 'file')} newly refused, {len(before - now):,} no longer refused",
+        products,
+        f"{counted(len(newly), 'file')} newly refused, {len(then - now):,} no longer refused.",
     ]
-    failed = _failed(record) - _failed(earlier[0])
+    failed = _failed(record) - _failed(before)
     if failed:
-        words.append(f"newly failed: {', '.join(sorted(failed))}")
-    return Difference(earlier[0].id, tuple(f"{w}." for w in words), newly)
+        words.append(f"newly failed: {', '.join(sorted(failed))}.")
+    return RunDifference(before.id, tuple(words), newly)
 
 
-def _earlier(record: RunRecord, folder: Path) -> Iterator[RunRecord]:
-    """Yield earlier runs of the same campaign, the newest first."""
+def _fate(product: ProductRecord) -> _Fate:
+    if product.change is None:
+        return _Fate.NEW if product.stamp.version == 1 else _Fate.UNCOMPARED
+    return _Fate.SAME if product.change.grade is Grade.NONE else _Fate.CHANGED
+
+
+def _before(record: RunRecord, folder: Path) -> RunRecord | None:
+    """Return the record of the last earlier run of the same campaign; None without any."""
     # The names of runs begin with their time.
-    folders = sorted((f for f in folder.parent.iterdir() if f.name < folder.name), reverse=True)
-    for other in folders[:_LOOK_BACK]:
+    earlier = sorted((f for f in folder.parent.iterdir() if f.name < folder.name), reverse=True)
+    for other in earlier:
         if (other / FILE_NAME).is_file():
-            try:
-                earlier = load_run_record(other)
-            except CatalogError:
-                continue
-            if earlier.campaign == record.campaign and earlier.started < record.started:
-                yield earlier
+            before = load_run_record(other)
+            if before.campaign == record.campaign and before.started < record.started:
+                return before
+    return None
 
 
-def _refused(records: Sequence[RunRecord]) -> set[str]:
+def _refused(record: RunRecord) -> set[str]:
     return {
         granule.path
-        for record in records
         for granule in (*record.refused, *(g for scene in record.scenes for g in scene.refused))
     }
 

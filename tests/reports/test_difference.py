@@ -10,7 +10,7 @@ import pytest
 from support.products import fabricated as fab
 from support.products.fabricated import START
 
-from lidarops.records import ProductRecord, RunRecord
+from lidarops.records import Change, Grade, ProductRecord, RunRecord, Stamp
 from lidarops.reports import run_page
 from lidarops.reports.difference import difference
 from lidarops.reports.run_record import save_run_record
@@ -39,16 +39,20 @@ def test_the_first_run_says_so(tmp_path: Path) -> None:
     assert "first run" in compared(tmp_path, record)
 
 
-def test_products_are_compared_with_the_last_run_that_made_them(tmp_path: Path) -> None:
-    other = replace(PRODUCT, path="h/b.nc", sha256="b" * 64)
-    run(tmp_path, 1, PRODUCT, other)
-    run(tmp_path, 2, replace(PRODUCT, sha256="c" * 64))
-    now = run(
-        tmp_path, 3, replace(PRODUCT, sha256="d" * 64, usable=45), other,
-        replace(PRODUCT, path="h/c.nc"),
-    )  # fmt: skip
-    assert "1 product new, 1 with other content, 1 made again" in compared(tmp_path, now)
-    assert difference(now, tmp_path / now.id).previous == "20240302T000000-x"
+def test_products_are_compared_with_the_files_that_they_replace(tmp_path: Path) -> None:
+    run(tmp_path, 1, PRODUCT)
+    same, other = (Change(grade, 0.0, "", 0.0, ()) for grade in (Grade.NONE, Grade.MINOR))
+    stamps = [(1, None), (3, same), (3, same), (4, other), (2, None)]
+    products = [
+        replace(PRODUCT, path=f"h/{number}.nc", stamp=Stamp(version), change=change)
+        for number, (version, change) in enumerate(stamps)
+    ]
+    now = run(tmp_path, 2, *products)
+    words = (
+        "1 product new, 1 with other content, 2 made again with the same content,"
+        " 1 made again without a file to compare with."
+    )
+    assert words in compared(tmp_path, now)
 
 
 def test_refused_files_and_failed_scenes_are_compared_with_the_run_before(tmp_path: Path) -> None:
@@ -62,13 +66,25 @@ def test_refused_files_and_failed_scenes_are_compared_with_the_run_before(tmp_pa
     assert difference(now, tmp_path / now.id).newly_refused == ("raw/3",)
 
 
-def test_other_campaigns_later_runs_and_damaged_records_are_passed_over(tmp_path: Path) -> None:
-    run(tmp_path, 1, PRODUCT, campaign="another")
-    run(tmp_path, 2, PRODUCT)
-    (tmp_path / "20240302T000000-x" / "run.json").write_text("{")
+def test_runs_of_other_campaigns_and_later_runs_are_passed_over(tmp_path: Path) -> None:
+    run(tmp_path, 1, PRODUCT)
+    run(tmp_path, 2, PRODUCT, campaign="another")
     now = run(tmp_path, 3, PRODUCT)
     run(tmp_path, 4, PRODUCT)
-    assert "first run" in compared(tmp_path, now)
+    assert difference(now, tmp_path / now.id).previous == "20240301T000000-x"
+
+
+@pytest.mark.parametrize("content", ["{", '{"format": "lidarops run record", "version": 1}'])
+def test_a_run_before_that_cannot_be_read_is_said(tmp_path: Path, content: str) -> None:
+    run(tmp_path, 1, PRODUCT)
+    run(tmp_path, 2, PRODUCT)
+    (tmp_path / "20240302T000000-x" / "run.json").write_text(content)
+    now = run(tmp_path, 3, PRODUCT)
+    words = compared(tmp_path, now)
+    assert "The report of the run before cannot be read." in words
+    assert "first run" not in words
+    assert "1 product new" in words
+    assert not difference(now, tmp_path / now.id).previous
 
 
 def test_the_report_begins_with_outcome_difference_and_figures(
