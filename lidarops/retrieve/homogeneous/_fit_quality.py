@@ -127,7 +127,7 @@ def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[floa
 def judge_fit(
     fit: PathEstimate,
     *,
-    length: float,
+    bin_width: float,
     known_variance: bool,
     counts: CountMoments | None = None,
     unknowns: int = 3,
@@ -138,8 +138,8 @@ def judge_fit(
     Parameters
     ----------
     fit : PathEstimate
-    length : float
-        Of the section, m.
+    bin_width : float
+        m.
     known_variance : bool
         Whether the weights are inverse variances.
     counts : CountMoments, optional
@@ -159,7 +159,7 @@ def judge_fit(
         limits = _limits(fit, unknowns, known_variance=known_variance)
         if counts is not None:
             limits = _limits_of_counts(limits, fit.bins, counts, unknowns)
-        determined = _determined(fit, length, mean_noise, limits.widening)
+        determined = _determined(fit, bin_width, mean_noise, limits.widening)
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > THRESHOLDS.least_signal**2),
             (HomogeneousQuality.POORLY_DETERMINED, determined),
@@ -193,12 +193,11 @@ def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
 
 
 def _determined(
-    fit: PathEstimate, length: float, noise: Array, widening: Array
+    fit: PathEstimate, bin_width: float, noise: Array, widening: Array
 ) -> npt.NDArray[np.bool_]:
     error = np.sqrt(fit.extinction_variance * noise) * widening
     # Where the signal dies within a bin, the error is that of the transmission of one bin.
-    steepest = 0.5 * np.maximum(fit.bins - 1.0, 1.0) / length
-    slope = np.minimum(fit.extinction + 1.0 / fit.mean_range, steepest)
+    slope = np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width)
     largest = THRESHOLDS.largest_relative_error * slope
     finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
     determined: npt.NDArray[np.bool_] = finite & (error < largest)

@@ -45,6 +45,10 @@ def solve_by_compression(problem: PathProblem) -> PathSolution:
     tables = _tables(problem)
     if tables is None:
         return solve_by_direct_fit(problem)
+    # The limits of the kernel are those of normal noise.
+    few = np.nanmin(problem.counts(), axis=1, initial=np.inf) < THRESHOLDS.many_counts
+    if few.all():
+        return solve_by_direct_fit(problem)
     count, bins = problem.power.shape
     out = np.empty((len(_compressed.RESULTS), count))
     quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
@@ -65,8 +69,6 @@ def solve_by_compression(problem: PathProblem) -> PathSolution:
         valid_bins=np.full(count, bins, np.int32),
         quality=quality,
     )
-    # The limits of the kernel are those of normal noise.
-    few = np.nanmin(problem.counts(), axis=1, initial=np.inf) < THRESHOLDS.many_counts
     routed = np.flatnonzero((state == _compressed.ROUTED) | few)
     if routed.size == 0:
         return solution
@@ -226,7 +228,7 @@ def _solution(
     length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
     verdict = judge_fit(
         fit,
-        length=problem.length,
+        bin_width=problem.bin_width,
         known_variance=problem.known_variance,
         counts=_count_moments(problem),
         unknowns=unknowns,

@@ -51,9 +51,11 @@ class PathProblem:
         return 0.3 * float(np.finfo(self.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
     @property
-    def length(self) -> float:
-        """Length of the section, m; 1 for a single bin."""
-        return float(self.range[-1] - self.range[0]) if self.range.size > 1 else 1.0
+    def bin_width(self) -> float:
+        """Mean spacing of the bins, those without data included, m; 1 for a single bin."""
+        if self.range.size < 2:
+            return 1.0
+        return float(self.range[-1] - self.range[0]) / (self.range.size - 1)
 
     @property
     def common_weights(self) -> Array:

@@ -29,6 +29,21 @@ def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance):
     assert np.sum(false & kept) <= 1
 
 
+def test_missing_bins_do_not_change_the_limit_of_steep_signals():
+    """The limit is that of the transmission of one bin, however many bins have data."""
+    r = 500.0 + 15.0 * np.arange(80)
+    power = 100.0 + 1e4 * (r[0] / r) ** 2 * np.exp(-2.0 * 0.04 * (r - r[0]))
+    power[40:] = np.nan
+    # With this noise the error is 0.9 of the limit, 0.15 / (2 * 15 m).
+    error = fit_homogeneous_path(power, r, variance=1.0).extinction_standard_error
+    noise = 0.9 * 0.15 / 30.0 / error
+    fit = fit_homogeneous_path(power, r, variance=noise**2)
+    assert fit.extinction == pytest.approx(0.04, rel=1e-3)
+    assert fit.quality & int(HomogeneousQuality.POORLY_DETERMINED) == 0
+    fit = fit_homogeneous_path(power, r, variance=1.3 * noise**2)
+    assert fit.quality & int(HomogeneousQuality.POORLY_DETERMINED)
+
+
 @pytest.mark.parametrize("counts", [1.0, 0.1, 0.02])
 def test_few_counts_are_neither_outlying_nor_a_poor_fit(counts):
     """One count in a bin that expects 0.02 is 7 standard deviations."""
