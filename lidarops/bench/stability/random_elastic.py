@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.harness.rows import Array, Mask
 from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
 from lidarops.flags import Quality
+from lidarops.netcdf.variables import ErrorKind
+from lidarops.products.elastic.variables import sources
 from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.background import known_shape
 from lidarops.retrieve.elastic import inversion, layers, outlying_bins
@@ -335,9 +337,9 @@ def _scored(
     with np.errstate(invalid="ignore"):
         behind_cloud = (window.top > clouds.cloud_base_range)[:, np.newaxis]
     bits |= np.where(behind_cloud, np.int32(ElasticQuality.CLOUD), np.int32(0))
-    budget = solved.budget
-    random = np.hypot(budget.noise, budget.background)
-    systematic: Any = np.sqrt(budget.reference**2 + budget.lidar_ratio**2 + budget.molecular**2)
+    # As products average them: what is independent between profiles is random.
+    random = _error(solved.budget, sources(ErrorKind.RANDOM))
+    systematic = _error(solved.budget, sources(ErrorKind.SYSTEMATIC))
     error = (solved.backscatter - sky.particles)[:, inside]
     return ScoredValues(
         failure, "backscatter", error, random[:, inside], systematic[:, inside],
@@ -345,6 +347,11 @@ def _scored(
         uncertain=(bits[:, inside] & int(ElasticQuality.CLOUD)) != 0,
         hidden=None if hidden is None else np.broadcast_to(hidden[:, np.newaxis], error.shape),
     )  # fmt: skip
+
+
+def _error(budget: inversion.ErrorBudget, causes: Iterable[str]) -> Array:
+    """Return the error by these causes together."""
+    return np.asarray(np.sqrt(sum(getattr(budget, cause) ** 2 for cause in causes)))
 
 
 def _mean_variance(counts: Array) -> Array:

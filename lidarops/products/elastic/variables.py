@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -82,16 +82,23 @@ def _error_budget() -> Iterator[Row]:
         )
 
 
-_BUDGET_TERMS: Final = tuple(f"aerosol_backscatter_error_{source}" for source in _BUDGET)
+def sources(kind: ErrorKind) -> tuple[str, ...]:
+    """Return the sources of error of this kind, fields of the error budget of the inversion."""
+    return tuple(source for source, (_, of_source, _) in _BUDGET.items() if of_source is kind)
+
+
+def _terms(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the variables of the error budget of these sources."""
+    return tuple(f"aerosol_backscatter_error_{source}" for source in names)
+
+
+_BUDGET_TERMS: Final = _terms(_BUDGET)
+_SHARED: Final = _terms(sources(ErrorKind.SYSTEMATIC))
 _MEANS: Final = ErrorBudget(
-    random=("aerosol_backscatter_error_noise", "aerosol_backscatter_error_background"),
+    random=_terms(sources(ErrorKind.RANDOM)),
     comment="Errors from noise and background are independent between profiles. Errors from"
     " reference, lidar ratio, molecules and dead time are assumed to be shared by all profiles, so"
     " that they are averaged and do not decrease with the number of profiles.",
-)
-_SHARED: Final = tuple(
-    f"aerosol_backscatter_error_{source}"
-    for source in ("reference", "lidar_ratio", "molecular", "dead_time")
 )
 
 LAYOUT: Final = Layout(
