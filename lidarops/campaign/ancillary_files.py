@@ -17,6 +17,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.interpolate import CubicSpline
 
 from lidarops.errors import AncillaryError, RetrievalInputError
 from lidarops.records import InputRecord, Role
@@ -43,6 +44,9 @@ _MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_sys
 """Variables of a product with measured lidar ratios and overlap."""
 _REJECTED: Final = 2
 """``usable`` of a value that is not to be used."""
+_POINTS: Final = 4
+"""Points of half a cell of a measured overlap; with lines between them it is off by less than 1e-3.
+"""
 _WIDEST: Final = 5000.0
 """m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
@@ -294,10 +298,26 @@ def _measured_overlap(raw: Mapping[str, tuple[str, Array]], name: str) -> Overla
             "holds no measured value", file=name, field="overlap", remedy="choose another night"
         )
     mean = (weight * np.where(known, overlap, 0.0)).sum(axis=0)[measured] / total[measured]
-    ranges = raw["range"][1]
-    # Full overlap begins with the next cell.
-    full = ranges[measured[-1]] + float(np.median(np.diff(ranges)))
-    return Overlap(np.append(ranges[measured], full), np.append(np.minimum(mean, 1.0), 1.0))
+    return _within_cells(raw["range"][1], measured, np.minimum(mean, 1.0))
+
+
+def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -> Overlap:
+    """Return the overlap with these means over the measured cells, 1 from the end of the last one.
+
+    A quadratic spline, sampled finely. Lines between the means have another slope, which looks like
+    extinction: a fourth of it in a boundary layer (`tests/end_to_end/test_raman.py`).
+    """
+    step = float(np.median(np.diff(ranges)))
+    cells = np.arange(measured[0], measured[-1] + 1)
+    centres = ranges[cells]
+    edges = np.append(centres - 0.5 * step, centres[-1] + 0.5 * step)
+    integral = np.append(0.0, np.cumsum(step * np.interp(cells, measured, means)))
+    spline = CubicSpline(edges, integral, bc_type=("not-a-knot", (1, 1.0))).derivative()
+    fine = np.linspace(centres[0], edges[-1], (2 * cells.size - 1) * _POINTS + 1)
+    overlap = np.minimum(spline(fine), 1.0)
+    # Noise where overlap is small bends the spline below zero.
+    first = int(np.max(np.flatnonzero(overlap <= 0.0) + 1, initial=0))
+    return Overlap(fine[first:], overlap[first:])
 
 
 def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:

@@ -179,7 +179,8 @@ def test_extinction_reaches_down_with_the_measured_overlap(repository, night, tm
     true = mean_over(particles(truth)["aerosol_extinction"], STEP, r, np.full(r.size, 60.0))
     found = product["aerosol_extinction"].values[:, near]
     assert np.isfinite(found).all()
-    assert np.abs(found.mean() / true[near].mean() - 1.0) < 0.15
+    # 4 % here; with lines between the means of cells of the overlap, 25 %.
+    assert np.abs(found.mean(axis=0) / true[near] - 1.0).max() < 0.1
     error = product["aerosol_extinction_standard_error"].values[:, near]
     assert np.abs((found - true[near]) / error).max() < 3.0
 
@@ -279,19 +280,35 @@ def test_the_night_of_manaus_agrees_with_clean_air_and_the_elastic_inversion(man
     elastic, raman = (product.isel(time=0) for product in manaus)
     r = raman["range"].values
     usable = (raman["quality_flag"].values & rejecting((*RamanQuality, *Quality))) == 0
-    # Up to 7.3 km the signal falls less than air explains, as where overlap is not complete: no
+    # Up to 7.4 km the signal falls less than air explains, as where overlap is not complete: no
     # value is below zero by more than its error and still good.
     negative = (raman["quality_flag"].values & RamanQuality.NEGATIVE_EXTINCTION) != 0
-    assert negative[(r > 2520.0) & (r < 7000.0)].all()
-    clean = usable & (r > 7000.0) & (r < 8500.0)
-    assert clean.sum() > 15
-    z = (raman["aerosol_extinction"].values / raman["aerosol_extinction_standard_error"].values)[
-        clean
-    ]
-    assert np.mean(np.abs(z) < 1.96) > 0.85
-    # Aerosol of the free atmosphere, by both methods.
+    assert negative[(r > 2520.0) & (r < 7380.0)].all()
+    assert not negative[r > 7380.0].any()
+    assert (usable & (r < 8500.0)).sum() > 15
+    # Clean air above the aerosol, rejected values too: no extinction within the errors.
+    clean = (r > 6000.0) & (r < 8500.0)
+    assert clean.sum() > 30
+    z = raman["aerosol_extinction"].values / raman["aerosol_extinction_standard_error"].values
+    assert np.mean(np.abs(z[clean]) < 1.96) > 0.85
+    assert np.mean(np.abs(z[clean & usable]) < 1.96) > 0.85
+    # Aerosol of the free atmosphere, by both methods. All these Raman values are rejected.
     haze = (r > 2600.0) & (r < 5000.0)
     with_55 = np.interp(r, elastic["range"].values, elastic["aerosol_backscatter"].values)
     away = raman["aerosol_backscatter"].values - with_55
     error = raman["aerosol_backscatter_standard_error"].values
     assert np.nanmean(np.abs(away[haze] / error[haze])) < 3.0
+
+
+def test_the_night_of_manaus_has_the_extinction_of_the_page(manaus):
+    heights = 1000.0 * np.array([3, 4, 5, 6, 8, 10])
+    rows = {
+        "raman": ((-20, -21, -2, -8, 0, 1), (5, 4, 4, 5, 5, 6)),
+        "elastic": ((-2, -6, -6, -1, 2, -2), (2, 2, 3, 4, 5, 9)),
+    }
+    for product, stated in zip(manaus, (rows["elastic"], rows["raman"]), strict=True):
+        near = np.abs(product["range"].values - heights[:, np.newaxis]) <= 30.0
+        for name, figures in zip(("", "_standard_error"), stated, strict=True):
+            values = 1e6 * product[f"aerosol_extinction{name}"].values[0]
+            means = [values[cells].mean() for cells in near]
+            np.testing.assert_allclose(means, figures, atol=0.6)
