@@ -40,6 +40,7 @@ SELECTIONS: Final = {
         figures=("all-homogeneous-path", "all-elastic-inversion", "all-scans-over-zenith-angle",
                  "all-networks-of-lidars"),
     ),
+    "memory": Selection("lidarops bench throughput --case memory --out bench", ("Peak memory",)),
     "published": Selection(
         "lidarops bench accuracy --case elastic --quick --data boeckmann --out bench",
         ("Background of published files", "Backscatter of published files"),

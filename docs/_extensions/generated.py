@@ -24,6 +24,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
     "campaign-keys": campaign_keys.page,
     "command-line": command_line.page,
     "every-function": python_api.every_function,
+    "memory": partial(benchmark_results.page, "memory"),
     "modules": python_api.offered,
     "product-variables": product_variables.page,
     "published": partial(benchmark_results.page, "published"),
