@@ -1,0 +1,35 @@
+"""One version: of the package, the citation, the changelog and the tag of a release."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+
+@pytest.fixture
+def version(repository: Path) -> str:
+    settings = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))
+    number: str = settings["project"]["version"]
+    return number
+
+
+def test_the_citation_and_the_changelog_name_the_version(repository: Path, version: str) -> None:
+    citation = yaml.safe_load((repository / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == version
+    changelog = (repository / "CHANGELOG.md").read_text(encoding="utf-8")
+    newest = re.search(r"^## (\S+)", changelog, re.MULTILINE)
+    assert newest
+    assert newest[1] == version
+
+
+def test_a_tagged_commit_has_the_version_of_its_tag(repository: Path, version: str) -> None:
+    command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
+    tags = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+    if tags.returncode or not tags.stdout.split():
+        pytest.skip("this commit has no tag of a release")
+    assert tags.stdout.split() == [f"v{version}"]
