@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -21,11 +22,18 @@ SIGNALS = Selection(instruments=("poor",))
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Archive:
-    """A small archive, whose signals are processed."""
+def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small archive, whose signals are processed."""
     archive = Archive(tmp_path_factory.mktemp("versions"), days=2)
     brought(archive)
-    return archive
+    return archive.folder
+
+
+@pytest.fixture
+def source(processed: Path, tmp_path: Path) -> Archive:
+    """A copy of it, with the same modification times."""
+    shutil.copytree(processed, tmp_path / "archive")
+    return Archive(tmp_path / "archive")
 
 
 def brought(archive: Archive, **options: bool) -> Result:
@@ -128,7 +136,7 @@ def test_compare_prints_grade_and_cause(source: Archive, tmp_path: Path) -> None
     assert same.exit_code == 0
     assert same.output.startswith("none")
     set_dead_time(source, 20e-9)
-    brought(source, thaw=True)
+    brought(source)
     found = CliRunner().invoke(app, ["compare", "--json", str(old), str(root / path)])
     assert found.exit_code == 1
     document = json.loads(found.output)
