@@ -42,7 +42,6 @@ _COUNTS: Final = (
     "false random",
     "false",
     "false plain",
-    "allowed",
     "plain hidden",
     "false hidden",
     "false bare",
@@ -59,8 +58,6 @@ class Verdict(StrEnum):
     MET = "met"
     UNDECIDED = "undecided"
     """Above the target by less than 2 Monte Carlo errors."""
-    DECLARED = "missed as declared"
-    """Above the target, but not above the share that docs and products state."""
     MISSED = "MISSED"
 
 
@@ -73,8 +70,6 @@ class Failure:
     """Whether the model holds, so that random errors alone must cover the truth."""
     unseen: str = ""
     """Reason why the data cannot reveal the violation; empty where they can."""
-    declared: float = 0.0
-    """Share of false values that docs and products state, where it is above the target."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,8 +145,7 @@ class Tally:
         if failure.satisfied:
             verdict = _goal(false_random, SATISFIED)
         else:
-            allowed = clustered_share(column["allowed"], plain).value
-            verdict = _goal(false_plain, VIOLATED, allowed)
+            verdict = _goal(false_plain, VIOLATED)
         if needless is not None and flagged is not None:
             verdict += f"; needless {_goal(flagged, needless)}"
         return {
@@ -178,17 +172,14 @@ class Tally:
         }
 
 
-def _goal(figure: Figure, target: float, declared: float = 0.0) -> str:
-    return f"{share_text(target)} {_verdict(figure, target, declared)}"
+def _goal(figure: Figure, target: float) -> str:
+    return f"{share_text(target)} {_verdict(figure, target)}"
 
 
-def _verdict(figure: Figure, target: float, declared: float) -> Verdict:
-    least = figure.value - 2.0 * figure.error
+def _verdict(figure: Figure, target: float) -> Verdict:
     if figure.value <= target:
         return Verdict.MET
-    if least <= target:
-        return Verdict.UNDECIDED
-    return Verdict.DECLARED if least <= declared else Verdict.MISSED
+    return Verdict.UNDECIDED if figure.value - 2.0 * figure.error <= target else Verdict.MISSED
 
 
 SATISFIED: Final = 1e-3
@@ -225,7 +216,6 @@ def _count(values: ScoredValues) -> dict[str, float]:
     false_random, false = ~(size <= FALSE * random), ~(size <= FALSE * stated)
     kept = valued & ~rejected
     plain, bare = kept & ~uncertain, kept & (bits == 0)
-    allowed = values.failure.declared or VIOLATED
     masks = {
         "values": valued,
         "covered": kept & (size <= COVERED * random),
@@ -243,5 +233,4 @@ def _count(values: ScoredValues) -> dict[str, float]:
         "solvable": solvable,
         "solvable rejected": solvable & ~plain,
     }
-    counts = {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
-    return counts | {"allowed": allowed * counts["plain"]}
+    return {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}

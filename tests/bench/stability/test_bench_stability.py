@@ -120,20 +120,6 @@ def test_undetectable_false_values_are_counted_separately():
     assert scores[BROKEN]["of these undetectable"].value == 1.0
 
 
-@pytest.mark.parametrize(
-    ("declared", "verdict"),
-    [(0.0, Verdict.MISSED), (0.01, Verdict.MISSED), (0.03, Verdict.DECLARED)],
-)
-def test_a_declared_share_excuses_no_more_than_it_states(declared, verdict):
-    failure = Failure("bent", declared=declared)
-    errors = np.zeros((50, 100))
-    errors[:, :2] = 9.0
-    hidden = np.ones(100, bool)
-    scores = counted(*(scored(failure, row, hidden=hidden) for row in errors))
-    assert scores["bent"]["target"] == f"0.5 % {verdict}"
-    assert scores[BROKEN]["target"] == f"0.5 % {verdict}"
-
-
 def test_visible_misfit_is_the_remainder_of_three_tangents():
     r = np.linspace(2000.0, 9000.0, 300)
     x = (r - r[0]) / np.ptp(r)
@@ -265,13 +251,20 @@ def test_command_fails_where_a_target_is_missed(stability, monkeypatch):
 def test_missed_targets_are_those_of_the_tables():
     errors = np.zeros((20, 500))
     errors[:, :5] = 9.0
+    scores = counted(*(scored(HIDDEN, row) for row in errors))
+    scores = {("x", failure): score for failure, score in scores.items()}
+    missed = [f"paths: {name} (x), target 0.5 % MISSED" for name in ("hidden", BROKEN)]
+    assert study.missed_targets("paths", scores) == missed
+    assert study.targets(scores) == f"Missed: hidden (x), {BROKEN} (x)."
+
+
+def test_a_chapter_states_all_scenes_that_were_drawn():
     tally = Tally()
-    for row in errors:
-        tally.add(scored(HIDDEN, row), 500)
-    chapter = study._chapter("paths", tally.rates(None))
-    assert any(
-        "hidden (x), target 0.5 % MISSED" in line for line in study.missed_targets([chapter])
-    )
+    for failure in (HOLDS, HIDDEN, Failure("bent")):
+        for quantity in ("x", "y"):
+            tally.add(replace(scored(failure, [0.0, 9.0]), quantity=quantity), 2)
+    tally.add(replace(scored(HOLDS, [0.0]), quantity="z"), 1)
+    assert study._chapter("paths", tally.rates(None)).text.startswith("6 random scenes.")
 
 
 def test_command_names_every_benchmark_where_one_is_unknown():
