@@ -11,7 +11,7 @@ from scipy import stats
 
 from lidarops.bench.accuracy.multiangle_cases import correlated
 from lidarops.bench.harness.rows import Array, Mask
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
+from lidarops.bench.stability.random_scenes import COVERED, FALSE, VISIBLE, Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -259,10 +259,13 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValue
 
 
 def _widening(bins: int) -> float:
-    """Return the factor on standard errors where the noise is estimated from the bins."""
+    """Return the factor on standard errors where the noise is estimated from the bins.
+
+    Calculated apart from the retrieval, whose errors must not decide which flags are needless.
+    """
     freedom = 18.0 / 35.0 * (bins - 2)
-    far = stats.t.isf(0.5 * THRESHOLDS.false_estimated, freedom) / 4.0
-    return float(max(far, stats.t.isf(0.025, freedom) / stats.norm.isf(0.025)))
+    far = stats.t.isf(0.5 * THRESHOLDS.false_estimated, freedom) / FALSE
+    return float(max(far, stats.t.isf(stats.norm.sf(COVERED), freedom) / COVERED))
 
 
 def _solved(

@@ -29,8 +29,8 @@ class Thresholds:
     largest_relative_error: float = 0.15
     """Standard error of extinction over extinction + 1 / mean range, and over 1 / (2 bin widths).
     Simulations: above the first, coverage of the accepted values falls below 0.93; without the
-    second, 42 % of the values are false where the signal falls by a factor of 1e4 to 1e6 in a bin.
-    """
+    second, 12 to 19 % of the values are false where the signal falls by a factor of 400 to 1e6 in a
+    bin."""
     false_alarm: float = 4e-4
     """Rate at which one test of residuals flags a profile that obeys the model. Assumed: half of
     the target of 1e-3 for needless flags."""

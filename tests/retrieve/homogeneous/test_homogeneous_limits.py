@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality, rejecting
@@ -13,8 +14,10 @@ from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
 
-@pytest.mark.parametrize("variance", [1.0, None], ids=["known noise", "estimated noise"])
-def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance):
+@pytest.mark.parametrize(
+    ("variance", "share"), [(1.0, 0.19), (None, 0.12)], ids=["known noise", "estimated noise"]
+)
+def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance, share):
     """The second bin then holds noise, which looks like the transmission of the first."""
     rng = np.random.default_rng(31)
     r = 500.0 + 15.0 * np.arange(16)
@@ -23,10 +26,35 @@ def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance):
     height = np.exp(rng.uniform(np.log(10.0), np.log(1e6), fall.shape))
     signal = height * (r[0] / r) ** 2 * np.exp(-fall * (r - r[0]) / 15.0)
     fit = fit_homogeneous_path(100.0 + signal + rng.normal(size=signal.shape), r, variance=variance)
-    kept = (fit.quality & rejecting((*Quality, *HomogeneousQuality))) == 0
+    bits = fit.quality & rejecting((*Quality, *HomogeneousQuality))
+    kept = bits == 0
     false = np.abs(fit.extinction - extinction) > 4.0 * fit.extinction_standard_error
     assert kept.sum() > 300
     assert np.sum(false & kept) <= 1
+    # The limit of the slope alone would keep these.
+    others = bits & ~int(HomogeneousQuality.POORLY_DETERMINED) == 0
+    others &= fit.extinction_standard_error < 0.15 * fit.extinction
+    assert np.mean(false[others]) == pytest.approx(share, abs=0.01)
+
+
+@pytest.mark.parametrize("method", ["compressed", "direct"])
+@pytest.mark.parametrize(
+    ("bins", "factor", "held"),
+    [(225, 1.01, 0.95), (50, 1.05, 0.95), (34, 1.08, 0.95), (20, 1.31, 0.97), (8, 3.9, 0.996)],
+)
+def test_errors_from_estimated_noise_are_widened_as_the_page_tells(method, bins, factor, held):
+    r = np.linspace(1000.0, 4000.0, bins)
+    noise = np.random.default_rng(34).normal(size=bins)
+    power = 100.0 + 1e5 * (r[0] / r) ** 2 * np.exp(-4e-4 * (r - r[0])) + noise
+    known, estimated = (
+        fit_homogeneous_path(power, r, variance=variance, method=method) for variance in (1.0, None)
+    )
+    level = np.sqrt(known.reduced_chi2 / estimated.reduced_chi2)
+    widening = estimated.extinction_standard_error / (level * known.extinction_standard_error)
+    assert widening == pytest.approx(factor, abs=0.006 if bins > 8 else 0.06)
+    freedom = 18.0 / 35.0 * (bins - 2)
+    assert 1.0 - 2.0 * stats.t.sf(1.96 * widening, freedom) == pytest.approx(held, abs=5e-4)
+    assert 2.0 * stats.t.sf(4.0 * widening, freedom) <= 5e-4 * (1.0 + 1e-9)
 
 
 def test_missing_bins_do_not_change_the_limit_of_steep_signals():
