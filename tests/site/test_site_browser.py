@@ -13,6 +13,7 @@ from support.archives.site_archive import CHROMIUM, add_unknown, browser, small_
 from support.products import fabricated as fab
 from support.products.fabricated import START
 
+from lidarops.records import Change, Grade, Stamp
 from lidarops.reports.run_page import build_report
 from lidarops.reports.run_record import save_run_record
 from lidarops.site.build import build_site
@@ -60,7 +61,8 @@ def _report(output: Path, folder: str) -> None:
     start = START if folder < "20260304" else START + timedelta(days=1)
     archive = fab.Archive(output / "runs")
     good = archive.write("good.nc", fab.homogeneous(fab.times(START, 40, 600.0)), "homogeneous")
-    changed = replace(good, sha256=folder[:16], usable=0)
+    change = Change(Grade.MAJOR, 4.0, "total_extinction", 0.1, ("settings",))
+    changed = replace(good, usable=0, stamp=Stamp(2), change=change)
     scenes = [
         fab.outcome("one", START, products=(changed,)),
         fab.outcome("two", START, error="the far range is empty", seconds={}),
