@@ -474,6 +474,13 @@ class TestManyScenes:
         assert "2 channels are not drawn" in page.text
         assert all(name in page.text for name in names)
 
+    def test_scenes_lead_to_the_figures_of_each_of_many_instruments(self, archive, tmp_path):
+        product = archive.write("p.nc", signal(times(START, 5, 60.0), bins=50), "signal")
+        names = [f"lidar-{number}" for number in range(10)]
+        scenes = [outcome(name, instrument=name, products=(product,)) for name in names]
+        page = built(run_record(archive.root, scenes), tmp_path / "report")
+        assert {f"#figures-{number}" for number in range(1, 11)} <= set(page.links)
+
     def test_more_sections_than_a_panel_holds(self, archive, tmp_path):
         sections = tuple((1000.0 * k, 1000.0 * k + 900.0) for k in range(1, 8))
         product = homogeneous(times(START, 9, 60.0), sections=sections)
