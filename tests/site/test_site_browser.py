@@ -347,6 +347,23 @@ def test_see_one_kind_only(visitor: Visitor) -> None:
     assert not visitor.page.locator(".g-most-card").first.is_visible()
 
 
+def test_quality_is_chosen_of_days_in_a_year_and_of_products_in_a_day(visitor: Visitor) -> None:
+    states = "links => links.map(link => getComputedStyle(link).visibility)"
+    visitor.click("March 2026")
+    (grade,) = visitor.page.locator("table.days a small").first.evaluate(
+        "e => [...e.parentElement.classList].filter(name => name.startsWith('g-'))"
+    )
+    days = visitor.page.locator(f"table.days a.{grade}")
+    for page, state in (("year", "hidden"), ("day", "visible")):
+        if page == "day":
+            visitor.page.locator(f"#f-{grade}").check()
+            days.first.click()
+            visitor.click("Choose kinds", "summary")
+        assert set(days.evaluate_all(states)) == {"visible"}, page
+        visitor.page.locator(f"#f-{grade}").uncheck()
+        assert set(days.evaluate_all(states)) == {state}, page
+
+
 def test_choose_another_date(visitor: Visitor) -> None:
     visitor.click("March 2026").click("usable, 6 products").click("Choose another day", "summary")
     visitor.page.locator("table.days a:not([aria-current])").first.click()
