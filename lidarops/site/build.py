@@ -44,7 +44,7 @@ from lidarops.site.paths import (
 )
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.values import NO_VALUES, read_values
-from lidarops.system.files import sha256_of, within, write_atomically
+from lidarops.system.files import copy_atomically, sha256_of, within, write_atomically
 from lidarops.system.processes import end_with_parent
 
 MANIFEST: Final = "manifest.json"
@@ -96,8 +96,9 @@ def build_site(
     """Write the site of all products of a campaign's output to its folder ``site``.
 
     Pages need neither server, network nor scripts. The page of a product depends only on the
-    product. It is kept while the sha256 of the product, the page and lidarops do not change. Equal
-    archives give equal bytes, for any number of workers.
+    product, except its links, which are written anew in each build. It is kept while the sha256 of
+    the product, the page and lidarops do not change. Equal archives give equal bytes, for any
+    number of workers.
 
     Parameters
     ----------
@@ -330,12 +331,15 @@ def _joined(*problems: str) -> str:
     return "; ".join(problem for problem in problems if problem)
 
 
-def _write(site: Path, name: str, content: bytes) -> None:
-    """Write a file of the site atomically. All files are written here."""
+def _write(site: Path, name: str, content: bytes | Path) -> None:
+    """Write a file of the site, or copy it, atomically. All files are written here."""
     target = within(site, name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, content)
+        if isinstance(content, Path):
+            copy_atomically(content, target)
+        else:
+            write_atomically(target, content)
     except OSError as error:
         raise CatalogError(
             f"cannot be written: {error}",
@@ -362,7 +366,7 @@ def _copy(products: Path, site: Path, entries: Sequence[Entry]) -> set[str]:
         names.add(name)
         copy = within(site, name)
         if not copy.is_file() or sha256_of(copy) != entry.sha256:
-            _write(site, name, within(products, entry.path).read_bytes())
+            _write(site, name, within(products, entry.path))
     return names
 
 
