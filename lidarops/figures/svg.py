@@ -135,7 +135,7 @@ def inline(figure: Figure) -> Markup:
             f'<svg class="fig {css}" viewBox="0 0 {width} {height:.0f}" role="img"'
             f' aria-label="{alt}">{content}</svg>'
         )
-    return Markup("".join(parts))  # noqa: S704 - `_text` escapes every text of the content
+    return Markup("".join(parts))  # noqa: S704 - `text` escapes every text of the content
 
 
 def file(figure: Figure, width: int = WIDTH) -> bytes:
@@ -148,7 +148,7 @@ def thumbnail(figure: Figure | None, words: str = "") -> bytes:
     """Return the first panel of a figure without axes as an SVG file; `words` without a figure."""
     width, height = THUMB
     if figure is None:
-        return _file(_text(width / 2, height / 2 + 5, words, "m s"), width, height)
+        return _file(text(width / 2, height / 2 + 5, words, "m s"), width, height)
     panel = figure.panels[0]
     x, y = _Scale(panel.x, 0, width), _Scale(panel.y, height - 4, 4)
     content = "".join(_layer(layer, x, y) for layer in map(_small, panel.layers) if layer)
@@ -267,21 +267,21 @@ def _panel(box: _Box) -> str:
     for y, label in box.y.ticks(max(3, round(height / 45))):
         grid += f"M{box.left:.1f} {y:.1f}h{box.width:.1f}"
         edge += f"M{box.left:.1f} {y:.1f}h-4"
-        words.append(_text(box.left - 9, y + 4, label, "e"))
+        words.append(text(box.left - 9, y + 4, label, "e"))
     for x, label in _spaced(box.x.ticks(max(2, round(box.width / 110)))):
         grid += f"M{x:.1f} {box.top:.1f}v{height:.1f}"
         edge += f"M{x:.1f} {box.foot:.1f}v4"
         for row, line in enumerate(label.split("\n") if box.labelled else ()):
-            words.append(_text(x, box.foot + 19 + 16 * row, line, "m"))
+            words.append(text(x, box.foot + 19 + 16 * row, line, "m"))
     for x in box.x(np.array(panel.x.breaks)).tolist():
         edge += f"M{x - 5:.1f} {box.foot + 5:.1f}l4-10m2 10l4-10"
     middle = box.top + height / 2
-    words.append(_text(box.left - 56, middle, panel.y.label, "m s", turned=True))
+    words.append(text(box.left - 56, middle, panel.y.label, "m s", turned=True))
     if box.labelled and panel.x.label:
         below = box.foot + _below(box) - 8
-        words.append(_text(box.left + box.width / 2, below, panel.x.label, "m s"))
+        words.append(text(box.left + box.width / 2, below, panel.x.label, "m s"))
     if panel.note:
-        words.append(_text(box.left + box.width / 2, middle, panel.note, "m s"))
+        words.append(text(box.left + box.width / 2, middle, panel.note, "m s"))
     layers = [_layer(layer, box.x, box.y) for layer in panel.layers]
     clip = f"{box.left:.1f} {box.top:.1f} {box.width:.1f} {height:.1f}"
     left, top, width, tall = clip.split()
@@ -326,11 +326,11 @@ def _sides(box: _Box) -> str:
         edge = f"M{x:.1f} {box.top:.1f}v{box.panel.height:.1f}"
         for y, label in _Scale(axis, box.foot, box.top).ticks(6):
             edge += f"M{x:.1f} {y:.1f}h4"
-            parts.append(_text(x + 7, y + 4, label))
+            parts.append(text(x + 7, y + 4, label))
         parts.append(f'<path class="axis" d="{edge}"/>')
         middle = box.top + box.panel.height / 2
         across = x + space - (42 if axis is box.panel.bar else 16)
-        parts.append(_text(across, middle, axis.label, "m s", turned=True))
+        parts.append(text(across, middle, axis.label, "m s", turned=True))
         x += space - 14 if axis is box.panel.right else 0
     return "".join(parts)
 
@@ -338,12 +338,12 @@ def _sides(box: _Box) -> str:
 def _legend(box: _Box) -> str:
     lines = [*_legend_lines(box.legend, box.width)]
     y = box.top - 8 - _LINE * (len(lines) - 1)
-    parts = [_text(box.left, box.top - 8 - _LINE * len(lines), box.panel.title, "b")]
+    parts = [text(box.left, box.top - 8 - _LINE * len(lines), box.panel.title, "b")]
     for row, line in enumerate(lines):
         for x, layer in line:
             at = f"translate({box.left + 14 + x:.1f} {y + _LINE * row - 4:.1f})"
             parts.append(f'<g transform="{at}">{_sample(layer)}</g>')
-            parts.append(_text(box.left + 28 + x, y + _LINE * row, layer.label, "s"))
+            parts.append(text(box.left + 28 + x, y + _LINE * row, layer.label, "s"))
     return "".join(parts)
 
 
@@ -421,7 +421,7 @@ def _layer(layer: Layer, x: _Scale, y: _Scale) -> str:
             return _curve(layer, x(layer.x), y(layer.y))
         case Words():
             places = zip(x(layer.x).tolist(), y(layer.y).tolist(), layer.texts, strict=True)
-            return "".join(_text(a + 9, b - 7, words) for a, b, words in places)
+            return "".join(text(a + 9, b - 7, words) for a, b, words in places)
 
 
 def _curve(curve: Curve, x: Floats, y: Floats) -> str:
@@ -496,8 +496,8 @@ def _image(
     )
 
 
-def _text(x: float, y: float, words: str, css: str = "", *, turned: bool = False) -> str:
-    """Return a text; `css` names style and anchor."""
+def text(x: float, y: float, words: str, css: str = "", *, turned: bool = False) -> str:
+    """Return a text as markup, escaped; `css` names style and anchor."""
     if not words:
         return ""
     turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""

@@ -364,7 +364,7 @@ def test_the_stac_item_is_linked_where_it_exists(tmp_path: Path) -> None:
 
 def test_stations_are_on_a_map(output: Path) -> None:
     text = (output / "site/index.html").read_text("utf-8")
-    assert '<a href="#s-odesa">' in text
+    assert '<a href="#s-odesa" aria-label="Одеса, hill">' in text
     assert 'id="s-odesa"' in text
     assert "46.44° N, 30.76° E, 53.5 m" in text
 
@@ -381,10 +381,36 @@ def test_the_map_is_to_the_north_and_escapes_names() -> None:
     places = [Place("<b>", "s-a", 60.0, -20.0), Place("south", "s-b", -10.0, 30.0)]
     markup = str(station_map(places))
     assert "<b>" not in markup
-    points = [tuple(map(float, point)) for point in re.findall(r'd="M([\d.]+) ([\d.]+)a5', markup)]
+    points = pins(markup)
     assert points[0][1] < points[1][1], "north is up"
     assert points[0][0] < points[1][0], "east is right"
     assert "20° W" in markup
     assert not station_map([])
     one = str(station_map([Place("alone", "s-c", 90.0, 180.0)]))
     assert "nan" not in one
+
+
+@pytest.mark.parametrize("count", [2, 14, 25])
+def test_names_on_the_map_neither_touch_nor_leave_it(count: int) -> None:
+    places = [Place(f"name {k}", f"s-{k}", 50.0, 2.0 * k) for k in range(count)]
+    markup = str(station_map(places))
+    heights = sorted(float(y) for y in re.findall(r'y="([-\d.]+)">name', markup))
+    assert len(heights) == min(count, 14)
+    assert heights[0] >= 12.0
+    assert heights[-1] <= 234.0
+    assert np.diff(heights).min() >= 15.0
+    assert len(pins(markup)) == count
+    assert all(f'aria-label="name {k}"' in markup for k in range(count))
+
+
+def test_the_map_crosses_the_date_line() -> None:
+    places = [Place("east", "s-a", 10.0, 179.0), Place("west", "s-b", 12.0, -179.0)]
+    markup = str(station_map(places))
+    assert pins(markup)[0][0] < pins(markup)[1][0]
+    labels = re.findall(r">([\d.]+°[ EW]*)<", markup)
+    assert labels[:3] == ["179° E", "180°", "179° W"]
+
+
+def pins(markup: str) -> list[tuple[float, ...]]:
+    found = re.findall(r'cx="([-\d.]+)" cy="([-\d.]+)"', markup)
+    return [tuple(map(float, point)) for point in found]
