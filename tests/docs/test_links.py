@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import subprocess
+from collections.abc import Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -33,13 +36,37 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in _anchors(linked), target
 
 
+def _tracked() -> list[str]:
+    """Return the files of the repository."""
+    done = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, check=True)
+    return done.stdout.decode().splitlines()
+
+
+def _exists(name: str, tracked: Sequence[str]) -> bool:
+    """Return whether a path of the repository exists, or a file of a name without folder.
+
+    KIND and NAME stand for any word.
+    """
+    pattern = re.sub("KIND|NAME", "*", name)
+    places = (pattern, f"lidarops/{pattern}") if "/" in name else (pattern, f"*/{pattern}")
+    return any(fnmatch(file, place) for file in tracked for place in places)
+
+
 def test_files_named_in_code_exist() -> None:
-    known = {path.name for path in REPOSITORY.rglob("*.*") if ".venv" not in path.parts}
+    tracked = _tracked()
     for page in pages():
         for name in re.findall(
             r"`([\w./-]+\.(?:py|toml|bib|md|cff|lock))`", page.read_text("utf-8")
         ):
-            assert Path(name).name in known, (name_of(page), name)
+            assert _exists(name, tracked), (name_of(page), name)
+
+
+def test_a_wrong_folder_or_a_built_file_is_no_file() -> None:
+    tracked = _tracked()
+    assert _exists("run/staleness.py", tracked)
+    assert _exists("retrieve/NAME/flags.py", tracked)
+    assert not _exists("plan/staleness.py", tracked)
+    assert not _exists("docs/_build/staleness.py", tracked)
 
 
 def test_every_page_is_reachable_from_the_readme_and_the_front_page() -> None:
