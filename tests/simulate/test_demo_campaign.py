@@ -13,8 +13,9 @@ from lidarops.simulate.campaign import simulate_campaign
 @pytest.fixture(scope="module")
 def demo(repository, tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
+    # Not beside the products of other tests, which look for raw files there.
     campaign = load_campaign(
-        repository / "catalogs/demo.yaml", archive=folder, output=folder / "out"
+        repository / "catalogs/demo.yaml", archive=folder / "raw", output=folder / "out"
     )
     return campaign, simulate_campaign(campaign)
 
