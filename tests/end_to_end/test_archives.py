@@ -79,15 +79,17 @@ def test_extinction_agrees_with_the_truth(demo: tuple[Campaign, RunRecord]) -> N
     assert 0.8 < score[good].std() < 1.2
 
 
-def test_every_retrieval_but_raman_gives_usable_values(demo: tuple[Campaign, RunRecord]) -> None:
+def test_every_retrieval_gives_usable_values(demo: tuple[Campaign, RunRecord]) -> None:
     campaign, record = demo
-    usable = dict.fromkeys(("homogeneous", "elastic", "multiangle", "visibility"), 0.0)
+    usable = dict.fromkeys(("homogeneous", "elastic", "raman", "multiangle", "visibility"), 0.0)
     for scene in record.scenes:
         for product in scene.products:
             with xr.open_dataset(campaign.products_root / product.path) as opened:
                 share = float((opened["usable"] < 2).mean())
             if product.kind in usable:
                 usable[product.kind] = max(share, usable[product.kind])
+    # Raman signals are weak from 6 km on; the product reaches to 15 km.
+    assert usable.pop("raman") > 0.5
     assert min(usable.values()) > 0.8, usable
 
 
@@ -202,9 +204,9 @@ def test_the_command_line_reprocesses_and_reports(
         (["reprocess", "CAMPAIGN", "--workers", "0"], 2, "workers"),
         (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 2, "/nowhere"),
         (
-            ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "raman"],
+            ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "integrated"],
             2,
-            "requested: visibility, homogeneous, multiangle, elastic, signal",
+            "requested: visibility, homogeneous, multiangle, elastic, raman, signal",
         ),
         (["inspect", "/nowhere"], 2, "/nowhere"),
         (["plot", "/"], 2, "directory"),
