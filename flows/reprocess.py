@@ -413,11 +413,13 @@ def main(
     ] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
+    with plain_errors():
+        stored_url = catalog_parameter(catalog)
     parameters: dict[str, Any] = {
         "campaign": campaign,
         "archive": archive,
         "out": out,
-        "catalog": catalog_parameter(catalog),
+        "catalog": stored_url,
         "instruments": instrument,
         "stations": station,
         "products": product,

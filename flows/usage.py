@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 from prefect.exceptions import ParameterTypeError
 from pydantic import AfterValidator, Field
 
 from lidarops.campaign.model import CATALOG_VARIABLE
+from lidarops.catalog.database import WITHOUT_PASSWORD, holds_password
 from lidarops.errors import CatalogError, LidarOpsError
-from lidarops.system.stores import is_url, refuse_keys
-
-_PASSWORD: Final = re.compile(r"://[^/:\s]*:\S*@")
-_NO_PASSWORD: Final = {"pattern": r"^(?!.*://[^/:]*:.*@)"}
-"""The server refuses other parameters before it stores them."""
+from lidarops.system.stores import WITHOUT_KEYS, is_url, refuse_keys
 
 _WRONG_USE = 2
 _REFUSED = 1
@@ -42,7 +38,7 @@ def _without_keys(location: str) -> str:
 
 
 def _without_password(url: str) -> str:
-    if _PASSWORD.search(url):
+    if holds_password(url):
         raise CatalogError(
             "the URL holds a password, which the Prefect server would keep",
             field="catalog",
@@ -52,17 +48,20 @@ def _without_password(url: str) -> str:
     return url
 
 
-Location = Annotated[str, AfterValidator(_without_keys), Field(json_schema_extra=_NO_PASSWORD)]
+# The server refuses other parameters by these patterns before it stores them.
+Location = Annotated[
+    str, AfterValidator(_without_keys), Field(json_schema_extra={"pattern": WITHOUT_KEYS})
+]
 """A folder, or a URL without credentials."""
 CatalogUrl = Annotated[
-    str, AfterValidator(_without_password), Field(json_schema_extra=_NO_PASSWORD)
+    str, AfterValidator(_without_password), Field(json_schema_extra={"pattern": WITHOUT_PASSWORD})
 ]
 """SQLAlchemy URL without password."""
 
 
 def catalog_parameter(url: str | None) -> str | None:
     """Return the URL as a parameter of a flow; one with a password goes into the environment."""
-    if url is None or not _PASSWORD.search(url):
+    if url is None or not holds_password(url):
         return url
     os.environ[CATALOG_VARIABLE] = url
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -24,6 +25,10 @@ BATCH = 1000
 """Largest number of values in the list of one statement."""
 _MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all products again"
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
+_SECRET: Final = re.compile("passw|secret")
+"""Names of passwords in the query of a URL: password, passwd, sslpassword, oauth_client_secret."""
+WITHOUT_PASSWORD: Final = rf"^(?!.*://[^/:]*:.*@)(?!.*[?&][^=&]*(?:{_SECRET.pattern})[^=&]*=)"
+"""Regular expression of URLs without password, for JSON schemas."""
 _BROKEN: Final = ("malformed", "not a database", "decode")
 """Words in the messages of SQLite about a damaged file."""
 
@@ -72,7 +77,7 @@ class Database:
     @property
     def place(self) -> str:
         """The URL without its password."""
-        return self._url.render_as_string(hide_password=True)
+        return _shown(self._url)
 
     def close(self) -> None:
         """Close the database connections."""
@@ -244,14 +249,32 @@ def refuse_wrong_url(url: str) -> None:
     _engine(_parsed(url)).dispose()
 
 
+def holds_password(url: str) -> bool:
+    """Return whether a database URL holds a password, also in its query.
+
+    Raises
+    ------
+    CatalogError
+        If the URL is invalid.
+    """
+    parsed = _parsed(url)
+    return bool(parsed.password) or any(map(_SECRET.search, parsed.query))
+
+
+def _shown(url: sa.URL) -> str:
+    """Return a URL without its passwords."""
+    secrets = filter(_SECRET.search, url.query)
+    return url.difference_update_query(secrets).render_as_string(hide_password=True)
+
+
 def _parsed(url: str) -> sa.URL:
     try:
         return sa.make_url(url)
     except sa.exc.ArgumentError as error:
         raise CatalogError(
             "is not a database URL",
-            # A password may stand before the @.
-            file=url.rpartition("@")[2],
+            # A password may stand before the @, or in the query.
+            file=url.rpartition("@")[2].partition("?")[0],
             remedy=_URLS,
             wrong_use=True,
         ) from error
@@ -263,14 +286,14 @@ def _engine(url: sa.URL) -> sa.Engine:
     except sa.exc.NoSuchModuleError as error:
         raise CatalogError(
             f"unknown kind of database: {error}",
-            file=url.render_as_string(hide_password=True),
+            file=_shown(url),
             remedy=_URLS,
             wrong_use=True,
         ) from error
     except (ImportError, sa.exc.SQLAlchemyError) as error:
         raise CatalogError(
             f"cannot be opened: {error}",
-            file=url.render_as_string(hide_password=True),
+            file=_shown(url),
             remedy="install its driver: pip install lidarops[postgresql]",
         ) from error
 

@@ -31,6 +31,8 @@ _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
 # Signatures and tokens stand there.
 _QUERY: Final = re.compile(r"""(https?://[^\s?'"]*)\?[^\s'")]*""")
+WITHOUT_KEYS: Final = rf"^(?!.*(?:{_KEYS.pattern}|{_QUERY.pattern}))"
+"""Regular expression of texts that `without_keys` leaves as they are, for JSON schemas."""
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
 _NAMES_SHOWN: Final = 3

@@ -225,7 +225,16 @@ SECRET = "swordfish"
     [
         (reprocess, "publish", f"s3://key:{SECRET}@bucket"),
         (reprocess, "archive", f"s3://key:{SECRET}@bucket"),
+        (reprocess, "archive", f"https://{SECRET}@host/a"),
+        (reprocess, "archive", f"https://host/a?sig={SECRET}"),
+        (reprocess, "publish", f"abfs://key:{SECRET}@account/a"),
         (reprocess, "catalog", f"postgresql+psycopg://user:{SECRET}@host/name"),
+        (reprocess, "catalog", f"postgresql+psycopg://user@host/name?password={SECRET}"),
+        (
+            catalog,
+            "catalog",
+            f"postgresql+psycopg://host/name?sslmode=require&sslpassword={SECRET}",
+        ),
         (catalog, "archive", f"s3://key:{SECRET}@bucket"),
         (catalog, "catalog", f"postgresql+psycopg://user:{SECRET}@host/name"),
     ],
@@ -240,8 +249,15 @@ def test_parameters_with_keys_are_refused_before_a_server_keeps_them(
     schema = parameter_schema(flow).model_dump()
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(parameters, schema)
-    for allowed in ("/folder", "s3://bucket/a", "postgresql+psycopg://user@host/name"):
+    places = ("/folder", "s3://bucket/a", "abfs://container@account/a", "https://host/a")
+    databases = (
+        "postgresql+psycopg://user@host/name",
+        "postgresql+psycopg://user@host/name?sslmode=require",
+        "sqlite:////folder/catalog.sqlite",
+    )
+    for allowed in databases if name == "catalog" else places:
         jsonschema.validate({"campaign": "campaign.yaml", name: allowed}, schema)
+        flow.validate_parameters({"campaign": "campaign.yaml", name: allowed})
 
 
 @pytest.mark.parametrize("option", ["--archive", "--publish"])

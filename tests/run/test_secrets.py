@@ -52,6 +52,8 @@ def test_a_store_with_a_key_is_refused_by_publish(tmp_path: Path) -> None:
         f"postgresql+psycopg//user:{SECRET}@host/name",
         f"luck://user:{SECRET}@host/name",
         f"postgresql+psycopg://user:{SECRET}@127.0.0.1:1/name",
+        f"postgresql+psycopg://user@127.0.0.1:1/name?password={SECRET}",
+        f"postgresql+psycopg//user@host/name?password={SECRET}",
     ],
 )
 def test_errors_of_a_database_do_not_show_its_password(url: str) -> None:
