@@ -22,6 +22,7 @@ from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import Verdicts
 from lidarops.system.files import sha256_of, within
+from lidarops.system.output_files import product_paths
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""
@@ -163,13 +164,9 @@ def list_products(root: Path) -> list[str]:
         raise ProductError(
             "is not a folder", file=root, remedy="give the folder of products", wrong_use=True
         )
-    below = root / "products" if (root / "products").is_dir() else root
-    paths = (file.relative_to(root) for file in below.rglob("*.nc"))
-    return sorted(path.as_posix() for path in paths if _is_listed(path))
-
-
-def _is_listed(path: Path) -> bool:
-    return path.parts[0] != FOLDER and not any(part.startswith(".") for part in path.parts)
+    if (root / "products").is_dir():
+        return [f"products/{path}" for path in product_paths(root / "products")]
+    return [path for path in product_paths(root) if not path.startswith(f"{FOLDER}/")]
 
 
 def read_product_facts(

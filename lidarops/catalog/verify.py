@@ -13,6 +13,7 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.records import Role
 from lidarops.system.files import sha256_of
+from lidarops.system.output_files import product_paths
 
 _UNLISTED: Final = (
     "is not in the ledger: a run makes it again if it is requested; else move it away"
@@ -51,7 +52,7 @@ def verify_archive(
             name = path.relative_to(campaign.output).as_posix()
             yield CheckedFile("temporary", name, LEFT_OVER)
     # Listed first: what a run writes from now on may be in the ledger only later.
-    unlisted = _product_files(campaign.products_root)
+    unlisted = set(product_paths(campaign.products_root))
     read = _digests_below(campaign.products_root)
     with store.all_products() as rows:
         for made in rows:
@@ -64,12 +65,6 @@ def verify_archive(
             yield CheckedFile("superseded", old.kept, _problem(read, old.kept, old.sha256))
     if inputs:
         yield from _check_inputs(campaign, store)
-
-
-def _product_files(root: Path) -> set[str]:
-    """Return the product files below a folder, without hidden ones, which writing leaves."""
-    paths = (path.relative_to(root).as_posix() for path in root.rglob("*.nc"))
-    return {path for path in paths if not path.rpartition("/")[2].startswith(".")}
 
 
 def _check_unlisted(store: Store, unlisted: set[str]) -> Iterator[CheckedFile]:

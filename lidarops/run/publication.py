@@ -11,12 +11,12 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.system.files import sha256_of
+from lidarops.system.output_files import COPIES, MANIFEST, SITE
 from lidarops.system.stores import Published, RemoteStore
 
-_SITE: Final = "site"
-"""Folder of the site, in the output and in the store."""
-_BESIDE: Final = ".."
+_PUBLISHED: Final = ".."
 """Where the products are in a store, relative to the site."""
+_ADDRESSES: Final = ("https://", "http://")
 
 
 def publish_products(campaign: Campaign, url: str) -> Published:
@@ -44,7 +44,8 @@ def publish_products(campaign: Campaign, url: str) -> Published:
         store.all_products() as made,
     ):
         products = {product.path: product.sha256 for product in made}
-    return RemoteStore(url).publish(campaign.products_root, products, _journal(campaign, url))
+    journal = _journal(campaign, url)
+    return RemoteStore(url).publish(campaign.products_root, products, journal, beside=SITE)
 
 
 def publish_site(campaign: Campaign, url: str) -> Published:
@@ -67,32 +68,32 @@ def publish_site(campaign: Campaign, url: str) -> Published:
     ProductError
         If the store cannot be written.
     """
-    site = Path(campaign.output) / _SITE
+    site = Path(campaign.output) / SITE
     _check_links(site)
     files = {
         path.relative_to(site).as_posix(): sha256_of(path)
         for path in sorted(site.rglob("*"))
         if path.is_file() and not path.is_symlink()
     }
-    place = f"{url.rstrip('/')}/{_SITE}"
+    place = f"{url.rstrip('/')}/{SITE}"
     return RemoteStore(place).publish(site, files, _journal(campaign, place))
 
 
 def _check_links(site: Path) -> None:
     """Refuse a site whose downloads lead to the disk that it was made on."""
-    manifest = site / "manifest.json"
+    manifest = site / MANIFEST
     try:
         place = str(json.loads(manifest.read_bytes())["products_at"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CatalogError(
             "there is no complete site", file=manifest, remedy="run lidarops site OUT first"
         ) from error
-    if place.startswith(_BESIDE) and place.rstrip("/") != _BESIDE:
+    if place.rstrip("/") not in (_PUBLISHED, COPIES) and not place.startswith(_ADDRESSES):
         raise CatalogError(
             f"downloads lead to {place}, but published products are beside the site",
             file=manifest,
             field="products_at",
-            remedy=f"run lidarops site OUT --products-at {_BESIDE}, or --copies",
+            remedy=f"run lidarops site OUT --products-at {_PUBLISHED}, or --copies",
         )
 
 

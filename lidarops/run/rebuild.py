@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import groupby
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +35,7 @@ from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps import dependence
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
+from lidarops.system.output_files import product_paths
 from lidarops.system.stores import without_keys
 
 _UNREADABLE: Final = (
@@ -108,7 +108,7 @@ def rebuild_ledger(
         with store.all_products() as made:
             known = {product.path for product in made}
         found: dict[int, list[_Found]] = defaultdict(list)
-        for path in _product_files(campaign.products_root):
+        for path in product_paths(campaign.products_root):
             progress(1)
             if path in known:
                 rebuilt.known += 1
@@ -121,11 +121,6 @@ def rebuild_ledger(
         if found:
             _enter(campaign, store, lock, found, rebuilt)
     return rebuilt
-
-
-def _product_files(root: Path) -> list[str]:
-    paths = (path.relative_to(root).as_posix() for path in root.rglob("*.nc"))
-    return sorted(path for path in paths if not path.rpartition("/")[2].startswith("."))
 
 
 def _found(campaign: Campaign, path: str) -> _Found:

@@ -31,24 +31,21 @@ from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.reports.reading import UNREADABLE
 from lidarops.site import pages, product_contents
-from lidarops.site.links import BESIDE, COPIES, Links
+from lidarops.site.links import BESIDE, Links
 from lidarops.site.neighbours import with_neighbours
 from lidarops.site.paths import (
-    SITE,
     day_page,
     month_list,
     product_folder,
     product_page,
-    product_paths,
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.values import NO_VALUES, read_values
 from lidarops.system.files import copy_atomically, sha256_of, within, write_atomically
+from lidarops.system.output_files import COPIES, MANIFEST, SITE, product_paths
 from lidarops.system.processes import end_with_parent
 
-MANIFEST: Final = "manifest.json"
-"""File that lists the products of a site. It also identifies a folder as a site."""
 _FORMAT: Final = "lidarops site"
 _EMPTY: Final = "no figure of the product"
 _OURS: Final = ("product", "station", COPIES)

@@ -14,8 +14,6 @@ from lidarops.site.product_entry import Entry
 
 BESIDE: Final = "../products"
 """Where products are in the output of a campaign, relative to the site."""
-COPIES: Final = "files"
-"""Folder of the site with copies of the products."""
 _ADDRESS: Final = re.compile(r"https?://[^\s\"<>]+")
 _RELATIVE: Final = re.compile(r"(?:[A-Za-z0-9._-]+/?)+")
 

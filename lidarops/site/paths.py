@@ -11,8 +11,6 @@ from urllib.parse import quote
 
 from lidarops.errors import ProductError
 
-SITE: Final = "site"
-"""Folder of the site beside the products."""
 _SAFE: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -38,22 +36,6 @@ def product_folder(output: Path) -> Path:
             wrong_use=not output.is_dir(),
         )
     return folder
-
-
-def product_paths(folder: Path) -> list[str]:
-    """List the products below a folder, sorted, without hidden files.
-
-    Links to folders are not followed, so that the search ends and stays inside.
-    """
-    paths = []
-    for parent, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        paths += [
-            (Path(parent) / name).relative_to(folder).as_posix()
-            for name in files
-            if name.endswith(".nc") and not name.startswith(".")
-        ]
-    return sorted(paths)
 
 
 def slug(name: str) -> str:

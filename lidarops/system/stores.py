@@ -248,7 +248,9 @@ class RemoteStore:
                     with suppress(FileNotFoundError):
                         self._fs.get_file(name, target)
 
-    def publish(self, root: Path, products: Mapping[str, str], journal: Path) -> Published:
+    def publish(
+        self, root: Path, products: Mapping[str, str], journal: Path, *, beside: str = ""
+    ) -> Published:
         """Upload the products that the store lacks or holds in another version.
 
         Readers of the store always see a complete product, the old or the new one. After an
@@ -263,6 +265,8 @@ class RemoteStore:
             Path relative to `root` -> SHA-256 in the ledger.
         journal : path
             Text file of this method, one per store; without it everything is sent again.
+        beside : str, optional
+            Folder of the store that is published by itself; its files are no others.
 
         Raises
         ------
@@ -289,7 +293,12 @@ class RemoteStore:
             with self._errors_as(ProductError, "cannot be written"):
                 self._upload(root, batch)
             _append_journal(journal, batch)
-        return Published(tuple(due), len(products) - len(due), len(sizes.keys() - products.keys()))
+        others = [
+            path
+            for path in sizes.keys() - products.keys()
+            if not (beside and path.startswith(f"{beside}/"))
+        ]
+        return Published(tuple(due), len(products) - len(due), len(others))
 
     def _existing(self) -> Sequence[Stored]:
         try:

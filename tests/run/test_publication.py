@@ -147,6 +147,10 @@ def test_the_site_is_published_beside_the_products(tmp_path: Path, campaign_file
     refused = runner.invoke(app, words, env={"COLUMNS": "300"})
     assert refused.exit_code == 1
     assert "--products-at .." in refused.output
+    for dead in ("products", "../../archive"):
+        words_of_site = ["site", str(campaign.output), "--products-at", dead]
+        assert runner.invoke(app, words_of_site).exit_code == 0
+        assert "--products-at .." in runner.invoke(app, words, env={"COLUMNS": "300"}).output
     made = runner.invoke(app, ["site", str(campaign.output), "--products-at", ".."])
     assert made.exit_code == 0, made.output
     sent = runner.invoke(app, words)
@@ -156,4 +160,9 @@ def test_the_site_is_published_beside_the_products(tmp_path: Path, campaign_file
             file = (page.parent / unquote(href)).resolve()
             assert file.is_relative_to(store.resolve()), href
             assert file.is_file(), href
-    assert "0 sent" in runner.invoke(app, words).output.splitlines()[-1]
+    again = runner.invoke(app, words).output
+    assert "0 sent" in again.splitlines()[-1]
+    assert "other files" not in again
+    for options in (["--copies"], ["--products-at", "https://example.org/products"]):
+        assert runner.invoke(app, ["site", str(campaign.output), *options]).exit_code == 0
+        assert runner.invoke(app, words).exit_code == 0
