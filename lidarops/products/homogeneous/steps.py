@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.flags import Quality
 from lidarops.products.homogeneous.look import (
     LOOKED_AT,
@@ -26,7 +25,7 @@ from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit, counts_per_power
 from lidarops.settings import SettingsModel, VisibilitySettings, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
@@ -318,6 +317,9 @@ class _Sections(WholeProduct):
             # The signal still holds its background, so it cannot be divided by the overlap: bins
             # with partial overlap are excluded.
             quality = quality | _partial(overlap(conditioned["range"].to_numpy()))
+        # An estimated variance scatters, which must not count as misfit.
+        estimated = self._data[RELATIVE_VARIANCE]
+        counts = None if estimated else counts_per_power(conditioned, shots, glued=True)
         far = self._settings.background_range
         return labeled.fit_homogeneous_path(
             conditioned["power"],
@@ -327,23 +329,10 @@ class _Sections(WholeProduct):
             quality=quality,
             method=self._settings.method,
             extinction=self._settings.extinction,
-            # An estimated variance scatters, which must not count as misfit.
-            relative_variance=self._data[RELATIVE_VARIANCE],
+            relative_variance=estimated,
             noise_correlation_length=conditioned[CORRELATION_LENGTH],
-            exposure=self._exposure(conditioned, shots),
+            exposure=None if counts is None else xr.DataArray(counts, dims="time"),
         )
-
-    def _exposure(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.DataArray | None:
-        """Return the counts per MHz in a bin of each profile; None for analog detection.
-
-        Bins of a glued channel whose noise is analog seem to hold more counts than they do.
-        """
-        if conditioned["power"].attrs["units"] != "MHz" or self._data[RELATIVE_VARIANCE]:
-            return None
-        width = float(conditioned["range"][1] - conditioned["range"][0])
-        # A profile without shots has no power.
-        exposure: xr.DataArray = shots.clip(min=1) * (width / LICEL_RANGE_PER_MICROSECOND)
-        return exposure.astype(np.float64)
 
     def _joined(self) -> xr.Dataset:
         joined: xr.Dataset = xr.concat(

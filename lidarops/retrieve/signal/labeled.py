@@ -277,7 +277,9 @@ def actual_noise(profiles: xr.Dataset) -> ActualNoise:
     return _actual_noise(power, variance, glued_until, stated, distance)
 
 
-def counts_per_power(profiles: xr.Dataset, shots: npt.ArrayLike) -> _Block | None:
+def counts_per_power(
+    profiles: xr.Dataset, shots: npt.ArrayLike, *, glued: bool = False
+) -> _Block | None:
     """Return the counts of a bin per MHz of power, (time,); None but for photon counting.
 
     Parameters
@@ -286,8 +288,11 @@ def counts_per_power(profiles: xr.Dataset, shots: npt.ArrayLike) -> _Block | Non
         From `condition`, or means of these.
     shots : (time,) int
         Number of shots of each profile; without a shot, one is taken.
+    glued : bool
+        Whether glued profiles have counts too, those of their far range. Their near bins, with the
+        noise of analog detection, then seem to hold more counts than they do.
     """
-    if DEAD_TIME_ERROR not in profiles["power"].attrs or "glue_top" in profiles:
+    if DEAD_TIME_ERROR not in profiles["power"].attrs or ("glue_top" in profiles and not glued):
         return None
     width = float(np.median(np.diff(profiles["range"].to_numpy().astype(np.float64))))
     return np.asarray(np.maximum(shots, 1) * (width / LICEL_RANGE_PER_MICROSECOND))
