@@ -168,6 +168,7 @@ def _scoreboard(ours: dict[str, list[Row]], others: dict[str, Any]) -> Iterator[
         )
         yield score["note"]
         yield ""
+    yield others["origin"]
 
 
 class _Form(NamedTuple):

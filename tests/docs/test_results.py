@@ -65,6 +65,7 @@ def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
 def test_the_scoreboard_shows_ours_beside_all_others() -> None:
     text = benchmark_results.scoreboard()
     others = json.loads((benchmark_results.RESULTS / "others.json").read_text())
+    assert text.endswith(others["origin"])
     for score in others["scores"]:
         for chain in score["chains"]:
             assert f"| {chain} " in text
