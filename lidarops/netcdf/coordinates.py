@@ -167,8 +167,8 @@ def _air_positions(
 def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes of a scan."""
     names = ["beam", "beam_zenith_angle"]
-    # Layers and planes are optional, and so are their coordinates.
-    optional = ("beam_azimuth", "layer_altitude", "plane", "plane_azimuth")
+    # Layers, planes and the baseline are optional, and so are their coordinates.
+    optional = ("beam_azimuth", "layer_altitude", "plane", "plane_azimuth", "baseline_range")
     names += [name for name in optional if name in source]
     by_name = {name: _along(source, layout.row(name)) for name in names}
     row = layout.row("altitude")

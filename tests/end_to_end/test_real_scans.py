@@ -101,3 +101,38 @@ def test_a_level_beam_above_the_background_of_the_far_range(data_root, tmp_path)
     assert (
         own["total_extinction_standard_error"] > 3.0 * one["total_extinction_standard_error"]
     ).all()
+
+
+def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products):
+    """A ray 3 degrees above the horizon, of 4 hours before; alone, analog is rejected."""
+    archive = tmp_path / "archive"
+    archive.mkdir()
+    for file in (data_root / "savant" / "2018-10-18-0703tRANSITION").iterdir():
+        (archive / file.name).symlink_to(file)
+    ray = data_root / "savant" / "2018-10-18-0254" / "R18A1803.042664"
+    (archive / ray.name).write_bytes(ray.read_bytes().replace(b"03:04:25", b"07:07:49", 2))
+    tree = yaml.safe_load(CAMPAIGN.read_text())
+    tree["instruments"]["savant"]["files"] = "R18*"
+    tree["instruments"]["savant"]["products"]["multiangle"]["channels"] = ["analog_355s"]
+    campaign = tmp_path / "blocked.yaml"
+    campaign.write_text(yaml.safe_dump(tree))
+    record = reprocess(load_campaign(campaign, archive=archive, output=tmp_path / "out"))
+    assert record is not None
+    (product,) = record.scenes[0].products
+    found = xr.load_dataset(Path(record.products) / product.path)
+    assert found["blocked_zenith_angle"].values.tolist() == [87.0]
+    assert found["blocked_azimuth"].values.tolist() == [87.0]
+    assert (np.abs(found["analog_baseline"]) < 0.005).all()
+    assert (found["usable"] < 2).all()
+    rows = [int(np.abs(found["altitude"].values - 220.0 - z).argmin()) for z in HEIGHTS[1:]]
+    photon, analog = (
+        part["vertical_optical_depth"].values[:, rows] for part in (products["photon_355s"], found)
+    )
+    spread = np.hypot(
+        products["photon_355s"]["vertical_optical_depth_standard_error"].values[:, rows],
+        found["vertical_optical_depth_standard_error"].values[:, rows],
+    )
+    assert (np.abs(analog - photon) < 2.0 * spread).all()
+    # Without the baseline, 0.05 too large.
+    row = int(np.abs(found["altitude"].values - 220.0 - 1500.0).argmin())
+    assert found["vertical_optical_depth"].values[:, row] == pytest.approx([0.12, 0.12], abs=0.01)

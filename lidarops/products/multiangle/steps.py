@@ -18,6 +18,7 @@ import xarray as xr
 
 from lidarops.constants import MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
+from lidarops.products.multiangle.baseline import BASELINE, Baseline, with_baseline
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
@@ -273,9 +274,10 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
 
     name = "multiangle"
     settings = ScanSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, BACKGROUND)
+    inputs = (PROFILES, WAVELENGTH, OVERLAP, MOLECULES, BACKGROUND, BASELINE)
     parts = (
-        Background(), Gradient(), GradientRegressor(), Robust(), Vertical(), Correlation(), Layers()
+        Background(), Baseline(), Gradient(), GradientRegressor(), Robust(), Vertical(),
+        Correlation(), Layers(),
     )  # fmt: skip
 
     def decide(self, case: Case) -> Decisions:
@@ -343,7 +345,8 @@ class _Scans(WholeProduct):
     def __init__(self, settings: ScanSettings, data: Data) -> None:
         self._settings, self._station = settings, data.source.station_altitude
         self._profiles = profiles = data[PROFILES]
-        geometry, overlap = data.source.geometry, data.get(OVERLAP)
+        self._geometry = geometry = data.source.geometry
+        self._baseline, overlap = data.get(BASELINE), data.get(OVERLAP)
         self._cycles = AltitudeCycles(
             profiles.range,
             zenith_angle=geometry["zenith_angle"].to_numpy(),
@@ -356,6 +359,7 @@ class _Scans(WholeProduct):
             molecules=data[MOLECULES] if data[BACKGROUND].method == "known_shape" else None,
             wavelength=data[WAVELENGTH],
             overlap=None if overlap is None else overlap(profiles.range),
+            baseline=self._baseline,
         )
 
     def ends(self) -> Indices:
@@ -379,6 +383,8 @@ class _Scans(WholeProduct):
         )
         if settings.method in _DIFFERENTIATING:
             optical_depth = optical_depth.assign_attrs(references=MULTIANGLE_PAPER)
+        if self._baseline is not None:
+            optical_depth = with_baseline(optical_depth, self._baseline, self._geometry)
         least = settings.least_signal_to_noise
         return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
 

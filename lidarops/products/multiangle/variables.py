@@ -72,11 +72,36 @@ _PLANE: Final = Row(
     comment="The beams of a plane are a range-height scan (RHI), of a volume of several planes.",
 )
 
+_BASELINE_RANGE: Final = Row(
+    name="baseline_range",
+    dims=("baseline_range",),
+    dtype="f8",
+    units="m",
+    long_name="range of the analog baseline",
+    coverage=Coverage.COORDINATE,
+    optional=True,
+    comment=f"Middles of the blocks over which it is averaged. {NO_STANDARD_NAME}",
+)
+
 
 def _direction(name: str) -> Row:
     """Return the row of a pointing angle of the beams."""
     angle = next(row for row in PLACE if row.name == name)
     return replace(angle, name=f"beam_{name}", dims=("beam",), follows_beam=False)
+
+
+def _blocked_direction(name: str) -> Row:
+    """Return the row of a pointing angle of the blocked profiles."""
+    row = _direction(name)
+    words = f"{row.long_name}, of a profile that shows the analog baseline"
+    return replace(
+        row,
+        name=f"blocked_{name}",
+        dims=("blocked",),
+        long_name=words,
+        coverage=Coverage.AUXILIARY,
+        optional=True,
+    )
 
 
 def _plane_azimuth() -> Row:
@@ -164,6 +189,7 @@ LAYOUT: Final = Layout(
         _LAYER,
         _PLANE,
         _plane_azimuth(),
+        _BASELINE_RANGE,
         *_STATION,
     ),
     data=(
@@ -353,6 +379,34 @@ LAYOUT: Final = Layout(
             optional=True,
             comment=f"Missing for a free beam. Farther bins are not used. {NO_STANDARD_NAME}",
         ),
+        Row(
+            name="analog_baseline",
+            dims=("baseline_range",),
+            dtype="f4",
+            units="{signal}",
+            long_name="analog signal without light, minus its mean in the range of the background",
+            coverage=Coverage.AUXILIARY,
+            uncertain=True,
+            error_kind=ErrorKind.SYSTEMATIC,
+            optional=True,
+            comment="From profiles that a tree or building blocks, at least 300 m behind it;"
+            " subtracted from all profiles, interpolated between ranges. Its standard error is that"
+            " of noise and of the scatter between profiles, and part of the error of the"
+            f" backgrounds. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="blocked_range",
+            dims=("blocked",),
+            dtype="f4",
+            units="m",
+            long_name="range from which a profile that shows the analog baseline is blocked",
+            coverage=Coverage.AUXILIARY,
+            valid_min=0.0,
+            optional=True,
+            comment=NO_STANDARD_NAME,
+        ),
+        _blocked_direction("zenith_angle"),
+        _blocked_direction("azimuth"),
         Row(
             name="residual",
             dims=("time", "beam", "altitude"),

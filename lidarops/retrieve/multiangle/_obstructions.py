@@ -51,10 +51,14 @@ def obstruction_range(power: Array, variance: Array, distance: Array) -> Array:
     # What is missing, such as saturated, is not dark.
     seen = np.where(inside > 0, level, np.inf)
     before = slice(0, count - _BEHIND - 1)
-    behind = np.stack(
-        [seen[:, first : first + count - _BEHIND - 1] for first in range(2, _BEHIND + 2)]
-    ).max(axis=0)
-    bright = level[:, before] > THRESHOLDS.obstruction_signal * error[:, before]
+    behind, noise = (
+        np.stack(
+            [array[:, first : first + count - _BEHIND - 1] for first in range(2, _BEHIND + 2)]
+        ).max(axis=0)
+        for array in (seen, error)
+    )
+    # The echo of a target is rough, and so is the noise that is estimated from it.
+    bright = level[:, before] > THRESHOLDS.obstruction_signal * noise
     dark = behind < THRESHOLDS.obstruction_drop * level[:, before]
     ends = bright & dark & (inside[:, before] > 0)
     rows = np.flatnonzero(ends.any(axis=1))

@@ -17,6 +17,7 @@ from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
 from lidarops.retrieve.multiangle._obstructions import obstruction_range
+from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
 from lidarops.retrieve.signal.averaging import RunningMean
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
@@ -69,6 +70,8 @@ class AltitudeCycles:
         m, for the scattering of the molecules.
     overlap : (range,) float, optional
         The signal is divided by it; NaN where it is not known.
+    baseline : AnalogBaseline, optional
+        Subtracted from the power of all profiles; its error is part of that of the background.
 
     Raises
     ------
@@ -90,6 +93,7 @@ class AltitudeCycles:
         molecules: MolecularProfile | None = None,
         wavelength: float = np.nan,
         overlap: Array | None = None,
+        baseline: AnalogBaseline | None = None,
     ) -> None:
         directions = scan_cycles.directions(zenith_angle, azimuth)
         numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
@@ -109,6 +113,7 @@ class AltitudeCycles:
             else _shapes(molecules, wavelength, order.zenith_angle, distance, station_altitude),
             altitude=levels,
             slant_edges=_slant_edges(order.zenith_angle, height),
+            baseline=baseline,
         )
         self._weights = np.asarray(shots, dtype=np.float64)
         self._bounds = np.asarray(time_bnds)
@@ -225,6 +230,7 @@ class _Settings:
     altitude: Array
     slant_edges: Array
     """(beam, altitude + 1) m: the range at which a beam crosses the edges of the cells."""
+    baseline: AnalogBaseline | None
 
     @property
     def in_front(self) -> slice:
@@ -247,6 +253,18 @@ class _Settings:
             return distance**2
         overlap = self.overlap[self.covered]
         return distance**2 / np.where(overlap > 0.0, overlap, np.nan)
+
+    def baseline_error(self, beam: Integers) -> Array:
+        """Return the standard error of the baseline within the cells of beams, mV."""
+        if self.baseline is None:
+            return np.zeros(beam.size)
+        errors = [
+            self.baseline.error_within(
+                self.distance[(self.distance >= edges[0]) & (self.distance <= edges[-1])]
+            )
+            for edges in self.slant_edges
+        ]
+        return np.array(errors)[beam]
 
     def response(self) -> Array:
         """Return the change of signals per change of the background, (beam, altitude) m2."""
@@ -386,6 +404,8 @@ def _net_bins(
         unknown = ~(np.isfinite(overlap) & (overlap > 0))
         bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
+    if settings.baseline is not None:
+        values -= settings.baseline.at(settings.distance)
     of_means = variance * length[:, np.newaxis]
     data = (values[:, front], settings.distance[front], of_means[:, front])
     tail = settings.background_range
@@ -404,6 +424,7 @@ def _net_bins(
     unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
     left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
+    left = np.hypot(left, settings.baseline_error(beam))
     distance = settings.distance[near]
     blocked = obstruction_range(net, of_means[:, near], distance)
     net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)

@@ -39,12 +39,27 @@ class Thresholds:
     obstruction_block: float = 60.0
     """m, length of the blocks of bins that are compared; assumed."""
     obstruction_signal: float = 20.0
-    """Standard errors of a block of which the next ones may be called dark; formula: noise alone
-    does not make four blocks dark that hold a tenth of it."""
+    """Standard errors of the next blocks, in the signal of one, of which they may be called dark;
+    formula: noise alone does not make four blocks dark that hold a tenth of it."""
     obstruction_drop: float = 0.02
     """Share of the signal of a block below which the blocks from 60 m behind it are dark. Behind a
     tree 0.3 percent were left (355 nm, photon counting); fog with an extinction of 10 km-1 leaves
     9 percent, and noise."""
+
+    # Analog baseline (`analog_baseline`).
+    lowest_free: float = 20.0
+    """degree of elevation from which no tree or building blocks a beam: what ends it is a cloud;
+    assumed."""
+    baseline_guard: float = 300.0
+    """m behind an obstruction from which the record shows no echo of it: in the beam of a real scan
+    it falls from 25 to 2 uV within 100 m behind the first 100 m, and to its noise."""
+    baseline_light: float = 0.1
+    """Power behind an obstruction over that of free beams from which it is light: an echo at the
+    window of a lidar without overlap nearby is no obstruction; assumed."""
+    baseline_block: float = 300.0
+    """m, shortest block over which the baseline is averaged; assumed."""
+    baseline_share: float = 0.2
+    """Length of a block over its range, where that is more; assumed."""
 
     # Background (`beam_backgrounds`).
     common_background: float = 0.5

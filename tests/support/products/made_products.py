@@ -352,7 +352,7 @@ def multiangle(
         },
         attrs={"steps": "joint: extinction is requested"},
     )
-    return with_planes(with_layers(found)) if layers else found
+    return with_baseline(with_planes(with_layers(found))) if layers else found
 
 
 def with_planes(data: xr.Dataset) -> xr.Dataset:
@@ -368,6 +368,18 @@ def with_planes(data: xr.Dataset) -> xr.Dataset:
         plane=("plane", np.arange(2, dtype=np.int32)),
         plane_azimuth=("plane", np.array([20.0, 110.0])),
     )
+
+
+def with_baseline(data: xr.Dataset) -> xr.Dataset:
+    """Return data with the analog baseline that two blocked profiles show."""
+    along = ("baseline_range",)
+    return data.assign(
+        analog_baseline=(along, np.array([3e-3, 2e-3, 1e-3])),
+        analog_baseline_standard_error=(along, np.array([1e-3, 5e-4, 5e-4])),
+        blocked_range=("blocked", np.array([150.0, 480.0])),
+        blocked_zenith_angle=("blocked", np.array([87.0, 85.0])),
+        blocked_azimuth=("blocked", np.array([40.0, 45.0])),
+    ).assign_coords(baseline_range=("baseline_range", np.array([450.0, 750.0, 1050.0])))
 
 
 def with_layers(data: xr.Dataset) -> xr.Dataset:

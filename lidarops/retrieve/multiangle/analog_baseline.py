@@ -1,0 +1,182 @@
+"""Baseline of an analog record after the shot, from beams that end at a tree or building."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.multiangle._obstructions import obstruction_range
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class AnalogBaseline:
+    """Power without light over range, minus that of the far range."""
+
+    range: Array
+    """(block,) m, middles of the blocks; rising."""
+    power: Array
+    """(block,) mV."""
+    standard_error: Array
+    """(block,) mV: of noise, and of the scatter between beams."""
+    profile: npt.NDArray[np.int64]
+    """(blocked,) numbers of the profiles in the scene."""
+    obstruction: Array
+    """(blocked,) m, range from which each of them is blocked."""
+
+    def at(self, distance: Array) -> Array:
+        """Return the baseline at ranges in m; nearer and farther than all blocks as in the last."""
+        return np.interp(distance, self.range, self.power)
+
+    def error_within(self, distance: Array) -> float:
+        """Return the root mean square of the standard error over ranges in m."""
+        if distance.size == 0:
+            return 0.0
+        return float(np.sqrt((np.interp(distance, self.range, self.standard_error) ** 2).mean()))
+
+
+class _Profile(NamedTuple):
+    """Means of one profile over blocks; NaN where bins are missing."""
+
+    number: int
+    obstruction: float
+    """m; inf for a free beam."""
+    mean: Array
+    variance: Array
+
+
+class BlockedBeams:
+    r"""Profiles of a scan that are blocked, and the baseline that they show.
+
+    Behind an obstruction (`_obstructions.obstruction_range`, and a guard of 300 m for the echo of a
+    strong target) there is no light, which is tested: the power in the first block is less than a
+    tenth of the median of the free beams. The power there minus that of the tail is averaged over
+    blocks of 300 m or a fifth of the range. With the variances :math:`v_{ib}` of profile :math:`i`
+    in block :math:`b`, and a variance :math:`e^2` between profiles by the moments of
+    `dersimonian1986`, pooled over blocks, the mean has weights :math:`1 / (v + e^2)`, and the
+    variance :math:`1 / \sum w + e^2`: the baseline of a free beam differs from the mean too.
+
+    Parameters
+    ----------
+    distance : (range,) float
+        m, rising.
+    tail : (float, float)
+        m, far range, whose mean is subtracted.
+    """
+
+    def __init__(self, distance: Array, tail: tuple[float, float]) -> None:
+        first = int(np.searchsorted(distance, 0.0, side="right"))
+        self._front = slice(first, None)
+        self._distance = distance[self._front]
+        self._tail = (self._distance >= tail[0]) & (self._distance <= tail[1])
+        edges = [0.0]
+        while edges[-1] < tail[0]:
+            edges.append(edges[-1] + max(_BLOCK, _SHARE * edges[-1]))
+        self._edges = np.array(edges[:-1])
+        self._places = np.searchsorted(self._distance, self._edges)
+        self._profiles: list[_Profile] = []
+
+    def add(self, power: Array, variance: Array, profile: npt.NDArray[np.int64]) -> None:
+        """Take profiles.
+
+        Parameters
+        ----------
+        power, variance : (profile, range) float
+            mV, mV2; NaN where missing. The variance is that of means over many bins.
+        profile : (profile,) int
+            Numbers of the profiles in the scene.
+        """
+        values, spread = power[:, self._front], variance[:, self._front]
+        sky, of_sky, _ = _means(values[:, self._tail], spread[:, self._tail], np.zeros(1, np.intp))
+        net = values - sky
+        ends = obstruction_range(net, spread, self._distance)
+        means, of_means, full = _means(net, spread, self._places)
+        means = np.where(full, means, np.nan)
+        for number, *parts in zip(profile, ends, means, of_means + of_sky, strict=True):
+            self._profiles.append(_Profile(int(number), float(parts[0]), *parts[1:]))
+
+    def baseline(self) -> AnalogBaseline | None:
+        """Return the baseline; None where no profile is blocked, or all are."""
+        blocked = [part for part in self._profiles if np.isfinite(part.obstruction)]
+        free = [part.mean for part in self._profiles if not np.isfinite(part.obstruction)]
+        if not blocked or not free:
+            return None
+        light = _median(np.stack(free))
+        behind = [self._behind(part) for part in blocked]
+        dark = [_is_dark(part, light) for part in behind]
+        blocked = [part for part, kept in zip(blocked, dark, strict=True) if kept]
+        if not blocked:
+            return None
+        mean = np.stack([part for part, kept in zip(behind, dark, strict=True) if kept])
+        variance = np.stack([part.variance for part in blocked])
+        known = np.isfinite(mean).any(axis=0)
+        power, of_power = _combined(mean[:, known], variance[:, known])
+        past = np.append(self._edges[1:], self._distance[self._tail][0])
+        return AnalogBaseline(
+            range=(0.5 * (self._edges + past))[known],
+            power=power,
+            standard_error=np.sqrt(of_power),
+            profile=np.array([part.number for part in blocked], dtype=np.int64),
+            obstruction=np.array([part.obstruction for part in blocked]),
+        )
+
+    def _behind(self, part: _Profile) -> Array:
+        """Return the means of the blocks behind the obstruction, NaN in front."""
+        dark = self._edges >= part.obstruction + THRESHOLDS.baseline_guard
+        return np.where(dark, part.mean, np.nan)
+
+
+def _median(values: Array) -> Array:
+    """Return the median over profiles of each block; NaN where there is no value."""
+    known = np.isfinite(values).any(axis=0)
+    middle = np.full(values.shape[1], np.nan)
+    middle[known] = np.nanmedian(values[:, known], axis=0)
+    return middle
+
+
+def _is_dark(behind: Array, light: Array) -> bool:
+    """Return whether the first block behind an obstruction holds no light."""
+    known = np.flatnonzero(np.isfinite(behind) & np.isfinite(light))
+    if known.size == 0:
+        return False
+    first = known[0]
+    return bool(abs(behind[first]) < THRESHOLDS.baseline_light * light[first])
+
+
+_BLOCK: Final = THRESHOLDS.baseline_block
+_SHARE: Final = THRESHOLDS.baseline_share
+
+
+def _means(
+    values: Array, variance: Array, places: npt.NDArray[np.intp]
+) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    """Return means over blocks that begin at places, their variances, and which are complete."""
+    known = np.isfinite(values) & np.isfinite(variance)
+    sums = [
+        np.add.reduceat(np.where(known, array, 0.0), places, axis=1)
+        for array in (np.ones_like(values), values, variance)
+    ]
+    count = np.maximum(sums[0], 1.0)
+    full = np.logical_and.reduceat(known, places, axis=1)
+    return sums[1] / count, sums[2] / count**2, full
+
+
+def _combined(mean: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the mean over profiles, (block,), and its variance with that between profiles."""
+    known = np.isfinite(mean)
+    values = np.where(known, mean, 0.0)
+    with np.errstate(divide="ignore"):
+        weight = np.where(known, 1.0 / variance, 0.0)
+    total = weight.sum(axis=0)
+    centre = (weight * values).sum(axis=0) / total
+    excess = (weight * (values - centre) ** 2).sum() - (known.sum(axis=0) - 1).sum()
+    spare = (total - (weight**2).sum(axis=0) / total).sum()
+    between = max(excess / spare, 0.0) if spare > 0.0 else 0.0
+    weight = np.where(known, 1.0 / (variance + between), 0.0)
+    total = weight.sum(axis=0)
+    return (weight * values).sum(axis=0) / total, 1.0 / total + between

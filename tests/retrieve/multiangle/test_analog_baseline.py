@@ -1,0 +1,71 @@
+"""The analog baseline that beams behind a tree or building show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarops.retrieve.multiangle.analog_baseline import BlockedBeams
+
+DISTANCE = 3.75 * (np.arange(8000) + 0.5)
+TAIL = (27e3, 30e3)
+NOISE = 5e-3
+TRUE = 4e-3 * np.exp(-DISTANCE / 6000.0) - 6e-3 * np.exp(-DISTANCE / 15000.0)
+"""mV."""
+
+
+def scan(rng, targets, *, echo=30.0, scatter=0.0, light=60.0):
+    """Return power and variance of analog profiles, each blocked at its target, in mV."""
+    power = np.empty((len(targets), DISTANCE.size))
+    for row, target in enumerate(targets):
+        falling = light * (300.0 / DISTANCE) ** 2 * np.exp(-2e-4 * DISTANCE)
+        falling = np.where(target > DISTANCE, falling, 0.0)
+        falling[(target <= DISTANCE) & (target + 40.0 > DISTANCE)] = echo
+        own = scatter * rng.normal() * np.exp(-DISTANCE / 15000.0)
+        power[row] = 4.8 + TRUE + own + falling + rng.normal(0.0, NOISE, DISTANCE.size)
+    return power, np.full(power.shape, NOISE**2)
+
+
+def baseline(power, variance, together=1000):
+    beams = BlockedBeams(DISTANCE, TAIL)
+    for first in range(0, len(power), together):
+        rows = np.arange(first, min(first + together, len(power)))
+        beams.add(power[rows], variance[rows], rows)
+    return beams.baseline()
+
+
+# Fewer beams do not show how much they differ.
+@pytest.mark.parametrize(("blocked", "scatter"), [(1, 0.0), (2, 0.0), (6, 0.0), (6, 3e-3)])
+def test_the_baseline_lies_within_its_error(blocked, scatter):
+    rng = np.random.default_rng(blocked)
+    deviations = []
+    for _ in range(30):
+        targets = [*rng.uniform(100.0, 900.0, blocked), np.inf, np.inf, np.inf]
+        found = baseline(*scan(rng, targets, scatter=scatter))
+        assert found.profile.tolist() == list(range(blocked))
+        assert (found.obstruction <= targets[:blocked]).all()
+        tail = TRUE[np.searchsorted(DISTANCE, TAIL[0]) : np.searchsorted(DISTANCE, TAIL[1])].mean()
+        expected = np.interp(found.range, DISTANCE, TRUE) - tail
+        deviations.append((found.power - expected) / found.standard_error)
+    spread = np.sqrt(np.mean(np.square(np.concatenate(deviations))))
+    # The error is that of the baseline of a free beam, which differs from the mean as others do.
+    assert (0.3 if scatter else 0.8) < spread < 1.2
+
+
+def test_profiles_taken_together_change_no_bit():
+    power, variance = scan(np.random.default_rng(1), [300.0, np.inf, 500.0, np.inf, 200.0])
+    one, other = (baseline(power, variance, together) for together in (1, 5))
+    for name in ("range", "power", "standard_error", "profile", "obstruction"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_free_beams_show_no_baseline():
+    assert baseline(*scan(np.random.default_rng(2), [np.inf] * 5)) is None
+
+
+def test_an_echo_before_the_overlap_is_no_obstruction():
+    """A bright window, darkness up to 500 m, and light beyond, in one of the profiles."""
+    power, variance = scan(np.random.default_rng(3), [np.inf] * 4)
+    power[0, (DISTANCE > 130.0) & (DISTANCE < 500.0)] = 4.8
+    power[0, DISTANCE < 130.0] += 3000.0
+    assert baseline(power, variance) is None
