@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import Any, Final
 
-from tables import first_sentence, table
+from tables import first_paragraph, table
 
 from lidarops.campaign.model import campaign_schema
 from lidarops.kinds import kinds
@@ -41,7 +41,7 @@ def page() -> str:
     for name in _mentioned(schema, definitions):
         section = definitions[name]
         if "properties" in section:
-            lines += [f"## {name}", "", first_sentence(section.get("description"))]
+            lines += [f"## {name}", "", first_paragraph(section.get("description"))]
             lines += _keys(section)
     return "\n".join(lines)
 

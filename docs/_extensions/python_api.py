@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final
 
-from tables import first_sentence, table
+from tables import first_paragraph, table
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
 
@@ -88,7 +88,7 @@ def public_names(module: ModuleType) -> Iterator[tuple[str, object]]:
 def offered() -> str:
     """Return the table of the modules that users may call."""
     rows = [
-        (f"[{name}](made/{name}.md)", first_sentence(import_module(name).__doc__))
+        (f"[{name}](made/{name}.md)", first_paragraph(import_module(name).__doc__))
         for name in MODULES
     ]
     return "\n".join(table(("module", "what it holds"), rows))
@@ -103,7 +103,7 @@ def every_function() -> str:
         module = module.removesuffix(".__init__")
         tree = ast.parse(path.read_text(encoding="utf-8"))
         rows = [
-            (f"`{node.name}`", first_sentence(ast.get_docstring(node)))
+            (f"`{node.name}`", first_paragraph(ast.get_docstring(node)))
             for node in tree.body
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
         ]
@@ -112,7 +112,7 @@ def every_function() -> str:
         if _package(path) != package:
             package = _package(path)
             lines += [f"## `{package}`", ""]
-        lines += [f"### `{module}`", "", first_sentence(ast.get_docstring(tree))]
+        lines += [f"### `{module}`", "", first_paragraph(ast.get_docstring(tree))]
         lines += table(("name", "what it does or is"), rows)
     return "\n".join(lines)
 

@@ -18,6 +18,6 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
-def first_sentence(docstring: str | None) -> str:
+def first_paragraph(docstring: str | None) -> str:
     """Return the first paragraph of a docstring on one line."""
     return (docstring or "").strip().split("\n\n")[0].replace("\n", " ")

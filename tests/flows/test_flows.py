@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import select
 import shutil
 import subprocess
@@ -31,6 +32,7 @@ from prefect.states import Completed, Failed, Pending, Running
 from prefect.utilities.callables import parameter_schema
 from support import factories
 from support.archives import raw_archives
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import flows.catalog
@@ -44,6 +46,7 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
+from lidarops.cli import app as cli
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.process.guard import Failure
 from lidarops.process.job import Job
@@ -357,6 +360,20 @@ def test_the_flow_takes_the_options_of_the_command_line(campaign_file: Path) -> 
     inside = ["--since", "2026-02-28", "--until", "2026-03-02"]
     assert products(*selection, *inside, "--wait", "1", "--memory-limit", "1GiB") == 1
     assert products("--since", "2026-03-05") == 0
+
+
+def test_the_options_that_only_the_command_line_has_are_listed(repository: Path) -> None:
+    app = typer.Typer()
+    app.command()(flows.reprocess.main)
+    flow, command = (
+        {word for option in made.params for word in option.opts if word.startswith("--")}
+        for made in (get_command(app), get_command(cli).commands["reprocess"])
+    )
+    page = (repository / "docs/howto/cluster.md").read_text("utf-8")
+    lacking = page.partition("It has no")[2].partition("In `deploy")[0]
+    listed = {word.rstrip("*") for word in re.findall(r"`(--[\w*-]+)`", lacking)}
+    only = command - flow - {"--help"}
+    assert {next((w for w in listed if word.startswith(w)), word) for word in only} == listed
 
 
 @pytest.mark.usefixtures("prefect_server")
