@@ -128,7 +128,8 @@ def catalog(
             show_rows("Not entered in the ledger", ("file", "reason"), rebuilt.problems.items())
             say(
                 f"{rebuilt.entered} products entered in the ledger, {rebuilt.without_scene} of them"
-                f" without raw files; {rebuilt.known} known before"
+                " of no present scene (raw files gone, or scenes cut otherwise);"
+                f" {rebuilt.known} known before"
             )
     failed = bool(refused) or findings.failed or bool(rebuilt and rebuilt.problems)
     exit_with_status(failed=failed)

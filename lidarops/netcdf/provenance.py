@@ -180,6 +180,11 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
     ProductError
         If the file cannot be read or holds no provenance.
     """
+    return read_origin(path)[0]
+
+
+def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read the PROV-JSON document of a product and its global attributes; see `read_provenance`."""
     try:
         check_contents(path)
         with xr.open_dataset(path, engine="netcdf4", decode_times=False) as product:
@@ -187,7 +192,7 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
                 raise ProductError(
                     "has no such variable", file=path, field="provenance", wrong_use=True
                 )
-            text = str(product["provenance"].item())
+            text, attributes = str(product["provenance"].item()), dict(product.attrs)
     # The type of HDF5's error depends on the place of the damage.
     except (OSError, RuntimeError, ValueError) as error:
         raise ProductError(
@@ -200,7 +205,7 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
         document: dict[str, Any] = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
-    return document
+    return document, attributes
 
 
 def _is_netcdf(path: Path) -> bool:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import secrets
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from itertools import groupby
 from operator import attrgetter
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from lidarops import __version__
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import Dependence, NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
@@ -29,19 +28,19 @@ from lidarops.plan.scenes import parse_scene_id
 from lidarops.process.context import recorded_settings
 from lidarops.process.job import Job
 from lidarops.records import Plan, ProductRecord, Role, SceneOutcome
-from lidarops.run.archive import update_catalog
 from lidarops.run.recipe import Recipe
+from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps import dependence
-from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
-from lidarops.system.stores import without_keys
 
 _UNREADABLE: Final = (
     ProductError, OSError, RuntimeError, ValueError, KeyError, IndexError, TypeError,
 )  # fmt: skip
 """Exceptions of damaged and foreign files; that of HDF5 depends on the place of the damage."""
+_BLOCK: Final = 1 << 24
+"""Quality flags that are read at a time."""
 
 
 @dataclass(slots=True)
@@ -53,14 +52,14 @@ class Rebuilt:
     known: int = 0
     """Products that the ledger knew already."""
     without_scene: int = 0
-    """Entered products of scenes of which no raw file is left."""
+    """Entered products of scenes that present raw files and campaign do not give."""
     problems: dict[str, str] = field(default_factory=dict)
     """Path -> why it was not entered."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
-    """A product file."""
+class _ProductFile:
+    """What a product file says of itself."""
 
     path: str
     recipe: Recipe
@@ -82,7 +81,7 @@ def rebuild_ledger(
     wait: float = 0.0,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> Rebuilt:
-    """Update the catalog, and enter the products that the ledger does not know.
+    """Enter the products that the ledger does not know, day by day.
 
     Each product states its inputs, plan, settings and code. One that was made with the present
     settings from the present files is fresh afterwards; any other is stale. Products whose raw
@@ -91,6 +90,7 @@ def rebuild_ledger(
     Parameters
     ----------
     campaign : Campaign
+        Its catalog must be up to date: `lidarops.run.archive.update_catalog`.
     wait : float
         s to wait for another run on the same catalog.
     progress : callable, optional
@@ -101,30 +101,85 @@ def rebuild_ledger(
     CatalogError
         If the catalog cannot be used, or another run holds it.
     """
-    update_catalog(campaign, wait=wait)
-    rebuilt = Rebuilt()
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         lock.acquire()
-        with store.all_products() as made:
+        return _Rebuilding(campaign, store, lock, progress).carry_out()
+
+
+@dataclass(slots=True)
+class _Rebuilding:
+    """Enters the products of one day after the other, so that memory holds those of one."""
+
+    campaign: Campaign
+    store: Store
+    lock: Lock
+    progress: Callable[[int], None]
+    rebuilt: Rebuilt = field(default_factory=Rebuilt)
+    run: Run | None = None
+    """None until there is something to enter."""
+
+    def carry_out(self) -> Rebuilt:
+        with self.store.all_products() as made:
             known = {product.path for product in made}
-        found: dict[int, list[_Found]] = defaultdict(list)
-        for path in product_paths(campaign.products_root):
-            progress(1)
+        paths: dict[int | None, list[str]] = defaultdict(list)
+        for path in product_paths(self.campaign.products_root):
             if path in known:
-                rebuilt.known += 1
-                continue
+                self.rebuilt.known += 1
+                self.progress(1)
+            else:
+                paths[_day_in(path)].append(path)
+        # Says which name each of them should have.
+        self._read(paths.pop(None, []))
+        judge = Judge(self.campaign, self.store)
+        for batch in judge.batches(day for day in paths if day is not None):
+            judgements = {judged.scene.id: judged for judged in judge.days(batch).judgements}
+            for day in batch:
+                products = sorted(self._read(paths[day]), key=_order)
+                for scene, members in groupby(products, attrgetter("scene")):
+                    self._enter(judge, judgements.get(scene), day, tuple(members))
+        if self.run is not None:
+            refused = len(self.store.refused())
+            self.store.end_run(
+                self.run.id, RunStatus.FINISHED, refused=refused, token=self.lock.token
+            )
+        return self.rebuilt
+
+    def _read(self, paths: Iterable[str]) -> list[_ProductFile]:
+        """Return the products among some files, and note what the others are."""
+        products = []
+        for path in paths:
+            self.progress(1)
             try:
-                product = _found(campaign, path)
-                found[day_of(product.start)].append(product)
+                products.append(_read_product(self.campaign, path))
             except _UNREADABLE as error:
-                rebuilt.problems[path] = str(error).removeprefix(f"{campaign.products_root}/")
-        if found:
-            _enter(campaign, store, lock, found, rebuilt)
-    return rebuilt
+                root = f"{self.campaign.products_root}/"
+                self.rebuilt.problems[path] = str(error).removeprefix(root)
+        return products
+
+    def _enter(
+        self, judge: Judge, judged: Judgement | None, day: int, products: tuple[_ProductFile, ...]
+    ) -> None:
+        if self.run is None:
+            self.run = new_run(self.campaign)
+            self.store.begin_run(self.run, self.lock.token)
+        self.rebuilt.entered += len(products)
+        self.rebuilt.without_scene += len(products) if judged is None else 0
+        self.store.record(_entry(judge, judged, day, products), self.run.id, self.lock.token)
 
 
-def _found(campaign: Campaign, path: str) -> _Found:
-    """Return what a product file says of itself."""
+def _day_in(path: str) -> int | None:
+    """Return the day in the name of a product; None if it is no such name."""
+    try:
+        return day_of(parse_scene_id(PurePosixPath(path).stem)[1])
+    except ValueError:
+        return None
+
+
+def _order(product: _ProductFile) -> tuple[str, str]:
+    return product.scene, product.path
+
+
+def _read_product(campaign: Campaign, path: str) -> _ProductFile:
     file = campaign.products_root / path
     recipe = Recipe.of(file)
     if recipe.campaign_name != campaign.name:
@@ -134,22 +189,39 @@ def _found(campaign: Campaign, path: str) -> _Found:
     if path != _expected_path(recipe):
         raise ProductError(f"should have the name {_expected_path(recipe)}", file=file)
     status = file.stat()
-    with xr.open_dataset(file, decode_cf=False) as product:
-        values = with_current_flags(product[[QUALITY_FLAG]].load())[QUALITY_FLAG].to_numpy()
-    rejecting = np.int32(flags_of(recipe.kind).rejecting)
+    values, unflagged, usable = _counts(file, recipe.kind)
     record = ProductRecord(
         path=path,
         kind=recipe.kind,
         channel=recipe.channel,
         sha256=sha256_of(file),
         size=status.st_size,
-        values=values.size,
+        values=values,
         flagged={},
-        unflagged=int(np.count_nonzero(values == 0)),
-        usable=int(np.count_nonzero(values & rejecting == 0)),
+        unflagged=unflagged,
+        usable=usable,
         stamp=recipe.stamp,
     )
-    return _Found(path, recipe, record, status.st_mtime_ns)
+    return _ProductFile(path, recipe, record, status.st_mtime_ns)
+
+
+def _counts(file: Path, kind: str) -> tuple[int, int, int]:
+    """Return the numbers of all values of a product, of those without any bit, and of usable ones.
+
+    The file may be larger than memory.
+    """
+    rejecting = np.int32(flags_of(kind).rejecting)
+    unflagged = usable = 0
+    with xr.open_dataset(file, decode_cf=False, cache=False) as product:
+        flags = product[[QUALITY_FLAG]]
+        first, size = flags[QUALITY_FLAG].dims[0], flags[QUALITY_FLAG].size
+        rows = max(1, _BLOCK * flags.sizes[first] // max(size, 1))
+        for start in range(0, flags.sizes[first], rows):
+            part = with_current_flags(flags.isel({first: slice(start, start + rows)}))
+            values = part[QUALITY_FLAG].to_numpy()
+            unflagged += int(np.count_nonzero(values == 0))
+            usable += int(np.count_nonzero(values & rejecting == 0))
+    return size, unflagged, usable
 
 
 def _expected_path(recipe: Recipe) -> str:
@@ -158,46 +230,8 @@ def _expected_path(recipe: Recipe) -> str:
     return path_of_product(names, recipe.plan.scene, datetime.fromisoformat(window[0]))
 
 
-def _enter(
-    campaign: Campaign,
-    store: Store,
-    lock: Lock,
-    found: Mapping[int, list[_Found]],
-    rebuilt: Rebuilt,
-) -> None:
-    now = datetime.now(UTC)
-    run = Run(
-        id=f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}",
-        started=now,
-        finished=None,
-        status=RunStatus.RUNNING,
-        holder=Lock.holder_name(),
-        version=__version__,
-        code_version=joint_code_version(),
-        archive=without_keys(campaign.archive),
-        folder=str(campaign.folder),
-    )
-    store.begin_run(run, lock.token)
-    judge = Judge(campaign, store)
-    for batch in judge.batches(found):
-        judgements = {judged.scene.id: judged for judged in judge.days(batch).judgements}
-        for day in batch:
-            for scene, members in groupby(sorted(found[day], key=_order), attrgetter("scene")):
-                judged = judgements.get(scene)
-                products = tuple(members)
-                rebuilt.entered += len(products)
-                rebuilt.without_scene += len(products) if judged is None else 0
-                entry = _entry(judge, judged, day, products)
-                store.record(entry, run.id, lock.token)
-    store.end_run(run.id, RunStatus.FINISHED, refused=len(store.refused()), token=lock.token)
-
-
-def _order(found: _Found) -> tuple[str, str]:
-    return found.scene, found.path
-
-
 def _entry(
-    judge: Judge, judged: Judgement | None, day: int, products: tuple[_Found, ...]
+    judge: Judge, judged: Judgement | None, day: int, products: tuple[_ProductFile, ...]
 ) -> SceneEntry:
     first = products[0]
     keys = first.recipe.settings["keys"]

@@ -9,12 +9,11 @@ from datetime import datetime, timedelta
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-import xarray as xr
 from pydantic import ValidationError
 
 from lidarops.campaign.model import Campaign
 from lidarops.errors import ProductError
-from lidarops.netcdf.provenance import read_provenance
+from lidarops.netcdf.provenance import read_origin
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
 from lidarops.records import (
@@ -52,7 +51,7 @@ class Recipe:
     @classmethod
     def of(cls, file: Path) -> Recipe:
         """Read the provenance of a product; raise ProductError if it is insufficient."""
-        document = read_provenance(file)
+        document, attributes_of_file = read_origin(file)
         try:
             entities = document["entity"]
             attributes = entities["lidarops:product"]
@@ -67,7 +66,7 @@ class Recipe:
                 inputs=_inputs(entities, document["used"]),
                 code_version=software["lidarops:code_version"],
                 versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
-                stamp=_stamp(file),
+                stamp=_stamp(attributes_of_file),
             )
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise _insufficient(file, repr(error)) from error
@@ -216,9 +215,7 @@ def _inputs(
     )
 
 
-def _stamp(file: Path) -> Stamp:
-    with xr.open_dataset(file, decode_cf=False) as product:
-        attributes = product.attrs
+def _stamp(attributes: Mapping[str, Any]) -> Stamp:
     written = datetime.fromisoformat(str(attributes["date_modified"]))
     return Stamp(int(attributes["product_version"]), written)
 

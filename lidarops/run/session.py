@@ -42,6 +42,22 @@ MOST_EMPTY_SCENES: Final = 1000
 _LOG = logging.getLogger(__name__)
 
 
+def new_run(campaign: Campaign) -> Run:
+    """Return a run of this process that starts now."""
+    started = datetime.now(UTC)
+    return Run(
+        id=f"{started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}",
+        started=started,
+        finished=None,
+        status=RunStatus.RUNNING,
+        holder=Lock.holder_name(),
+        version=__version__,
+        code_version=joint_code_version(),
+        archive=without_keys(campaign.archive),
+        folder=str(campaign.folder),
+    )
+
+
 class Session:
     """A run that enters each scene in the ledger as it ends.
 
@@ -76,25 +92,14 @@ class Session:
         self._named = 0
         self.settled: set[str] = set()
         """Scenes whose products are all fresh now."""
-        self.started = datetime.now(UTC)
-        self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+        self._run = new_run(campaign)
+        self.id, self.started = self._run.id, self._run.started
         self._journal = Journal(campaign.report_root / self.id) if journal else None
 
     def begin(self) -> None:
         """Enter the run in the ledger, and remove temporary files of killed runs."""
         self._sweep()
-        run = Run(
-            id=self.id,
-            started=self.started,
-            finished=None,
-            status=RunStatus.RUNNING,
-            holder=Lock.holder_name(),
-            version=__version__,
-            code_version=joint_code_version(),
-            archive=without_keys(self._campaign.archive),
-            folder=str(self._campaign.folder),
-        )
-        self._store.begin_run(run, self._lock.token)
+        self._store.begin_run(self._run, self._lock.token)
         if self._journal:
             self._journal.begin(self._record((), Findings()))
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.cli import app
-from lidarops.run.archive import bring_up_to_date, reprocess
+from lidarops.run.archive import bring_up_to_date, reprocess, update_catalog
 from lidarops.run.rebuild import rebuild_ledger
 
 _OF_THE_RUN = {"run"}
@@ -55,6 +55,7 @@ def test_a_lost_ledger_is_restored_row_by_row(archive: Archive) -> None:
     before = _rows(campaign)
     contents = archive.contents("out/products")
     _lose(archive)
+    update_catalog(campaign)
     rebuilt = rebuild_ledger(campaign)
     assert (rebuilt.entered, rebuilt.known, rebuilt.without_scene) == (len(before), 0, 0)
     assert rebuilt.problems == {}
@@ -64,11 +65,31 @@ def test_a_lost_ledger_is_restored_row_by_row(archive: Archive) -> None:
     assert rebuild_ledger(campaign).known == len(before)
 
 
+def test_an_interrupted_rebuild_keeps_the_days_that_it_has_entered(archive: Archive) -> None:
+    _lose(archive)
+    campaign = archive.write()
+    update_catalog(campaign)
+    read = 0
+
+    def interrupt(_done: int) -> None:
+        nonlocal read
+        read += 1
+        if read > 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        rebuild_ledger(campaign, progress=interrupt)
+    rebuilt = rebuild_ledger(campaign)
+    assert (rebuilt.known, rebuilt.entered) == (6, 6)
+    assert reprocess(campaign) is None
+
+
 def test_products_made_otherwise_are_stale_after_it(archive: Archive) -> None:
     _lose(archive)
     archive.tree["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
     archive.flip("raw/poor/h01")
     campaign = archive.write()
+    update_catalog(campaign)
     rebuild_ledger(campaign)
     record = reprocess(campaign)
     assert made(record) == {
