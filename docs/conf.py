@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import sys
@@ -12,21 +11,14 @@ from typing import TYPE_CHECKING
 
 from jupyter_client.manager import KernelManager
 
+from lidarops.system.code_version import source_version
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
 REPOSITORY = HERE.parent
 sys.path[:0] = [str(HERE / "_extensions"), str(REPOSITORY / "tests")]
-
-
-def _code_digest() -> str:
-    """Return a digest of all code, so that no notebook shows results of other code."""
-    digest = hashlib.sha256()
-    for path in sorted((REPOSITORY / "lidarops").rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
 
 project = "lidarops"
 author = "The lidarops developers"
@@ -54,7 +46,8 @@ nb_execution_mode = "cache"
 nb_execution_in_temp = True
 # Notebooks call the commands of this environment.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-nb_execution_cache_path = str(HERE / "_build" / "notebooks" / _code_digest())
+# No notebook shows results of other code.
+nb_execution_cache_path = str(HERE / "_build" / "notebooks" / source_version())
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_execution_show_tb = True

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -25,7 +24,6 @@ from lidarops.figures import any_kind, svg
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.quality_panel import quality_figure, read_quality
-from lidarops.kinds import kinds
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -42,6 +40,7 @@ from lidarops.site.paths import (
 )
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.values import NO_VALUES, read_values
+from lidarops.system.code_version import pages_version
 from lidarops.system.files import copy_atomically, sha256_of, within, write_atomically
 from lidarops.system.output_files import COPIES, MANIFEST, SITE, product_paths
 from lidarops.system.processes import end_with_parent
@@ -415,24 +414,7 @@ def _sweep(site: Path, expected: set[str]) -> None:
 @cache
 def _version() -> str:
     """Return a digest of the code that makes pages; if it changes, all pages are made again."""
-    package = Path(__file__).resolve().parents[1]
-    sources = [
-        package / "flags.py",
-        *package.glob("products/*/flags.py"),
-        *package.glob("retrieve/*/flags.py"),
-        *(package / "figures").glob("*.*"),
-        package / "reports/run_record.py",
-    ]
-    for kind in kinds().values():
-        sources += Path(str(import_module(kind.package).__file__)).parent.glob("*.py")
-    sources += [path for path in (package / "site").rglob("*") if path.suffix in _SOURCES]
-    digest = hashlib.sha256(__version__.encode())
-    for source in sorted(sources):
-        digest.update(source.name.encode() + source.read_bytes().replace(b"\r\n", b"\n"))
-    return digest.hexdigest()
-
-
-_SOURCES: Final = (".py", ".html", ".css")
+    return f"{__version__} {pages_version()}"
 
 
 def _write_manifest(

@@ -25,6 +25,10 @@ _CATALOGUES: Final = "lidarops.catalog.headers"
 """Module that makes an entry of the catalog from the header of a raw file."""
 _OF_KIND: Final = ("settings", "steps", "variables", "flags")
 """Modules of a kind that make its products, as far as it has them."""
+_PAGES: Final = "lidarops.site.build"
+"""Module that makes the pages of products."""
+_ON_PAGES: Final = ("figures", "flags", "variables")
+"""Modules of a kind that decide what its pages hold, as far as it has them."""
 _APART: Final = (
     # Fetches raw files, whose contents each product records.
     "lidarops.system",
@@ -34,8 +38,13 @@ _APART: Final = (
     "lidarops.campaign.yaml_errors",
 )
 """Modules and packages that the others import, and that cannot change a product."""
-_WITH_DATA: Final = ("lidarops.products", "lidarops.retrieve")
-"""Packages of lidarops whose tables and other data count."""
+_WITH_DATA: Final = (
+    "lidarops.figures",
+    "lidarops.products",
+    "lidarops.retrieve",
+    "lidarops.site",
+)
+"""Packages of lidarops whose tables, templates and other data count."""
 
 
 @cache
@@ -125,6 +134,26 @@ def reading_version() -> str:
         16 hexadecimal digits.
     """
     return _installed().digest((_CATALOGUES, *_formats()))
+
+
+def pages_version(sources: Sources | None = None) -> str:
+    """Return a digest of the sources that decide what the pages of products hold.
+
+    Parameters
+    ----------
+    sources : Sources, optional
+        From `sources_in`; by default the installed ones.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
+    """
+    sources = sources or _installed()
+    packages = [kind.package for kind in kinds().values()]
+    of_kinds = (f"{package}.{name}" for package in packages for name in _ON_PAGES)
+    starts = (_PAGES, *packages, *of_kinds)
+    return sources.digest(name for name in starts if sources.has(name))
 
 
 @cache

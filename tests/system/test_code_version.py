@@ -15,6 +15,7 @@ from lidarops.system.code_version import (
     _APART,
     code_version,
     joint_code_version,
+    pages_version,
     source_roots,
     sources_in,
     version_of,
@@ -63,6 +64,32 @@ def test_comments_docstrings_and_line_ends_of_any_module_change_nothing(copy: Co
         text = path.read_text(encoding="utf-8").replace('"""', '"""In other words. ', 1)
         path.write_bytes(f"# A comment.\n{text}".replace("\n", "\r\n").encode())
     assert copy.versions() == before
+
+
+@pytest.mark.parametrize(
+    ("module", "counts"),
+    [
+        ("records.py", True),
+        ("netcdf/stored_flags.py", True),
+        ("netcdf/variables.py", True),
+        ("figures/raster.py", True),
+        ("products/raman/figures.py", True),
+        ("retrieve/elastic/flags.py", True),
+        ("site/values.py", True),
+        ("site/templates/site.css", True),
+        ("figures/figure.css", True),
+        ("reports/run_record.py", False),
+        ("products/raman/steps.py", False),
+        ("run/staleness.py", False),
+        ("catalog/scan.py", False),
+    ],
+)
+def test_a_change_of_what_pages_are_made_of_changes_their_version(
+    growing: Copy, module: str, *, counts: bool
+):
+    before = pages_version(growing.sources())
+    growing.change(module)
+    assert (pages_version(growing.sources()) != before) == counts
 
 
 @pytest.mark.parametrize(
