@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarops.figures.panels import Axis, Band, Figure, Panel, time_panel_axis
 from lidarops.figures.raster import column_edges, column_starts, profile_bounds
-from lidarops.figures.series_data import quality_bits
+from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.time_axis import Tick, Times, time_axis
 from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
@@ -21,8 +21,8 @@ Floats = NDArray[np.float64]
 
 _COLUMNS: Final = 240
 """Most columns."""
-_READ_BYTES: Final = 16_000_000
-"""Most bytes of flags in memory."""
+READ_VALUES: Final = 2_000_000
+"""Most flags in memory."""
 _HEIGHT: Final = 110
 _TICKS: Final = tuple(Tick(share, f"{100 * share:.0f}") for share in (0.0, 0.5, 1.0))
 
@@ -38,6 +38,12 @@ class QualityOverTime:
     """(column,) Share of values without a bit."""
     rejected: Floats
     """(column,) Share of values not to use."""
+    profiles: NDArray[np.int64]
+    """(column,) Number of profiles."""
+
+    def mean(self, share: Floats) -> float:
+        """Return the share of all values, as all profiles have equally many."""
+        return float(np.average(share, weights=self.profiles))
 
 
 def read_quality(product: xr.Dataset) -> QualityOverTime | None:
@@ -56,16 +62,15 @@ def read_quality(product: xr.Dataset) -> QualityOverTime | None:
     order = np.argsort(product["time"].values, kind="stable")
     start, stop = (edge[order] for edge in profile_bounds(product))
     rejecting = rejecting_mask(stored_bits(flags.attrs, product.attrs.get("lidarops_kind")))
-    counts = np.zeros((2, order.size))
-    step = max(1, _READ_BYTES * order.size // (8 * flags.size))
-    for first in range(0, order.size, step):
-        bits = quality_bits(flags.isel(time=slice(first, first + step)))
-        bits = bits.reshape(bits.shape[0], -1)
-        counts[:, first : first + step] = (bits == 0).mean(1), ((bits & rejecting) != 0).mean(1)
+    shares = []
+    for block in blocks(flags, READ_VALUES):
+        bits = quality_bits(block).reshape(block.sizes["time"], -1)
+        shares.append([(bits == 0).mean(axis=1), ((bits & rejecting) != 0).mean(axis=1)])
+    of_profiles = np.concatenate(shares, axis=1)[:, order]
     columns = column_starts(start, stop, -(-order.size // _COLUMNS))
     profiles = np.diff([*columns, order.size])
-    good, rejected = np.add.reduceat(counts[:, order], columns, axis=1) / profiles
-    return QualityOverTime(*column_edges(start, stop, columns), good, rejected)
+    good, rejected = np.add.reduceat(of_profiles, columns, axis=1) / profiles
+    return QualityOverTime(*column_edges(start, stop, columns), good, rejected, profiles)
 
 
 def quality_figure(quality: QualityOverTime) -> Figure:
@@ -88,7 +93,7 @@ def quality_figure(quality: QualityOverTime) -> Figure:
         Band(along, usable, whole, "full q-reject", label="do not use"),
     )
     y = Axis("values (%)", 0.0, 1.0, ticks=_TICKS)
-    mean = float(quality.good.mean()), float(quality.rejected.mean())
+    mean = quality.mean(quality.good), quality.mean(quality.rejected)
     words = (
         f"On average {percent(mean[0])} of the values good,"
         f" {percent(max(0.0, 1.0 - sum(mean)))} to use with care, {percent(mean[1])} not to use"

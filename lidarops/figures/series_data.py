@@ -6,7 +6,7 @@ Also checks and reads variables of any product.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, TypeVar
@@ -339,6 +339,17 @@ def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
 def float_values(product: xr.Dataset, name: str) -> Floats:
     """Return a variable in double precision."""
     return np.asarray(product[name].values, dtype=np.float64)
+
+
+def blocks(variable: xr.DataArray, most: int) -> Iterator[xr.DataArray]:
+    """Yield a variable some rows at a time, at most `most` values but at least a row."""
+    if not variable.dims or variable.size == 0:
+        yield variable
+        return
+    first, rows = next(iter(variable.sizes.items()))
+    step = max(1, most * rows // variable.size)
+    for start in range(0, rows, step):
+        yield variable.isel({first: slice(start, start + step)})
 
 
 def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -17,12 +16,12 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
+from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.netcdf.sizes import check_sizes
@@ -199,7 +198,7 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
     if variable.dtype.kind not in "fiu" or variable.size == 0:
         return properties
     missing, ends = 0, []
-    for values in _blocks(variable):
+    for values in (block.to_numpy() for block in blocks(variable, _READ_VALUES)):
         finite = values[np.isfinite(values)]
         missing += values.size - finite.size
         ends += [float(finite.min()), float(finite.max())] if finite.size else []
@@ -207,17 +206,6 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
     if ends:
         properties |= {"minimum": min(ends), "maximum": max(ends)}
     return properties
-
-
-def _blocks(variable: xr.DataArray) -> Iterator[NDArray[Any]]:
-    """Yield the values of a variable, some rows at a time."""
-    if not variable.dims:
-        yield variable.to_numpy()
-        return
-    first, rows = next(iter(variable.sizes.items()))
-    step = max(1, _READ_VALUES * rows // variable.size)
-    for start in range(0, rows, step):
-        yield variable.isel({first: slice(start, start + step)}).to_numpy()
 
 
 def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
@@ -229,15 +217,16 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     rows = []
     if "usable" in dataset.variables and dataset["usable"].size:
         verdicts: Counter[int] = Counter()
-        for usable in _blocks(dataset["usable"]):
+        for block in blocks(dataset["usable"], _READ_VALUES):
+            usable = block.to_numpy()
             verdicts.update({v: int(np.count_nonzero(usable == v)) for v in range(len(_VERDICTS))})
         rows = [
             _counted(name, "verdict", verdicts[value], size, "")
             for value, name in enumerate(_VERDICTS)
         ]
     counts: Counter[StoredBit] = Counter()
-    for flags in _blocks(dataset["quality_flag"]) if size else ():
-        counts.update(count_bits(flags.astype(np.int64), bits))
+    for flags in blocks(dataset["quality_flag"], _READ_VALUES) if size else ():
+        counts.update(count_bits(quality_bits(flags), bits))
     for bit in (bit for bit in bits if counts[bit]):
         severity = "unknown" if bit.severity is None else bit.severity.name.lower()
         rows.append(_counted(bit.word, severity, counts[bit], size, bit.description))

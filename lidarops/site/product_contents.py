@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from lidarops.figures.series_data import quality_bits
+from lidarops.figures.quality_panel import READ_VALUES
+from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -20,8 +20,6 @@ from lidarops.records import GLUED
 from lidarops.site.product_entry import UNKNOWN
 
 PROVENANCE: Final = "provenance"
-_READ_BYTES: Final = 16_000_000
-"""Most bytes of flags in memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,24 +116,14 @@ def count_quality(product: xr.Dataset) -> QualityCounts:
     counts: Counter[StoredBit] = Counter()
     values = usable = unflagged = 0
     rejecting = np.int64(rejecting_mask(bits))
-    for flags in _blocks(product[QUALITY_FLAG]):
+    for block in blocks(product[QUALITY_FLAG], READ_VALUES):
+        flags = np.atleast_1d(quality_bits(block))
         values += flags.size
         usable += int(np.count_nonzero((flags & rejecting) == 0))
         unflagged += flags.size - int(np.count_nonzero(flags))
         counts.update(count_bits(flags, bits))
     rows = [_flag_row(bit, counts[bit], values) for bit in bits if counts[bit]]
     return QualityCounts(values, usable, unflagged, tuple(rows))
-
-
-def _blocks(flags: xr.DataArray) -> Iterator[NDArray[np.int64]]:
-    first = flags.dims[0] if flags.dims else None
-    if first is None or flags.size == 0:
-        yield np.atleast_1d(quality_bits(flags))
-        return
-    length = flags.sizes[first]
-    step = max(1, _READ_BYTES * length // (8 * flags.size))
-    for start in range(0, length, step):
-        yield quality_bits(flags.isel({first: slice(start, start + step)}))
 
 
 def _flag_row(bit: StoredBit, count: int, values: int) -> FlagRow:

@@ -17,7 +17,7 @@ from lidarops.kinds import flags_of
 @pytest.fixture(params=[1, 10**9])
 def product(request, monkeypatch):
     """Flags of 30 profiles, read in many blocks and in one."""
-    monkeypatch.setattr(quality_panel, "_READ_BYTES", request.param)
+    monkeypatch.setattr(quality_panel, "READ_VALUES", request.param)
     made = signal(times(START, 30, 60.0), bins=50)
     bits = [0, 0, int(Quality.PILE_UP), int(Quality.SATURATED), int(Quality.INPUT_MISSING)]
     flags = np.random.default_rng(3).choice(bits, (30, 50))
@@ -48,6 +48,17 @@ def test_many_profiles_become_means():
     flags = made["quality_flag"].values
     size = 3000 // quality.good.size + 1
     np.testing.assert_allclose(quality.good[0], (flags[:size] == 0).mean(), atol=1e-9)
+
+
+def test_the_words_are_of_all_values_whatever_the_columns():
+    # 250 profiles in columns of 2, and one that is a column of its own.
+    time = np.concatenate([times(START, 250, 60.0), times(START + timedelta(hours=9), 1, 60.0)])
+    made = signal(time, bins=20).assign_attrs(lidarops_kind="signal")
+    made["quality_flag"][:] = 0
+    made["quality_flag"].values[-1] = int(Quality.SATURATED)
+    quality = read_quality(made)
+    assert quality.profiles.tolist() == [*[2] * 125, 1]
+    assert f"{100 * 250 / 251:.1f} % of the values good" in quality_figure(quality).words
 
 
 def test_nothing_is_drawn_in_a_gap():
