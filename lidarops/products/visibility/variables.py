@@ -181,7 +181,8 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Separate from total_extinction_standard_error, which covers noise and prior."
             " Effect of the errors of exponent, lidar ratio and overlap declared in the settings,"
-            f" and of signal that may remain in the background. {NO_STANDARD_NAME}",
+            " of signal that may remain in the background, and of the multiplier where one is"
+            f" requested. {NO_STANDARD_NAME}",
         ),
         Row(
             name="condition",

@@ -31,7 +31,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
-__all__ = ["CHOSEN", "MULTIPLIERS", "cycle_start", "solve_triangles", "systematic_error"]
+__all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 
 CHOSEN: Final = "chosen"
 """Multiplier with the smallest sum of squared bias and variance in the block."""
@@ -39,42 +39,6 @@ MULTIPLIERS: Final[Array] = 1.0 - np.concatenate([[0.0], np.geomspace(1e-4, 1.0,
 """Multipliers to choose from: 15 per decade of the difference from 1, which grows with the noise
 (`test_the_chosen_multiplier_is_no_worse_than_any_fixed_one`)."""
 _BEAMS: Final = 3
-
-
-def cycle_start(
-    start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike, multiplier: npt.ArrayLike
-) -> Array:
-    r"""Return the reciprocal extinction at the first crossing of a cycle of beams.
-
-    .. math::
-        \frac{1}{\hat\sigma_1} = \frac{\sum_j \mu_j Q_{j-1} J_j / \alpha_j}{1 - \mu_K Q_K},
-        \quad Q_j = \prod_{l \le j} \alpha'_l / \alpha_l, \quad \mu_j = \lambda^{j-1}
-
-    For any number K of beams; with K = 3, equations 11 and 12 of the paper.
-
-    Parameters
-    ----------
-    start, end : (..., row) float
-        Signals (P r^2)^m at the beginning and the end of each row, in any unit of the beam.
-    integral : (..., row) float
-        m times that unit: 2 m times the integral of the signal, negative where the row leads
-        towards its lidar.
-    multiplier : (...) float
-        Lambda of the paper, 0 to 1.
-
-    Returns
-    -------
-    (...) float
-        m; negative or infinite where the rows have no solution.
-
-    References
-    ----------
-    drabenko2021.
-    """
-    alpha, beyond, area, powers = (
-        np.asarray(values, dtype=np.float64) for values in (start, end, integral, multiplier)
-    )
-    return _sum_rows(alpha, beyond, area, powers).reciprocal
 
 
 def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) -> Array:
@@ -238,9 +202,8 @@ class _Rows:
             count = int(layout.first_passage[beam + 1] - own)
             taken = np.zeros((3, 2 * count - 1))
             taken[0, first - own] = taken[1, last - own] = 1.0
-            taken[2, count + between.start - own : count + between.stop - own] = triangle.direction[
-                row
-            ]
+            steps = slice(count + between.start - own, count + between.stop - own)
+            taken[2, steps] = triangle.direction[row]
             packed = data.covariance[:, layout.offset[beam] : layout.offset[beam + 1]]
             square = packed.reshape(profiles, 2 * count - 1, 2 * count - 1)
             covariance[:, row] = taken @ square @ taken.T
@@ -291,7 +254,7 @@ def _solve_block(
     # Where the block shows no attenuation, the error is unknown unless the rows cancel.
     out.multiplier_error[place] = np.where(multiplier == 1.0, 0.0, error) * extinction
     members, crossing = place
-    for ends, values in zip((triangle.first, triangle.last), (0, 1), strict=True):
+    for values, ends in enumerate((triangle.first, triangle.last)):
         for row, passage in enumerate(ends):
             out.carried[members, crossing, passage] -= np.where(
                 solved, derivative[:, values, row], 0.0
@@ -325,6 +288,14 @@ class _Sums(NamedTuple):
 
 
 def _sum_rows(start: Array, end: Array, integral: Array, multiplier: Array) -> _Sums:
+    r"""Return the reciprocal extinction at the first crossing of a cycle of beams.
+
+    .. math::
+        \frac{1}{\hat\sigma_1} = \frac{\sum_j \mu_j Q_{j-1} J_j / \alpha_j}{1 - \mu_K Q_K},
+        \quad Q_j = \prod_{l \le j} \alpha'_l / \alpha_l, \quad \mu_j = \lambda^{j-1}
+
+    With K = 3 rows, equations 11 and 12 of `drabenko2021`.
+    """
     powers = _powers(multiplier, start.shape[-1])
     product = np.cumprod(end / start, axis=-1)
     before = np.concatenate([np.ones_like(product[..., :1]), product[..., :-1]], axis=-1)
