@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 _WATCH: Final = Path(__file__).with_name("watch.py")
+_START: Final = "_run_uvicorn_command"
+_LOG = logging.getLogger(__name__)
 _watchers: list[subprocess.Popen[bytes]] = []
 
 
@@ -25,17 +28,21 @@ def tie_to_this_process() -> None:
     # It takes seconds to import; Prefect imports it where it starts a server.
     from prefect.server.api.server import SubprocessASGIServer  # noqa: PLC0415
 
-    start = SubprocessASGIServer._run_uvicorn_command  # noqa: SLF001 - no public hook has the process
+    # No public hook has the process, and another release of Prefect may start it otherwise.
+    start = getattr(SubprocessASGIServer, _START, None)
+    if start is None:
+        _LOG.warning("this Prefect starts servers otherwise: one may outlive a killed flow")
+        return
     if hasattr(start, "__wrapped__"):
         return
 
     @wraps(start)
     def tied(server: SubprocessASGIServer) -> subprocess.Popen[Any]:
-        process = start(server)
+        process: subprocess.Popen[Any] = start(server)
         _watch(process.pid)
         return process
 
-    SubprocessASGIServer._run_uvicorn_command = tied  # type: ignore[method-assign, assignment]  # noqa: SLF001
+    setattr(SubprocessASGIServer, _START, tied)
     running = SubprocessASGIServer().server_process
     if running is not None:
         _watch(running.pid)

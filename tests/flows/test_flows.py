@@ -27,7 +27,8 @@ from prefect import Flow, get_client, runtime
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
-from prefect.settings import get_current_settings
+from prefect.server.api.server import SubprocessASGIServer
+from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
 from prefect.states import Completed, Failed, Pending, Running
 from prefect.utilities.callables import parameter_schema
 from support import factories
@@ -41,6 +42,7 @@ from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
 from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
+from flows.temporary_server import tie_to_this_process
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -111,8 +113,10 @@ def test_a_temporary_server_ends_with_its_flow_however_that_ends(
         env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     children: dict[str, int] = {}
+    until = time.monotonic() + 120
     while not {"uvicorn", "watch.py"} <= children.keys():
         assert flow_run.poll() is None
+        assert time.monotonic() < until
         time.sleep(0.05)
         children = _children(flow_run.pid)
     ended = os.pidfd_open(children["uvicorn"])
@@ -127,9 +131,26 @@ def _children(process: int) -> dict[str, int]:
     return {
         Path(word).name: int(child)
         for listing in Path(f"/proc/{process}/task").glob("*/children")
-        for child in listing.read_text().split()
-        for word in Path(f"/proc/{child}/cmdline").read_text().split("\0")
+        for child in _read(listing).split()
+        for word in _read(Path(f"/proc/{child}/cmdline")).split("\0")
     }
+
+
+def _read(file: Path) -> str:
+    """Return the text of a file of a thread or process; nothing once that has ended."""
+    try:
+        return file.read_text()
+    except OSError:
+        return ""
+
+
+def test_a_prefect_that_starts_servers_otherwise_runs_flows(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delattr(SubprocessASGIServer, "_run_uvicorn_command")
+    with temporary_settings(updates={PREFECT_API_URL: None}):
+        tie_to_this_process()
+    assert "starts servers otherwise" in caplog.text
 
 
 @pytest.mark.parametrize("flow", [catalog, reprocess])
