@@ -25,7 +25,8 @@ from lidarops.kinds import flags_of, kinds
 from lidarops.system.files import write_atomically
 
 INDEX: Final = "products.parquet"
-FORMAT: Final = b"1"
+FORMAT: Final = b"2"
+"""Raised with every change of the columns."""
 _KEY: Final = b"lidarops_index"
 _PREFIX_BYTES: Final = 16
 _LEVEL: Final = 15

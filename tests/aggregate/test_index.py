@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from support.archives.aggregate_archive import add_day, facts_of
 
+from lidarops.aggregate import index as indices
 from lidarops.aggregate.facts import Facts, ProductSelection
 from lidarops.aggregate.index import INDEX, find_in_index, find_products, write_index
 from lidarops.errors import ProductError, RetrievalInputError
@@ -169,3 +170,14 @@ def test_another_parquet_table_is_refused(tmp_path: Path):
     pd.DataFrame({"path": ["a"]}).to_parquet(tmp_path / INDEX)
     with pytest.raises(ProductError, match="is not an index of this version"):
         find_products(tmp_path / INDEX)
+
+
+def test_an_index_with_the_columns_of_before_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its numbers of values were those of usable and unflagged ones."""
+    with monkeypatch.context() as patch:
+        patch.setattr(indices, "FORMAT", b"1")
+        index = tmp_path / write_index(tmp_path, fabricated(8))
+    with pytest.raises(ProductError, match="not an index of this version"):
+        find_in_index(index, ProductSelection())
