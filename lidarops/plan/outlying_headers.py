@@ -54,14 +54,14 @@ def without_outlying(
     outlying = outlying_headers(granules, days, read)
     kept, refused = [], []
     for granule in granules:
-        found = outlying.get(granule.path)
-        if found is None:
+        stated = outlying.get(granule.path)
+        if stated is None:
             kept.append(granule)
-        elif found.refused:
-            reason = f"its header states {found.refused}: {_REMEDY}"
+        elif stated.refused:
+            reason = f"its header states {stated.refused}: {_REMEDY}"
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))
         else:
-            note = f"the header states {found.note}"
+            note = f"the header states {stated.note}"
             kept.append(replace(granule, notes=(*granule.notes, note)))
     return kept, refused
 
@@ -84,16 +84,16 @@ def outlying_headers(
     dict
         By path.
     """
-    found = {}
+    outlying = {}
     ordered = sorted(granules, key=lambda g: (g.instrument, g.role.value, g.start, g.path))
     for _, alike in itertools.groupby(ordered, key=lambda g: (g.instrument, g.role)):
         own = list(alike)
         lone = {index: near for key in (_digest, _layout) for index, near in _lone(own, days, key)}
         for index, near in lone.items():
-            outlying = _compared(own[index], [own[other] for other in near], read)
-            if outlying is not None:
-                found[own[index].path] = outlying
-    return found
+            stated = _compared(own[index], [own[other] for other in near], read)
+            if stated is not None:
+                outlying[own[index].path] = stated
+    return outlying
 
 
 def _digest(granule: Granule) -> Hashable:

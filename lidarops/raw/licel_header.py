@@ -503,9 +503,9 @@ def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, .
     """Refuse a file if two or more channels contradict the shots of a single one.
 
     A recorder that misses triggers misses them for all its datasets; a damaged digit is one. All
-    channels of each of 272 real files state the same shots, those of recorders with two memories as
-    the sum over both, and in 180 files they are those of line 3. A dataset without shots gives no
-    values.
+    channels of each of 272 measured files state the same shots, those of recorders with two
+    memories as the sum over both, and in 180 files they are those of line 3. A dataset without
+    shots gives no values.
     """
     fired = {laser.shots for laser in lasers}
     groups = memories(datasets)

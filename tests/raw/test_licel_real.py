@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,8 +12,11 @@ import numpy as np
 import pytest
 from support.licel_strategies import naive_physical, naive_read
 
+from lidarops.errors import RawFormatError
 from lidarops.raw import licel
+from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.licel_format import raw_header
+from lidarops.raw.licel_header import memories
 
 
 @pytest.fixture(scope="session")
@@ -185,3 +190,45 @@ def test_layout(data_root):
     assert channels[3].name == "photon_408o"
     assert (channels[3].bins, channels[3].bin_width, channels[3].adc_bits) == (4096, 7.5, 0)
     assert channels[0].mode == "analog"
+
+
+def _measured(data_root: Path) -> Iterator[tuple[str, licel.Header, dict[str, np.ndarray]]]:
+    for folder in ("manaus", "manaus_raman", "pilar", "saopaulo", "savant"):
+        for path in sorted((data_root / folder).rglob("*")):
+            if path.is_file() and path.suffix not in {".csv", ".nc", ".txt"}:
+                # Notes and settings of the instruments lie among them.
+                with suppress(RawFormatError):
+                    yield path.name, *licel.read_counts(path)
+
+
+def test_checks_of_headers_follow_from_what_measured_files_state(data_root):
+    """All channels have the same shots, and one file has one bin beyond full scale."""
+    files, as_line_3, beyond = 0, 0, {}
+    for name, header, counts in _measured(data_root):
+        files += 1
+        shots = {sum(d.shots for d in group) for group in memories(header.datasets)}
+        assert len(shots - {0}) <= 1, name
+        as_line_3 += shots - {0} <= {laser.shots for laser in header.lasers}
+        for channel in raw_header(header).channels:
+            if channel.full_scale is not None and channel.shots:
+                bins = int(np.count_nonzero(counts[channel.name] > channel.full_scale))
+                if bins:
+                    beyond[name, channel.name] = bins
+    assert (files, as_line_3) == (272, 180)
+    assert beyond == {("RM10C1315.162", "analog_355o"): 1}
+
+
+def test_simulated_signals_that_are_scaled_to_32_bits_are_read(data_root):
+    """Those of Böckmann exceed the full scale of their header by design."""
+    scaled = set()
+    for path in (data_root / "synthetic").rglob("*"):
+        if path.is_file() and path.suffix not in {".csv", ".nc", ".txt"}:
+            header, counts = licel.read_counts(path)
+            for channel in raw_header(header).channels:
+                values = counts[channel.name]
+                if channel.full_scale and np.count_nonzero(values > channel.full_scale) > 1:
+                    assert values.max() == np.iinfo(np.int32).max
+                    content = path.read_bytes()
+                    parse_raw_header(content, file=path.name, size=len(content))
+                    scaled.add(path.relative_to(data_root / "synthetic").parts[0])
+    assert scaled == {"boeckmann"}
