@@ -331,6 +331,11 @@ class Verdicts(NamedTuple):
     care: int
     reject: int
 
+    @classmethod
+    def of(cls, values: int, *, unflagged: int, usable: int) -> Verdicts:
+        """Return the numbers of so many values, some without any bit and some not rejected."""
+        return cls(unflagged, usable - unflagged, values - usable)
+
     @property
     def values(self) -> int:
         """Number of all values."""
@@ -364,7 +369,7 @@ class ProductRecord:
     def verdicts(self) -> Verdicts:
         """Numbers of good values, of those to be used with care, and of rejected ones."""
         usable = self.unflagged if self.usable is None else self.usable
-        return Verdicts(self.unflagged, usable - self.unflagged, self.values - usable)
+        return Verdicts.of(self.values, unflagged=self.unflagged, usable=usable)
 
 
 @dataclass(frozen=True, slots=True)

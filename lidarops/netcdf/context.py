@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from typing import cast
 
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
@@ -41,12 +42,17 @@ class Context:
     raw_format: str
     """Raw format of its files, in words."""
     stamp: Stamp = field(default_factory=Stamp)
-    """Version of its content, and when it is written."""
+    """Version of its content, and when it is written; now, where it has no time."""
+
+    def __post_init__(self) -> None:
+        """Take the time once: several attributes of the file state it."""
+        if self.stamp.written is None:
+            object.__setattr__(self, "stamp", replace(self.stamp, written=writing_time()))
 
     @property
     def written(self) -> datetime:
         """When the product is written, UTC."""
-        return self.stamp.written or writing_time()
+        return cast("datetime", self.stamp.written)
 
 
 def product_path(context: Context) -> str:

@@ -233,9 +233,14 @@ def writing_time() -> datetime:
     ProductError
         If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
     """
+    return _epoch() or datetime.now(UTC).replace(microsecond=0)
+
+
+def _epoch() -> datetime | None:
+    """Return the time of ``SOURCE_DATE_EPOCH``; None where it is not set."""
     epoch = os.environ.get(EPOCH_VARIABLE, "")
     if not epoch:
-        return datetime.now(UTC).replace(microsecond=0)
+        return None
     try:
         return datetime.fromtimestamp(int(epoch), UTC)
     except (ValueError, OverflowError, OSError) as error:
@@ -267,15 +272,8 @@ def product_date(end: datetime) -> tuple[datetime, str]:
     ProductError
         If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
     """
-    epoch = os.environ.get(EPOCH_VARIABLE, "")
-    if epoch:
-        try:
-            return datetime.fromtimestamp(int(epoch), UTC), f"that of {EPOCH_VARIABLE}"
-        except (ValueError, OverflowError, OSError) as error:
-            raise ProductError(
-                f"is {epoch!r}, not a number of seconds",
-                field=EPOCH_VARIABLE,
-                remedy="set it to whole seconds since 1970-01-01, or unset it",
-            ) from error
+    epoch = _epoch()
+    if epoch is not None:
+        return epoch, f"that of {EPOCH_VARIABLE}"
     release = datetime.combine(RELEASE_DATE, time(tzinfo=UTC))
     return max(end, release), "the later of the end of the data and the release of lidarops"

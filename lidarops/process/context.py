@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from lidarops.campaign.model import Campaign, Station, as_settings
@@ -17,7 +16,6 @@ from lidarops.records import (
     Plan,
     Provenance,
     Scene,
-    Stamp,
 )
 from lidarops.steps import dependence
 from lidarops.system.code_version import code_version
@@ -82,7 +80,7 @@ def product_context(
         raw_format=" and ".join(
             sorted({raw_format(granule.format).title for granule in (*scene.granules, *scene.dark)})
         ),
-        stamp=_stamped(job.place(kind, channel.name).stamp),
+        stamp=job.place(kind, channel.name).stamp,
     )
 
 
@@ -110,11 +108,6 @@ def recorded_settings(
         "window": [scene.start.isoformat(), scene.stop.isoformat()],
         "notes": list(dependence.product_notes(scene, plan, product[1])),
     }
-
-
-def _stamped(stamp: Stamp) -> Stamp:
-    """Return a stamp with a time of writing: now, unless it has one."""
-    return stamp if stamp.written else replace(stamp, written=provenance.writing_time())
 
 
 def _campaign_settings(job: Job, plan: Plan, kind: str, channel: str) -> dict[str, Any]:

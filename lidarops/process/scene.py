@@ -21,7 +21,7 @@ from lidarops.process import execution
 from lidarops.process.context import product_context
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.input_files import check_files, local_files, open_granules
-from lidarops.process.job import Job, Place, nothing_to_do
+from lidarops.process.job import Job, nothing_to_do
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
@@ -201,7 +201,16 @@ class _Work:
         return self._record(context, writer)
 
     def _record(self, context: Context, writer: ProductWriter) -> ProductRecord:
-        return _record(context, writer, self.job.place(context.kind, context.channel))
+        written = writer.written
+        stays = written.change is not None and written.change.grade is Grade.NONE
+        former = self.job.place(context.kind, context.channel).former
+        return ProductRecord(
+            product_path(context),
+            context.kind,
+            context.channel,
+            **{item.name: getattr(written, item.name) for item in fields(written)},
+            stamp=former if stays else context.stamp,
+        )
 
 
 class _Instrument(_Work):
@@ -321,15 +330,3 @@ class _Network(_Work):
                 data,
                 channel_ranges(layout, scene_facts(job.campaign, planned)),
             )
-
-
-def _record(context: Context, writer: ProductWriter, place: Place) -> ProductRecord:
-    written = writer.written
-    stays = written.change is not None and written.change.grade is Grade.NONE
-    return ProductRecord(
-        product_path(context),
-        context.kind,
-        context.channel,
-        **{item.name: getattr(written, item.name) for item in fields(written)},
-        stamp=place.former if stays else context.stamp,
-    )

@@ -405,16 +405,16 @@ class Judge:
         )
         # Also files that cannot be used: the day is judged again when they change.
         judged = replace(self.judgement(scene, whole), ancillaries=self._ancillary_records(planned))
-        stale = []
+        stale: list[Stale] = []
+        frozen: list[Stale] = []
         requested = dependence.plan_of_kinds(whole, self._selection.kinds)
         products = dependence.planned_products(requested)
         for kind, channel in products:
             known = made.get((scene.id, kind, channel))
             reason, restored = self._reason(judged, (kind, channel), known, touched)
             if reason:
-                stale.append(Stale(kind, channel, reason, known, restored))
-        frozen = [one for one in stale if self._stays_frozen(scene, one)]
-        stale = [one for one in stale if one not in frozen]
+                one = Stale(kind, channel, reason, known, restored)
+                (frozen if self._stays_frozen(scene, one) else stale).append(one)
         return replace(
             judged,
             requested=requested,

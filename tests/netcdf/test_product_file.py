@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import tracemalloc
-from itertools import pairwise
+from datetime import UTC, datetime
+from itertools import pairwise, repeat
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,11 @@ from support.products.made_products import MAKERS, context, elastic, homogeneous
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
+from lidarops.netcdf import context as contexts
 from lidarops.netcdf import write as writer
 from lidarops.netcdf.product_file import ProductWriter, WrittenProduct, create_product
 from lidarops.netcdf.write import CHUNK_BYTES, write_product
+from lidarops.records import Stamp
 
 PROFILES, BINS = 53, 9000
 """A signal has 29 profiles a chunk, and its last chunk is cut."""
@@ -232,3 +235,11 @@ def test_memory_does_not_grow_with_the_number_of_profiles(tmp_path: Path):
     short, long = peak(100), peak(800)
     assert long < short + MIB
     assert long < 20 * MIB
+
+
+def test_a_product_states_one_time_of_writing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not that of each question for it."""
+    times = map(datetime.fromtimestamp, range(100), repeat(UTC))
+    monkeypatch.setattr(contexts, "writing_time", lambda: next(times))
+    unstamped = context(stamp=Stamp())
+    assert unstamped.written == unstamped.written == unstamped.stamp.written
