@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
-from lidarops.netcdf.provenance import read_provenance
+from lidarops.netcdf.provenance import read_origin, read_provenance
 from lidarops.netcdf.write import write_product
 from lidarops.run.archive import Selection, reprocess
 from lidarops.run.reproduction import Reproduction, explain_difference, reproduce_product
@@ -321,13 +321,13 @@ def test_the_exit_code_states_the_result(campaign: Campaign, moved: Campaign):
 
 def _forge(monkeypatch: pytest.MonkeyPatch, product: Path, renamed: dict[str, str]) -> None:
     """Let the provenance of a product name other paths."""
-    document = read_provenance(product)
+    document, attributes = read_origin(product)
     for entity in document["entity"].values():
         path = entity.get("lidarops:path")
         if path in renamed:
             entity["lidarops:path"] = renamed.pop(path)
     assert not renamed
-    monkeypatch.setattr("lidarops.run.recipe.read_provenance", lambda _: document)
+    monkeypatch.setattr("lidarops.run.recipe.read_origin", lambda _: (document, attributes))
 
 
 @pytest.mark.parametrize("escape", ["{outside}", "../outside"])
