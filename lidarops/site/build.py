@@ -387,8 +387,8 @@ def _write_calendar(
             lines = [f"{links.product(entry, name)}\n" for entry in month_entries]
             write(name, "".join(lines).encode())
         by_day = pages.days(station_entries)
-        around = [None, *by_day, None]
-        for (before, _), (day, after) in zip(pairwise(around), pairwise(around[1:]), strict=False):
+        ends = [None, *by_day, None]
+        for (before, _), (day, after) in zip(pairwise(ends), pairwise(ends[1:]), strict=False):
             if day is not None:
                 name = day_page(station, day)
                 write(name, pages.day(station, day, by_day, before, after))

@@ -24,7 +24,7 @@ from lidarops.site.links import Links
 from lidarops.site.neighbours import Neighbours
 from lidarops.site.paths import day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import Origin, QualityCounts, citation, variables
-from lidarops.site.product_entry import UNKNOWN, Entry, Grade, Problem, mean_share
+from lidarops.site.product_entry import UNKNOWN, Entry, Problem, ShareGrade, mean_share
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import Values
 
@@ -186,9 +186,7 @@ def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
         "alt": entry.alt,
         "href": href(entry.page, page),
         "title": _about(entry.kind, "Kind"),
-        "kind": entry.kind,
         "light": entry.light or entry.channel,
-        "channel": entry.channel,
         "where": where,
         "grade": entry.grade,
         "quality": "" if share is None else verdicts_in_words(entry.verdicts),
@@ -262,7 +260,7 @@ def index(
         title=title,
         lead=_index_lead(entries, by_station),
         trail=[],
-        grades=list(Grade),
+        grades=list(ShareGrade),
         map=station_map(_places(by_station)),
         stac=links.catalog(INDEX),
         report=links.report(INDEX),
@@ -332,7 +330,7 @@ def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
             "label": f"{calendar.month_name[number]} {group[0].day[:4]}",
             "days": len({entry.day for entry in group}),
             "share": _short(share),
-            "grade": Grade.of(share),
+            "grade": ShareGrade.of(share),
         }
     return cells
 
@@ -369,7 +367,7 @@ def year(
         ]
         if len(all_years) > 1
         else [],
-        grades=list(Grade),
+        grades=list(ShareGrade),
         weekdays=calendar.day_name[:],
         months=[
             {
@@ -380,7 +378,7 @@ def year(
                 f" {size(sum(entry.size for entry in group))}",
                 "weeks": _weeks(key, month, by_day, page),
             }
-            for month, group in (months(entries) if not kind else by_month).items()
+            for month, group in by_month.items()
         ],
     )
 
@@ -405,7 +403,7 @@ def _day(key: str, date_: date, month: int, by_day: ByDay, page: str) -> dict[st
         "href": href(day_page(key, date_.isoformat()), page),
         "number": date_.day,
         "share": _short(share),
-        "grade": Grade.of(share),
+        "grade": ShareGrade.of(share),
         "words": f" usable, {counted(len(entries), 'product')}",
     }
 
@@ -434,21 +432,25 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
         month=f"{calendar.month_name[int(day_[5:7])]} {day_[:4]}",
         weeks=_weeks(key, day_[:7], by_day, page),
         weekdays=calendar.day_name[:],
-        grades=[grade for grade in Grade if any(entry.grade is grade for entry in entries)],
+        grades=[grade for grade in ShareGrade if any(entry.grade is grade for entry in entries)],
         kinds=[_about(kind, "Kind") for kind in shown_kinds[:_FILTERED]],
         instruments=[
-            (
-                _named(group_[0].name, instrument),
-                [
-                    (
-                        shown_kinds.index(kind),
-                        _about(kind, "Kind"),
-                        [_card(entry, page, place=False) for entry in rows],
-                    )
-                    for kind, rows in groupby(group_, key=lambda entry: entry.kind)
-                ],
-            )
-            for instrument, group in groupby(ordered, key=lambda entry: entry.instrument)
-            for group_ in [list(group)]
+            _instrument(list(group), shown_kinds, page)
+            for _, group in groupby(ordered, key=lambda entry: entry.instrument)
         ],
     )
+
+
+def _instrument(
+    entries: Sequence[Entry], shown_kinds: Sequence[str], page: str
+) -> tuple[str, list[tuple[int, str, list[dict[str, Any]]]]]:
+    """Return the name of an instrument, and its products of a day by kind."""
+    kinds_ = [
+        (
+            shown_kinds.index(kind),
+            _about(kind, "Kind"),
+            [_card(entry, page, place=False) for entry in rows],
+        )
+        for kind, rows in groupby(entries, key=lambda entry: entry.kind)
+    ]
+    return _named(entries[0].name, entries[0].instrument), kinds_

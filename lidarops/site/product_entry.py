@@ -14,7 +14,7 @@ from lidarops.records import Verdicts
 UNKNOWN: Final = "unknown"
 
 
-class Grade(StrEnum):
+class ShareGrade(StrEnum):
     """Grade of a share of usable values."""
 
     MOST = "most"
@@ -34,7 +34,7 @@ class Grade(StrEnum):
         return _MEANING[self]
 
     @classmethod
-    def of(cls, share: float | None) -> Grade:
+    def of(cls, share: float | None) -> ShareGrade:
         """Return the grade of a share of usable values (0 to 1; None without quality flags)."""
         if share is None:
             return cls.UNKNOWN
@@ -48,11 +48,11 @@ class Grade(StrEnum):
 _SOME: Final = 0.25
 _MOST: Final = 0.75
 _MEANING: Final = {
-    Grade.MOST: "75 % or more of the values usable",
-    Grade.SOME: "25 to 75 % usable",
-    Grade.FEW: "less than 25 % usable",
-    Grade.NONE: "no value usable",
-    Grade.UNKNOWN: "no quality flags",
+    ShareGrade.MOST: "75 % or more of the values usable",
+    ShareGrade.SOME: "25 to 75 % usable",
+    ShareGrade.FEW: "less than 25 % usable",
+    ShareGrade.NONE: "no value usable",
+    ShareGrade.UNKNOWN: "no quality flags",
 }
 
 
@@ -126,9 +126,9 @@ class Entry:
         return Verdicts(self.unflagged, self.usable - self.unflagged, self.values - self.usable)
 
     @property
-    def grade(self) -> Grade:
+    def grade(self) -> ShareGrade:
         """Grade of the share of usable values."""
-        return Grade.of(self.share)
+        return ShareGrade.of(self.share)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from lidarops.errors import CatalogError, ProductError
 from lidarops.flags import Quality
 from lidarops.site import paths
 from lidarops.site.build import build_site
-from lidarops.site.product_entry import Grade
+from lidarops.site.product_entry import ShareGrade
 from lidarops.system.files import within
 
 FIRST_PAGE = 300_000
@@ -372,16 +372,16 @@ def test_paths_that_lead_out_are_refused(tmp_path: Path, path: str) -> None:
 @pytest.mark.parametrize(
     ("share", "grade"),
     [
-        (None, Grade.UNKNOWN),
-        (0.0, Grade.NONE),
-        (1e-9, Grade.FEW),
-        (0.25, Grade.SOME),
-        (0.75, Grade.MOST),
-        (1.0, Grade.MOST),
+        (None, ShareGrade.UNKNOWN),
+        (0.0, ShareGrade.NONE),
+        (1e-9, ShareGrade.FEW),
+        (0.25, ShareGrade.SOME),
+        (0.75, ShareGrade.MOST),
+        (1.0, ShareGrade.MOST),
     ],
 )
-def test_grades_cover_every_share(share: float | None, grade: Grade) -> None:
-    assert Grade.of(share) is grade
+def test_grades_cover_every_share(share: float | None, grade: ShareGrade) -> None:
+    assert ShareGrade.of(share) is grade
 
 
 _KILLED = """
