@@ -1,12 +1,19 @@
-"""Page templates of reports, benchmarks and the site."""
+"""Page templates and the shared style of reports, benchmarks and the site."""
 
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops.figures.wording import visible
+
+
+@cache
+def page_style() -> str:
+    """Return the style sheet that reports and the site share."""
+    return Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 
 @cache

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
+from markupsafe import Markup
 
 from lidarops.errors import CatalogError
-from lidarops.figures.wording import duration, percent, size, visible
+from lidarops.figures.templates import environment, page_style
+from lidarops.figures.wording import duration, percent, size
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
@@ -150,6 +152,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         difference=difference(record, folder),
         changes=run_tables.changes(record),
         narrow=gallery.NARROW,
+        page_style=Markup(page_style()),  # noqa: S704 - it is a file of the package
         overview=_overview(pictures),
         findings=[*finding_rows(record.findings), *disagreement_rows(record.scenes)],
         instruments=run_tables.instruments(record),
@@ -181,17 +184,10 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("lidarops.reports"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        finalize=lambda value: visible(value) if type(value) is str else value,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
-    environment.filters |= {"lacking": lacking, "source_hash": _source_hash}
-    return environment
+    own = environment("lidarops.reports")
+    own.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
+    own.filters |= {"lacking": lacking, "source_hash": _source_hash}
+    return own
 
 
 def _source_hash(style: str) -> str:

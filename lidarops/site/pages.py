@@ -16,7 +16,7 @@ import xarray as xr
 from lidarops import __version__
 from lidarops.figures import svg
 from lidarops.figures.panels import Figure
-from lidarops.figures.templates import environment
+from lidarops.figures.templates import environment, page_style
 from lidarops.figures.wording import counted, percent, size, verdicts_in_words
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
@@ -47,7 +47,7 @@ ByDay = Mapping[str, Sequence[Entry]]
 def style() -> str:
     """Return the style sheet of the site, with that of figures."""
     own = files("lidarops.site").joinpath("templates", "site.css").read_text(encoding="utf-8")
-    return svg.style() + own
+    return svg.style() + page_style() + own
 
 
 def _render(template: str, page: str, **context: Any) -> bytes:
