@@ -26,12 +26,13 @@ class Thresholds:
     symmetrical; with 5, none is left at 355 nm of the published simulations."""
     typical_lidar_ratio: float = 50.0
     """sr, by which extinction helps to decide whether backscatter is certain enough for a lidar
-    ratio. Decided by backscatter alone, lidar ratios of few counts are 21 % too small
-    (`tests/retrieve/raman/test_raman_coverage.py`)."""
+    ratio. Decided by backscatter alone, lidar ratios of few counts are too small on average: those
+    are kept whose backscatter is too high by noise."""
     negative: float = 4.0
     """Standard errors by which the optical depth between two cells must be below zero to contradict
-    the signal. Of 800 profiles of simulated haze the lowest is -3.0; in the night of Manaus, whose
-    overlap is not full where it was stated to be, -16 and -23."""
+    the signal. 1 of 3,000 profiles of simulated haze does
+    (`tests/retrieve/raman/test_raman_coverage.py`); in the night of Manaus, whose overlap is not
+    full where it was stated to be, all values up to 7.4 km (`tests/end_to_end/test_raman.py`)."""
     fewest_cells: int = 8
     """Cells with data of a profile that is fitted. Assumed."""
     many_counts: float = 1000.0
