@@ -233,7 +233,8 @@ def test_every_method_is_scored_in_every_scene(study):
         lines, spline = (
             value(f"straight lines, {name}", DEPTH) for name in ("numpy", "GCV spline")
         )
-        assert spline < 1.05 * lines
+        # In the clear scene a spline through all altitudes is the best one.
+        assert spline < (1.0 if scene == SHORT.label else 0.95) * lines
         assert value("kano_hamilton", "solved") == 1.0
         assert value("joint", DEPTH) < 0.6 * value("kano_hamilton", DEPTH)
         assert value("joint", SLOPE) < 0.2 * value("kano_hamilton", SLOPE)

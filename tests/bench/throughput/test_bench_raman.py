@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.registry import Benchmark
 from lidarops.bench.throughput import raman_night
 
 
@@ -17,4 +16,3 @@ def test_the_night_is_timed_and_its_retrievals_give_values():
     means = raman_night.means_of(raman_night.night(60))
     for product in raman_night.retrieved(means):
         assert np.isfinite(product["aerosol_extinction"].values).any()
-    assert Benchmark("raman") is Benchmark.RAMAN
