@@ -545,35 +545,30 @@ def _lidar_ratio(
         mask = known.reshape(-1, *(1,) * (values.ndim - 1))
         return np.asarray(kernel @ np.where(mask, values, 0.0))
 
-    smooth = smoothed(value)
+    smooth, total = smoothed(value), smoothed(calibrated.total)
     of_smooth = smoothed(noise)
     own = kernel**2 @ np.where(known, calibrated.own, 0.0) ** 2
-    level = calibrated.reference * smoothed(calibrated.total)
+    level = calibrated.reference * total
     error = np.sqrt((of_smooth**2).sum(axis=1) + own + level**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         uncertainty = (error / smooth) ** 2
         inverse = _backscatter.inverse_mean(smooth, uncertainty)
-    ratio = extinction.value * inverse
-
-    def change(of_extinction: Array, of_backscatter: Array) -> Array:
-        return np.asarray((of_extinction - ratio[:, np.newaxis] * of_backscatter) * column)
-
-    column = inverse[:, np.newaxis]
-    random = (change(extinction.noise, of_smooth) ** 2).sum(axis=1)
-    random += (own + level**2) * (ratio * inverse) ** 2
-    systematic = np.zeros(value.size)
-    for cause in causes:
-        effects = cause.extinction[:, np.newaxis], smoothed(cause.backscatter)[:, np.newaxis]
-        square = change(*effects)[:, 0] ** 2
-        if cause.name in RANDOM:
-            random += square
-        else:
-            systematic += square
-    # The variance of a reciprocal to the second order.
-    random *= 1.0 + 8.0 * uncertainty
-    likely = _likely(extinction, smooth, error)
-    total = smoothed(calibrated.total)
-    least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
+        ratio = extinction.value * inverse
+        by_noise = extinction.noise - ratio[:, np.newaxis] * of_smooth
+        random = (by_noise**2).sum(axis=1) + (own + level**2) * ratio**2
+        systematic = np.zeros(value.size)
+        for cause in causes:
+            square = (cause.extinction - ratio * smoothed(cause.backscatter)) ** 2
+            if cause.name in RANDOM:
+                random += square
+            else:
+                systematic += square
+        # The variance of a reciprocal to the second order.
+        random *= inverse**2 * (1.0 + 8.0 * uncertainty)
+        systematic *= inverse**2
+        likely = _likely(extinction, smooth, error)
+        # The error is in proportion to total backscatter: this is that of the likely one.
+        least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
     certain = complete & (smooth > error) & (likely > least)
     return (
         np.where(certain, ratio, np.nan),
