@@ -24,6 +24,8 @@ _COLUMNS: Final = 240
 READ_VALUES: Final = 2_000_000
 """Most flags in memory."""
 _HEIGHT: Final = 110
+_ROUNDING: Final = 1e-9
+"""Smaller shares come from rounding; one value of 1e8 is more."""
 _TICKS: Final = tuple(Tick(share, f"{100 * share:.0f}") for share in (0.0, 0.5, 1.0))
 
 
@@ -86,10 +88,12 @@ def quality_figure(quality: QualityOverTime) -> Figure:
         return np.repeat(share, 3)
 
     usable = steps(1.0 - quality.rejected)
+    # Its edge tells care from the others without colour: no edge where there is no such value.
+    care = np.where(usable - steps(quality.good) > _ROUNDING, usable, np.nan)
     good, none, whole = steps(quality.good), np.zeros(along.size), np.ones(along.size)
     layers = (
         Band(along, none, good, "full q-good", label="good"),
-        Band(along, good, usable, "full q-care", label="use with care"),
+        Band(along, good, care, "full q-care", label="use with care"),
         Band(along, usable, whole, "full q-reject", label="do not use"),
     )
     y = Axis("values (%)", 0.0, 1.0, ticks=_TICKS)
