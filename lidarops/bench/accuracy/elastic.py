@@ -478,7 +478,6 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
                 elastic_cases.TAIL_MEAN,
                 elastic_cases.KNOWN_SHAPE,
                 elastic_cases.KNOWN_CLEAN_RANGE,
-                elastic_cases.LINEAR,
             )
         },
         "layers.screen": lambda few: elastic_cases.find_clouds(power[:few], noise[:few], sky),
@@ -487,6 +486,7 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
         ALL_STEPS: everything,
     }
     peers: dict[str, _Step] = {
+        elastic_cases.LINEAR: background(elastic_cases.LINEAR),
         "Klett, numpy": lambda few: elastic_cases.klett_numpy(whole[:few], sky),
     }
     return ours, peers

@@ -399,10 +399,10 @@ def lines(scan: Scan) -> ScanEstimates:
 
 def spline(scan: Scan) -> ScanEstimates:
     """Smooth the optical depths of `lines` by a cubic spline, its strength by cross validation."""
-    found = lines(scan)
-    error = np.asarray(found.standard_error)
-    smooth = np.full(found.optical_depth.shape, np.nan)
-    for t, depth in enumerate(found.optical_depth):
+    unsmoothed = lines(scan)
+    error = np.asarray(unsmoothed.standard_error)
+    smooth = np.full(unsmoothed.optical_depth.shape, np.nan)
+    for t, depth in enumerate(unsmoothed.optical_depth):
         known = np.isfinite(depth)
         if known.sum() >= _FEWEST_KNOTS:
             height = scan.scene.altitude[known]

@@ -22,7 +22,6 @@ PROFILES: Final = 720
 BINS: Final = 4000
 CHANNELS: Final = {"355": 355e-9, "387": 386.7e-9, "408": 407.5e-9, "532": 532e-9, "607": 607.4e-9}
 """m, by name. The pairs are 355 with 387 and 408, 532 with 607."""
-MEANS: Final = 24
 _STEP: Final = 7.5
 _SECONDS: Final = 60
 _COUNTS: Final = 300.0

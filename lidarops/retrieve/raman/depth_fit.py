@@ -129,6 +129,7 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
         return None
     information = _working(values, noise, used)[0]
     mean = float(information.mean())
+    # LAPACK copies right-hand sides in another order.
     inverse = _solved(information, weight * mean, np.eye(signal.size, order="F"))
     return DepthFit(used, information, inverse, walk * mean)
 

@@ -192,8 +192,8 @@ def test_particles_at_the_detection_limit_are_found_as_often_as_stated():
         rejections = choose_reference(power, RANGE, noise**2, **settings).rejections[:, 0]
         # Of the windows that pass the tests of shape.
         tested = (rejections & ~np.int32(Rejection.MORE_PARTICLES)) == 0
-        found = np.mean(rejections[tested] == Rejection.MORE_PARTICLES)
-        assert least < found < most
+        flagged = np.mean(rejections[tested] == Rejection.MORE_PARTICLES)
+        assert least < flagged < most
 
 
 def test_profiles_are_independent_and_their_windows_fit_the_inversion():
