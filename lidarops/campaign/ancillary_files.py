@@ -17,7 +17,6 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.interpolate import CubicSpline
 
 from lidarops.errors import AncillaryError, RetrievalInputError
 from lidarops.records import InputRecord, Role
@@ -312,6 +311,9 @@ def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -
     centres = ranges[cells]
     edges = np.append(centres - 0.5 * step, centres[-1] + 0.5 * step)
     integral = np.append(0.0, np.cumsum(step * np.interp(cells, measured, means)))
+    # A run with nothing to do needs no splines.
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415
+
     spline = CubicSpline(edges, integral, bc_type=("not-a-knot", (1, 1.0))).derivative()
     fine = np.linspace(centres[0], edges[-1], (2 * cells.size - 1) * _POINTS + 1)
     overlap = np.minimum(spline(fine), 1.0)
