@@ -20,8 +20,8 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, archive, campaigns, elastic, homogeneous, memory, multiangle, network "
-            "or reader."
+            help="all, archive, campaigns, elastic, homogeneous, memory, multiangle, network, "
+            "raman or reader."
         ),
     ] = None,
     data: Annotated[
