@@ -196,6 +196,17 @@ class TestClearestCycle:
         assert np.isnan(profile.estimates["vertical_optical_depth"].value[20])
 
 
+def test_values_whose_errors_would_hide_all_others_do_not_set_the_axis():
+    """A tenth of the altitudes, with errors of 200 per km, as in real scans far from the lidar."""
+    product = multiangle()
+    noisy = (ALTITUDE > REACH - 400.0) & (ALTITUDE <= REACH)
+    error = product["total_extinction_standard_error"]
+    product["total_extinction_standard_error"] = error.where(~noisy, 0.2)
+    clear = drawn(multiangle()).panels[1].x
+    axis = drawn(product).panels[1].x
+    assert axis.high - axis.low < 1.2 * (clear.high - clear.low)
+
+
 class TestTruth:
     def test_the_file_nearest_to_the_zenith_is_taken(self):
         product = multiangle()

@@ -59,6 +59,8 @@ _EXTINCTION: Final = ImageQuantity("total extinction", units="km⁻¹", limits=(
 _HEIGHT: Final = 366
 _MARKS: Final = 30
 """About the largest number of marks of one kind in a panel."""
+_UNCLEAR: Final = 10.0
+"""Lower quartiles of the errors beyond which an error does not set the axis."""
 _USUAL: Final = 0.97
 """Share of the residuals inside the colour scale."""
 _LEAST: Final = 0.01
@@ -106,7 +108,8 @@ def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
     truth = _truth(profile, quantity, scale)
     # A truth beyond the reach, such as a cloud, does not set the axis.
     reached = truth.y <= np.fmin(profile.reach, profile.altitude[-1]) / 1e3
-    spans = [value - error, value + error, truth.x[reached]]
+    clear = _clear(value, error)
+    spans = [(value - error)[clear], (value + error)[clear], truth.x[reached]]
     if not finite(spans).size:
         spans = [scale * estimate.rejected]
     x = percentile_axis(label, spans, share=0.5, room=0.08)
@@ -124,6 +127,16 @@ def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
         reach = f"reach, {profile.reach / 1e3:.3g} km"
         layers.append(Curve(np.array([x.low, x.high]), level, "ink thin d3", label=reach))
     return Panel(x, y, tuple(layers), _HEIGHT)
+
+
+def _clear(value: Floats, error: Floats) -> NDArray[np.bool_]:
+    """Return which values set the axis: not those whose errors would hide all others."""
+    known = np.isfinite(value) & np.isfinite(error)
+    if not known.any():
+        return known
+    low, middle = np.percentile(error[known], [25.0, 50.0])
+    usual = np.abs(value[known & (error <= middle)]).max()
+    return np.asarray(known & (error <= max(_UNCLEAR * low, usual)))
 
 
 def _truth(profile: ScanProfile, quantity: str, scale: float) -> Curve:
