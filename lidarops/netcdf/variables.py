@@ -116,6 +116,8 @@ class Row:
     """The bits that a flag variable can carry."""
     reasons: type[IntFlag] | None = None
     """Bits of a variable that states reasons, and judges no value."""
+    states: tuple[str, ...] = ()
+    """Words of a variable whose values are 0, 1, ..."""
     summary: bool = False
     """Whether it is `usable`, which is computed from the flags and never passed in."""
     error_kind: ErrorKind | None = None
@@ -345,6 +347,9 @@ def attributes(
     if row.reasons is not None:
         attrs["flag_masks"] = np.array([int(reason) for reason in row.reasons], dtype=stored)
         attrs["flag_meanings"] = " ".join(str(reason.name).lower() for reason in row.reasons)
+    if row.states:
+        attrs["flag_values"] = np.arange(len(row.states), dtype=stored)
+        attrs["flag_meanings"] = " ".join(row.states)
     attrs["comment"] = (
         " ".join(text for text in (attrs.get("comment"), row.comment) if text) or None
     )

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.retrieve.signal.labeled_screening import Screening
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.step import Datum
 
@@ -90,6 +91,16 @@ class Profiles(ABC):
     @abstractmethod
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""
+
+    @abstractmethod
+    def screened(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, screening: Screening
+    ) -> Averages:
+        """Return an empty average of profiles over clock intervals, without outlying parts.
+
+        Its means have the variables of
+        `lidarops.retrieve.signal.labeled_screening.ScreenedAverage.completed`.
+        """
 
 
 class Averages(ABC):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import LAG_STEP, glued_parts
 from lidarops.steps.conditioning import PROFILES
 from lidarops.steps.data import Data
-from lidarops.steps.profiles import GluedProfiles
+from lidarops.steps.profiles import FileProfiles, GluedProfiles
 from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
 from lidarops.steps.workload import Workload
@@ -108,7 +108,9 @@ class Glue(Step[ChannelCase, GlueSettings]):
         lag = labeled_gluing.ChannelLag(labeled_gluing.range_lag(*ranges))
         if data.get(LAG):
             lag = labeled_gluing.estimate_lag(_groups(analog, photon), known=lag.bins)
-        data[PROFILES] = GluedProfiles(analog[PROFILES], photon[PROFILES], lag)
+        # Parts of a glued channel are channels of the files.
+        of_analog, of_photon = (cast("FileProfiles", part[PROFILES]) for part in (analog, photon))
+        data[PROFILES] = GluedProfiles(of_analog, of_photon, lag)
 
 
 def _groups(analog: Data, photon: Data) -> Iterator[tuple[_Power, _Power]]:

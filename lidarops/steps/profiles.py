@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final, TypedDict
 
 import numpy as np
@@ -12,6 +12,8 @@ import xarray as xr
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.steps.data import Averages, Chunk, Indices, Profiles
 
 _PARTS: Final = ("power", "variance", "quality")
@@ -62,17 +64,34 @@ class FileProfiles(Profiles):
 
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""
+        return _FileAverages(self, self._means(geometry, shots, seconds))
+
+    def _means(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int | None = None
+    ) -> ClockAverage:
         dark = self._settings["dark"]
-        return _FileAverages(
-            self,
-            ClockAverage(
-                geometry,
-                self._range,
-                seconds=seconds,
-                shots=shots,
-                shared_variance=None if dark is None else dark.variance,
-            ),
+        return ClockAverage(
+            geometry,
+            self._range,
+            seconds=seconds,
+            shots=shots,
+            shared_variance=None if dark is None else dark.variance,
+            parts=parts,
         )
+
+    def record(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, lag: int = 0
+    ) -> Record:
+        """Return the record of an empty screened average."""
+        parts = THRESHOLDS.most_parts
+        return Record(self._means(geometry, shots, seconds, parts), self._range, lag)
+
+    def screened(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, screening: Screening
+    ) -> Averages:
+        """Return an empty average of profiles over clock intervals, without outlying parts."""
+        records = [self.record(geometry, shots, seconds)]
+        return _ScreenedAverages((self,), ScreenedAverage(records, screening), _alone)
 
 
 class _FileAverages(Averages):
@@ -101,12 +120,14 @@ class GluedProfiles(Profiles):
 
     Parameters
     ----------
-    analog, photon : Profiles
+    analog, photon : FileProfiles
     lag : ChannelLag
         Lag of the analog record behind the photon-counting one.
     """
 
-    def __init__(self, analog: Profiles, photon: Profiles, lag: labeled_gluing.ChannelLag) -> None:
+    def __init__(
+        self, analog: FileProfiles, photon: FileProfiles, lag: labeled_gluing.ChannelLag
+    ) -> None:
         self._analog, self._photon, self._lag = analog, photon, lag
 
     @property
@@ -129,6 +150,53 @@ class GluedProfiles(Profiles):
             self._photon.averages(geometry, shots, seconds),
             self._lag,
         )
+
+    def screened(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, screening: Screening
+    ) -> Averages:
+        """Return an empty average of profiles over clock intervals, without outlying parts."""
+        records = [
+            self._analog.record(geometry, shots, seconds, round(self._lag.bins)),
+            self._photon.record(geometry, shots, seconds),
+        ]
+        average = ScreenedAverage(records, screening)
+        return _ScreenedAverages((self._analog, self._photon), average, self._glued)
+
+    def _glued(self, analog: xr.Dataset, photon: xr.Dataset) -> xr.Dataset:
+        glued = labeled_gluing.glue(analog, photon, self._lag)
+        kept = photon.isel(range=slice(glued.sizes["range"])).drop_vars(_PARTS)
+        return kept.assign(glued.variables).assign(labeled_gluing.glue_cells(analog, photon, glued))
+
+
+def _alone(record: xr.Dataset) -> xr.Dataset:
+    return record
+
+
+class _ScreenedAverages(Averages):
+    """Means of the records of a channel without outlying parts."""
+
+    def __init__(
+        self,
+        records: tuple[FileProfiles, ...],
+        means: ScreenedAverage,
+        joined: Callable[..., xr.Dataset],
+    ) -> None:
+        self._records, self._means, self._joined = records, means, joined
+
+    def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
+        """Add the next profiles: all of a chunk, or some of its rows."""
+        conditioned = [chunk.profiles(record) for record in self._records]
+        self._means.add(conditioned if rows is None else [c.isel(time=rows) for c in conditioned])
+
+    @property
+    def times(self) -> xr.Dataset:
+        """``time`` and ``time_bnds`` of all means."""
+        return self._means.times
+
+    def completed(self) -> Iterator[xr.Dataset]:
+        """Yield the means that are complete."""
+        for records in self._means.completed():
+            yield self._joined(*records)
 
 
 class _GluedAverages(Averages):

@@ -45,6 +45,7 @@ OWN = {
         "unstable_inversion": 19,
         "negative_backscatter": 20,
         "unknown_overlap": 21,
+        "partly_cloudy": 22,
     },
     "raman": {
         "no_reference": 17,
@@ -87,7 +88,7 @@ LEFT = {
     "shared": 3,
     "signal": 14,
     "homogeneous": 10,
-    "elastic": 9,
+    "elastic": 8,
     "raman": 10,
     "multiangle": 3,
     "visibility": 10,
@@ -127,6 +128,8 @@ SCENES = {
     "test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatter",
     "ElasticQuality.UNKNOWN_OVERLAP": "test_labeled_elastic::"
     "test_an_overlap_that_is_not_stated_is_no_cloud",
+    "ElasticQuality.PARTLY_CLOUDY": "test_partly_cloudy::"
+    "test_a_cirrus_that_ends_before_the_middle_is_stated",
     "RamanQuality.NO_REFERENCE": "test_raman_retrieval::"
     "test_particles_everywhere_leave_no_reference",
     "RamanQuality.WEAK_SIGNAL": "test_raman_retrieval::"

@@ -105,6 +105,7 @@ def test_variables_without_standard_name():
             "reference_top",
             "reference_detection_limit",
             "cloud_base_range",
+            "cloud_fraction",
             "background",
             "background_standard_error",
             "scattering_ratio",

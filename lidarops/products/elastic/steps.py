@@ -16,6 +16,7 @@ from lidarops.products.elastic.variables import LAYOUT
 from lidarops.records import Role
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
+from lidarops.retrieve.signal.labeled_screening import Screening
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
@@ -202,7 +203,8 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
 
     def held(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the averages that are completed together, and of their inversion."""
-        return _BYTES_OF_A_BIN * work.bins * min(_averages(work), MEANS_TOGETHER)
+        together = min(_averages(work), MEANS_TOGETHER)
+        return (_BYTES_OF_A_BIN * together + _BYTES_OF_PARTS) * work.bins
 
 
 def _averages(work: Workload) -> int:
@@ -210,7 +212,9 @@ def _averages(work: Workload) -> int:
     return work.intervals(average.seconds) if average else 0
 
 
-_BYTES_OF_A_BIN: Final = 170.0
+_BYTES_OF_PARTS: Final = 1500.0
+"""Bytes per bin of the parts of the open average: 44 each of two records that are glued."""
+_BYTES_OF_A_BIN: Final = 240.0
 """Bytes per bin of an average that is open or being inverted, from ``lidarops bench throughput
 --case memory``."""
 
@@ -221,8 +225,11 @@ class _Inversion(RowProduct):
     def __init__(self, settings: InversionSettings, data: Data) -> None:
         self._settings, self._data = settings, data
         source, profiles = data.source, data[PROFILES]
-        self._averages = profiles.averages(
-            source.geometry, profiles.shots(source.archive), data[AVERAGE]
+        self._averages = profiles.screened(
+            source.geometry,
+            profiles.shots(source.archive),
+            data[AVERAGE],
+            Screening(labeled.cloud_contrast(data[WAVELENGTH]), data[REFERENCE].highest),
         )
         self._begun = False
         self._lidar_ratio = _ratio_at(settings, source)

@@ -25,6 +25,7 @@ from lidarops.netcdf.variables import (
 )
 from lidarops.products.elastic.flags import FLAGS
 from lidarops.retrieve.air.reference_window import Rejection
+from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12
@@ -280,13 +281,65 @@ LAYOUT: Final = Layout(
             " lower ratio to air.",
         ),
         Row(
+            name="cloud_mask",
+            dims=_BINS,
+            dtype="i1",
+            units="1",
+            standard_name="status_flag",
+            long_name="clouds and dense layers in the mean profile",
+            coverage=Coverage.AUXILIARY,
+            states=("clear", "partly_cloudy", "cloudy"),
+            comment="partly_cloudy: some of the averaged profiles show a cloud, not all. cloudy:"
+            " all of them do, or their mean does. From base to apparent top: beyond a cloud that"
+            " attenuates strongly there may be more. Profiles that are left out do not count.",
+        ),
+        Row(
+            name="cloud_fraction",
+            dims=_BINS,
+            dtype="f4",
+            units="1",
+            long_name="share of the averaged profiles in which a cloud or dense layer is detected",
+            coverage=Coverage.AUXILIARY,
+            valid_min=0.0,
+            valid_max=1.0,
+            comment="The profiles of a mean are divided into up to"
+            f" {SIGNAL_THRESHOLDS.most_parts} parts, and clouds are sought in each, in cells of"
+            f" about {SIGNAL_THRESHOLDS.cell_length:g} m. Where only the mean shows a cloud, the"
+            f" share is missing, and cloud_mask is cloudy. {NO_STANDARD_NAME}",
+        ),
+        Row(
             name="cloud_base_range",
             dims=("time",),
             dtype="f4",
             units="m",
             long_name="range at which the lowest cloud or dense layer begins",
             coverage=Coverage.AUXILIARY,
-            comment=f"Missing where no cloud or dense layer was detected. {NO_STANDARD_NAME}",
+            comment="Of all profiles in the mean. Missing where no cloud or dense layer was"
+            f" detected. {NO_STANDARD_NAME}",
+        ),
+        Row(
+            name="cloud_base_altitude",
+            dims=("time",),
+            dtype="f4",
+            units="m",
+            standard_name="cloud_base_altitude",
+            long_name="altitude above the geoid at which the lowest cloud or dense layer begins",
+            coverage=Coverage.AUXILIARY,
+            comment="Of all profiles in the mean. Missing where no cloud or dense layer was"
+            " detected.",
+        ),
+        Row(
+            name="cloud_top_altitude",
+            dims=("time",),
+            dtype="f4",
+            units="m",
+            standard_name="cloud_top_altitude",
+            long_name="altitude above the geoid of the apparent top of the highest cloud or dense"
+            " layer",
+            coverage=Coverage.AUXILIARY,
+            comment="Of all profiles in the mean: where the signal is back at its level below the"
+            " base, which in a cloud that attenuates strongly is below the true top. Missing where"
+            " no cloud or dense layer was detected.",
         ),
         SUBTRACTED_BACKGROUND,
         *GLUING,
@@ -301,6 +354,21 @@ LAYOUT: Final = Layout(
             coverage=Coverage.AUXILIARY,
             cell_methods="time: sum",
             valid_min=0.0,
+        ),
+        Row(
+            name="profiles_left_out",
+            dims=("time",),
+            dtype="i4",
+            units="1",
+            standard_name="number_of_observations",
+            long_name="number of raw profiles that are left out of the mean as outlying",
+            coverage=Coverage.AUXILIARY,
+            cell_methods="time: sum",
+            valid_min=0.0,
+            comment="Profiles are left out where their signal exceeds that of all others of the"
+            " interval at some range by more than the contrast of a cloud and noise allow, or lies"
+            " below zero unlike that of all others, if they are at most a fifth of the interval: a"
+            " short cloud, a bird, an aircraft, interference.",
         ),
         shots(of="all profiles in the mean"),
     ),

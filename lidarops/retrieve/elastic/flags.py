@@ -45,3 +45,11 @@ class ElasticQuality(FlagBit):
             " or not stated: it may be incomplete here too"
         ),
     )
+    PARTLY_CLOUDY = (
+        FIRST_OWN + 5,
+        Severity.CARE,
+        (
+            "some of the averaged profiles, not all, show a cloud here, or between here and the"
+            " start of the inversion: the mean is that of cloudy and clear air"
+        ),
+    )

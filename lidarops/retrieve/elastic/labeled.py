@@ -1,6 +1,7 @@
 """The elastic retrieval of mean profiles in xarray.
 
-In this order: outlying bins, background, clouds, reference window, inversion, quality flags.
+In this order: outlying bins, background, clouds of the mean and of its parts, reference window,
+inversion, quality flags.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ _WITHHELD: Final = int(
     Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
 )
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
+_PARTS: Final = ("part_power", "part_variance")
 _INCOMPLETE_OVERLAP: Final = np.int32(Quality.INCOMPLETE_OVERLAP)
 _UNKNOWN_OVERLAP: Final = np.int32(ElasticQuality.UNKNOWN_OVERLAP)
 
@@ -87,6 +89,39 @@ class _Signal:
     uncertain: Mask
 
 
+@dataclass(frozen=True, slots=True)
+class _Clouds:
+    """Clouds of means, (time, range)."""
+
+    mask: Mask
+    """Clouds of the mean, or of all profiles in it."""
+    fraction: Array
+    """Share of the profiles with a cloud; NaN where only the mean shows it."""
+
+    @property
+    def partly(self) -> Mask:
+        """Bins that are cloudy in some of the profiles, but not in the mean."""
+        return np.asarray((self.fraction > 0.0) & ~self.mask)
+
+    @property
+    def any(self) -> Mask:
+        """Bins that are cloudy in some profiles or the mean."""
+        return np.asarray(self.mask | self.partly)
+
+
+def cloud_contrast(wavelength: float) -> float:
+    """Return the least contrast of a cloud; aerosol over air scales with lambda^3.
+
+    Parameters
+    ----------
+    wavelength : float
+        m.
+    """
+    scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
+    contrast = 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
+    return max(contrast, THRESHOLDS.least_cloud_contrast)
+
+
 def constant_ratio(ratio: float, standard_error: float) -> RatioAt:
     """Return the function of a lidar ratio and standard error, sr, that are equal everywhere."""
 
@@ -116,7 +151,9 @@ def invert_elastic(
     averages : xr.Dataset
         ``power``, ``variance``, ``quality`` over (time, range) and ``shots``, ``profiles`` over
         time, with the scalar coordinate ``zenith_angle`` (degree), from
-        `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. For the error of the
+        `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. With the signals of
+        their parts, from `lidarops.retrieve.signal.labeled_screening.ScreenedAverage`, clouds are
+        sought in these too, else in the mean only. For the error of the
         dead time, see `lidarops.retrieve.signal.labeled.dead_time_error`.
     molecules : MolecularProfile
     wavelength : float
@@ -159,11 +196,11 @@ def invert_elastic(
     air = _air(molecules, station_altitude + climb * distance, distance, wavelength)
     ratio, ratio_error = lidar_ratio(station_altitude + climb * distance)
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
-    means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
+    means = _Means(averages, distance, air, quality, overlap, cloud_contrast(wavelength))
     signal, clouds = _signal_and_clouds(
-        means, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
+        means, averages, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
     )
-    window = _window(signal, means, reference, clouds.mask)
+    window = _window(signal, means, reference, clouds.any)
     solution = _elastic.invert_elastic(
         signal.power,
         distance,
@@ -181,12 +218,15 @@ def invert_elastic(
         noise_correlation_length=means.correlation_length,
     )
     quality = means.quality
+    heights = _cloud_heights(clouds.any, distance)
     quality |= _solution_flags(solution, window, signal, quality)
+    cloudy = _with_beyond(clouds.mask, distance, window)
     for mask, bit in (
-        (clouds.mask, ElasticQuality.CLOUD),
-        (_negative(solution), ElasticQuality.NEGATIVE_BACKSCATTER),
+        (cloudy, ElasticQuality.CLOUD),
+        (_with_beyond(clouds.partly, distance, window) & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
+        (_with_beyond(_negative(solution), distance, window), ElasticQuality.NEGATIVE_BACKSCATTER),
     ):
-        quality |= _with_beyond(mask, distance, window).astype(np.int32) * np.int32(bit)
+        quality |= mask.astype(np.int32) * np.int32(bit)
     profiles = {
         name: np.where(solution.valid, values, np.nan)
         for name, values in _profile_variables(solution).items()
@@ -208,11 +248,16 @@ def invert_elastic(
                 "time",
                 np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32),
             ),
-            "cloud_base_range": ("time", clouds.cloud_base_range),
+            "cloud_mask": (("time", "range"), clouds.mask + clouds.any.astype(np.int8)),
+            "cloud_fraction": (("time", "range"), clouds.fraction),
+            "cloud_base_range": ("time", heights[0]),
+            "cloud_base_altitude": ("time", station_altitude + climb * heights[0]),
+            "cloud_top_altitude": ("time", station_altitude + climb * heights[1]),
             "background": ("time", signal.background),
             "background_standard_error": ("time", signal.background_standard_error),
             "quality_flag": (("time", "range"), quality),
             "profiles": averages["profiles"],
+            "profiles_left_out": averages.get("profiles_left_out", 0 * averages["profiles"]),
             "shots": averages["shots"],
         },
         coords={name: averages[name] for name in averages.coords},
@@ -250,6 +295,8 @@ class _Means:
         self.exposure = None if counts is None else counts / (noise.excess * length)
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
+        self.partly = np.zeros(self.raw.shape, dtype=np.bool_)
+        """Bins in clouds of some profiles of a mean; see `_with_parts`."""
 
     def _bridge_outliers(self) -> None:
         """Replace outlying bins before the background and the window depend on them."""
@@ -294,13 +341,79 @@ class _Means:
 
 
 def _signal_and_clouds(
-    means: _Means, reference: Reference, *, known_shape: bool, overlap_is_stated: bool
-) -> tuple[_Signal, _layers.Layers]:
+    means: _Means,
+    averages: xr.Dataset,
+    reference: Reference,
+    *,
+    known_shape: bool,
+    overlap_is_stated: bool,
+) -> tuple[_Signal, _Clouds]:
     """Return signals without background, and their clouds, with incomplete overlap flagged."""
+    signal, layers, doubtful = _signal_beyond_overlap(
+        means, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
+    )
+    fraction = np.where(doubtful, 0.0, _cloud_fraction(averages, means))
+    means.partly = (fraction > 0.0) & ~layers.mask
+    if means.partly.any():
+        signal, layers = _signal_beyond_clouds(means, known_shape=known_shape)
+    mask = (layers.mask | (fraction == 1.0)) & ~doubtful
+    return signal, _Clouds(mask, np.where(mask & (fraction == 0.0), np.nan, fraction))
+
+
+def _cloud_fraction(averages: xr.Dataset, means: _Means) -> Array:
+    """Return the share of the profiles of each mean that lie in parts with a cloud, (time, range).
+
+    The false-alarm rate is that of a mean.
+    """
+    fraction = np.zeros(means.raw.shape)
+    if "part_power" not in averages:
+        return fraction
+    bins = int(averages["part_power"].attrs["bins"])
+    profiles = averages["part_profiles"].to_numpy()
+    cells = min(averages.sizes["cell"], means.distance.size // bins)
+
+    def mean_of_bins(values: Array) -> Array:
+        in_cells = values[..., : cells * bins].reshape(*values.shape[:-1], cells, bins)
+        return np.asarray(in_cells.mean(axis=-1))
+
+    withheld = mean_of_bins(((means.quality & _WITHHELD) != 0).astype(float)) > 0.5
+    overlap = mean_of_bins(means.overlap)
+    power, variance = (averages[name].to_numpy()[..., :cells] for name in _PARTS)
+    power = np.where(withheld[:, np.newaxis], np.nan, power / overlap)
+    there = profiles > 0
+    found = _layers.find_layers(
+        power[there],
+        mean_of_bins(means.distance),
+        (variance / overlap**2)[there],
+        molecular_attenuated=mean_of_bins(means.air.shape),
+        contrast=means.contrast,
+        false_alarm=THRESHOLDS.cloud_false_alarm / profiles.shape[1],
+        quantum=averages["part_quantum"].to_numpy()[there],
+    )
+    masks = np.zeros((*profiles.shape, cells))
+    masks[there] = found.mask
+    share = (masks * profiles[..., np.newaxis]).sum(axis=1) / profiles.sum(axis=1)[:, np.newaxis]
+    fraction[:, : cells * bins] = np.repeat(share, bins, axis=-1)
+    return fraction
+
+
+def _cloud_heights(mask: Mask, distance: Array) -> tuple[Array, Array]:
+    """Return the ranges at which the lowest cloud begins and the highest one ends; NaN for none."""
+    cloudy = mask.any(axis=-1)
+    base = distance[np.argmax(mask, axis=-1)]
+    top = distance[mask.shape[-1] - 1 - np.argmax(mask[:, ::-1], axis=-1)]
+    return np.where(cloudy, base, np.nan), np.where(cloudy, top, np.nan)
+
+
+def _signal_beyond_overlap(
+    means: _Means, reference: Reference, *, known_shape: bool, overlap_is_stated: bool
+) -> tuple[_Signal, _layers.Layers, Mask]:
+    """Return signals without background, their layers, and those that may be the overlap's."""
     signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
     near = clouds.mask & _begin_before(clouds.mask, means.distance < reference.lowest)
+    nowhere = np.zeros_like(near)
     if not near.any():
-        return signal, clouds
+        return signal, clouds, nowhere
     window = _window(signal, means, reference, clouds.mask & ~near)
     ratio, error = means.ratio_to_air(signal.power)
     partial = _less_than_air(ratio, error, near, window, means.distance)
@@ -310,28 +423,29 @@ def _signal_and_clouds(
         means.quality = means.quality | _overlap_bits(ratio, partial, clouds.mask, window, means)
         signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
     if overlap_is_stated:
-        return signal, clouds
+        return signal, clouds, nowhere
     # Without clean air to compare with, a rise may as well be that of the overlap.
     doubtful = near & ~window.chosen[:, np.newaxis]
     means.quality = means.quality | np.where(doubtful, _UNKNOWN_OVERLAP, np.int32(0))
-    return signal, _layers.Layers.of(clouds.mask & ~doubtful, means.distance)
+    return signal, _layers.Layers.of(clouds.mask & ~doubtful, means.distance), doubtful
 
 
 def _signal_beyond_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _layers.Layers]:
     """Return signals without background, and their clouds."""
     signal = _subtract_background(means, np.ones_like(means.raw, bool), known_shape=known_shape)
     clouds = means.find_clouds(signal.power)
-    if not known_shape or not clouds.cloudy.any():
+    cloudy = clouds.mask | means.partly
+    if not known_shape or not cloudy.any():
         return signal, clouds
     # Only beyond the cloud does the signal have the shape of air: fit the background there.
     step = float(np.median(np.diff(means.distance)))
-    hidden = np.zeros_like(clouds.mask)
+    hidden = np.zeros_like(cloudy)
     margin = min(round(THRESHOLDS.cloud_margin / step), hidden.shape[1])
-    hidden[:, margin:] = clouds.mask[:, : hidden.shape[1] - margin]
-    hidden |= clouds.mask
+    hidden[:, margin:] = cloudy[:, : hidden.shape[1] - margin]
+    hidden |= cloudy
     beyond = ~np.logical_or.accumulate(hidden[:, ::-1], axis=-1)[:, ::-1]
     enough = beyond.sum(axis=-1) >= THRESHOLDS.least_share_beyond * means.distance.size
-    refitted = clouds.cloudy & enough
+    refitted = cloudy.any(axis=-1) & enough
     signal = _subtract_background(means, beyond | ~refitted[:, np.newaxis], known_shape=True)
     return signal, means.find_clouds(signal.power)
 
@@ -426,13 +540,6 @@ def _window(
         background_standard_error=np.nan_to_num(signal.background_standard_error),
         exclude=clouds,
     )
-
-
-def _cloud_contrast(wavelength: float) -> float:
-    """Return the least contrast of a cloud; aerosol over air scales with lambda^3."""
-    scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
-    contrast = 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
-    return max(contrast, THRESHOLDS.least_cloud_contrast)
 
 
 def _solution_flags(

@@ -17,6 +17,7 @@ from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.elastic._fernald import HUGE, usable
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
+from lidarops.retrieve.signal.screening import skewness_margin
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -57,6 +58,8 @@ def find_layers(
     *,
     molecular_attenuated: npt.ArrayLike,
     contrast: float = THRESHOLDS.cloud_contrast,
+    false_alarm: float = THRESHOLDS.cloud_false_alarm,
+    quantum: npt.ArrayLike = 0.0,
 ) -> Layers:
     r"""Return layers at whose base the scattering ratio rises by more than a factor.
 
@@ -67,7 +70,7 @@ def find_layers(
 
     for at least one length of the windows. This tests the hypothesis that the ratio rises by no
     more than the factor :math:`c`. If that holds everywhere, whatever the aerosol, a profile is
-    flagged with a probability below `Thresholds.cloud_false_alarm`, because :math:`t` is the
+    flagged with a probability below the false-alarm rate, because :math:`t` is the
     quantile of the normal distribution for that rate over the number of bins and lengths
     (Bonferroni bound), times the factor by which the noise of means over :math:`L` bins exceeds
     the stated one in the far half of the profile, with two standard errors
@@ -92,6 +95,11 @@ def find_layers(
         `power`.
     contrast : float
         The factor :math:`c`, at least 1.
+    false_alarm : float
+        Probability of a false layer in a profile.
+    quantum : (...) float
+        Power of a bin with a single count, broadcast to the profiles: the counts above a base must
+        exceed the limit by a margin for their skewness (`skewness_margin`). 0 for many counts.
 
     Returns
     -------
@@ -121,16 +129,19 @@ def find_layers(
     step = float(np.median(np.diff(grid.values))) if grid.size > 1 else 1.0
     # A window has at least two bins.
     lengths = np.unique(np.maximum(np.rint(np.array(THRESHOLDS.window_lengths) / step), 2.0))
-    rate = THRESHOLDS.cloud_false_alarm / (grid.size * lengths.size)
+    rate = false_alarm / (grid.size * lengths.size)
     mask = np.zeros(rows.shape, dtype=np.bool_)
     values = rows.astype(np.float64, copy=False)
+    limits = -float(ndtri(rate)) * _excess_noise(values, noise, lengths)
+    margins = skewness_margin(limits) * np.reshape(quantum, (-1, 1))
     _mark_layers(
         frozen(values),
         frozen(noise),
         frozen(shape),
         lengths.astype(np.int64),
         float(contrast),
-        frozen(-float(ndtri(rate)) * _excess_noise(values, noise, lengths)),
+        frozen(limits),
+        frozen(margins),
         mask,
     )
     layers = Layers.of(mask.reshape(*leading, grid.size), grid.values)
@@ -179,8 +190,11 @@ def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
 
 
 @_compiled
-def _rise(sums: Array, i: int, length: int, contrast: float) -> float:
-    """Return by how many standard errors the rise of the ratio to air exceeds `contrast`."""
+def _rise(sums: Array, i: int, length: int, contrast: float, margin: float) -> float:
+    """Return by how many standard errors the rise of the ratio to air exceeds `contrast`.
+
+    The sum above is taken to be less by `margin`.
+    """
     first, stop = i - length, i + length
     if first < 0 or stop >= sums.shape[1]:
         return 0.0
@@ -191,7 +205,7 @@ def _rise(sums: Array, i: int, length: int, contrast: float) -> float:
         return 0.0
     low, low_variance = _mean(sums, first, i)
     high, high_variance = _mean(sums, i, stop)
-    excess = high - contrast * low
+    excess = high - contrast * low - margin / (sums[SHAPE, i] - sums[SHAPE, stop])
     variance = high_variance + contrast * contrast * low_variance
     if not excess > _ROUNDING * high:
         return 0.0
@@ -206,13 +220,14 @@ def _steepest(
     lengths: npt.NDArray[np.int64],
     contrast: float,
     thresholds: Array,
+    margins: Array,
 ) -> tuple[int, int]:
     """Return the bin of the steepest rise for the shortest window that shows it, and its length."""
     stop = min(start + reach + 1, int(sums.shape[1]) - 1)
     for k, length in enumerate(lengths):
         best, highest = start, 0.0
         for i in range(start, stop):
-            rise = _rise(sums, i, length, contrast)
+            rise = _rise(sums, i, length, contrast, margins[k])
             if rise > highest:
                 best, highest = i, rise
         if highest >= thresholds[k]:
@@ -222,13 +237,18 @@ def _steepest(
 
 @_compiled
 def _next_base(
-    sums: Array, start: int, lengths: npt.NDArray[np.int64], contrast: float, thresholds: Array
+    sums: Array,
+    start: int,
+    lengths: npt.NDArray[np.int64],
+    contrast: float,
+    thresholds: Array,
+    margins: Array,
 ) -> tuple[int, int]:
     """Return the bin where the next layer begins and the window length that shows it; or -1."""
     for i in range(start, sums.shape[1] - 1):
         for k, length in enumerate(lengths):
-            if _rise(sums, i, length, contrast) >= thresholds[k]:
-                return _steepest(sums, i, length, lengths, contrast, thresholds)
+            if _rise(sums, i, length, contrast, margins[k]) >= thresholds[k]:
+                return _steepest(sums, i, length, lengths, contrast, thresholds, margins)
     return -1, 0
 
 
@@ -252,6 +272,7 @@ def _mark_layers(
     lengths: npt.NDArray[np.int64],
     contrast: float,
     thresholds: Array,
+    margins: Array,
     layers: Mask,
 ) -> None:
     """Mark the bins between base and top of all layers of each profile.
@@ -266,6 +287,8 @@ def _mark_layers(
         Least factor by which the ratio to air rises.
     thresholds : (profile, scale) float64
         Standard errors by which the rise exceeds that factor.
+    margins : (profile, scale) float64
+        Sums of power above a base by which it exceeds it further.
     layers : (profile, bin) bool
         Output, False before.
     """
@@ -275,7 +298,7 @@ def _mark_layers(
         _accumulate(power[k], noise, air, sums)
         end = 0
         while True:
-            base, length = _next_base(sums, end, lengths, contrast, thresholds[k])
+            base, length = _next_base(sums, end, lengths, contrast, thresholds[k], margins[k])
             if base < 0:
                 break
             end = _end(sums, base, length)

@@ -101,16 +101,34 @@ class RunningMean:
 
     def averages(self) -> Averages:
         """Return the means of what was added; once, because the sums become the means."""
-        total, value, noise, systematic = self._sums
+        sums = self._sums
         del self._sums
-        with np.errstate(invalid="ignore", divide="ignore"):
-            value /= total
-            noise /= total**2
-            systematic /= total
-            systematic **= 2
-        for means in (value, noise, systematic):
-            means[self._count == 0] = np.nan
-        return Averages(value, noise, systematic, self._count)
+        return _averages(sums, self._count)
+
+    def joined(self, groups: npt.NDArray[np.bool_]) -> Averages:
+        """Return the means of all values of some groups, (1, range), from their sums."""
+        sums, count = self._sums, self._count
+        if not groups.all():
+            sums, count = sums[:, groups], count[groups]
+        return _averages(sums.sum(axis=1, keepdims=True), count.sum(axis=0, keepdims=True))
+
+    @property
+    def sums(self) -> Array:
+        """(4, group, range), in the order of the fractions above: denominator, numerators."""
+        return self._sums
+
+
+def _averages(sums: Array, count: Counts) -> Averages:
+    """Return the means that follow from sums, in whose memory they come to lie."""
+    total, value, noise, systematic = sums
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value /= total
+        noise /= total**2
+        systematic /= total
+        systematic **= 2
+    for means in (value, noise, systematic):
+        means[count == 0] = np.nan
+    return Averages(value, noise, systematic, count)
 
 
 def _term(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
@@ -173,3 +191,17 @@ def _add_profiles(
             noise[i] += weight * weight * row_variance[i] if valid else 0.0
             systematic[i] += weight * math.sqrt(row_shared[i]) if valid else 0.0
             number[i] += 1 if valid else 0
+
+
+@_compiled
+def join_bits(
+    quality: npt.NDArray[np.int32],
+    groups: npt.NDArray[np.intp],
+    passed: int,
+    bits: npt.NDArray[np.int32],
+) -> None:
+    """Add the bits of profiles, (time, range), that are `passed`, to those of their groups."""
+    for t in range(quality.shape[0]):
+        row, of_group = quality[t], bits[groups[t]]
+        for i in range(row.size):
+            of_group[i] |= row[i] & passed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -11,7 +12,8 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.signal.averaging import RunningMean
+from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.signal.averaging import Averages, RunningMean, join_bits
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 
 _PROFILES_IN_CACHE: Final = 32
@@ -22,7 +24,23 @@ _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
 Shared = Callable[[npt.NDArray[np.datetime64]], npt.NDArray[np.float64]]
 Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.intp]
+Bits = npt.NDArray[np.int32]
+Units = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class PartSums:
+    """Sums of the parts of one interval, from which its mean follows."""
+
+    sums: RunningMean
+    lengths: RunningMean
+    quality: Bits
+    """(part, range), without INPUT_MISSING."""
+    profiles: Bits
+    """(part,), their numbers."""
+    shots: Bits
+    units: Units
+    """Attributes of power, variance and range."""
 
 
 class ClockAverage:
@@ -44,6 +62,9 @@ class ClockAverage:
     shared_variance : callable, optional
         Returns the part of ``variance`` that neighbouring profiles have in common at given
         times, (time, range), such as that of a dark signal. It does not average down.
+    parts : int, optional
+        Greatest number of parts of an interval. It is then cut into parts of consecutive profiles,
+        as equal in number as can be, and `completed_parts` gives their sums.
 
     Raises
     ------
@@ -59,6 +80,7 @@ class ClockAverage:
         seconds: float,
         shots: xr.DataArray,
         shared_variance: Shared | None = None,
+        parts: int | None = None,
     ) -> None:
         if not 0 < seconds <= 86400 or 86400 % seconds:
             raise RetrievalInputError(
@@ -72,48 +94,64 @@ class ClockAverage:
         first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
         self._starts, self._stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
         self._middles = self._starts + (self._stops - self._starts) // 2
-        self._counts = np.diff(first, append=interval.size)
-        self._group = np.repeat(np.arange(first.size), self._counts)
+        counts = np.diff(first, append=interval.size)
+        pieces = np.minimum(parts or 1, counts)
+        within = np.arange(interval.size) - np.repeat(first, counts)
+        part = within * np.repeat(pieces, counts) // np.repeat(counts, counts)
+        self._groups = np.append(0, np.cumsum(pieces))
+        self._group = np.repeat(self._groups[:-1], counts) + part
         self._weights = shots.to_numpy().astype(np.float64)
-        self._shots = np.add.reduceat(shots.to_numpy(), first).astype(np.int32)
+        begins = np.flatnonzero(np.diff(self._group, prepend=-1))
+        self._profiles = np.diff(begins, append=interval.size).astype(np.int32)
+        self._shots = np.add.reduceat(shots.to_numpy(), begins).astype(np.int32)
         self._shared_variance = shared_variance
         self._distance = distance
         self._added = 0
-        self._edges = np.append(first[::MEANS_TOGETHER], interval.size)
+        self._together = 1 if parts else MEANS_TOGETHER
+        self._edges = np.append(first[:: self._together], interval.size)
         self._completed: list[xr.Dataset] = []
+        self._parts: list[PartSums] | None = [] if parts else None
         self._begin(0)
 
     @property
     def times(self) -> xr.Dataset:
         """``time`` and ``time_bnds`` of all means."""
-        return xr.Dataset(coords=self._times(slice(None)))
+        return xr.Dataset(coords=self.times_of(slice(None)))
 
-    def _times(self, means: slice) -> dict[str, Any]:
+    @property
+    def left(self) -> int:
+        """Number of profiles to the end of the means that are completed next; 0 after the last."""
+        following = np.searchsorted(self._edges, self._added, side="right")
+        return 0 if following == self._edges.size else int(self._edges[following]) - self._added
+
+    def times_of(self, means: slice) -> dict[str, Any]:
+        """Return ``time`` and ``time_bnds`` of some means."""
         bounds = np.stack([self._starts[means], self._stops[means]], axis=-1)
         return {"time": self._middles[means], "time_bnds": (("time", "nv"), bounds)}
 
     def _begin(self, number: int) -> None:
         """Begin the means that are completed together."""
-        self._open = slice(number, number + MEANS_TOGETHER)
-        times = self._middles[self._open]
-        shape = times.size, self._distance.size
+        self._open = slice(number, min(number + self._together, self._middles.size))
+        first, past = self._groups[[self._open.start, self._open.stop]]
+        self._first_group = int(first)
+        shape = int(past - first), self._distance.size
         self._sums, self._bits = RunningMean(shape), np.zeros(shape, dtype=np.int32)
-        self._lengths = RunningMean((times.size, 1))
-        shared = self._shared_variance
+        self._lengths = RunningMean((shape[0], 1))
+        shared, times = self._shared_variance, self._middles[self._open]
         self._shared = None if shared is None or not times.size else shared(times)
 
-    def add(self, conditioned: xr.Dataset) -> None:
+    def add(self, conditioned: xr.Dataset, rows: slice = slice(None)) -> None:
         """Add the next profiles, from `lidarops.retrieve.signal.labeled.condition`."""
         names = ("power", "variance", "quality", CORRELATION_LENGTH)
-        arrays = [conditioned[name].to_numpy() for name in names]
+        arrays = [conditioned[name].to_numpy()[rows] for name in names]
         units = {name: dict(conditioned[name].attrs) for name in ("power", "variance", "range")}
         first, count = 0, len(arrays[0])
         while first < count:
-            left = self._edges[np.searchsorted(self._edges, self._added, side="right")]
-            past = min(first + _PROFILES_IN_CACHE, count, first + int(left) - self._added)
+            left = self.left
+            past = min(first + _PROFILES_IN_CACHE, count, first + left)
             self._add(*(array[first:past] for array in arrays))
-            if self._added == left:
-                self._completed.append(self._means(units))
+            if past - first == left:
+                self._complete(units)
                 self._begin(self._open.stop)
             first = past
 
@@ -121,8 +159,10 @@ class ClockAverage:
         self, power: Array, variance: Array, quality: npt.NDArray[np.int32], length: Array
     ) -> None:
         profiles = slice(self._added, self._added + len(power))
-        group = self._group[profiles] - self._open.start
-        common = None if self._shared is None else self._shared[group]
+        group = self._group[profiles] - self._first_group
+        # Parts share the variance of their mean.
+        mean = group if self._parts is None else np.zeros_like(group)
+        common = None if self._shared is None else self._shared[mean]
         self._sums.add(
             power,
             variance if common is None else np.maximum(variance - common, 0.0),
@@ -132,9 +172,28 @@ class ClockAverage:
         )
         weights = self._weights[profiles]
         self._lengths.add(length[:, np.newaxis], 0.0, groups=group, weights=weights)
-        first = np.flatnonzero(np.diff(group, prepend=-1))
-        self._bits[group[first]] |= np.bitwise_or.reduceat(quality & ~_MISSING, first, axis=0)
+        join_bits(frozen(quality), frozen(group), int(~_MISSING), self._bits)
         self._added += len(power)
+
+    def _complete(self, units: Units) -> None:
+        """Keep what is complete."""
+        groups = slice(self._first_group, self._first_group + len(self._bits))
+        profiles, shots = self._profiles[groups], self._shots[groups]
+        if self._parts is not None:
+            self._parts.append(
+                PartSums(self._sums, self._lengths, self._bits, profiles, shots, units)
+            )
+            return
+        length = self._lengths.averages().values[:, 0]
+        means = self._sums.averages(), self._bits, length, profiles, shots
+        self._completed.append(self.labeled(self._open, *means, units))
+
+    def completed_parts(self) -> Iterator[PartSums]:
+        """Yield the sums of the parts of the intervals that are complete, and forget them."""
+        sums = list(self._parts or ())
+        if self._parts is not None:
+            self._parts.clear()
+        yield from sums
 
     def completed(self) -> Iterator[xr.Dataset]:
         """Yield the means that all their profiles were added to, in batches, and forget them.
@@ -156,25 +215,43 @@ class ClockAverage:
         """Return the means of all profiles, as `completed` yields them."""
         return joined(self.completed())
 
-    def _means(self, units: dict[str, dict[str, Any]]) -> xr.Dataset:
-        means, length = self._sums.averages(), self._lengths.averages().values[:, 0]
-        self._bits[~np.isfinite(means.values)] |= _MISSING
+    def labeled(
+        self,
+        means: slice,
+        values: Averages,
+        quality: Bits,
+        length: Array,
+        profiles: Bits,
+        shots: Bits,
+        units: Units,
+    ) -> xr.Dataset:
+        """Return means with their coordinates, as `completed` yields them.
+
+        Parameters
+        ----------
+        means : slice
+            Their numbers.
+        values : Averages
+        quality : (time, range) int32
+            Without INPUT_MISSING.
+        length, profiles, shots : (time,)
+        units : dict of dict
+            Attributes of power, variance and range.
+        """
+        missing = np.where(np.isfinite(values.values), np.int32(0), _MISSING)
         plane = ("time", "range")
         return xr.Dataset(
             {
                 # A copy, because these are part of the sums, which are four times as large.
-                "power": (plane, means.values.copy(), units["power"]),
-                "variance": (plane, means.variance + means.shared_variance, units["variance"]),
-                "quality": (plane, self._bits),
+                "power": (plane, values.values.copy(), units["power"]),
+                "variance": (plane, values.variance + values.shared_variance, units["variance"]),
+                "quality": (plane, quality | missing),
                 # Without a shot it is not known, and neither is the mean.
                 CORRELATION_LENGTH: ("time", np.nan_to_num(length, nan=1.0), {"units": "1"}),
-                "profiles": ("time", self._counts[self._open].astype(np.int32)),
-                "shots": ("time", self._shots[self._open]),
+                "profiles": ("time", profiles),
+                "shots": ("time", shots),
             },
-            coords={
-                **self._times(self._open),
-                "range": ("range", self._distance, units["range"]),
-            },
+            coords={**self.times_of(means), "range": ("range", self._distance, units["range"])},
         )
 
 

@@ -130,6 +130,34 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
     return result
 
 
+def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dict[str, Any]:
+    """Return ``part_power`` and ``part_variance`` of glued means, by the lines of the means.
+
+    Parameters
+    ----------
+    analog, photon : xr.Dataset
+        From `lidarops.retrieve.signal.labeled_screening.ScreenedAverage`, the lag corrected.
+    glued : xr.Dataset
+        From `glue`.
+    """
+    bins = int(photon["part_power"].attrs["bins"])
+    distance = photon["range"].to_numpy()
+    cells = distance[distance > 0.0][bins // 2 :: bins][: photon.sizes["cell"]]
+    middle = (0.5 * (glued["glue_bottom"] + glued["glue_top"])).to_numpy()[
+        :, np.newaxis, np.newaxis
+    ]
+    slope = glued["glue_slope"].to_numpy()[:, np.newaxis, np.newaxis]
+    near = cells <= middle
+    along = ("time", "part", "cell")
+    power, variance = (
+        np.where(near, analog[name].to_numpy() * slope**exponent, photon[name].to_numpy())
+        for name, exponent in (("part_power", 1), ("part_variance", 2))
+    )
+    # Without a line it is not known which record holds.
+    power[~np.isfinite(middle[:, 0, 0])] = np.nan
+    return {"part_power": (along, power, {"bins": bins}), "part_variance": (along, variance)}
+
+
 def _whole_profiles(array: xr.DataArray) -> xr.DataArray:
     if "range" not in array.dims:
         return array

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import numba
@@ -110,6 +111,7 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
     return NoiseCorrelation(excess, correlations, error, known)
 
 
+@cache
 def _polynomials(size: int) -> Array:
     """Return orthonormal polynomials of degree 0 to 2 over a section."""
     place = np.linspace(-1.0, 1.0, size)

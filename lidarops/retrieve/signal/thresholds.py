@@ -25,6 +25,18 @@ class Thresholds:
     """Standard deviations of a bin about a limit within which the mean of its neighbours decides:
     a choice by the noise of the bin would bias every mean of those that are left."""
 
+    # Parts of a mean
+    most_parts: int = 16
+    """Parts into which the profiles of a mean are divided: 15 profiles of 2 minutes in half an hour
+    are parts of their own. More parts take more memory and have more noise. Assumed."""
+    fewest_parts: int = 5
+    """Parts of which one may be left out: at most a fifth of a mean. Assumed."""
+    cell_length: float = 30.0
+    """m; in which signals of parts are averaged, half of the shortest window in which a cloud is
+    found."""
+    screening_false_alarm: float = 0.001
+    """Probability that noise makes a part of a mean outlying. Required of the product."""
+
     # Analog
     near_full_scale: float = 0.5
     """Share of full scale above which a bin is tested for clipped shots. Assumed."""

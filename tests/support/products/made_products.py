@@ -220,7 +220,16 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "reference_top": ("time", window + 50.0),
             "reference_detection_limit": ("time", np.where(np.isnan(window), np.nan, 0.1)),
             "reference_rejections": ("time", np.zeros(profiles, np.int32)),
-            "cloud_base_range": ("time", np.where(np.arange(profiles) == 0, 40.0, np.nan)),
+            "cloud_mask": (dims, ((flags & int(ElasticQuality.CLOUD)) != 0) * np.int8(2)),
+            "cloud_fraction": (dims, ((flags & int(ElasticQuality.CLOUD)) != 0) * 1.0),
+            **{
+                f"cloud_{end}": ("time", np.where(np.arange(profiles) == 0, value, np.nan))
+                for end, value in (
+                    ("base_range", 40.0),
+                    ("base_altitude", 140.0),
+                    ("top_altitude", 200.0),
+                )
+            },
             "background": ("time", rng.uniform(0.1, 2.0, profiles)),
             "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
             "glue_slope": ("time", np.full(profiles, 20.0)),
@@ -229,6 +238,7 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "glue_top": ("time", np.full(profiles, 150.0)),
             "quality_flag": (dims, flags),
             "profiles": ("time", np.full(profiles, 10, np.int32)),
+            "profiles_left_out": ("time", np.arange(profiles, dtype=np.int32)),
             "shots": ("time", np.full(profiles, 6000, np.int32)),
         },
         coords={**clock(profiles, **beam), "range": ("range", 7.5 * (np.arange(bins) + 0.5))},
