@@ -1,8 +1,8 @@
-"""Makes the aggregates of an output: index, views, means, STAC catalog."""
+"""Makes the aggregates of an output: index, views, means, stores, STAC catalog."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from lidarops.aggregate.index import write_index
 from lidarops.aggregate.means import MeansFile, write_means
 from lidarops.aggregate.means_variables import Period, Weights
 from lidarops.aggregate.stac import write_stac
+from lidarops.aggregate.versioned_store import StoreUpdate, stored_kinds, update_store
 from lidarops.aggregate.virtual_dataset import View, write_view
 from lidarops.errors import ProductError
 
@@ -36,6 +37,9 @@ class AggregateOptions:
     """Period of means; None for no means."""
     weights: Weights = Weights.SHOTS
     stac: bool = False
+    store: bool = False
+    runs: Mapping[str, str] = field(default_factory=dict)
+    """Product path -> run that made it, for the snapshots of stores."""
 
 
 @dataclass(slots=True)
@@ -48,6 +52,7 @@ class AggregateResult:
     stac: str | None = None
     views: list[View] = field(default_factory=list)
     means: list[MeansFile] = field(default_factory=list)
+    stores: list[StoreUpdate] = field(default_factory=list)
     refused: list[Refused] = field(default_factory=list)
     """Products that could not be read."""
     failed: list[str] = field(default_factory=list)
@@ -64,7 +69,8 @@ def make_aggregates(
     Parameters
     ----------
     root : path
-        Output of a campaign, or a folder of products; aggregates go to its ``aggregates``.
+        Output of a campaign, or a folder of products; aggregates go to its ``aggregates``, stores
+        to its ``stores``.
     options : AggregateOptions
     progress : callable
         Called with 1 for each product that was examined.
@@ -99,6 +105,9 @@ def make_aggregates(
         _try(made, partial(_view, made, group_products))
         if options.period is not None:
             _try(made, partial(_means, made, group_products, options.period, options.weights))
+    if options.store:
+        for kind in sorted({product.kind for product in products} | set(stored_kinds(root))):
+            _try(made, partial(_store, made, kind, products, options))
     if options.stac:
         _try(made, partial(_stac, made, products, options.selection))
     return made
@@ -163,6 +172,21 @@ def _means(
     made.means += done.files
     made.refused += done.refused
     made.notes += [done.note] if done.note else []
+
+
+def _store(
+    made: AggregateResult, kind: str, products: Sequence[Facts], options: AggregateOptions
+) -> None:
+    selection = options.selection
+    if selection.kind not in (None, kind):
+        return
+    if selection.since is not None or selection.until is not None:
+        raise ProductError("a store holds all times", remedy="run without --since and --until")
+    alike = [product for product in products if product.kind == kind]
+    done = update_store(made.root, kind, alike, selection, options.runs)
+    made.stores.append(done)
+    made.refused += done.refused
+    made.failed += done.failed
 
 
 def _stac(made: AggregateResult, products: Sequence[Facts], selection: ProductSelection) -> None:

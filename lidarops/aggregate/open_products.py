@@ -1,4 +1,4 @@
-"""Opens products as one lazy dataset: from files, a folder or an index."""
+"""Opens products as one lazy dataset: from files, a folder, an index or a store."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import numpy as np
 import xarray as xr
 
 from lidarops.aggregate._join import join, shared_attributes
+from lidarops.aggregate._pieces import open_piece
 from lidarops.aggregate.facts import (
-    UNSHARED,
     Facts,
     Group,
     ProductSelection,
     Refused,
-    coordinate_names,
     groups,
     list_products,
     read_facts,
@@ -25,12 +24,10 @@ from lidarops.aggregate.facts import (
     refuse_duplicates,
 )
 from lidarops.aggregate.index import INDEX, IndexedPaths, find_in_index
-from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.aggregate.selection import parse_selection
 from lidarops.aggregate.usable import CARE, masked
-from lidarops.errors import ProductError
-from lidarops.netcdf.variables import attributes
-from lidarops.records import DetectionMode
+from lidarops.aggregate.versioned_store import is_store, open_store
+from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.system.files import within
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -46,14 +43,15 @@ def open_products(
     since: datetime | str | None = None,
     until: datetime | str | None = None,
     usable: int = CARE,
+    version: str | None = None,
 ) -> xr.Dataset:
     """Open products of one instrument, kind, channel and grid as one dataset in order of time.
 
     Parameters
     ----------
     source : path or str, or iterable of these
-        Product files; or a folder of products or of a campaign's output; or an index that
-        `lidarops aggregate` wrote, which is much faster for a large archive.
+        Product files; or a folder of products or of a campaign's output; or an index or a store
+        that `lidarops aggregate` wrote, which is much faster for a large archive.
     kind, channel, station, instrument : str, optional
         Select products.
     since, until : datetime or ISO 8601 text, optional
@@ -62,11 +60,14 @@ def open_products(
     usable : int
         Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN.
         ``quality_flag`` and ``usable`` are not masked.
+    version : str, optional
+        Id of a snapshot of a store; without it the newest.
 
     Returns
     -------
     xarray.Dataset
-        Decoded, with units as attributes, on dask arrays with one chunk per product or smaller.
+        Decoded, with units as attributes, on dask arrays, with one chunk per product or smaller
+        unless it is of a store.
         ``product`` (product) is the id of each product, ``product_index`` (time) the index of the
         product of each profile. Variables of a whole product, such as the assumed lidar ratio,
         have the dimension ``product``.
@@ -78,7 +79,7 @@ def open_products(
         no product is found; if the products cannot be joined (the message lists instruments,
         kinds, channels and grids to choose from).
     RetrievalInputError
-        If `usable`, `kind` or a time is invalid.
+        If `usable`, `kind` or a time is invalid, or `version` is given without a store.
 
     Examples
     --------
@@ -86,6 +87,13 @@ def open_products(
     >>> data.total_extinction.resample(time="1D").mean()  # doctest: +SKIP
     """
     selection = parse_selection(kind, channel, station, instrument, since, until)
+    store = _path_of(source)
+    if store is not None and is_store(Path(store)):
+        return masked(open_store(Path(store), selection, version), usable)
+    if version is not None:
+        raise RetrievalInputError(
+            "only stores have versions", field="version", remedy="give the folder of a store"
+        )
     root, all_products = _find(source, selection)
     if not all_products:
         raise ProductError("no product found", file=_path_of(source), remedy="select less strictly")
@@ -147,34 +155,10 @@ def _from_index(indexed: IndexedPaths) -> tuple[Path, list[Facts]]:
 
 
 def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
-    pieces = [_piece(within(root, facts.path), facts) for facts in products]
+    pieces = [open_piece(within(root, facts.path), facts, dask=True) for facts in products]
     owners = [facts.path for facts in products for _ in range(facts.profiles)]
     refuse_duplicates(np.concatenate([piece["time"].values for piece in pieces]), owners)
     joined = join(pieces)
     joined.attrs = shared_attributes([piece.attrs for piece in pieces])
     # Decoded once, which is much faster than decoding each piece.
     return xr.decode_cf(joined)
-
-
-def _piece(file: Path, facts: Facts) -> xr.Dataset:
-    """Open a product, with the dimension ``product`` for variables of the whole product."""
-    try:
-        opened = xr.open_dataset(
-            file, engine="netcdf4", chunks={}, drop_variables=list(UNSHARED), decode_cf=False
-        )
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ProductError(f"cannot be read: {error}", file=file) from error
-    static = coordinate_names(facts.kind)
-    variables = {}
-    for name, variable in opened.variables.items():
-        whole = "time" not in variable.dims and name not in static
-        variables[name] = variable.expand_dims("product") if whole else variable
-    index = np.zeros(facts.profiles, np.int32)
-    mode = DetectionMode(facts.mode)
-    about = {row.name: attributes(row, mode=mode) for row in (PRODUCT, PRODUCT_INDEX)}
-    about[PRODUCT.name].pop("_Encoding")
-    own = {
-        PRODUCT.name: (PRODUCT.dims, np.array([facts.id]), about[PRODUCT.name]),
-        PRODUCT_INDEX.name: (PRODUCT_INDEX.dims, index, about[PRODUCT_INDEX.name]),
-    }
-    return xr.Dataset(variables, coords=own, attrs=opened.attrs)

@@ -52,11 +52,20 @@ def aggregate(
         typer.Option(help="Weights of the profiles in a mean: shots, plain or inverse-variance."),
     ] = "shots",
     stac: Annotated[bool, typer.Option("--stac", help="Also write a STAC catalog.")] = False,
+    store: Annotated[
+        bool,
+        typer.Option(
+            "--store",
+            help="Also add what is new to the stores, one of each kind, as a new snapshot. The"
+            " snapshot names runs if a campaign file is given.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write an index of products, and one virtual dataset for each instrument, kind and channel.
 
-    Writes to the folder aggregates, which can be deleted and made again at any time.
+    Writes to the folder aggregates, which can be deleted and made again at any time. Stores are in
+    the folder stores, and keep the values of products that were replaced.
 
     Example: lidarops aggregate demo
 
@@ -66,14 +75,17 @@ def aggregate(
     from lidarops.aggregate.means_variables import Period, Weights
     from lidarops.aggregate.selection import parse_choice, parse_selection
 
+    root, runs = _root(out, with_runs=store)
     options = AggregateOptions(
         parse_selection(kind, channel, station, instrument, utc(since), utc(until)),
         None if means is None else parse_choice(Period, means, "means"),
         parse_choice(Weights, weights, "weights"),
         stac,
+        store,
+        runs,
     )
     with progress_bar("aggregate", None) as bar:
-        made = make_aggregates(_root(out), options, progress=bar.advance)
+        made = make_aggregates(root, options, progress=bar.advance)
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
@@ -81,12 +93,23 @@ def aggregate(
     exit_with_status(failed=bool(made.refused or made.failed))
 
 
-def _root(out: Path) -> Path:
+def _root(out: Path, *, with_runs: bool) -> tuple[Path, dict[str, str]]:
+    """Return the output folder, and product path -> run if the campaign file is given."""
     if not out.is_file():
-        return out
+        return out, {}
     from lidarops.campaign.model import load_campaign
+    from lidarops.catalog.store import Store
 
-    return Path(load_campaign(out).output)
+    campaign = load_campaign(out)
+    root = Path(campaign.output)
+    if not with_runs:
+        return root, {}
+    below = Path(campaign.products_root).relative_to(root)
+    with (
+        Store(campaign.catalog_url, campaign.name, create=False) as store,
+        store.all_products() as products,
+    ):
+        return root, {(below / product.path).as_posix(): product.run for product in products}
 
 
 def _tell(made: AggregateResult) -> None:
@@ -94,6 +117,8 @@ def _tell(made: AggregateResult) -> None:
     show_rows("Views", ("file", "products", "profiles", "parts"), views)
     means = ((file.path, file.products, file.periods) for file in made.means)
     show_rows("Means", ("file", "products", "periods"), means)
+    stores = ((s.path, s.groups, s.added, s.dropped, s.snapshot) for s in made.stores)
+    show_rows("Stores", ("folder", "groups", "added", "dropped", "snapshot"), stores)
     refused = ((product.path, product.reason) for product in made.refused)
     show_rows("Refused", ("file", "reason"), refused)
     for sentence in made.notes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -61,6 +62,26 @@ def test_a_selection_leaves_the_index_alone(tmp_path: Path):
     code, output = run(tmp_path, "--kind", "signal", "--stac")
     assert code == 1
     assert "lists all products" in output
+
+
+def test_stores_are_made_and_their_snapshots_shown(tmp_path: Path):
+    pytest.importorskip("icechunk")
+    add_day(tmp_path, 0)
+    add_day(tmp_path, 0, "signal")
+    stores = json.loads(run(tmp_path, "--store", "--json")[1])["stores"]
+    assert [store["path"] for store in stores] == ["stores/homogeneous", "stores/signal"]
+    assert [store["added"] for store in stores] == [1, 1]
+    code, output = run(tmp_path, "--store", "--kind", "signal")
+    assert code == 0
+    assert stores[1]["snapshot"] in output
+    assert stores[0]["snapshot"] not in output
+    # What the archive no longer holds leaves its store, even if it was the last of its kind.
+    shutil.rmtree(next(tmp_path.glob("products/*/*/signal")))
+    _, signals = json.loads(run(tmp_path, "--store", "--json")[1])["stores"]
+    assert (signals["path"], signals["groups"], signals["dropped"]) == ("stores/signal", 0, 1)
+    code, output = run(tmp_path, "--store", "--since", "2026-01-01")
+    assert code == 1
+    assert "a store holds all times" in output
 
 
 def test_signals_of_a_scan_have_no_mean_and_the_others_are_made(tmp_path: Path):

@@ -116,6 +116,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     campaign.write_text(harbour() + SIMULATION)
     lidarops("simulate", str(campaign))
     lidarops("reprocess", str(campaign))
+    lidarops("aggregate", str(folder / "out"), "--store")
     campaign.write_text(harbour())
     return folder
 

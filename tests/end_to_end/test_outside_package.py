@@ -210,7 +210,7 @@ def test_products_are_verified_and_reproduced(campaign: Campaign) -> None:
 
 
 def test_products_are_indexed_joined_and_averaged(copied: Campaign) -> None:
-    run("aggregate", copied.output, "--means", "day", "--stac")
+    run("aggregate", copied.output, "--means", "day", "--stac", "--store")
     folder = Path(copied.output) / "aggregates"
     index = folder / "products.parquet"
     assert len(lidarops.find_products(index, kind=KIND)) == len(products(copied))
@@ -221,6 +221,8 @@ def test_products_are_indexed_joined_and_averaged(copied: Campaign) -> None:
         last = joined.sel(time=slice("2025-01-01", None)).integral.astype(float)
         np.testing.assert_allclose(means.integral[-1], last.mean("time"), rtol=1e-5)
     assert list(folder.glob(f"views/*{KIND}_photon*"))
+    store = Path(copied.output) / "stores" / KIND
+    xr.testing.assert_identical(lidarops.open_products(store, channel="photon_532o"), joined)
 
 
 def test_the_schema_describes_its_settings() -> None:

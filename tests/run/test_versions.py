@@ -11,6 +11,7 @@ import xarray as xr
 from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
+from lidarops.aggregate.open_products import open_products
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.records import Grade, ProductRecord
@@ -142,6 +143,47 @@ def test_compare_prints_grade_and_cause(source: Archive, tmp_path: Path) -> None
     document = json.loads(found.output)
     assert document["grade"] == "major"
     assert any("dead_time" in cause for cause in document["causes"])
+
+
+def test_a_store_keeps_the_version_before_and_names_the_run(source: Archive) -> None:
+    pytest.importorskip("icechunk")
+    campaign = source.write()
+    store = Path(campaign.output) / "stores/signal"
+    first = snapshot_of(source)
+    old = open_products(store, channel="photon_532o", usable=2).load()
+    set_dead_time(source, 20e-9)
+    result = brought(source)
+    assert result.record is not None
+    remade = [
+        path
+        for path, product in products(result).items()
+        if product.change and product.change.grade is not Grade.NONE
+    ]
+    second = snapshot_of(source)
+    assert first != second == snapshot_of(source)
+    assert message_of(store).splitlines() == [
+        f"run {result.record.id}: signal: {len(remade)} added, {len(remade)} dropped",
+        *(f"products/{path} version 2" for path in sorted(remade)),
+    ]
+    new = open_products(store, channel="photon_532o", usable=2).load()
+    assert not new.quality_flag.equals(old.quality_flag)
+    before = open_products(store, channel="photon_532o", version=first, usable=2).load()
+    xr.testing.assert_identical(before, old)
+
+
+def snapshot_of(archive: Archive) -> str:
+    """Update the store of signals and return its newest snapshot."""
+    called = CliRunner().invoke(app, ["aggregate", str(archive.file), "--store", "--json"])
+    assert called.exit_code == 0, called.output
+    (store,) = json.loads(called.stdout)["stores"]
+    return str(store["snapshot"])
+
+
+def message_of(store: Path) -> str:
+    import icechunk
+
+    repository = icechunk.Repository.open(icechunk.local_filesystem_storage(str(store)))
+    return str(next(repository.ancestry(branch="main")).message)
 
 
 def _paths(root: Path) -> list[str]:

@@ -13,6 +13,7 @@ import xarray as xr
 from lidarops.aggregate.facts import Facts, list_products, read_product_facts
 from lidarops.netcdf.context import product_path
 from lidarops.netcdf.write import write_product
+from lidarops.records import Stamp
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, SCENE, START, context, provenance
 
@@ -27,6 +28,7 @@ def add_day(
     change: Change = lambda data: data,
     of: dict[str, Any] | None = None,
     folder: str = "products",
+    version: int = 1,
     **maker: Any,
 ) -> str:
     """Write the product of a day with values scaled by a random factor; return its path."""
@@ -35,16 +37,18 @@ def add_day(
     data = data.assign_coords(time=data.time + shift, time_bnds=data.time_bnds + shift)
     for name in ("total_extinction", "signal"):
         if name in data:
-            data[name] = data[name] * np.random.default_rng(1000 + day).uniform(0.5, 2.0)
+            data[name] = data[name] * np.random.default_rng(1000 * version + day).uniform(0.5, 2.0)
     data = change(data)
     start = START + timedelta(days=day)
+    settings = {"day": day} if version == 1 else {"day": day, "version": version}
     scene = f"{SCENE.rpartition('_')[0]}_{start:%Y%m%dT%H%M%S}"
     about = context(
         kind,
         scene=scene,
         start=start,
         stop=start + timedelta(days=1),
-        provenance=provenance(kind, scene=scene, settings={"day": day}),
+        provenance=provenance(kind, scene=scene, settings=settings),
+        stamp=Stamp(version, start + timedelta(days=2)),
         **(of or {}),
     )
     path = f"{folder}/{product_path(about)}".removeprefix("/")

@@ -1,0 +1,57 @@
+"""Opens one product as a piece that can be joined with others of its group."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names
+from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
+from lidarops.errors import ProductError
+from lidarops.netcdf.variables import attributes
+from lidarops.records import DetectionMode
+
+
+def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
+    """Open a product, with the dimension ``product`` for variables of the whole product.
+
+    Parameters
+    ----------
+    file : path
+    facts : Facts
+    dask : bool
+        Whether values become dask arrays; without it, each read costs less.
+
+    Returns
+    -------
+    xr.Dataset
+        Lazy, not decoded, with ``product`` (product,) and ``product_index`` (time,).
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be read.
+    """
+    chunks: dict[str, int] | None = {} if dask else None
+    try:
+        opened = xr.open_dataset(
+            file, engine="netcdf4", chunks=chunks, drop_variables=list(UNSHARED), decode_cf=False
+        )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ProductError(f"cannot be read: {error}", file=file) from error
+    static = coordinate_names(facts.kind)
+    variables = {}
+    for name, variable in opened.variables.items():
+        whole = "time" not in variable.dims and name not in static
+        variables[name] = variable.expand_dims("product") if whole else variable
+    index = np.zeros(facts.profiles, np.int32)
+    mode = DetectionMode(facts.mode)
+    about = {row.name: attributes(row, mode=mode) for row in (PRODUCT, PRODUCT_INDEX)}
+    about[PRODUCT.name].pop("_Encoding")
+    own = {
+        PRODUCT.name: (PRODUCT.dims, np.array([facts.id]), about[PRODUCT.name]),
+        PRODUCT_INDEX.name: (PRODUCT_INDEX.dims, index, about[PRODUCT_INDEX.name]),
+    }
+    return xr.Dataset(variables, coords=own, attrs=opened.attrs)

@@ -1,0 +1,228 @@
+"""Writes products as the rows of one Zarr group of a store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.aggregate._join import shared_attributes
+from lidarops.aggregate._optional_packages import need
+from lidarops.aggregate._pieces import open_piece
+from lidarops.aggregate.facts import Facts, opened, plain, refuse_duplicates
+from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
+from lidarops.errors import ProductError
+from lidarops.system.files import within
+
+_LEAST_CHUNK: Final = 2**14
+"""Bytes: a small variable has one chunk for many products, so that it opens fast."""
+_LARGEST_CHUNK: Final = 2**20
+"""Bytes: as in products."""
+
+
+@dataclass(slots=True)
+class Changes:
+    """What an update changes."""
+
+    added: list[tuple[str, str]] = field(default_factory=list)
+    """Path and version of products."""
+    dropped: int = 0
+    failed: list[str] = field(default_factory=list)
+
+
+class UnreadableProductError(Exception):
+    """A product that cannot be read, though its facts could."""
+
+    def __init__(self, facts: Facts, reason: str) -> None:
+        super().__init__(reason)
+        self.facts = facts
+        self.reason = reason
+
+
+def root_of(store: Any) -> Any:
+    """Return the root group of a store."""
+    return need("zarr").open_group(store, mode="r" if store.read_only else "a")
+
+
+def write_group(
+    store: Any, name: str, root: Path, products: Sequence[Facts], changes: Changes
+) -> None:
+    """Write what a group lacks: a product stays if it is where it would be written.
+
+    Parameters
+    ----------
+    store : icechunk.IcechunkStore
+        Of a writable session.
+    name : str
+        Of the group.
+    root : path
+    products : sequence of Facts
+        All of the group, in order of time.
+    changes : Changes
+        Gets what changes.
+
+    Raises
+    ------
+    ProductError
+        If a time occurs twice, or a product has changed. Nothing is written then.
+    UnreadableProductError
+        If a product cannot be read. Part of the group may be written then.
+    """
+    ids = [product.id for product in products]
+    starts = np.cumsum([0, *(product.profiles for product in products)]).tolist()
+    stored = _stored_places(store, name)
+    lacking = [at for at in range(len(ids)) if stored.get(ids[at]) != (at, starts[at])]
+    if not lacking and len(stored) == len(ids):
+        return
+    attrs = _attributes(root, products)
+    if 0 in lacking:
+        # The first product gives the attributes of variables and the length of chunks.
+        lacking = list(range(len(ids)))
+        _create(store, name, _piece(root, products[0]))
+    group = root_of(store)[name]
+    group.attrs.put({key: plain(value) for key, value in shared_attributes(attrs).items()})
+    for array in group.array_values():
+        length = {"time": starts[-1], PRODUCT.name: len(ids)}
+        dims = array.metadata.dimension_names or ()
+        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
+    rows = {name: _Rows(array) for name, array in group.arrays()}
+    for at in lacking:
+        _write_product(rows, root, products[at], at, starts[at])
+        if ids[at] not in stored:
+            changes.added.append((products[at].path, str(attrs[at]["product_version"])))
+    for array in rows.values():
+        array.flush()
+    changes.dropped += len(stored.keys() - set(ids))
+
+
+def _stored_places(store: Any, name: str) -> dict[str, tuple[int, int]]:
+    """Return id -> number and first row of each product of a group."""
+    root = root_of(store)
+    if name not in root:
+        return {}
+    ids = root[name][PRODUCT.name][:].tolist()
+    lengths = np.bincount(root[name][PRODUCT_INDEX.name][:], minlength=len(ids))
+    starts = np.cumsum([0, *lengths]).tolist()
+    return {product: (at, starts[at]) for at, product in enumerate(ids)}
+
+
+def _attributes(root: Path, products: Sequence[Facts]) -> list[Mapping[str, Any]]:
+    """Return the global attributes of products.
+
+    Raises
+    ------
+    ProductError
+        If a time occurs twice, or a product has changed.
+    """
+    attrs: list[Mapping[str, Any]] = []
+    times = []
+    for facts in products:
+        try:
+            with opened(within(root, facts.path)) as product:
+                attrs.append(dict(product.attrs))
+                times.append(product["time"].values)
+        except ProductError as error:
+            raise UnreadableProductError(facts, error.problem) from error
+        if attrs[-1]["id"] != facts.id:
+            raise ProductError("changed while it was read", file=facts.path, remedy="run again")
+    refuse_duplicates(
+        np.concatenate(times), [facts.path for facts in products for _ in range(facts.profiles)]
+    )
+    return attrs
+
+
+def _create(store: Any, name: str, piece: xr.Dataset) -> None:
+    """Write a group like a product, but without its rows."""
+    # Of variable length, which all readers of Zarr know.
+    text = piece[PRODUCT.name].astype(np.dtypes.StringDType(), keep_attrs=True)
+    like = piece.reset_coords().assign_coords({PRODUCT.name: text})
+    encoding = {}
+    for key, variable in like.variables.items():
+        variable.encoding = {}
+        if key != PRODUCT.name:
+            encoding[key] = {"chunks": _chunk(variable), "compressors": _compressor()}
+    like.isel(time=slice(0), product=slice(0)).drop_attrs(deep=False).to_zarr(
+        store, group=name, mode="w", encoding=encoding, zarr_format=3, consolidated=False
+    )
+
+
+def _chunk(variable: xr.Variable) -> tuple[int, ...]:
+    if not _is_long(variable):
+        return variable.shape
+    row = variable.dtype.itemsize * int(np.prod(variable.shape[1:]))
+    rows = min(max(variable.shape[0], _LEAST_CHUNK // row), max(1, _LARGEST_CHUNK // row))
+    return (rows, *variable.shape[1:])
+
+
+def _is_long(variable: xr.Variable) -> bool:
+    return bool({"time", PRODUCT.name} & set(variable.dims))
+
+
+def _compressor() -> Any:
+    return need("zarr.codecs").BloscCodec(cname="zstd", clevel=5, shuffle="shuffle")
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Rows of an array that wait until their chunk is complete, because each write keeps a copy."""
+
+    array: Any
+    first: int = 0
+    stop: int = 0
+    waiting: list[NDArray[Any]] = field(default_factory=list)
+
+    def add(self, first: int, values: NDArray[Any]) -> None:
+        """Write rows of one chunk, at the latest when the next one begins."""
+        if first != self.stop:
+            self.flush()
+            self.first = first
+        self.waiting.append(values)
+        self.stop = first + len(values)
+        if self.stop % self.array.chunks[0] == 0:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write all rows that wait."""
+        if self.waiting:
+            self.array[self.first : self.stop] = np.concatenate(self.waiting)
+        self.waiting.clear()
+        self.first = self.stop
+
+
+def _write_product(
+    rows: Mapping[str, _Rows], root: Path, facts: Facts, number: int, start: int
+) -> None:
+    piece = _piece(root, facts)
+    piece[PRODUCT_INDEX.name] = piece[PRODUCT_INDEX.name] + np.int32(number)
+    for name, variable in piece.variables.items():
+        if not _is_long(variable):
+            continue
+        array = rows[str(name)]
+        first = start if "time" in variable.dims else number
+        for low, high in _blocks(first, first + variable.shape[0], array.array.chunks[0]):
+            array.add(low, _values(variable[low - first : high - first], facts))
+
+
+def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:
+    """Yield the rows from `start` to `stop` in blocks within chunks, so that memory holds few."""
+    return pairwise((start, *range((start // chunk + 1) * chunk, stop, chunk), stop))
+
+
+def _values(variable: xr.Variable, facts: Facts) -> NDArray[Any]:
+    try:
+        return variable.values
+    except (OSError, RuntimeError) as error:
+        raise UnreadableProductError(facts, f"cannot be read: {error}") from error
+
+
+def _piece(root: Path, facts: Facts) -> xr.Dataset:
+    try:
+        return open_piece(within(root, facts.path), facts, dask=False)
+    except ProductError as error:
+        raise UnreadableProductError(facts, error.problem) from error
