@@ -80,7 +80,11 @@ class ChannelFacts(SettingsModel):
     wavelength: float | None = quantity(
         None, unit="m", gt=1e-7, lt=2e-5, description="where the header is wrong"
     )
-    dead_time: float | None = quantity(None, unit="s", ge=1e-10, le=2e-7)
+    dead_time: Annotated[float, Field(ge=1e-10, le=2e-7)] | Literal["estimate"] | None = quantity(
+        None,
+        unit="s",
+        description="or 'estimate', against the analog channel of the same detector",
+    )
     dead_time_uncertainty: float | None = quantity(
         None, unit="1", ge=0, le=1, description="relative standard error of dead_time; 0.2 if none"
     )

@@ -194,7 +194,7 @@ def _unknown(channel: ChannelLayout) -> str:
     if not channel.wavelength > 0:
         return "; ? wavelength in m, such as 5.32e-7: that of the header is not plausible"
     if channel.mode is DetectionMode.PHOTON:
-        return "; ? dead_time in s, such as 4.0e-9: without it, high rates are too low"
+        return "; ? dead_time in s, such as 4.0e-9, or estimate: without it, high rates are too low"
     return ""
 
 

@@ -15,6 +15,7 @@ from lidarops.records import LeftOut, Plan, PlannedStep, Scene
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import (
     READ_STEP,
+    estimated_against,
     file_channels,
     joined_layout,
     prepared_channels,
@@ -95,6 +96,11 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
                                 if other != channel and channel.name in file_channels(other.name)
                             ),
                             *_companions_of(channel.name, instrument),
+                            *(
+                                other.name
+                                for other in scene.layout
+                                if channel.name == estimated_against(other, facts, scene.layout)
+                            ),
                         )
                     )
                 ),

@@ -5,6 +5,7 @@ A scene is the unit of work. It gives its product files, or an outcome that stat
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -38,9 +39,10 @@ from lidarops.steps.channels import (
     counted_channels,
     file_channels,
     member_channel,
+    prepared_channels,
 )
 from lidarops.steps.conditioning import DARK
-from lidarops.steps.data import Chunk, ProductStream, Source, WholeProduct, in_one_batch
+from lidarops.steps.data import Chunk, Data, ProductStream, Source, WholeProduct, in_one_batch
 from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
 from lidarops.steps.network import Member
 from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
@@ -231,7 +233,7 @@ class _Instrument(_Work):
 
     def _sample(self, channel: str, granules: Sequence[Granule]) -> Iterator[xr.Dataset]:
         """Yield power, variance and quality of a channel in some granules."""
-        channels = (channel, *file_channels(channel))
+        channels = prepared_channels(self.job.plan.steps, channel)
         steps = [step for step in self.job.plan.steps if step.channel in channels]
         few = replace(self._scene, granules=tuple(granules))
         # The signal is compared with bins beyond the sections.
@@ -250,6 +252,7 @@ class _Instrument(_Work):
             )
             for kind in streams
         }
+        words = _words(data[""], channel)
         with ExitStack() as until_written:
             writers: dict[str, ProductWriter] = {}
             channels = counted_channels(steps, channel)
@@ -261,12 +264,26 @@ class _Instrument(_Work):
                         writers[kind].add(rows)
                         self._clock.lap("write")
                     else:
-                        writer = self._writer(rows, contexts[kind])
+                        writer = self._writer(_with_words(rows, words), contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
         yield from (self._record(contexts[kind], writer) for kind, writer in writers.items())
         for kind, stream in streams.items():
             if isinstance(stream, WholeProduct):
-                yield self._written(contexts[kind], stream.results())
+                results = stream.results()
+                frame = _with_words(next(results), words)
+                yield self._written(contexts[kind], itertools.chain([frame], results))
+
+
+def _words(data: Data, channel: str) -> list[str]:
+    """Return what steps decided from the data, of a channel or of both parts of a glued one."""
+    parts = (data.channels.get(part, data) for part in file_channels(channel))
+    return [words for part in parts for words in part.statements]
+
+
+def _with_words(frame: xr.Dataset, words: Sequence[str]) -> xr.Dataset:
+    """Return the frame of a product that states what steps decided from the data."""
+    stated = [frame.attrs["steps"]] if frame.attrs.get("steps") else []
+    return frame.assign_attrs(steps="; ".join([*words, *stated])) if words else frame
 
 
 def _taken(chunk: Chunk, streams: Mapping[str, ProductStream]) -> Iterator[tuple[str, xr.Dataset]]:

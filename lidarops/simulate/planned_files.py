@@ -191,7 +191,7 @@ def photon_dead_time(site: SimulatedInstrument, start: datetime, channel: str) -
         If the facts of the instrument give none.
     """
     seconds = channel_facts(site.instrument.facts_at(start), channel).dead_time
-    if seconds is None:
+    if not isinstance(seconds, float):
         raise CampaignError(
             f"the facts give no dead time at {start:%Y-%m-%d %H:%M} UTC",
             field=f"instruments.{site.key}.facts.channels.{channel}.dead_time",

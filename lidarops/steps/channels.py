@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
-from lidarops.records import GLUED, ChannelLayout, PlannedStep, is_glued
+from lidarops.records import GLUED, ChannelLayout, DetectionMode, PlannedStep, is_glued
 
 READ_STEP: Final = "read"
 LAG_STEP: Final = "lag"
@@ -57,6 +57,22 @@ def counted_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, .
 def range_channel(channel: str) -> str:
     """Return the channel that defines the ranges: for a glued one, the photon-counting one."""
     return file_channels(channel)[-1]
+
+
+def estimated_against(
+    channel: ChannelLayout, facts: InstrumentFacts, layout: Iterable[ChannelLayout]
+) -> str:
+    """Return the analog channel against which the dead time of a channel is to be estimated.
+
+    Empty where none is requested, or the files hold none with the same bin width.
+    """
+    if channel.mode is not DetectionMode.PHOTON or is_glued(channel.name):
+        return ""
+    if channel_facts(facts, channel.name).dead_time != "estimate":
+        return ""
+    analog = channel.name.replace("photon_", "analog_", 1)
+    same = (other for other in layout if other.name == analog)
+    return next((other.name for other in same if other.bin_width == channel.bin_width), "")
 
 
 def joined_layout(

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 
-from lidarops.constants import DEAD_TIME_UNCERTAINTY
+from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
 from lidarops.records import DetectionMode, Granule, Role
-from lidarops.retrieve.signal import labeled
+from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
+from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
+from lidarops.retrieve.signal.lag import enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import range_offset
+from lidarops.steps.channels import estimated_against, range_offset
 from lidarops.steps.data import Data, Profiles
 from lidarops.steps.profiles import FileProfiles
 from lidarops.steps.reading import ARCHIVE
@@ -200,9 +204,11 @@ def _times_around(times: Sequence[datetime], first: datetime, last: datetime) ->
 class DeadTimeSettings(SettingsModel):
     """Settings of the step ``dead_time``."""
 
-    dead_time: float = quantity(unit="s")
-    dead_time_uncertainty: float
-    """Relative standard error."""
+    dead_time: float | None = quantity(None, unit="s", description="None if it is estimated")
+    dead_time_uncertainty: float | None = None
+    """Relative standard error; None if it is estimated."""
+    analog: str | None = None
+    """Channel against which it is estimated."""
 
 
 class DeadTime(Step[ChannelCase, DeadTimeSettings]):
@@ -210,15 +216,27 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
 
     name = "dead_time"
     settings = DeadTimeSettings
+    from_companions = (PROFILES,)
     outputs = (DEAD_TIME, DEAD_TIME_ERROR)
 
     def decide(self, case: ChannelCase) -> Decisions:
-        """Run for photon counting with a known dead time."""
+        """Run for photon counting with a known dead time, or one that can be estimated."""
         dead_time = case.facts_of_channel.dead_time
         if case.channel.mode is not DetectionMode.PHOTON:
             yield Leave("analog detection has no dead time")
         elif dead_time is None:
             yield Leave("the campaign gives no dead_time; pile-up is flagged for an assumed 4 ns")
+        elif dead_time == "estimate":
+            analog = estimated_against(case.channel, case.facts, case.scene.layout)
+            if case.member:
+                yield Leave("dead times are not estimated for a network; pile-up is flagged")
+            elif not enough_bins(case.channel.bins):
+                yield Leave(f"the {case.channel.bins} bins are too few for an estimate")
+            elif not analog:
+                yield Leave("the files hold no analog channel of the same detector and bins")
+            else:
+                words = f"the campaign requests an estimate, against {analog}"
+                yield Run(words, DeadTimeSettings(analog=analog))
         else:
             reason, error = "given by the campaign", case.facts_of_channel.dead_time_uncertainty
             if error is None:
@@ -227,10 +245,68 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
             settings = DeadTimeSettings(dead_time=dead_time, dead_time_uncertainty=error)
             yield Run(reason, settings, number=dead_time)
 
+    def companions(self, settings: DeadTimeSettings) -> tuple[str, ...]:
+        """Return the analog channel of an estimate."""
+        return () if settings.analog is None else (settings.analog,)
+
     def carry_out(self, settings: DeadTimeSettings, data: Data) -> None:
         """Give the dead time, and its relative standard error."""
-        data[DEAD_TIME] = settings.dead_time
-        data[DEAD_TIME_ERROR] = settings.dead_time_uncertainty
+        if settings.analog is not None:
+            estimate = _estimated_dead_time(data, data.channels[settings.analog])
+            words = f"dead_time: no estimate of {data.channel} against {settings.analog}"
+            if estimate is not None:
+                data[DEAD_TIME] = estimate.dead_time
+                data[DEAD_TIME_ERROR] = min(estimate.standard_error / estimate.dead_time, 1.0)
+                words = (
+                    f"dead_time: {1e9 * estimate.dead_time:.3f} ns of {data.channel}, estimated"
+                    f" against {settings.analog}, standard error"
+                    f" {1e9 * estimate.standard_error:.3f} ns"
+                )
+            data.statements.append(words)
+        elif settings.dead_time is not None and settings.dead_time_uncertainty is not None:
+            data[DEAD_TIME] = settings.dead_time
+            data[DEAD_TIME_ERROR] = settings.dead_time_uncertainty
+
+
+def _estimated_dead_time(photon: Data, analog: Data) -> DeadTimeEstimate | None:
+    """Return the dead time from the first profiles of a scene."""
+    archive, profiles = photon[ARCHIVE], analog[PROFILES]
+    channel = photon.channel
+    width = archive[channel].attrs["bin_width"]
+    groups: list[tuple[Array, ...]] = []
+
+    def noise() -> Iterator[tuple[Array, Array]]:
+        """Yield the records for an estimate of the lag, and keep their sums."""
+        for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
+            raw = archive.isel(time=rows)
+            counts = raw[channel].to_numpy().astype(np.float64)
+            shots = raw[f"{channel}_shots"].to_numpy()
+            exposure = shots * (width / LICEL_RANGE_PER_MICROSECOND)
+            part = profiles.of(raw)
+            power, variance, length = (
+                part[name].to_numpy() for name in ("power", "variance", CORRELATION_LENGTH)
+            )
+            share = (exposure / max(exposure.sum(), 1e-300))[:, np.newaxis]
+            of_mean = (variance * length[:, np.newaxis] * share**2).sum(axis=0)
+            groups.append(
+                (counts.sum(axis=0), exposure.sum(), (power * share).sum(axis=0), of_mean)
+            )
+            yield power, counts / np.maximum(exposure, 1e-300)[:, np.newaxis]
+
+    distance = _ranges(archive, channel, photon.get(RANGE_OFFSET) or 0.0)
+    known = labeled_gluing.range_lag(profiles.range, distance)
+    lag = labeled_gluing.estimate_lag(noise(), known=known).bins
+    kept = [group for group in groups if group[1] > 0.0]
+    if not kept:
+        return None
+    counts, exposure, power, variance = (np.stack(parts) for parts in zip(*kept, strict=True))
+    return estimate_dead_time(counts, exposure, power, variance, lag)
+
+
+def _ranges(archive: xr.Dataset, channel: str, offset: float) -> Array:
+    """Return the ranges of a channel in m, shifted by an offset."""
+    grid = str(archive[channel].dims[-1])
+    return np.asarray(archive[grid].to_numpy() + offset, dtype=np.float64)
 
 
 class NoiseSettings(SettingsModel):

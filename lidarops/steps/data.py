@@ -173,6 +173,8 @@ class Data:
     channel: str
     channels: Mapping[str, Data]
     """Data of the channels that were prepared before."""
+    statements: list[str] = field(default_factory=list)
+    """What steps decided from the data, in words for the product."""
     _values: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, datum: Datum[T]) -> T:
@@ -190,4 +192,4 @@ class Data:
 
     def of_product(self) -> Data:
         """Return a copy for the steps of one product, which other products do not see."""
-        return Data(self.source, self.channel, self.channels, dict(self._values))
+        return Data(self.source, self.channel, self.channels, self.statements, dict(self._values))

@@ -145,6 +145,9 @@ def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
     """
     if step.name != Window.name:
         return ""
+    estimates = [s for s in steps if s.name == "dead_time" and "analog" in s.settings]
+    if any(step.channel in (s.channel, s.settings["analog"]) for s in estimates):
+        return "the estimate of a dead time needs all bins"
     windowed = {
         (other.channel, other.product)
         for other in steps

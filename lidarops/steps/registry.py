@@ -144,7 +144,7 @@ def _needs(planned: PlannedStep, places: Collection[tuple[str, str, str, str]]) 
         names = [s.name for s in FILE_STEPS if not {*step.from_parts}.isdisjoint(s.outputs)]
         for part in glued_parts(planned.channel):
             needs += [f"{part}/{name}" for name in present(part, names)]
-    if isinstance(step, ProductStep):
+    if isinstance(step, ProductStep | Step):
         for other in step.companions(step.typed(planned)):
             names = [
                 s.name

@@ -123,7 +123,13 @@ class Step(Choice[C_contra, S]):
     """What the step takes from other steps, where they run."""
     from_parts: ClassVar[tuple[Datum[Any], ...]] = ()
     """What the step takes from those of the two channels that are glued."""
+    from_companions: ClassVar[tuple[Datum[Any], ...]] = ()
+    """What the step takes from the steps of other channels."""
     outputs: ClassVar[tuple[Datum[Any], ...]] = ()
+
+    def companions(self, settings: S) -> tuple[str, ...]:  # noqa: ARG002 - most need none
+        """Return the other channels from which the step takes data."""
+        return ()
 
     @abstractmethod
     def carry_out(self, settings: S, data: Data) -> None:

@@ -153,6 +153,8 @@ def test_variables_without_standard_name():
             "residual",
             "beam_signal",
             "beam_obstruction",
+            "vertical_optical_depth_dead_time_error",
+            "total_extinction_dead_time_error",
             "analog_baseline",
             "analog_baseline_standard_error",
             "blocked_range",

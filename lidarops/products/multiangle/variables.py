@@ -155,6 +155,17 @@ def _gradient_error(quantity: str, words: str, units: str) -> Row:
     )
 
 
+def _dead_time_error(quantity: str, words: str, units: str) -> Row:
+    return replace(
+        _gradient_error(quantity, words, units),
+        name=f"{quantity}_dead_time_error",
+        long_name=f"calibration (systematic) uncertainty of {words} from the dead time",
+        optional=True,
+        comment=f"Separate from {quantity}_standard_error. Change with one standard error of the"
+        f" dead time, without smoothing. Missing for analog signals. {NO_STANDARD_NAME}",
+    )
+
+
 LAYOUT: Final = Layout(
     title="Optical depth and extinction from scans over zenith angle",
     summary="Optical depth and extinction of molecules and particles together, from signals of one"
@@ -216,6 +227,7 @@ LAYOUT: Final = Layout(
             comment=f"Along the vertical, at the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         _gradient_error("vertical_optical_depth", "optical depth", "1"),
+        _dead_time_error("vertical_optical_depth", "optical depth", "1"),
         Row(
             name="monotone_vertical_optical_depth",
             dims=_LEVELS,
@@ -256,6 +268,7 @@ LAYOUT: Final = Layout(
             f" {NO_STANDARD_NAME}",
         ),
         _gradient_error("total_extinction", "extinction", "m-1"),
+        _dead_time_error("total_extinction", "extinction", "m-1"),
         Row(
             name="log_intercept",
             dims=_LEVELS,

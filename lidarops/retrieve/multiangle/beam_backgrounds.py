@@ -124,6 +124,21 @@ class ScanSignals:
         square = np.einsum("tbz,tbc,tcz->tz", pull, self.covariance, pull)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
+    def shift_by(self, retrieval: MultiAngleResult, change: Array) -> Array:
+        """Return the change of optical depths with one of all signals, (time, altitude).
+
+        Parameters
+        ----------
+        retrieval : MultiAngleResult
+            Of these signals.
+        change : (time, beam, altitude) float
+        """
+        weight, per_background, _ = self._samples(retrieval)
+        fit = _Regression(weight, self.path)
+        relative = per_background / self.response * np.nan_to_num(change)
+        slope = (weight * fit.arm * np.nan_to_num(relative)).sum(axis=1) / fit.squares
+        return np.asarray(-0.5 * slope)
+
     def _samples(self, retrieval: MultiAngleResult) -> tuple[Array, Array, Array]:
         """Return weight, relative change per background, and residual; 0 where there is none."""
         scatter = np.nan_to_num(retrieval.inhomogeneity)[:, np.newaxis] ** 2

@@ -154,6 +154,7 @@ def retrieve_optical_depth(
         attrs={"steps": _step_texts(retrieval)},
     )
     product = product.assign(_plane_variables(signals, beams, settings))
+    product = product.assign(_dead_time_variables(retrieval, signals, beams, station_altitude))
     if not layers:
         return product
     return product.assign(_layer_variables(retrieval, quality, levels, bounds))
@@ -219,6 +220,26 @@ def _plane_variables(
             f"plane_{_variable(name)}": xr.Variable(cube, np.stack(values, axis=1))
             for name, values in pieces.items()
         },
+    }
+
+
+def _dead_time_variables(
+    retrieval: MultiAngleResult, signals: ScanSignals, beams: xr.Dataset, station_altitude: float
+) -> dict[str, xr.Variable]:
+    """Return the errors by the dead time; none for analog signals."""
+    if "dead_time_error" not in beams:
+        return {}
+    shift = signals.shift_by(retrieval, beams["dead_time_error"].to_numpy())
+    depth = np.diff(beams["altitude"].to_numpy(), prepend=station_altitude)
+    errors = {
+        "optical_depth": np.abs(shift),
+        "extinction": np.abs(np.diff(shift, axis=1, prepend=0.0)) / depth,
+    }
+    return {
+        f"{_variable(name)}_dead_time_error": xr.Variable(
+            ("time", "altitude"), np.where(np.isfinite(getattr(retrieval, name)), error, np.nan)
+        )
+        for name, error in errors.items()
     }
 
 

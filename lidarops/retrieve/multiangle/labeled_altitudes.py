@@ -19,7 +19,7 @@ from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_ce
 from lidarops.retrieve.multiangle._obstructions import obstruction_range
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
 from lidarops.retrieve.signal.averaging import RunningMean
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, dead_time_change
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -121,7 +121,7 @@ class AltitudeCycles:
             azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any()
         )
         self._batches = list(_batches(order))
-        self._pieces: list[tuple[Array, Array, Flags, Array, Array]] = []
+        self._pieces: list[tuple[_Block, ...]] = []
 
     def ends(self) -> Integers:
         """Return the profiles before which a chunk may end: those that begin a cycle."""
@@ -146,6 +146,7 @@ class AltitudeCycles:
             conditioned[name].to_numpy()
             for name in ("power", "variance", "quality", CORRELATION_LENGTH)
         )
+        change = dead_time_change(conditioned)
         while len(self._pieces) < len(self._batches):
             batch = self._batches[len(self._pieces)]
             members = self._order.profile[batch]
@@ -155,6 +156,7 @@ class AltitudeCycles:
             self._pieces.append(
                 _batch_on_altitudes(
                     tuple(part[members - first] for part in profiles),
+                    None if change is None else (change[0][members - first], change[1]),
                     self._weights[members],
                     cycle,
                     self._order.beam[batch],
@@ -172,15 +174,16 @@ class AltitudeCycles:
             missing; ``quality`` (the bits of all bins at an altitude) over (time, altitude);
             ``left`` (the standard error of the background by signal in the far range) and
             ``obstruction`` (m, the range from which a beam is blocked; NaN if none) over (time,
-            beam); ``response`` (the mean of the square of range over overlap, m2) over (beam,
-            altitude); and ``shots`` over time. ``time`` is the middle of
-            ``time_bnds``, which span the profiles of a cycle.
+            beam); for photon counting ``dead_time_error`` (the change of ``signal`` with one
+            standard error of the dead time) over (time, beam, altitude); ``response`` (the mean of
+            the square of range over overlap, m2) over (beam, altitude); and ``shots`` over time.
+            ``time`` is the middle of ``time_bnds``, which span the profiles of a cycle.
         """
         order = self._order
         arrays = [np.concatenate(pieces) for pieces in zip(*self._pieces, strict=True)]
         cube = ("time", "beam", "altitude")
-        dims = (cube, cube, ("time", "altitude"), ("time", "beam"), ("time", "beam"))
-        names = ("signal", "variance", "quality", "left", "obstruction")
+        dims = (cube, cube, ("time", "altitude"), ("time", "beam"), ("time", "beam"), cube)
+        names = ("signal", "variance", "quality", "left", "obstruction", "dead_time_error")
         bounds = _cycle_bounds(self._bounds, order)
         coordinates = {
             "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
@@ -194,7 +197,7 @@ class AltitudeCycles:
         total = np.bincount(order.cycle, weights=self._weights[order.profile])
         return xr.Dataset(
             {
-                **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=True)},
+                **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=False)},
                 "response": (("beam", "altitude"), self._settings.response()),
                 "shots": ("time", np.rint(total).astype(np.int32)),
             },
@@ -328,18 +331,24 @@ def _batches(order: _Order) -> Iterator[slice]:
 
 def _batch_on_altitudes(
     profiles: tuple[_Block, ...],
+    dead_time: tuple[_Block, float] | None,
     shots: Array,
     cycle: Integers,
     beam: Integers,
     settings: _Settings,
-) -> tuple[Array, Array, Flags, Array, Array]:
+) -> tuple[_Block, ...]:
     """Return signal and variance as (cycle, beam, altitude), quality as (cycle, altitude).
 
     The fourth and fifth arrays are, as (cycle, beam), the signal that may have been subtracted with
-    the background, and the range from which the beam is blocked, m.
+    the background, and the range from which the beam is blocked, m. A sixth one, with a change of
+    the power by the dead time and of the background over its square, is that of the signal.
     """
     power, variance, quality, length = profiles
     bins = _net_bins(power, variance, quality, length, beam, settings)
+    if dead_time is not None:
+        of_sky = dead_time[1] * bins.background**2
+        change = dead_time[0][:, settings.covered] - of_sky[:, np.newaxis]
+        bins = bins._replace(change=np.where(np.isfinite(bins.power), change, np.nan))
     beams = len(settings.slant_edges)
     visit = cycle * beams + beam
     first = np.flatnonzero(np.diff(visit, prepend=-1))
@@ -349,6 +358,7 @@ def _batch_on_altitudes(
     signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     flags = np.zeros((shape[0], shape[2]), dtype=np.int32)
     left_by_beam, blocked = np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
+    changed = None if bins.change is None else np.full(shape, np.nan)
     left_by_beam[cycle[first], beam[first]] = bins.left
     blocked[cycle[first], beam[first]] = np.where(
         np.isfinite(bins.obstruction), bins.obstruction, np.nan
@@ -369,7 +379,17 @@ def _batch_on_altitudes(
         noise = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
         signal[cycle[rows], number], spread[cycle[rows], number] = at_centres(means.signal, noise)
         flags[cycle[rows]] |= means.quality
-    return signal, spread, flags, left_by_beam, blocked
+        if changed is not None and bins.change is not None:
+            changed[cycle[rows], number] = average_over_cells(
+                bins.change[rows],
+                bins.variance[rows],
+                bins.quality[rows],
+                gain,
+                settings.distance[near],
+                settings.slant_edges[number],
+            ).signal
+    known: tuple[_Block, ...] = (signal, spread, flags, left_by_beam, blocked)
+    return known if changed is None else (*known, changed)
 
 
 class _Bins(NamedTuple):
@@ -387,6 +407,10 @@ class _Bins(NamedTuple):
     """(profile,): signal that may have been subtracted with the background."""
     obstruction: Array
     """(profile,): m, range from which the beam is blocked; inf for a free beam."""
+    background: Array
+    """(profile,)."""
+    change: Array | None = None
+    """(profile, range): of the power, with one standard error of the dead time."""
 
 
 def _net_bins(
@@ -428,7 +452,7 @@ def _net_bins(
     distance = settings.distance[near]
     blocked = obstruction_range(net, of_means[:, near], distance)
     net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)
-    return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left, blocked)
+    return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left, blocked, sky.background)
 
 
 def _shapes(
@@ -474,4 +498,12 @@ def _visit_means(bins: _Bins, shots: Array, first: npt.NDArray[np.intp]) -> _Bin
         level / np.add.reduceat(shots, first) ** 2,
         left / count,
         np.minimum.reduceat(bins.obstruction, first),
+        bins.background[first],
+        None if bins.change is None else _mean_change(bins.change, bins.variance, group, shots),
     )
+
+
+def _mean_change(change: Array, variance: Array, group: Integers, shots: Array) -> Array:
+    sums = RunningMean((int(group[-1]) + 1, change.shape[1]))
+    sums.add(change, variance, groups=group, weights=shots)
+    return sums.averages().values

@@ -171,6 +171,20 @@ def dead_time_error(profiles: xr.Dataset, background: xr.DataArray) -> xr.DataAr
     return error
 
 
+def dead_time_change(profiles: xr.Dataset) -> tuple[_Block, float] | None:
+    """Return the change of power with one standard error of the dead time, and a factor.
+
+    That of a background is the factor times its square (`dead_time_error`); None for analog.
+    """
+    error = profiles["power"].attrs.get(DEAD_TIME_ERROR)
+    if error is None:
+        return None
+    per_square = error * 1e6
+    if "dead_time_error" in profiles:
+        return profiles["dead_time_error"].to_numpy(), per_square
+    return profiles["power"].to_numpy() ** 2 * per_square, per_square
+
+
 def _with_range(counts: xr.DataArray, offset: float) -> xr.DataArray:
     """Return counts over ``range``, shifted by an offset in m."""
     grid = str(counts.dims[-1])

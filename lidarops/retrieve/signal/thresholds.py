@@ -123,5 +123,28 @@ class Thresholds:
     misfit_false_alarm: float = 1e-4
     """Probability with which noise exceeds the largest chi-square, for few bins. Assumed."""
 
+    # Dead time against analog (`dead_time`).
+    highest_load: float = 0.95
+    """Share of dead time up to which bins count. An error of 1 percent in the slope of analog
+    changes the dead time by 1 / load - 1 percent: of a real scan, loads up to 0.5 give 4.4 and
+    5.2 ns, all 5.9 and 6.3; with 6.2 and 6.8 ns, its optical depth is that of other azimuths."""
+    least_load: float = 0.1
+    """Share that the largest must reach: below, an error of the analog baseline has more effect;
+    assumed."""
+    least_dead_time: float = 5.0
+    """Standard errors of noise below which there is no dead time; assumed."""
+    least_rate: float = 1.0
+    """MHz, rate from which bins count; assumed."""
+    least_analog: float = 3.0
+    """Analog signal over its noise from which bins count; assumed."""
+    dead_time_block: int = 2
+    """Bins that are averaged; few, because the rate is no linear function of the light; assumed."""
+    fewest_cells: int = 50
+    """Averages from which a dead time is estimated; assumed."""
+    first_dead_time: float = 4e-3
+    """Microseconds, first guess; the result does not depend on it."""
+    dead_times: tuple[float, float] = (1e-4, 0.1)
+    """Microseconds, smallest and largest dead time of a step; chosen."""
+
 
 THRESHOLDS: Final = Thresholds()
