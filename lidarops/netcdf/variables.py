@@ -23,6 +23,7 @@ from lidarops.errors import LidarOpsError, ProductError
 from lidarops.flags import Flags, Severity
 from lidarops.kinds import flags_of, kind_of, kinds
 from lidarops.records import DetectionMode
+from lidarops.retrieve.air.reference_window import Rejection
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
 STANDARD_NAME_TABLE: Final = "CF Standard Name Table v93"
@@ -36,6 +37,18 @@ _SIGNAL_UNITS: Final = {DetectionMode.ANALOG: "mV", DetectionMode.PHOTON: "MHz"}
 _ERROR_BITS: Final = 8
 """Significant bits of the standard error of a rounded quantity: 0.2 percent at worst."""
 NO_STANDARD_NAME: Final = f"The {STANDARD_NAME_TABLE} has no name for this quantity."
+AEROSOL_EXTINCTION: Final = (
+    "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient_aerosol_particles"
+)
+AEROSOL_BACKSCATTER: Final = (
+    "volume_backwards_scattering_coefficient_of_radiative_flux_by_ranging_instrument_in_air_due_to"
+    "_ambient_aerosol_particles"
+)
+AEROSOL_LIDAR_RATIO: Final = (
+    "ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering_coefficient_by_ranging"
+    "_instrument_in_air_due_to_ambient_aerosol_particles"
+)
+"""Standard names of what several kinds retrieve."""
 
 QUALITY_FLAG: Final = "quality_flag"
 USABLE: Final = "usable"
@@ -618,6 +631,59 @@ GLUING: Final = (
     ),
 )
 """Variables of a channel that is glued from an analog and a photon-counting one."""
+
+
+MOLECULAR_BACKSCATTER: Final = Row(
+    name="molecular_backscatter",
+    dims=("range",),
+    dtype="f4",
+    units="m-1 sr-1",
+    long_name="backscatter coefficient of molecules",
+    coverage=Coverage.REFERENCE,
+    comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
+)
+
+REFERENCE_WINDOW: Final = tuple(
+    Row(
+        name=f"reference_{end}",
+        dims=("time",),
+        dtype="f4",
+        units="m",
+        long_name=f"range at which the reference window {verb}",
+        coverage=Coverage.AUXILIARY,
+        comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
+    )
+    for end, verb in (("bottom", "begins"), ("top", "ends"))
+)
+"""Where a profile was compared with clean air."""
+
+AVERAGED_PROFILES: Final = Row(
+    name="profiles",
+    dims=("time",),
+    dtype="i4",
+    units="1",
+    standard_name="number_of_observations",
+    long_name="number of raw profiles in the mean",
+    coverage=Coverage.AUXILIARY,
+    cell_methods="time: sum",
+    valid_min=0.0,
+)
+
+
+def reference_rejections(comment: str) -> Row:
+    """Return the row of the reasons for which candidates of the reference window failed."""
+    return Row(
+        name="reference_rejections",
+        dims=("time",),
+        dtype="i4",
+        units="1",
+        standard_name="status_flag",
+        long_name="reasons for which candidates of the reference window were rejected",
+        coverage=Coverage.AUXILIARY,
+        reasons=Rejection,
+        comment="Of all candidates together; where none passed, no_reference is raised in"
+        f" quality_flag. {comment}",
+    )
 
 
 def shots(*, of: str) -> Row:

@@ -8,9 +8,15 @@ from typing import Final
 
 from lidarops.constants import LEAST_SQUARES_PAPER, LIDAR_EQUATION_PAPER
 from lidarops.netcdf.variables import (
+    AEROSOL_BACKSCATTER,
+    AEROSOL_EXTINCTION,
+    AEROSOL_LIDAR_RATIO,
+    AVERAGED_PROFILES,
     GLUING,
+    MOLECULAR_BACKSCATTER,
     NO_STANDARD_NAME,
     RANGE,
+    REFERENCE_WINDOW,
     STANDARD_NAME_TABLE,
     SUBTRACTED_BACKGROUND,
     Coverage,
@@ -21,10 +27,10 @@ from lidarops.netcdf.variables import (
     altitude,
     coordinates,
     quality,
+    reference_rejections,
     shots,
 )
 from lidarops.products.elastic.flags import FLAGS
-from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
 _BINS: Final = ("time", "range")
@@ -135,8 +141,7 @@ LAYOUT: Final = Layout(
             dims=_BINS,
             dtype="f4",
             units="m-1 sr-1",
-            standard_name="volume_backwards_scattering_coefficient_of_radiative_flux_by_ranging"
-            "_instrument_in_air_due_to_ambient_aerosol_particles",
+            standard_name=AEROSOL_BACKSCATTER,
             long_name="backscatter coefficient of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
@@ -152,8 +157,7 @@ LAYOUT: Final = Layout(
             dims=_BINS,
             dtype="f4",
             units="m-1",
-            standard_name="volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient"
-            "_aerosol_particles",
+            standard_name=AEROSOL_EXTINCTION,
             long_name="extinction coefficient of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
@@ -204,15 +208,7 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.BOTH,
             comment="Calibrated in the reference window.",
         ),
-        Row(
-            name="molecular_backscatter",
-            dims=("range",),
-            dtype="f4",
-            units="m-1 sr-1",
-            long_name="backscatter coefficient of molecules",
-            coverage=Coverage.REFERENCE,
-            comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
-        ),
+        MOLECULAR_BACKSCATTER,
         Row(
             name="molecular_extinction",
             dims=("range",),
@@ -227,32 +223,14 @@ LAYOUT: Final = Layout(
             dims=("range",),
             dtype="f4",
             units="sr",
-            standard_name="ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering"
-            "_coefficient_by_ranging_instrument_in_air_due_to_ambient_aerosol_particles",
+            standard_name=AEROSOL_LIDAR_RATIO,
             long_name="assumed ratio of extinction to backscatter of aerosol particles",
             coverage=Coverage.REFERENCE,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Set by the campaign, not measured. Its errors at all ranges are one error.",
         ),
-        Row(
-            name="reference_bottom",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            long_name="range at which the reference window begins",
-            coverage=Coverage.AUXILIARY,
-            comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="reference_top",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            long_name="range at which the reference window ends",
-            coverage=Coverage.AUXILIARY,
-            comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
-        ),
+        *REFERENCE_WINDOW,
         Row(
             name="reference_detection_limit",
             dims=("time",),
@@ -265,20 +243,11 @@ LAYOUT: Final = Layout(
             " states 1.5 standard errors of the comparison for them. Missing where no window passed"
             f" the tests, or none beside it is comparable. {NO_STANDARD_NAME}",
         ),
-        Row(
-            name="reference_rejections",
-            dims=("time",),
-            dtype="i4",
-            units="1",
-            standard_name="status_flag",
-            long_name="reasons for which candidates of the reference window were rejected",
-            coverage=Coverage.AUXILIARY,
-            reasons=Rejection,
-            comment="Of all candidates together; where none passed, no_reference is raised in"
-            " quality_flag. too_few_bins: data in less than half of the bins; excluded: a cloud;"
-            " low_signal: the signal does not exceed zero by 3 standard errors; slope, curvature,"
-            " scatter: it departs from the shape of clean air; more_particles: another window has a"
-            " lower ratio to air.",
+        reference_rejections(
+            "too_few_bins: data in less than half of the bins; excluded: a cloud; low_signal: the"
+            " signal does not exceed zero by 3 standard errors; slope, curvature, scatter: it"
+            " departs from the shape of clean air; more_particles: another window has a lower ratio"
+            " to air."
         ),
         Row(
             name="cloud_mask",
@@ -344,17 +313,7 @@ LAYOUT: Final = Layout(
         SUBTRACTED_BACKGROUND,
         *GLUING,
         quality(_BINS, FLAGS),
-        Row(
-            name="profiles",
-            dims=("time",),
-            dtype="i4",
-            units="1",
-            standard_name="number_of_observations",
-            long_name="number of raw profiles in the mean",
-            coverage=Coverage.AUXILIARY,
-            cell_methods="time: sum",
-            valid_min=0.0,
-        ),
+        AVERAGED_PROFILES,
         Row(
             name="profiles_left_out",
             dims=("time",),

@@ -6,8 +6,14 @@ from collections.abc import Iterator
 from typing import Final
 
 from lidarops.netcdf.variables import (
+    AEROSOL_BACKSCATTER,
+    AEROSOL_EXTINCTION,
+    AEROSOL_LIDAR_RATIO,
+    AVERAGED_PROFILES,
+    MOLECULAR_BACKSCATTER,
     NO_STANDARD_NAME,
     RANGE,
+    REFERENCE_WINDOW,
     SUBTRACTED_BACKGROUND,
     Coverage,
     ErrorBudget,
@@ -17,10 +23,10 @@ from lidarops.netcdf.variables import (
     altitude,
     coordinates,
     quality,
+    reference_rejections,
     shots,
 )
 from lidarops.products.raman.flags import FLAGS
-from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
 
 _BINS: Final = ("time", "range")
@@ -38,17 +44,6 @@ _WORDS: Final = {
     "overlap": "the overlap function",
 }
 _PARTS: Final = ("quality_flag", "profiles", "shots")
-_EXTINCTION: Final = (
-    "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient_aerosol_particles"
-)
-_BACKSCATTER: Final = (
-    "volume_backwards_scattering_coefficient_of_radiative_flux_by_ranging_instrument_in_air_due_to"
-    "_ambient_aerosol_particles"
-)
-_LIDAR_RATIO: Final = (
-    "ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering_coefficient_by_ranging"
-    "_instrument_in_air_due_to_ambient_aerosol_particles"
-)
 _COMMENT_OF_MEANS: Final = (
     "Noise, resolution and background are independent from profile to profile; errors by all other"
     " causes are shared by all profiles, so that they are averaged and do not decrease with the"
@@ -140,7 +135,7 @@ LAYOUT: Final = Layout(
             dims=_BINS,
             dtype="f4",
             units="m-1",
-            standard_name=_EXTINCTION,
+            standard_name=AEROSOL_EXTINCTION,
             long_name="extinction coefficient of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
@@ -175,7 +170,7 @@ LAYOUT: Final = Layout(
             dims=_BINS,
             dtype="f4",
             units="m-1 sr-1",
-            standard_name=_BACKSCATTER,
+            standard_name=AEROSOL_BACKSCATTER,
             long_name="backscatter coefficient of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
@@ -191,7 +186,7 @@ LAYOUT: Final = Layout(
             dims=_BINS,
             dtype="f4",
             units="sr",
-            standard_name=_LIDAR_RATIO,
+            standard_name=AEROSOL_LIDAR_RATIO,
             long_name="ratio of extinction to backscatter of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
@@ -264,53 +259,15 @@ LAYOUT: Final = Layout(
             comment="Below the range of full overlap, from the lidar ratio measured above it."
             f" {NO_STANDARD_NAME}",
         ),
-        Row(
-            name="molecular_backscatter",
-            dims=("range",),
-            dtype="f4",
-            units="m-1 sr-1",
-            long_name="backscatter coefficient of molecules",
-            coverage=Coverage.REFERENCE,
-            comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
-        ),
-        *(
-            Row(
-                name=f"reference_{end}",
-                dims=("time",),
-                dtype="f4",
-                units="m",
-                long_name=f"range at which the reference window {word}",
-                coverage=Coverage.AUXILIARY,
-                comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
-            )
-            for end, word in (("bottom", "begins"), ("top", "ends"))
-        ),
-        Row(
-            name="reference_rejections",
-            dims=("time",),
-            dtype="i4",
-            units="1",
-            standard_name="status_flag",
-            long_name="reasons for which candidates of the reference window were rejected",
-            coverage=Coverage.AUXILIARY,
-            reasons=Rejection,
-            comment="Of all candidates together; where none passed, no_reference is raised in"
-            " quality_flag. The elastic signal is corrected for the measured attenuation before it"
-            " is compared with air.",
+        MOLECULAR_BACKSCATTER,
+        *REFERENCE_WINDOW,
+        reference_rejections(
+            "The elastic signal is corrected for the measured attenuation before it is compared"
+            " with air."
         ),
         SUBTRACTED_BACKGROUND,
         quality(_BINS, FLAGS),
-        Row(
-            name="profiles",
-            dims=("time",),
-            dtype="i4",
-            units="1",
-            standard_name="number_of_observations",
-            long_name="number of raw profiles in the mean",
-            coverage=Coverage.AUXILIARY,
-            cell_methods="time: sum",
-            valid_min=0.0,
-        ),
+        AVERAGED_PROFILES,
         shots(of="all profiles in the mean"),
     ),
 )
