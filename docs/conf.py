@@ -46,6 +46,8 @@ nb_execution_mode = "cache"
 nb_execution_in_temp = True
 # Notebooks call the commands of this environment.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+# Their output is text: no progress bars, and tables as wide as a page.
+os.environ |= {"TERM": "dumb", "COLUMNS": "110"}
 # No notebook shows results of other code.
 nb_execution_cache_path = str(HERE / "_build" / "notebooks" / source_version())
 nb_execution_raise_on_error = True
@@ -62,6 +64,10 @@ napoleon_use_rtype = False
 
 html_theme = "pydata_sphinx_theme"
 html_title = "lidarops"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+# Single pages have no neighbours to list.
+html_sidebars = {page: [] for page in ("index", "getting_started", "results/index")}
 html_math_renderer = "mathml"
 html_show_sourcelink = False
 html_copy_source = False

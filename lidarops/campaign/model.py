@@ -83,7 +83,8 @@ class ChannelFacts(SettingsModel):
     dead_time: Annotated[float, Field(ge=1e-10, le=2e-7)] | Literal["estimate"] | None = quantity(
         None,
         unit="s",
-        description="or 'estimate', against the analog channel of the same detector",
+        description="time after a photon in which the counter is blind, from its data sheet; or"
+        " 'estimate', against the analog channel of the same detector",
     )
     dead_time_uncertainty: float | None = quantity(
         None, unit="1", ge=0, le=1, description="relative standard error of dead_time; 0.2 if none"
@@ -165,7 +166,8 @@ class InstrumentFacts(SettingsModel):
     )
     molecular_profile: Inside | None = Field(
         default=None,
-        description="CSV or NetCDF file of altitude (m), pressure (Pa or hPa), temperature (K)",
+        description="CSV or NetCDF file of altitude (m), pressure (Pa or hPa), temperature (K); its"
+        " path is relative to the campaign file",
     )
     channels: dict[str, ChannelFacts] = Field(default={})
 

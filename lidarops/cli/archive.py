@@ -400,6 +400,10 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     title = "Requested products that could not be made again (kept)"
     show_rows(title, ("file", "reason"), kept)
     _show_scenes_with_problems(result)
+    empty = [p for scene in scenes for p in scene.products if p.usable == 0]
+    if empty:
+        names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
+        say(f"products without a usable value, flags say why: {len(empty)} ({names})")
     if no_scene:
         typer.echo(NO_SCENE)
     elif result.record is not None:

@@ -63,4 +63,5 @@ def compile_code() -> None:
     """
     from lidarops.run.compilation import compile_retrievals
 
+    say("compiling the retrievals: about two minutes")
     say(f"compiled code is kept in {compile_retrievals()}")

@@ -98,10 +98,8 @@ def _chart(chart: Chart) -> tuple[panels.Panel, ...]:
     first = chart.panels[0]
     heights = [y for panel in chart.panels for y in _heights(panel)]
     y = _axis(first.y_label, heights, log=first.y_log)
-    return tuple(
-        _panel(panel, replace(y, label=panel.y_label), legend=panel is first)
-        for panel in chart.panels
-    )
+    labels = list(dict.fromkeys(series.label for panel in chart.panels for series in panel.series))
+    return tuple(_panel(panel, replace(y, label=panel.y_label), labels) for panel in chart.panels)
 
 
 def _heights(panel: ChartPanel) -> Iterator[float]:
@@ -112,7 +110,7 @@ def _heights(panel: ChartPanel) -> Iterator[float]:
         yield panel.level
 
 
-def _panel(panel: ChartPanel, y: panels.Axis, *, legend: bool) -> panels.Panel:
+def _panel(panel: ChartPanel, y: panels.Axis, labels: Sequence[str]) -> panels.Panel:
     across = [x for series in panel.series for x in series.x]
     x = _axis(panel.x_label, [*across, *(at for at, _ in panel.front)], log=panel.x_log)
     layers: list[Layer] = []
@@ -120,13 +118,13 @@ def _panel(panel: ChartPanel, y: panels.Axis, *, legend: bool) -> panels.Panel:
         layers.append(Curve(np.array([x.low, x.high]), np.full(2, panel.level), "soft thin"))
     if panel.front:
         at, front = np.array(panel.front, dtype=np.float64).T
-        layers.append(Curve(at, front, "ink thin", steps=True, label="Pareto front" * legend))
-    for number, series in enumerate(panel.series):
-        layers += _series(series, number, series.label * legend)
+        layers.append(Curve(at, front, "ink thin", steps=True, label="Pareto front"))
+    for series in panel.series:
+        layers += _series(series, labels.index(series.label))
     return panels.Panel(x, y, tuple(layers), height=_HEIGHT, title=panel.title)
 
 
-def _series(series: Series, number: int, label: str) -> Iterator[Layer]:
+def _series(series: Series, number: int) -> Iterator[Layer]:
     x = np.array(series.x, dtype=np.float64)
     style = f"c{number % _COLOURS}"
     if series.low:
@@ -135,7 +133,7 @@ def _series(series: Series, number: int, label: str) -> Iterator[Layer]:
     style += f" d{number % _DASHES}" + " hollow" * series.hollow
     mark = SERIES_MARKS[number % len(SERIES_MARKS)]
     y = np.array(series.y, dtype=np.float64)
-    yield Curve(x, y, style, mark, joined=series.joined, label=label)
+    yield Curve(x, y, style, mark, joined=series.joined, label=series.label)
 
 
 def _ladder(ladder: Ladder) -> panels.Panel:

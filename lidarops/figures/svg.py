@@ -238,13 +238,18 @@ def _beside(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
 
 
 def _legends(panels: Sequence[Panel]) -> Iterator[tuple[Curve | Band, ...]]:
-    known: set[str] = {""}
+    """Yield the labelled layers of each panel that no panel before has with the same look."""
+    known: set[tuple[object, ...]] = set()
     for panel in panels:
-        legend = [
-            la for la in panel.layers if isinstance(la, Curve | Band) and la.label not in known
-        ]
-        known |= {layer.label for layer in legend}
-        yield tuple(legend)
+        labelled = {_look(la): la for la in panel.layers if isinstance(la, Curve | Band)}
+        yield tuple(la for look, la in labelled.items() if la.label and look not in known)
+        known |= labelled.keys()
+
+
+def _look(layer: Curve | Band) -> tuple[object, ...]:
+    """Return what a legend shows of a layer."""
+    line = (layer.mark, layer.joined) if isinstance(layer, Curve) else ()
+    return layer.label, layer.style, *line
 
 
 def _above(panel: Panel, legend: Sequence[Curve | Band], width: float) -> float:

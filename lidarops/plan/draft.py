@@ -64,7 +64,7 @@ class _Site:
         )
         height = "from the header" if self.altitude is not None else "headers state none"
         yield f"  {self.key}:"
-        yield f"    name: {_text(self.name or self.key)}"
+        yield f"    name: {_text(self.name or self.key)}  # ? the header has 8 characters"
         yield f"    latitude: {latitude:.8g}  # ? degree north, {source}"
         yield f"    longitude: {longitude:.8g}  # ? degree east"
         yield f"    altitude: {self.altitude or 0.0:g}  # ? m above the geoid, {height}"
@@ -107,7 +107,7 @@ def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema:
         f"name: {_key(name)}",
         f"title: {_text(f'Lidar measurements of {name}')}  # ?",
         f"archive: {_text(archive)}",
-        "output: out  # folder of catalog, products and reports",
+        "output: out  # folder of catalog, products and reports, of this campaign alone",
         "",
         "stations:",
         *(line for site in dict.fromkeys(sites) for line in site.lines()),
@@ -118,7 +118,7 @@ def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema:
         lines += [*_instrument(key, instrument, site), ""]
     lines += _networks(dict(zip(keys, zip(instruments, sites, strict=True), strict=True)))
     lines.append("scenes: {window: day}  # products of one file each: day, 6h, 30min")
-    return "\n".join([*lines, *_left_out(contents), ""])
+    return "\n".join([*lines, *_left_out(contents, archive), ""])
 
 
 def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
@@ -249,19 +249,23 @@ def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[
             yield ""
 
 
-def _left_out(contents: FolderContents) -> Iterator[str]:
+def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
     """Yield comments on the files that no instrument has."""
     scratch = [p for group in contents.groups if group.stem == _SCRATCH for p in group.files]
     tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
     rest = [path for path in contents.other if path not in tables]
     for title, paths in (
         ("the last record of the acquisition, left out", scratch),
-        ("? soundings, lidar ratios or overlap? Name them in the facts: molecular_profile", tables),
+        (
+            "? soundings, lidar ratios or overlap? Name them in the facts, as molecular_profile",
+            # As seen from the campaign file.
+            [f"{archive}/{path}" for path in tables],
+        ),
         ("of no raw format", rest),
         ("damaged", [f"{path}: {reason}" for path, reason in contents.refused]),
     ):
         if paths:
-            yield f"# {len(paths)} files, {title}:"
+            yield f"# {len(paths)} file{'s' * (len(paths) > 1)}, {title}:"
             yield from (f"#   {json.dumps(path)}" for path in paths[:_SHOWN])
 
 

@@ -24,7 +24,7 @@ _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} 
 _WRONG_IN_THEMSELVES: Final = 1
 """Bins that may hold any counts: one of 272 measured files has one bin beyond full scale."""
 _SCALED_TO: Final = np.iinfo(np.int32).max
-"""Largest count of simulated signals that are scaled to 32 bits, as those of `bockmann2004`: no
+"""Largest count of simulated signals that are scaled to 32 bits, as those of `boeckmann2004`: no
 counts of a recorder."""
 _SECTOR: Final = 128
 """Bins in 512 bytes, the smallest block that a disk loses."""

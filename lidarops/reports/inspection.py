@@ -49,6 +49,8 @@ _HEADER: Final = "source"
 """Key of the header as written."""
 _READ_VALUES: Final = 4_000_000
 """Values in memory at a time."""
+_OTHERS: Final = 20
+"""Most files of no raw format in the table; the JSON output has all."""
 _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
@@ -91,7 +93,14 @@ def tables(file: Path) -> list[Table]:
             _row(about, key.replace("_", " "), _with_unit(key, value))
     if description["type"] == "folder":
         refused = _listed("Damaged files", description["refused"], ("file", "reason"))
-        return [about, _listed("Groups of like files", description["groups"], _GROUP), refused]
+        others = [{"file": path} for path in description["other"][:_OTHERS]]
+        other = _listed("Files of no raw format", others, ("file",))
+        return [
+            about,
+            _listed("Groups of like files", description["groups"], _GROUP),
+            refused,
+            other,
+        ]
     if description["type"] == "raw":
         for note in description["notes"] or ["none"]:
             _row(about, "notes", note)
@@ -111,6 +120,8 @@ def tables(file: Path) -> list[Table]:
 def _with_unit(key: str, value: object) -> str:
     if value is None:
         return "not known"
+    if value == "":
+        return "none"
     return f"{value} {_UNITS[key]}" if key in _UNITS else str(value)
 
 

@@ -112,6 +112,15 @@ def test_every_variable_and_flag_is_listed() -> None:
             assert f"| `{bit.word}` | {int(bit)} |" in bits
 
 
+def test_the_flags_that_point_to_facts_exist(repository) -> None:
+    page = (repository / "docs/howto/campaign.md").read_text(encoding="utf-8")
+    section = page.partition("## Most values are rejected")[2]
+    cells = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    named = {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
+    assert len(named) > 10
+    assert named <= {bit.word for kind in OWN_KINDS for bit in flags_of(kind)}
+
+
 def test_every_stiff_case_is_listed() -> None:
     page = stiff_cases.page()
     for case in CASES:
