@@ -6,10 +6,20 @@ While that process loads modules, for seconds, it does not see that its parent h
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 from typing import Final
+
+_PARENT: Final = "__LIDAROPS_PARENT_PID"
+"""Variable with the id of the parent; see `lidarops.system.processes`."""
 
 _PR_SET_PDEATHSIG: Final = 1
 """Of prctl on Linux: the signal that a process gets when its parent dies."""
 
-ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+# Who imports this module has no parent to end with.
+_parent = os.environ.pop(_PARENT, None)
+if _parent is not None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(_parent):
+        # It was killed before, for which no signal comes.
+        os._exit(1)

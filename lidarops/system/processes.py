@@ -35,12 +35,13 @@ _ONE_THREAD: Final = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
 """Variables that libraries read when they are loaded; dask sets the same for its workers."""
-_LIBRARY_VARIABLES: Final = frozenset(
-    {*_ONE_THREAD, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
-)
-"""Variables that dask, when it starts workers, and netCDF4 also set in this process."""
-
 _ENDS_WITH_PARENT: Final = "lidarops.system.ends_with_parent"
+_PARENT: Final = "__LIDAROPS_PARENT_PID"
+"""Variable with the id of this process, for that module."""
+_LIBRARY_VARIABLES: Final = frozenset(
+    {*_ONE_THREAD, _PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
+)
+"""Variables that dask, when it starts workers, netCDF4 and `preload_modules` set here, too."""
 
 _NO_MORE: Final[Any] = object()
 
@@ -62,6 +63,7 @@ def preload_modules(modules: Collection[str]) -> None:
     in_main = threading.current_thread() is threading.main_thread()
     multiprocessing.set_forkserver_preload([*([_ENDS_WITH_PARENT] if in_main else []), *modules])
     unset = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
+    unset[_PARENT] = str(os.getpid())
     os.environ.update(unset)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:

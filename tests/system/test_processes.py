@@ -268,8 +268,9 @@ class TestPreloadModules:
         environment = os.environ | {"PYTHONPATH": str(tmp_path)}
         # Its standard error stays open as long as the server.
         done = subprocess.run(
-            [sys.executable, str(script)], stdout=subprocess.PIPE, env=environment, check=False
-        )
+            [sys.executable, str(script)],
+            stdout=subprocess.PIPE, env=environment, timeout=30, check=False,
+        )  # fmt: skip
         assert done.returncode == -signal.SIGKILL
         assert _ends(int(done.stdout))
 
