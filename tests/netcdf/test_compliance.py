@@ -24,6 +24,8 @@ SHAPES: dict[str, dict[str, Any]] = {
     "one_profile": {"zenith": 3.0, "profiles": 1},
     "many_profiles": {"zenith": 0.0, "profiles": 300},
 }
+# Five seconds each, and the same variables as the others.
+SLOW = {"one_profile", "many_profiles"}
 
 
 def missing(kind: str) -> xr.Dataset:
@@ -35,7 +37,9 @@ def missing(kind: str) -> xr.Dataset:
     return data
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "shape", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in SHAPES]
+)
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_products_comply(kind: str, shape: str, tmp_path: Path):
     path = tmp_path / "product.nc"
