@@ -74,67 +74,97 @@ def write_group(
     UnreadableProductError
         If a product cannot be read. Part of the group may be written then.
     """
+    held = _held(store, name)
     ids = [product.id for product in products]
     starts = np.cumsum([0, *(product.profiles for product in products)]).tolist()
-    stored = _stored_places(store, name)
-    lacking = [at for at in range(len(ids)) if stored.get(ids[at]) != (at, starts[at])]
-    if not lacking and len(stored) == len(ids):
+    lacking = [at for at in range(len(ids)) if held.places.get(ids[at]) != (at, starts[at])]
+    gone = held.places.keys() - set(ids)
+    if not lacking and not gone:
         return
-    attrs = _attributes(root, products)
     if 0 in lacking:
         # The first product gives the attributes of variables and the length of chunks.
         lacking = list(range(len(ids)))
+    # What all have in common is known of those that stay, unless others go.
+    read = range(len(ids)) if gone else lacking
+    about = {at: _about(root, products[at]) for at in read}
+    _refuse_duplicates(products, starts, held, about)
+    known = [] if gone or 0 in lacking else [held.attributes]
+    shared = shared_attributes([*known, *(stated.attributes for stated in about.values())])
+    if 0 in lacking:
         _create(store, name, _piece(root, products[0]))
     group = root_of(store)[name]
-    group.attrs.put({key: plain(value) for key, value in shared_attributes(attrs).items()})
-    for array in group.array_values():
-        length = {"time": starts[-1], PRODUCT.name: len(ids)}
-        dims = array.metadata.dimension_names or ()
-        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
-    rows = {name: _Rows(array) for name, array in group.arrays()}
-    for at in lacking:
-        _write_product(rows, root, products[at], at, starts[at])
-        if ids[at] not in stored:
-            changes.added.append((products[at].path, str(attrs[at]["product_version"])))
-    for array in rows.values():
-        array.flush()
-    changes.dropped += len(stored.keys() - set(ids))
+    group.attrs.put({key: plain(value) for key, value in shared.items()})
+    _write_rows(group, root, products, lacking, starts)
+    new = [at for at in lacking if ids[at] not in held.places]
+    changes.added += [(products[at].path, about[at].attributes["product_version"]) for at in new]
+    changes.dropped += len(gone)
 
 
-def _stored_places(store: Any, name: str) -> dict[str, tuple[int, int]]:
-    """Return id -> number and first row of each product of a group."""
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """What a group holds before an update."""
+
+    attributes: Mapping[str, Any]
+    times: NDArray[np.float64]
+    places: Mapping[str, tuple[int, int]]
+    """Id -> number and first row of each product."""
+
+
+def _held(store: Any, name: str) -> _Held:
     root = root_of(store)
     if name not in root:
-        return {}
-    ids = root[name][PRODUCT.name][:].tolist()
-    lengths = np.bincount(root[name][PRODUCT_INDEX.name][:], minlength=len(ids))
+        return _Held({}, np.empty(0), {})
+    group = root[name]
+    ids = group[PRODUCT.name][:].tolist()
+    lengths = np.bincount(group[PRODUCT_INDEX.name][:], minlength=len(ids))
     starts = np.cumsum([0, *lengths]).tolist()
-    return {product: (at, starts[at]) for at, product in enumerate(ids)}
+    places = {product: (at, starts[at]) for at, product in enumerate(ids)}
+    return _Held(group.attrs.asdict(), group["time"][:], places)
 
 
-def _attributes(root: Path, products: Sequence[Facts]) -> list[Mapping[str, Any]]:
-    """Return the global attributes of products.
+@dataclass(frozen=True, slots=True)
+class _About:
+    """What the file of a product states."""
 
-    Raises
-    ------
-    ProductError
-        If a time occurs twice, or a product has changed.
-    """
-    attrs: list[Mapping[str, Any]] = []
-    times = []
-    for facts in products:
-        try:
-            with opened(within(root, facts.path)) as product:
-                attrs.append(dict(product.attrs))
-                times.append(product["time"].values)
-        except ProductError as error:
-            raise UnreadableProductError(facts, error.problem) from error
-        if attrs[-1]["id"] != facts.id:
-            raise ProductError("changed while it was read", file=facts.path, remedy="run again")
-    refuse_duplicates(
-        np.concatenate(times), [facts.path for facts in products for _ in range(facts.profiles)]
-    )
-    return attrs
+    attributes: Mapping[str, Any]
+    times: NDArray[np.float64]
+
+
+def _about(root: Path, facts: Facts) -> _About:
+    try:
+        with opened(within(root, facts.path)) as product:
+            about = _About(dict(product.attrs), product["time"].values)
+    except ProductError as error:
+        raise UnreadableProductError(facts, error.problem) from error
+    if about.attributes["id"] != facts.id:
+        raise ProductError("changed while it was read", file=facts.path, remedy="run again")
+    return about
+
+
+def _refuse_duplicates(
+    products: Sequence[Facts], starts: Sequence[int], held: _Held, about: Mapping[int, _About]
+) -> None:
+    times = [
+        about[at].times if at in about else held.times[slice(*rows)]
+        for at, rows in enumerate(pairwise(starts))
+    ]
+    owners = [facts.path for facts in products for _ in range(facts.profiles)]
+    refuse_duplicates(np.concatenate(times), owners)
+
+
+def _write_rows(
+    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
+) -> None:
+    length = {"time": starts[-1], PRODUCT.name: len(products)}
+    rows = {}
+    for name, array in group.arrays():
+        dims = array.metadata.dimension_names or ()
+        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
+        rows[name] = _Rows(array)
+    for at in lacking:
+        _write_product(rows, root, products[at], at, starts[at])
+    for array in rows.values():
+        array.flush()
 
 
 def _create(store: Any, name: str, piece: xr.Dataset) -> None:

@@ -121,10 +121,27 @@ def test_a_product_made_again_may_have_other_times(tmp_path: Path):
     for day in range(3):
         add_day(tmp_path, day, KIND)
     update(tmp_path)
-    for day, profiles in ((1, 8), (0, 2), (2, 1)):
+    for day, profiles in ((1, 8), (0, 2)):
         add_day(tmp_path, day, KIND, version=2, profiles=profiles)
         update(tmp_path)
         assert_like_products(tmp_path)
+
+
+def test_attributes_are_those_that_all_products_have(tmp_path: Path):
+    add_day(tmp_path, 0, KIND)
+    odd = add_day(tmp_path, 1, KIND, of={"title": "Another title"})
+    update(tmp_path)
+    store = store_path(tmp_path, KIND)
+    assert "title" not in open_products(store).attrs
+    # No later product can bring it back,
+    add_day(tmp_path, 2, KIND)
+    update(tmp_path)
+    assert_like_products(tmp_path)
+    # but the end of the odd one does.
+    assert add_day(tmp_path, 1, KIND, version=2) == odd
+    update(tmp_path)
+    assert open_products(store).attrs["title"].startswith("Demo campaign")
+    assert_like_products(tmp_path)
 
 
 def test_without_anything_new_there_is_no_snapshot(tmp_path: Path):
