@@ -72,6 +72,11 @@ class Station(SettingsModel):
     latitude: float = quantity(unit="degree", ge=-90, le=90, description="north")
     longitude: float = quantity(unit="degree", ge=-180, le=180, description="east")
     altitude: float = quantity(0.0, unit="m", ge=-500, le=9000, description="above the geoid")
+    wigos_station_id: str = Field(
+        default="",
+        pattern=r"^(\d-\d{1,5}-\d{1,5}-[0-9A-Za-z]{1,16})?$",
+        description="WIGOS station identifier, such as 0-20000-0-33837",
+    )
 
 
 class ChannelFacts(SettingsModel):
@@ -317,6 +322,7 @@ class Metadata(SettingsModel):
     creator_name: str = ""
     creator_email: str = ""
     creator_url: str = ""
+    principal_investigator: str = ""
     publisher_name: str = ""
     publisher_email: str = ""
     publisher_url: str = ""

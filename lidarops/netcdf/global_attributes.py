@@ -138,6 +138,8 @@ def _people(context: Context) -> dict[str, str]:
         "creator_institution": institution,
         "creator_email": metadata.creator_email,
         "creator_url": metadata.creator_url,
+        # As in files of EARLINET.
+        "PI": metadata.principal_investigator,
         "publisher_name": publisher,
         "publisher_type": _kind_of(publisher, institution),
         "publisher_institution": institution,
@@ -164,6 +166,10 @@ def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]
     return {
         "platform": station.name,
         "platform_vocabulary": "station names of the campaign",
+        # Identifiers as in files of EARLINET and E-PROFILE.
+        "station_ID": context.station_key,
+        "wigos_station_id": station.wigos_station_id,
+        "measurement_ID": context.scene,
         "instrument": context.instrument_name,
         "instrument_vocabulary": "instrument names of the campaign",
         # Latitude first: the order of axes that EPSG:4326 defines.

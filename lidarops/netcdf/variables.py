@@ -146,6 +146,10 @@ class Row:
     algorithm: str | None = None
     comment: str | None = None
 
+    def code(self, state: str) -> int:
+        """Return the number by which a variable with `states` holds one of them."""
+        return self.states.index(state)
+
     def standard_error(self) -> Row:
         """Return the row of this quantity's standard error."""
         return replace(
@@ -643,19 +647,60 @@ MOLECULAR_BACKSCATTER: Final = Row(
     comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
 )
 
-REFERENCE_WINDOW: Final = tuple(
+REFERENCE_WINDOW: Final = (
+    *(
+        Row(
+            name=f"reference_{end}{ending}",
+            dims=("time",),
+            dtype="f4",
+            units="m",
+            long_name=f"{place} at which the reference window {verb}",
+            coverage=Coverage.AUXILIARY,
+            comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
+        )
+        for ending, place in (("", "range"), ("_altitude", "altitude above the geoid"))
+        for end, verb in (("bottom", "begins"), ("top", "ends"))
+    ),
     Row(
-        name=f"reference_{end}",
-        dims=("time",),
+        name="reference_scattering_ratio",
+        dims=(),
         dtype="f4",
-        units="m",
-        long_name=f"range at which the reference window {verb}",
-        coverage=Coverage.AUXILIARY,
-        comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
-    )
-    for end, verb in (("bottom", "begins"), ("top", "ends"))
+        units="1",
+        long_name="assumed ratio of backscatter of particles and molecules to that of molecules in"
+        " the reference window",
+        coverage=Coverage.REFERENCE,
+        uncertain=True,
+        error_kind=ErrorKind.SYSTEMATIC,
+        comment="Set by the campaign, as its standard error is: the value by which profiles are"
+        f" calibrated. {NO_STANDARD_NAME}",
+    ),
 )
-"""Where a profile was compared with clean air."""
+"""Where a profile was compared with clean air, and how clean the air is taken to be."""
+
+MOLECULAR_SOURCE: Final = Row(
+    name="molecular_source",
+    dims=(),
+    dtype="i1",
+    units="1",
+    long_name="source of pressure and temperature of the molecular atmosphere",
+    coverage=Coverage.AUXILIARY,
+    states=("standard_atmosphere", "sounding"),
+    comment="standard_atmosphere: US Standard Atmosphere 1976. sounding: the file of a sounding or"
+    f" model that the campaign gives; provenance names it. {NO_STANDARD_NAME}",
+)
+
+BACKGROUND_METHOD: Final = Row(
+    name="background_method",
+    dims=(),
+    dtype="i1",
+    units="1",
+    long_name="method by which the background is estimated",
+    coverage=Coverage.AUXILIARY,
+    states=("tail_mean", "cubic", "known_shape"),
+    comment="tail_mean: mean of the far range. cubic: from the cubic of a homogeneous section."
+    " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
+    f" the far range where the fit fails. {NO_STANDARD_NAME}",
+)
 
 AVERAGED_PROFILES: Final = Row(
     name="profiles",
@@ -668,6 +713,20 @@ AVERAGED_PROFILES: Final = Row(
     cell_methods="time: sum",
     valid_min=0.0,
 )
+
+
+def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
+    """Return the row of the method by which a product was retrieved."""
+    return Row(
+        name="retrieval_method",
+        dims=(),
+        dtype="i1",
+        units="1",
+        long_name="method of the retrieval",
+        coverage=Coverage.AUXILIARY,
+        states=states,
+        comment=f"{comment} {NO_STANDARD_NAME}",
+    )
 
 
 def reference_rejections(comment: str) -> Row:

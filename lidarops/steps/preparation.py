@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import Final, Literal, Protocol
 
+from lidarops.netcdf.variables import MOLECULAR_SOURCE
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.thresholds import THRESHOLDS
@@ -21,6 +22,11 @@ MOLECULES: Final = Datum[MolecularProfile]("molecules")
 
 FEWEST_BINS: Final = THRESHOLDS.fewest_bins
 """Fewest bins of a section, and of the range of a background."""
+
+
+def molecular_source(molecules: MolecularProfile) -> int:
+    """Return the value of the variable ``molecular_source``."""
+    return MOLECULAR_SOURCE.code("standard_atmosphere" if molecules.standard else "sounding")
 
 
 def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, float]:

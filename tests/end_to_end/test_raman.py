@@ -106,6 +106,18 @@ def test_a_simulated_night_agrees_with_the_truth(night):
     assert np.all(error < 0.15 * extinction[:, layer])
 
 
+def test_the_file_states_its_reference_and_the_source_of_the_air(night):
+    campaign, _, record = night
+    product = product_of(campaign, record)
+    sources = product["molecular_source"].attrs["flag_meanings"].split()
+    assert sources[product["molecular_source"].item()] == "standard_atmosphere"
+    # The station lies at 500 m, and the beam is vertical.
+    altitude = product["reference_bottom_altitude"].values
+    np.testing.assert_allclose(altitude, 500.0 + product["reference_bottom"].values, rtol=1e-6)
+    assert np.isfinite(altitude).all()
+    assert product["reference_scattering_ratio"].item() >= 1.0
+
+
 def test_water_vapour_needs_no_overlap(night):
     campaign, _, record = night
     product = product_of(campaign, record)

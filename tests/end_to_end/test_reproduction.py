@@ -12,6 +12,7 @@ from typing import Any
 
 import h5py
 import netCDF4
+import numpy as np
 import pytest
 import xarray as xr
 import yaml
@@ -26,6 +27,7 @@ from lidarops.netcdf.provenance import read_origin, read_provenance
 from lidarops.netcdf.write import write_product
 from lidarops.run.archive import Selection, reprocess
 from lidarops.run.reproduction import Reproduction, explain_difference, reproduce_product
+from lidarops.settings import ReferenceSettings
 from lidarops.simulate.campaign import simulate_campaign
 
 SOUNDING = "altitude [m],pressure [hPa],temperature [K]\n" + "".join(
@@ -103,6 +105,37 @@ def test_every_kind_is_made_again_to_the_last_byte(kind: str, campaign: Campaign
     assert result.identical, explain_difference(result)
     assert result.differences == ()
     assert "identical" in explain_difference(result)
+
+
+def states(product: xr.Dataset, name: str) -> str:
+    """Return the state of a coded variable, by the attributes of the file alone."""
+    attrs = product[name].attrs
+    meanings = dict(zip(attrs["flag_values"].tolist(), attrs["flag_meanings"].split(), strict=True))
+    return meanings[product[name].item()]
+
+
+def test_files_state_methods_reference_and_source_of_the_air(campaign: Campaign):
+    opened = {kind: xr.load_dataset(of_kind(campaign, kind)) for kind in KINDS}
+    elastic = opened["elastic"]
+    assert states(elastic, "molecular_source") == "sounding"
+    assert states(elastic, "background_method") == "known_shape"
+    assert states(opened["signal"], "background_method") == "tail_mean"
+    assert states(opened["homogeneous"], "retrieval_method") == "compressed"
+    # The method that ran, not auto, which was requested.
+    ran = states(opened["multiangle"], "retrieval_method")
+    assert f"; {ran}: " in opened["multiangle"].attrs["lidarops_steps"]
+    bins = np.diff(elastic["range"].values)
+    np.testing.assert_allclose(elastic["vertical_resolution"], bins, rtol=1e-6)
+    assert np.isfinite(elastic["reference_top"]).any()
+    for end in ("bottom", "top"):
+        rise = np.cos(np.deg2rad(elastic["zenith_angle"])) * elastic[f"reference_{end}"]
+        stated = elastic[f"reference_{end}_altitude"]
+        np.testing.assert_allclose(stated, elastic["station_altitude"] + rise, rtol=1e-6)
+    assumed = ReferenceSettings()
+    ratio = assumed.scattering_ratio
+    assert elastic["reference_scattering_ratio"].item() == pytest.approx(ratio)
+    error = elastic["reference_scattering_ratio_standard_error"].item()
+    assert error == pytest.approx(ratio * assumed.relative_error)
 
 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])

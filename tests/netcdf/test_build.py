@@ -15,11 +15,13 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from pydantic import ValidationError
 from support.oracles.angle_scenes import retrieve_scan
 from support.products.encoded_products import build_product
 from support.products.made_products import (
     MAKERS,
     PLACED,
+    SCENE,
     STATION,
     context,
     homogeneous,
@@ -288,11 +290,24 @@ def test_what_a_campaign_does_not_give_is_left_out():
     assert not {*bare.lacking, "publisher_name", "creator_type", "metadata_link"} & set(attrs)
     assert not [value for value in attrs.values() if "unknown" in str(value)]
     assert "Golub" in attrs["references"]
+    assert not {"PI", "wigos_station_id"} & set(attrs)
     given = Metadata(creator_name="A. Person", creator_email="a.person@example.org")
     attrs = build_product(homogeneous(), context(metadata=given)).attrs
     assert attrs["publisher_name"] == "A. Person"
     assert attrs["publisher_email"] == "a.person@example.org"
     assert set(bare.lacking) - set(given.lacking) == {"creator_name", "creator_email"}
+
+
+def test_identifiers_and_the_principal_investigator_are_stated_as_networks_do():
+    named = STATION.model_copy(update={"wigos_station_id": "0-20000-0-33837"})
+    people = Metadata(principal_investigator="A. Person")
+    attrs = build_product(homogeneous(), context(station=named, metadata=people)).attrs
+    assert attrs["PI"] == "A. Person"
+    assert attrs["wigos_station_id"] == "0-20000-0-33837"
+    assert attrs["station_ID"] == "odesa"
+    assert attrs["measurement_ID"] == attrs["lidarops_scene"] == SCENE
+    with pytest.raises(ValidationError, match="wigos_station_id"):
+        Station(name="Odesa", latitude=46.0, longitude=30.0, wigos_station_id="33837")
 
 
 def test_no_attribute_is_empty():
@@ -608,6 +623,8 @@ def test_a_scan_goes_from_profiles_to_a_product():
         station_altitude=STATION.altitude,
         background_range=(5400.0, 6000.0),
     )
+    assert found.attrs["method"] == "joint"
+    found = found.assign(retrieval_method=0, background_method=0)
     product = decoded(found, "multiangle")
     assert {"time": 3, "altitude": 59, "beam": 4}.items() <= product.sizes.items()
     np.testing.assert_array_equal(product["quality_flag"], found["quality_flag"])

@@ -81,6 +81,11 @@ def test_variables_without_standard_name():
         *("glue_lag", "glue_lag_standard_error", "glue_slope", "glue_slope_standard_error"),
         *("glue_bottom", "glue_top"),
     }
+    reference = {
+        *("reference_bottom", "reference_top"),
+        *("reference_bottom_altitude", "reference_top_altitude"),
+        *("reference_scattering_ratio", "reference_scattering_ratio_standard_error"),
+    }
     unnamed = {
         kind: {row.name for row in layout.variables if not row.standard_name}
         for kind, known in kinds().items()
@@ -95,15 +100,18 @@ def test_variables_without_standard_name():
             "background",
             "background_standard_error",
             "noise_correlation_length",
+            "background_method",
             *gluing,
         },
         "elastic": {
             *(f"aerosol_backscatter_error_{cause}" for cause in _CAUSES),
             "molecular_backscatter",
             "molecular_extinction",
-            "reference_bottom",
-            "reference_top",
+            *reference,
+            "molecular_source",
+            "background_method",
             "reference_detection_limit",
+            "vertical_resolution",
             "cloud_base_range",
             "cloud_fraction",
             "background",
@@ -125,8 +133,9 @@ def test_variables_without_standard_name():
             "overlap",
             "overlap_standard_error",
             "molecular_backscatter",
-            "reference_bottom",
-            "reference_top",
+            *reference,
+            "molecular_source",
+            "background_method",
             "background",
             "background_standard_error",
         },
@@ -160,6 +169,8 @@ def test_variables_without_standard_name():
             "blocked_range",
             "effective_degrees_of_freedom",
             "reach",
+            "retrieval_method",
+            "background_method",
         },
         "visibility": {
             "visibility_in_air_lower",
@@ -174,6 +185,7 @@ def test_variables_without_standard_name():
             "prior_deviation",
             "multiplier",
             "beam_range",
+            "retrieval_method",
         },
         "homogeneous": {
             "visibility_in_air_lower",
@@ -187,8 +199,35 @@ def test_variables_without_standard_name():
             "background_standard_error",
             "background_model_error",
             "reduced_chi2",
+            "retrieval_method",
         },
     }
+
+
+def test_method_codes_are_published_and_keep_their_numbers():
+    """Readers of older files rely on the numbers: append, and never reorder."""
+    coded = {
+        (kind, row.name): row.states
+        for kind, known in kinds().items()
+        for row in layout_of(kind).data
+        if row.name.endswith(("_method", "_source")) and known.package.startswith("lidarops.")
+    }
+    background = ("tail_mean", "cubic", "known_shape")
+    assert coded == {
+        ("homogeneous", "retrieval_method"): (
+            "compressed", "direct", "cubic", "known_background", "linearized", "known_extinction",
+        ),
+        ("multiangle", "retrieval_method"): (
+            "joint", "kano_hamilton", "two_angle", "mld", "mld_prior",
+        ),
+        ("visibility", "retrieval_method"): (
+            "beams_with_prior", "beams_without_prior", "triangles",
+        ),
+        **{(kind, "background_method"): background
+           for kind in ("signal", "elastic", "raman", "multiangle")},
+        **{(kind, "molecular_source"): ("standard_atmosphere", "sounding")
+           for kind in ("elastic", "raman")},
+    }  # fmt: skip
 
 
 def test_one_name_is_one_quantity_in_all_kinds():

@@ -11,6 +11,7 @@ import xarray as xr
 from pydantic import model_validator
 
 from lidarops.campaign.model import channel_facts
+from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.records import Role
@@ -23,7 +24,7 @@ from lidarops.steps.channels import range_channel, range_offset
 from lidarops.steps.conditioning import FULL_OVERLAP_RANGE, OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct, Source
 from lidarops.steps.pointing import fixed_zenith
-from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
+from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, molecular_source
 from lidarops.steps.profiles import gluing
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
@@ -265,7 +266,13 @@ class _Inversion(RowProduct):
             overlap_is_stated=data.get(FULL_OVERLAP_RANGE) is not None,
         )
         least = settings.least_signal_to_noise
-        return with_low_signal_to_noise(inverted, LAYOUT.weighed, least).assign(gluing(averages))
+        return with_low_signal_to_noise(inverted, LAYOUT.weighed, least).assign(
+            **gluing(averages),
+            molecular_source=molecular_source(data[MOLECULES]),
+            background_method=BACKGROUND_METHOD.code(
+                "known_shape" if data.get(KNOWN_SHAPE) is True else "tail_mean"
+            ),
+        )
 
 
 def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:

@@ -20,6 +20,7 @@ from lidarops.products.homogeneous.look import (
     omitted_sections,
 )
 from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
+from lidarops.products.homogeneous.variables import AUTOMATIC, LAYOUT
 from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
@@ -346,7 +347,11 @@ class _Sections(WholeProduct):
         if requested is not None:
             definition = VisibilityDefinition(self._data[WAVELENGTH], **dict(requested))
             sections = _with_visibility(sections, definition)
-        return in_one_batch(sections)
+        method = self._settings.method
+        row = LAYOUT.row("retrieval_method")
+        return in_one_batch(
+            sections.assign(retrieval_method=row.code(AUTOMATIC if method == "auto" else method))
+        )
 
 
 def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, get_args
 
 from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.netcdf.variables import (
@@ -16,15 +16,20 @@ from lidarops.netcdf.variables import (
     altitude,
     coordinates,
     quality,
+    retrieval_method,
     shots,
 )
 from lidarops.netcdf.visibility_rows import visibility_rows
 from lidarops.products.homogeneous.flags import FLAGS
+from lidarops.products.homogeneous.settings import Method
 
 _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
 _OF_EXTINCTION = ("total_extinction_model_error", *_OF_FIT)
 
+AUTOMATIC: Final = "compressed"
+"""What the method ``auto`` of the settings stands for."""
+_METHODS: Final = (AUTOMATIC, *(name for name in get_args(Method) if name != "auto"))
 _CURVED_SIGNAL = (
     "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
     " section, and by the opposite amount at the other"
@@ -49,7 +54,7 @@ LAYOUT: Final = Layout(
     references=(
         CUBIC_PAPER,
         LEAST_SQUARES_PAPER,
-        "Golub, G. H. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432.",
+        "Golub, G. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432, doi:10.1137/0710036.",
     ),
     comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 total_extinction r),"
     " with range r. altitude, geospatial_vertical_min and geospatial_vertical_max refer to the"
@@ -148,6 +153,11 @@ LAYOUT: Final = Layout(
             long_name="number of fitted range bins of the section",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
+        ),
+        retrieval_method(
+            _METHODS,
+            "compressed: least squares from few sums over the bins, by direct where a profile has"
+            " gaps; auto of the settings stands for it.",
         ),
         quality(_SECTIONS, FLAGS),
         shots(of="the profile"),

@@ -18,6 +18,7 @@ import xarray as xr
 
 from lidarops.constants import MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
+from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.multiangle.baseline import BASELINE, Baseline, with_baseline
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
@@ -344,6 +345,7 @@ class _Scans(WholeProduct):
 
     def __init__(self, settings: ScanSettings, data: Data) -> None:
         self._settings, self._station = settings, data.source.station_altitude
+        self._background_method = data[BACKGROUND].method
         self._profiles = profiles = data[PROFILES]
         self._geometry = geometry = data.source.geometry
         self._baseline, overlap = data.get(BASELINE), data.get(OVERLAP)
@@ -380,6 +382,10 @@ class _Scans(WholeProduct):
             regularisation=settings.regularisation,
             largest_gradient=settings.largest_gradient,
             layers=[(low + self._station, high + self._station) for low, high in settings.layers],
+        )
+        optical_depth = optical_depth.assign(
+            retrieval_method=LAYOUT.row("retrieval_method").code(optical_depth.attrs["method"]),
+            background_method=BACKGROUND_METHOD.code(self._background_method),
         )
         if settings.method in _DIFFERENTIATING:
             optical_depth = optical_depth.assign_attrs(references=MULTIANGLE_PAPER)

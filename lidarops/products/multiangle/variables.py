@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, get_args
 
 from lidarops.netcdf.variables import (
+    BACKGROUND_METHOD,
     NO_STANDARD_NAME,
     PLACE,
     TIME,
@@ -14,9 +15,11 @@ from lidarops.netcdf.variables import (
     Layout,
     Row,
     quality,
+    retrieval_method,
     shots,
 )
 from lidarops.products.multiangle.flags import FLAGS
+from lidarops.products.multiangle.settings import Method
 
 _LEVELS: Final = ("time", "altitude")
 _BITS: Final = 12
@@ -430,6 +433,12 @@ LAYOUT: Final = Layout(
             significant_bits=8,
             comment=f"Missing where the beam has no usable signal. {NO_STANDARD_NAME}",
         ),
+        retrieval_method(
+            tuple(name for name in get_args(Method) if name != "auto"),
+            "The method that ran: auto of the settings chooses two_angle, joint or kano_hamilton"
+            " from the data.",
+        ),
+        BACKGROUND_METHOD,
         quality(_LEVELS, FLAGS),
         Row(
             name="effective_degrees_of_freedom",

@@ -10,6 +10,7 @@ from typing import Final, cast
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
+from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.raman.settings import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import LeftOut, PlannedStep
@@ -22,9 +23,17 @@ from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import member_channel, range_channel, wavelength
 from lidarops.steps.conditioning import OVERLAP, PROFILES
-from lidarops.steps.data import Averages, Chunk, Data, ProductStream, RowProduct, WholeProduct
+from lidarops.steps.data import (
+    Averages,
+    Chunk,
+    Data,
+    ProductStream,
+    RowProduct,
+    WholeProduct,
+    in_one_batch,
+)
 from lidarops.steps.pointing import fixed_zenith
-from lidarops.steps.preparation import AVERAGE, MOLECULES, Average
+from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, molecular_source
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import REQUESTED, Decisions, Leave, Look, ProductStep, Run
@@ -282,7 +291,10 @@ class _Retrieval(RowProduct):
             water=None if water is None else self._water(water),
             overlap=None if overlap is None else overlap(elastic["range"].to_numpy()),
         )
-        return with_low_signal_to_noise(retrieved, LAYOUT.weighed, settings.least_signal_to_noise)
+        flagged = with_low_signal_to_noise(
+            retrieved, LAYOUT.weighed, settings.least_signal_to_noise
+        )
+        return _with_methods(flagged, settings, data)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
         settings = self._settings
@@ -296,6 +308,15 @@ class _Retrieval(RowProduct):
 def _of(data: Data, channel: str) -> Data:
     """Return what the steps of a channel gave."""
     return data if channel == data.channel else data.channels[channel]
+
+
+def _with_methods(product: xr.Dataset, settings: RetrievalSettings, data: Data) -> xr.Dataset:
+    """Return the product with the source of its air and the method of its backgrounds."""
+    method = "known_shape" if settings.known_shape else "tail_mean"
+    return product.assign(
+        molecular_source=molecular_source(data[MOLECULES]),
+        background_method=BACKGROUND_METHOD.code(method),
+    )
 
 
 def _pointing(data: Data) -> Mapping[str, float]:
@@ -334,8 +355,7 @@ class _Dark(WholeProduct):
             station_altitude=source.station_altitude,
             assumptions=_assumptions(settings, data[WAVELENGTH], raman),
         )
-        yield empty
-        yield empty
+        return in_one_batch(_with_methods(empty, settings, data))
 
 
 STEP: Final = Raman()

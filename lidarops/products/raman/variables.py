@@ -10,7 +10,9 @@ from lidarops.netcdf.variables import (
     AEROSOL_EXTINCTION,
     AEROSOL_LIDAR_RATIO,
     AVERAGED_PROFILES,
+    BACKGROUND_METHOD,
     MOLECULAR_BACKSCATTER,
+    MOLECULAR_SOURCE,
     NO_STANDARD_NAME,
     RANGE,
     REFERENCE_WINDOW,
@@ -116,9 +118,9 @@ LAYOUT: Final = Layout(
     ),
     processing_level="L2: retrieved quantities",
     references=(
-        "Ansmann, A. et al. (1990), Opt. Lett. 15, 746-748.",
-        "Ansmann, A. et al. (1992), Appl. Opt. 31, 7113-7131.",
-        "Pappalardo, G. et al. (2004), Appl. Opt. 43, 5370-5385.",
+        "Ansmann, A. et al. (1990), Opt. Lett. 15, 746-748, doi:10.1364/OL.15.000746.",
+        "Ansmann, A. et al. (1992), Appl. Opt. 31, 7113-7131, doi:10.1364/AO.31.007113.",
+        "Pappalardo, G. et al. (2004), Appl. Opt. 43, 5370-5385, doi:10.1364/AO.43.005370.",
     ),
     comment="Profiles are means over time; range is along the beam. Extinction and lidar ratio are"
     " means over vertical_resolution, which follows from the signal; backscatter is that of the"
@@ -259,12 +261,14 @@ LAYOUT: Final = Layout(
             comment="Below the range of full overlap, from the lidar ratio measured above it."
             f" {NO_STANDARD_NAME}",
         ),
+        MOLECULAR_SOURCE,
         MOLECULAR_BACKSCATTER,
         *REFERENCE_WINDOW,
         reference_rejections(
             "The elastic signal is corrected for the measured attenuation before it is compared"
             " with air."
         ),
+        BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         quality(_BINS, FLAGS),
         AVERAGED_PROFILES,

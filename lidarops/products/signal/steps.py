@@ -11,6 +11,7 @@ import xarray as xr
 
 from lidarops.constants import CUBIC_PAPER
 from lidarops.flags import Quality
+from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.signal.settings import SignalSettings
 from lidarops.products.signal.variables import LAYOUT
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
@@ -99,7 +100,9 @@ class _Signals(RowProduct):
     def _frame(self) -> xr.Dataset:
         """Return times, pointing and ranges of all profiles."""
         words = background_words(self._background.method, self._background.range)
-        frame = self._geometry.assign_coords(range=self._profiles.range)
+        frame = self._geometry.assign_coords(range=self._profiles.range).assign(
+            background_method=BACKGROUND_METHOD.code(self._background.method)
+        )
         cited = {"references": CUBIC_PAPER} if self._background.method == "cubic" else {}
         return frame.assign_attrs(steps=words, **cited)
 

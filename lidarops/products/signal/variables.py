@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops.netcdf.variables import (
+    BACKGROUND_METHOD,
     GLUING,
     NO_STANDARD_NAME,
     RANGE,
@@ -59,6 +60,7 @@ LAYOUT: Final = Layout(
             comment="Of channels with photon counting. All ranges and profiles share it. Not part"
             f" of signal_standard_error. {NO_STANDARD_NAME}",
         ),
+        BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         Row(
             name="noise_correlation_length",

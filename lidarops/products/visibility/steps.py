@@ -26,6 +26,7 @@ from lidarops.products.visibility.settings import (
     PriorName,
     VisibilityProductSettings,
 )
+from lidarops.products.visibility.variables import LAYOUT
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, Scene, is_glued
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.left_signal import window_before
@@ -353,7 +354,7 @@ class _NetworkStream(NetworkStream):
         """Return the variables of the product."""
         settings = self._settings
         signals = [beam.signals() for beam in self._beams]
-        return labeled.retrieve_network(
+        retrieved = labeled.retrieve_network(
             signals,
             self._network(signals),
             labeled.NetworkSettings(
@@ -366,6 +367,10 @@ class _NetworkStream(NetworkStream):
                 overlap_relative_error=settings.overlap_relative_error,
             ),
         )
+        method = "beams_with_prior" if settings.prior == "block" else "beams_without_prior"
+        if settings.multiplier is not None:
+            method = "triangles"
+        return retrieved.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
 
     def _network(self, signals: Sequence[BeamAverages]) -> geometry.Network:
         settings = self._settings

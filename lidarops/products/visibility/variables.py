@@ -16,6 +16,7 @@ from lidarops.netcdf.variables import (
     Row,
     deployment,
     quality,
+    retrieval_method,
     shots,
 )
 from lidarops.netcdf.visibility_rows import visibility_rows
@@ -25,6 +26,7 @@ _SERIES: Final = ("time", "crossing")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
 
+_METHODS: Final = ("beams_with_prior", "beams_without_prior", "triangles")
 _OF_VALUE: Final = ("condition", "quality_flag", "path_optical_depth", "reduced_chi2", "shots")
 
 
@@ -209,6 +211,12 @@ LAYOUT: Final = Layout(
             comment="Row j of a cycle of three beams is multiplied by its power j - 1. 1 is exact;"
             " a smaller one limits noise, and its bias in homogeneous air is part of"
             f" total_extinction_systematic_error. {NO_STANDARD_NAME}",
+        ),
+        retrieval_method(
+            _METHODS,
+            "beams_with_prior: all beams, with a prior that the profiles of a block share."
+            " beams_without_prior: all beams alone. triangles: one triangle of beams at each"
+            " crossing, with a multiplier.",
         ),
         replace(
             quality(_SERIES, FLAGS),

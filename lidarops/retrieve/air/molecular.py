@@ -243,6 +243,8 @@ class MolecularProfile:
     """Pa."""
     temperature: Array
     """K."""
+    standard: bool = False
+    """Whether it is the US Standard Atmosphere, not a sounding."""
 
     def __post_init__(self) -> None:
         for name in ("altitude", "pressure", "temperature"):
@@ -271,7 +273,7 @@ class MolecularProfile:
         if altitude is None:
             layer_bases = _EARTH_RADIUS * _BASE / (_EARTH_RADIUS - _BASE)
             altitude = np.union1d(np.linspace(LOWEST, HIGHEST, 891), layer_bases)
-        return cls(np.asarray(altitude, dtype=np.float64), *us_standard(altitude))
+        return cls(np.asarray(altitude, dtype=np.float64), *us_standard(altitude), standard=True)
 
     @classmethod
     def from_profile(

@@ -238,8 +238,15 @@ def invert_elastic(
             "molecular_extinction": ("range", air.extinction),
             "lidar_ratio": ("range", ratio),
             "lidar_ratio_standard_error": ("range", ratio_error),
+            "vertical_resolution": float(np.median(np.diff(distance))),
             "reference_bottom": ("time", window.bottom),
             "reference_top": ("time", window.top),
+            "reference_bottom_altitude": ("time", station_altitude + climb * window.bottom),
+            "reference_top_altitude": ("time", station_altitude + climb * window.top),
+            "reference_scattering_ratio": reference.scattering_ratio,
+            "reference_scattering_ratio_standard_error": (
+                reference.scattering_ratio * reference.relative_error
+            ),
             "reference_detection_limit": (
                 "time",
                 np.where(np.isinf(window.detection_limit), np.nan, window.detection_limit),

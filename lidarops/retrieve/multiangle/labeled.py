@@ -110,8 +110,8 @@ def retrieve_optical_depth(
     xr.Dataset
         In memory: the variables of the ``multiangle`` product. Where a value is NaN, a bit of
         ``quality_flag`` gives the reason; the optical depth of a layer is NaN where a bit at one of
-        its bounds rejects the value there. The attribute ``steps`` lists the method that ran and
-        the methods that did not, with reasons.
+        its bounds rejects the value there. The attribute ``method`` names the method that ran;
+        ``steps`` lists it and the methods that did not, with reasons.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def retrieve_optical_depth(
             "shots": beams["shots"],
         },
         coords={name: beams[name] for name in beams.coords},
-        attrs={"steps": _step_texts(retrieval)},
+        attrs={"steps": _step_texts(retrieval), "method": _method_of(retrieval)},
     )
     product = product.assign(_plane_variables(signals, beams, settings))
     product = product.assign(_dead_time_variables(retrieval, signals, beams, station_altitude))
@@ -299,6 +299,12 @@ def _solve(
     return optical_depth.retrieve_optical_depth(
         beams.signal, zenith_angle, altitude, variance=beams.variance, **settings
     )
+
+
+def _method_of(retrieval: MultiAngleResult) -> str:
+    """Return the method that ran."""
+    ran = (step.step for step in retrieval.steps if step.ran)
+    return next(name for name in ran if name in set(optical_depth.MultiAngleMethod))
 
 
 def _step_texts(retrieval: MultiAngleResult) -> str:

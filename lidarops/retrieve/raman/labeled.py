@@ -186,6 +186,15 @@ def retrieve(
     return xr.Dataset(
         {
             **variables,
+            "reference_bottom_altitude": (
+                "time",
+                station_altitude + climb * result.reference_bottom,
+            ),
+            "reference_top_altitude": ("time", station_altitude + climb * result.reference_top),
+            "reference_scattering_ratio": settings.scattering_ratio,
+            "reference_scattering_ratio_standard_error": (
+                settings.scattering_ratio * settings.reference_relative_error
+            ),
             "background": ("time", of_elastic.background),
             "background_standard_error": ("time", of_elastic.background_standard_error),
             "profiles": elastic["profiles"],

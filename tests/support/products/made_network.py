@@ -84,7 +84,8 @@ def product(intervals: int = 6, **settings: Any) -> xr.Dataset:
         "visibility": VisibilityDefinition(wavelength=532e-9),
     } | settings
     beams = [beam(number, intervals=intervals) for number in range(3)]
-    return retrieve_network(beams, network(), NetworkSettings(**values))
+    retrieved = retrieve_network(beams, network(), NetworkSettings(**values))
+    return retrieved.assign(retrieval_method=0)
 
 
 def without(averages: BeamAverages, rows: slice) -> BeamAverages:
