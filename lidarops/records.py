@@ -166,6 +166,13 @@ class PlannedStep:
     needs: tuple[str, ...] = ()
     """Steps whose outputs it takes, run or left out: ``name``, or ``channel/name`` of another
     channel."""
+    warning: str = ""
+    """Why its results may be of no use; empty where nothing is known against them."""
+
+    @property
+    def words(self) -> str:
+        """The reason, with the warning."""
+        return "; ".join(filter(None, (self.reason, self.warning)))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as plain JSON types."""
@@ -174,6 +181,7 @@ class PlannedStep:
             "channel": self.channel,
             "settings": dict(self.settings),
             "reason": self.reason,
+            **({"warning": self.warning} if self.warning else {}),
             **_origin_fields(self),
             **({"needs": list(self.needs)} if self.needs else {}),
         }

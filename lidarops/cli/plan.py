@@ -183,11 +183,13 @@ def _show_plan(title: str, plan: Plan) -> None:
 
 def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
     from lidarops.figures.wording import decided_on
+    from lidarops.records import PlannedStep
 
     number = decided_on(entry.number)
     rule = f"[{entry.rule} {number}]" if number else f"[{entry.rule}]" if entry.rule else ""
     member = f"of {entry.instrument}" if entry.instrument else ""
-    reason = " ".join(filter(None, (entry.reason, rule)))
+    words = entry.words if isinstance(entry, PlannedStep) else entry.reason
+    reason = " ".join(filter(None, (words, rule)))
     return "; ".join(filter(None, (member, effect, reason, needs)))
 
 

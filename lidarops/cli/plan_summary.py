@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
 from lidarops.cli.app import say, wrapped
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _REQUEST: Final = "request"
 """Rule by which products are left out that the campaign does not request."""
+_READ: Final = "read"
+"""Step that is left out for channels of which nothing is made."""
 
 
 def scene_title(judged: Judgement) -> str:
@@ -61,9 +63,31 @@ def _say_steps(plan: Plan) -> None:
         (left.name, left.reason, left.channel) for left in missed
     ):
         _say(f"requested, but left out: {name} {channels}: {reason}", "  ")
-    others = dict.fromkeys(left.name for left in plan.left_out if left.name not in kinds())
+    for channels, reason in _unread(plan, {left.channel for left in missed}):
+        _say(f"without product: {channels}: {reason}", "  ")
+    warned = [step for step in plan.steps if step.warning]
+    for name, channels, warning in grouped(
+        (step.name, step.warning, step.channel) for step in warned
+    ):
+        _say(f"warning: {name} {channels}: {warning}", "  ")
+    shown = {*kinds(), _READ}
+    others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:
         _say(f"left out, of some channels: {', '.join(others)}", "  ")
+
+
+def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
+    """Yield channels that the campaign names and that are not read, with the reason.
+
+    Without those of which a product is shown as left out.
+    """
+    unread = (
+        left
+        for left in plan.left_out
+        if left.name == _READ and left.rule != _REQUEST and left.channel not in told
+    )
+    for _, channels, reason in grouped((left.name, left.reason, left.channel) for left in unread):
+        yield channels, reason
 
 
 def show_times(runs: Mapping[str, RunTime]) -> None:

@@ -115,7 +115,7 @@ def _history(context: Context, date: datetime) -> str:
     plan = context.provenance.plan
 
     channels = ("", context.channel)
-    done = [f"{step.name}: {step.reason}" for step in plan.steps if step.channel in channels]
+    done = [f"{step.name}: {step.words}" for step in plan.steps if step.channel in channels]
     omitted = [
         f"left out {omission.name}: {omission.reason}"
         for omission in plan.left_out

@@ -282,7 +282,8 @@ def _carried_out(scene: SceneOutcome) -> Iterator[PlannedStep]:
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
         idle = idle_window(step, steps)
-        yield replace(step, reason=f"{step.reason}; no effect: {idle}") if idle else step
+        reason = f"{step.words}; no effect: {idle}" if idle else step.words
+        yield replace(step, reason=reason)
 
 
 def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:

@@ -61,7 +61,7 @@ class ChannelCase:
         if isinstance(decision, Leave):
             return LeftOut(**common)
         settings = decision.settings.model_dump(mode="json", exclude_none=True)
-        return PlannedStep(settings=settings, **common)
+        return PlannedStep(settings=settings, warning=decision.warning, **common)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

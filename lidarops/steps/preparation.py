@@ -65,12 +65,13 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
             "the last tenth of the bins" if limits is None else "background_range of the campaign"
         )
         reason = f"mean of {where}; signal there biases it"
+        warning = ""
         if method == "cubic":
             # `test_the_cubic_doubts_weak_signals`
-            reason = (
-                f"cubic of a homogeneous section, {where}; other sections bias it, and all values"
-                " are marked as uncertain where the signal of the first bin of the section is less"
-                " than 30 times its noise, some up to 300 times"
+            reason = f"cubic of a homogeneous section, {where}; other sections bias it"
+            warning = (
+                "the cubic marks all values as uncertain where the signal of the first bin of its"
+                " section is less than 30 times its noise, and some up to 300 times"
             )
         elif method == "known_shape":
             reason = (
@@ -81,6 +82,7 @@ class Background(Step[ProductCase[BackgroundRequest], BackgroundSettings]):
             reason,
             BackgroundSettings(method=method, range=(start, stop)),
             number=(stop - start) / case.channel.bin_width,
+            warning=warning,
         )
 
     def carry_out(self, settings: BackgroundSettings, data: Data) -> None:

@@ -55,6 +55,8 @@ class Run:
     """Number on which the rule decided, where there is one."""
     rule: str = ""
     """Name of the rule that decided, if not that of the step."""
+    warning: str = ""
+    """Why its results may be of no use; `lidarops plan` prints it."""
 
 
 @dataclass(frozen=True, slots=True)

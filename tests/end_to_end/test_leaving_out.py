@@ -622,26 +622,3 @@ def test_omissions_lose_and_change_no_good_value(tmp_path):
     assert good > 1000
     read = [sum(scene.bytes_read for scene in record.scenes) for record in (planned_run, whole)]
     assert read[0] <= 0.5 * read[1]
-
-
-def test_the_plan_warns_that_the_cubic_rejects_weak_signals():
-    changes = with_products(homogeneous={**SECTIONS, "method": "cubic"})
-    reasons = {
-        method: next(step.reason for step in plan.steps if step.name == "homogeneous")
-        for method, plan in {"cubic": planned(LEVEL, **changes), "auto": planned(LEVEL)}.items()
-    }
-    assert "rejects all values" in reasons["cubic"]
-    assert "rejects" not in reasons["auto"]
-
-
-def test_the_plan_warns_that_the_cubic_of_a_signal_needs_light():
-    cubic = {"background": "cubic", "background_range": [750, 4500]}
-    reasons = {
-        method: next(step.reason for step in plan.steps if step.name == "background")
-        for method, plan in {
-            "cubic": planned(LEVEL, **with_products(signal=cubic)),
-            "tail": planned(LEVEL, **with_products(signal={})),
-        }.items()
-    }
-    assert "less than 30 times its noise" in reasons["cubic"]
-    assert "noise" not in reasons["tail"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -27,16 +28,19 @@ def planned(file: Path, *options: str, width: int = 80) -> list[str]:
     return _STYLE.sub("", shown.output).splitlines()
 
 
+def written(folder: Path, **changes: Any) -> Path:
+    """Return the file of a campaign of one scene; `changes` replace keys of its instrument."""
+    raw_archives.write(folder / "raw" / "coast" / "h00", raw_archives.content(0.0, bins=1000))
+    path = folder / "campaign.yaml"
+    settings = factories.campaign(**changes).model_dump(mode="json", exclude={"simulation"})
+    path.write_text(yaml.safe_dump(settings))
+    return path
+
+
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A campaign of one scene."""
-    folder = tmp_path_factory.mktemp("plan")
-    raw_archives.write(folder / "raw" / "coast" / "h00", raw_archives.content(0.0, bins=1000))
-    path = folder / "campaign.yaml"
-    path.write_text(
-        yaml.safe_dump(factories.campaign().model_dump(mode="json", exclude={"simulation"}))
-    )
-    return path
+    return written(tmp_path_factory.mktemp("plan"))
 
 
 def words(lines: list[str]) -> set[str]:
@@ -64,6 +68,36 @@ def test_all_shows_settings_and_reasons(campaign: Path) -> None:
     for expected in ("wavelength", "Left out", "[request]", "Estimated CPU time"):
         assert expected in text
         assert expected not in " ".join(planned(campaign, width=300))
+
+
+PATH = {"channels": ["photon_532o"], "sections": [[750, 4500]]}
+CUBIC = {"background": "cubic", "background_range": [750, 4500]}
+
+
+@pytest.mark.parametrize(
+    ("products", "warning"),
+    [
+        ({"homogeneous": {**PATH, "method": "cubic"}}, "warning: homogeneous photon_532o: the"),
+        ({"signal": {**CUBIC}}, "warning: background analog_532o, photon_532o: the"),
+        ({"homogeneous": PATH, "signal": {}}, ""),
+    ],
+)
+def test_the_cubic_is_warned_of_by_default(
+    tmp_path: Path, products: dict[str, Any], warning: str
+) -> None:
+    text = " ".join(planned(written(tmp_path, products=products), width=300))
+    assert ("less than 30 times its noise" in text) == bool(warning)
+    assert ("warning: " in text) == bool(warning)
+    assert warning in text
+
+
+def test_a_channel_without_a_plausible_wavelength_is_shown_with_the_reason(tmp_path: Path) -> None:
+    file = written(tmp_path, products={"signal": {}})
+    raw = tmp_path / "raw" / "coast" / "h00"
+    raw.write_bytes(raw.read_bytes().replace(b"00532.o", b"00001.o", 1))
+    text = " ".join(planned(file, width=300))
+    assert "without product: analog_1o: the wavelength" in text
+    assert "steps: read" in text
 
 
 def test_rows_become_paragraphs_where_columns_are_too_narrow(

@@ -175,11 +175,15 @@ _LOOK: Final = LookForSignal()
 _BACKGROUNDS: Final = {
     "known_background": "comes from the far range",
     "known_extinction": "is retrieved at the extinction of the campaign",
-    # `test_the_cubic_needs_a_strong_signal`
-    "cubic": "is that of the cubic, which rejects all values where the signal of the first bin of a"
-    " section is less than 30 times its noise, and some up to 300 times",
+    "cubic": "is that of the cubic",
 }
 """Where the background comes from, by method, unless from the section with extinction."""
+_WARNINGS: Final = {
+    # `test_the_cubic_needs_a_strong_signal`
+    "cubic": "the cubic rejects all values where the signal of the first bin of a section is less"
+    " than 30 times its noise, and some up to 300 times",
+}
+"""What `lidarops plan` warns of, by method."""
 
 
 class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
@@ -218,6 +222,7 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
                     visibility=definition and definition.resolved,
                 ),
                 number=float(len(level)),
+                warning=_WARNINGS.get(settings.method, ""),
             )
 
     def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:
