@@ -49,3 +49,5 @@ LIDAR_EQUATION_PAPER: Final = (
     "Vasylkivskyi, I. V. et al. (2009): Analysis of the equation of laser sensing of the atmosphere"
     " with lidar (in Ukrainian), Visnyk of Vinnytsia Polytechnic Institute."
 )
+KNOWN_SHAPE_PAPERS: Final = f"{LEAST_SQUARES_PAPER}\n{LIDAR_EQUATION_PAPER}"
+"""Of a background fitted with the shape of clean air, for the products in which that runs."""

@@ -145,10 +145,9 @@ def test_every_cited_key_is_an_entry_of_the_sources(repository: Path) -> None:
     ("kind", "papers"),
     [
         ("homogeneous", {constants.CUBIC_PAPER, constants.LEAST_SQUARES_PAPER}),
-        ("elastic", {constants.LEAST_SQUARES_PAPER, constants.LIDAR_EQUATION_PAPER}),
         ("visibility", {constants.MULTIPOSITION_PAPER}),
     ],
 )
 def test_products_cite_the_papers_that_they_use(kind: str, papers: set[str]) -> None:
-    """The cubic of `signal` and the scans of `mld` add theirs where they run."""
+    """The cubic, the known shape and the scans of `mld` add theirs where they run."""
     assert papers <= set(layout_of(kind).references)

@@ -14,6 +14,7 @@ from support.raman_signals import mean_over
 
 from lidarops.campaign.ancillary_files import lidar_ratio_profile
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.flags import Quality, rejecting
 from lidarops.kinds import flags_of
 from lidarops.records import RunRecord
@@ -116,6 +117,26 @@ def test_the_file_states_its_reference_and_the_source_of_the_air(night):
     np.testing.assert_allclose(altitude, 500.0 + product["reference_bottom"].values, rtol=1e-6)
     assert np.isfinite(altitude).all()
     assert product["reference_scattering_ratio"].item() >= 1.0
+
+
+@pytest.mark.parametrize("background", ["known_shape", "tail_mean"])
+def test_products_cite_the_papers_of_the_known_shape_where_it_runs(
+    repository, tmp_path, background
+):
+    campaign, _ = simulated(repository, tmp_path, "2024-09-20T21:00:00+00:00", 0.5)
+    (name, lidar), *_ = campaign.instruments.items()
+    requests = {
+        kind: getattr(lidar.products, kind).model_copy(update={"background": background})
+        for kind in ("elastic", "raman")
+    }
+    products = lidar.products.model_copy(update=requests)
+    changed = {name: lidar.model_copy(update={"products": products})}
+    campaign = campaign.model_copy(update={"instruments": changed})
+    record = reprocess(campaign)
+    for kind in requests:
+        cited = product_of(campaign, record, kind).attrs["references"]
+        assert (KNOWN_SHAPE_PAPERS in cited) == (background == "known_shape")
+        assert "Appl. Opt." in cited
 
 
 def test_water_vapour_needs_no_overlap(night):

@@ -12,6 +12,7 @@ import yaml
 from support.archives.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.flags import Quality
 from lidarops.reports.findings import disagreement_rows
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
@@ -76,8 +77,10 @@ def test_a_product_names_the_paper_and_the_steps_of_its_own_method(tmp_path):
     settings, _ = campaign(tmp_path, duration=1200)
     lidar = settings.instruments["scanner"]
     shown, variables = {}, {}
-    for method in ("mld", "two_angle", "joint"):
-        scan = lidar.products.multiangle.model_copy(update={"method": method})
+    backgrounds = {"mld": "known_shape", "two_angle": "tail_mean", "joint": "known_shape"}
+    for method, background in backgrounds.items():
+        changes = {"method": method, "background": background}
+        scan = lidar.products.multiangle.model_copy(update=changes)
         products = lidar.products.model_copy(update={"multiangle": scan})
         instruments = {"scanner": lidar.model_copy(update={"products": products})}
         again = settings.model_copy(
@@ -89,6 +92,9 @@ def test_a_product_names_the_paper_and_the_steps_of_its_own_method(tmp_path):
             shown[method] = product.attrs["references"], product.attrs["lidarops_steps"]
             variables[method] = set(product.variables)
     assert {method for method, (cited, _) in shown.items() if "Gobrusenko" in cited} == {"mld"}
+    for paper in KNOWN_SHAPE_PAPERS.splitlines():
+        of_shape = {method for method, (cited, _) in shown.items() if paper in cited}
+        assert of_shape == {"mld", "joint"}
     fitted = {m for m, (_, steps) in shown.items() if "left out horizontal_gradient" not in steps}
     assert fitted == {"joint"}
     assert {method for method, names in variables.items() if "regularisation" in names} == {"mld"}

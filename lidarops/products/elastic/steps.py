@@ -11,6 +11,7 @@ import xarray as xr
 from pydantic import model_validator
 
 from lidarops.campaign.model import channel_facts
+from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
@@ -248,6 +249,7 @@ class _Inversion(RowProduct):
     def _inverted(self, averages: xr.Dataset) -> xr.Dataset:
         data, settings = self._data, self._settings
         geometry, overlap = data.source.geometry, data.get(OVERLAP)
+        known_shape = data.get(KNOWN_SHAPE) is True
         pointing = {
             name: float(geometry[name][0])
             for name in ("zenith_angle", "azimuth")
@@ -261,10 +263,12 @@ class _Inversion(RowProduct):
             lidar_ratio=self._lidar_ratio,
             molecular_relative_error=settings.molecular_relative_error,
             reference=data[REFERENCE],
-            known_shape=data.get(KNOWN_SHAPE) is True,
+            known_shape=known_shape,
             overlap=None if overlap is None else overlap(averages["range"].to_numpy()),
             overlap_is_stated=data.get(FULL_OVERLAP_RANGE) is not None,
         )
+        if known_shape:
+            inverted = inverted.assign_attrs(references=KNOWN_SHAPE_PAPERS)
         least = settings.least_signal_to_noise
         return with_low_signal_to_noise(inverted, LAYOUT.weighed, least).assign(
             **gluing(averages),

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
-from lidarops.constants import LEAST_SQUARES_PAPER, LIDAR_EQUATION_PAPER
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -124,8 +123,6 @@ LAYOUT: Final = Layout(
         "Klett, J. D. (1981), Appl. Opt. 20, 211-220, doi:10.1364/AO.20.000211.",
         "Fernald, F. G. (1984), Appl. Opt. 23, 652-653, doi:10.1364/AO.23.000652.",
         "Sasano, Y. et al. (1985), Appl. Opt. 24, 3929-3932, doi:10.1364/AO.24.003929.",
-        LEAST_SQUARES_PAPER,
-        LIDAR_EQUATION_PAPER,
     ),
     comment="aerosol_extinction is aerosol_backscatter times the assumed lidar ratio, not an"
     " independent measurement. Profiles are means over time; range is along the beam. Particles in"

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.constants import MULTIANGLE_PAPER
+from lidarops.constants import KNOWN_SHAPE_PAPERS, MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
 from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.multiangle.baseline import BASELINE, Baseline, with_baseline
@@ -349,6 +349,7 @@ class _Scans(WholeProduct):
         self._profiles = profiles = data[PROFILES]
         self._geometry = geometry = data.source.geometry
         self._baseline, overlap = data.get(BASELINE), data.get(OVERLAP)
+        self._known_shape = data[BACKGROUND].method == "known_shape"
         self._cycles = AltitudeCycles(
             profiles.range,
             zenith_angle=geometry["zenith_angle"].to_numpy(),
@@ -358,7 +359,7 @@ class _Scans(WholeProduct):
             altitude_grid=self._station + altitude_steps(settings.step, settings.highest),
             station_altitude=self._station,
             background_range=data[BACKGROUND].range,
-            molecules=data[MOLECULES] if data[BACKGROUND].method == "known_shape" else None,
+            molecules=data[MOLECULES] if self._known_shape else None,
             wavelength=data[WAVELENGTH],
             overlap=None if overlap is None else overlap(profiles.range),
             baseline=self._baseline,
@@ -387,12 +388,19 @@ class _Scans(WholeProduct):
             retrieval_method=LAYOUT.row("retrieval_method").code(optical_depth.attrs["method"]),
             background_method=BACKGROUND_METHOD.code(self._background_method),
         )
-        if settings.method in _DIFFERENTIATING:
-            optical_depth = optical_depth.assign_attrs(references=MULTIANGLE_PAPER)
+        papers = self._papers()
+        if papers:
+            optical_depth = optical_depth.assign_attrs(references="\n".join(papers))
         if self._baseline is not None:
             optical_depth = with_baseline(optical_depth, self._baseline, self._geometry)
         least = settings.least_signal_to_noise
         return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
+
+    def _papers(self) -> list[str]:
+        """Return the papers of what runs, beside those of all methods."""
+        differentiates = self._settings.method in _DIFFERENTIATING
+        of_method = [MULTIANGLE_PAPER] if differentiates else []
+        return of_method + ([KNOWN_SHAPE_PAPERS] if self._known_shape else [])
 
 
 STEP: Final = MultiAngle()

@@ -10,6 +10,7 @@ from typing import Final, cast
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
+from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.raman.settings import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
@@ -291,6 +292,8 @@ class _Retrieval(RowProduct):
             water=None if water is None else self._water(water),
             overlap=None if overlap is None else overlap(elastic["range"].to_numpy()),
         )
+        if settings.known_shape:
+            retrieved = retrieved.assign_attrs(references=KNOWN_SHAPE_PAPERS)
         flagged = with_low_signal_to_noise(
             retrieved, LAYOUT.weighed, settings.least_signal_to_noise
         )
