@@ -260,8 +260,17 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
         bounds = np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]")
         start, stop = (_datetime(moment) for moment in (bounds[0, 0], bounds[-1, 1]))
         lineage = Lineage(tuple(year.inputs.values()), period, weights, start, stop)
+        first, last = (_datetime(pair[0] + (pair[1] - pair[0]) // 2) for pair in bounds[[0, -1]])
         about = MeansDescription(
-            lineage.id, period, weights, start, stop, len(year.inputs), means_version(group.kind)
+            lineage.id,
+            period,
+            weights,
+            start,
+            stop,
+            first,
+            last,
+            len(year.inputs),
+            means_version(group.kind),
         )
         periods = Periods(bounds.astype(np.float64), year.records)
         dataset = encode_means(frame, periods, year.shared or {}, about, means_provenance(lineage))

@@ -155,7 +155,9 @@ def layout(kind: str, period: Period, weights: Weights) -> Layout:
         comment=f"Means over UTC {period.value}s: {weights.description}. Values that a quality"
         " bit rejects, and values that are missing or have no standard error, are left out."
         " A profile belongs to the period that contains its middle. The bounds of a period are"
-        f" those of the {period.value}, even if only part of it was measured. Comment of the"
+        f" those of the {period.value}, even if only part of it was measured."
+        " time_coverage_start and time_coverage_end are the first and the last time;"
+        " time_coverage_duration is that from the first to the last bound. Comment of the"
         f" products: {source.comment}",
         coordinates=tuple(time if row.name == "time" else row for row in source.coordinates),
         data=tuple(_rows(source, kind, weights)),
@@ -307,8 +309,9 @@ def global_attributes(
         f" weights {about.weights.value} [{program}]",
         "comment": f"{_replaced(comment, source.comment, table.comment)} Dates of creation and"
         f" change are {why}, so that equal inputs give equal files.",
-        "time_coverage_start": _iso(about.start),
-        "time_coverage_end": _iso(about.stop),
+        # As ACDD has it: the times of the first and last value, which are middles of periods.
+        "time_coverage_start": _iso(about.first),
+        "time_coverage_end": _iso(about.last),
         "time_coverage_duration": f"P{(about.stop - about.start).days}D",
         "time_coverage_resolution": about.period.duration,
         **dict.fromkeys(dates, stamp),
@@ -333,6 +336,10 @@ class MeansDescription:
     start: datetime
     """Start of the first period."""
     stop: datetime
+    first: datetime
+    """Middle of the first period."""
+    last: datetime
+    """Middle of the last period."""
     inputs: int
     """Number of products."""
     code_version: str

@@ -559,7 +559,7 @@ _STATION = Row(
     dims=("station_strlen",),
     dtype="S1",
     standard_name="platform_name",
-    long_name="name of the station",
+    long_name="name of the station, or of the network of lidars",
     coverage=Coverage.REFERENCE,
 )
 QUANTIZATION: Final = Row(
