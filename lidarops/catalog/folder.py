@@ -51,6 +51,8 @@ class FileGroup:
     """Number of files that state no zenith angle, or a doubtful one."""
     doubts: tuple[str, ...]
     """Why pointings are doubtful, in words."""
+    notes: tuple[str, ...]
+    """Oddities of the headers, in words."""
 
     @property
     def pattern(self) -> str:
@@ -249,6 +251,7 @@ def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
         azimuths=tuple(sorted({h.azimuth for h in known if h.azimuth is not None})),
         without_zenith=len(headers) - len(angles),
         doubts=tuple(sorted({header.doubt for header in headers if header.doubt})),
+        notes=tuple(sorted({note for header in headers for note in header.notes})),
     )
 
 

@@ -31,6 +31,8 @@ _ALTITUDES: Final = (-500.0, 9000.0)
 """m; those that a station of a campaign may have."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
+_POINTING: Final = "zenith angle"
+"""Words of the notes on headers that tell how their pointing is read."""
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
 
@@ -209,7 +211,9 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
             f" headers, over {len(sides) or 'no known'} azimuths"
         )
     else:
-        yield f"zenith_angle: {abs(angles[0]):g}  # ? degree, {angles[0]:g} in all headers"
+        notes = {note for group in headers.signal for note in group.notes if _POINTING in note}
+        taken = f" ({'; '.join(sorted(notes))})" if notes else ""
+        yield f"zenith_angle: {abs(angles[0]):g}  # ? degree, {angles[0]:g} by all headers{taken}"
     if angles and headers.without_zenith:
         doubts = [doubt for group in headers.signal for doubt in group.doubts]
         yield f"# ? {headers.without_zenith} files state no sure pointing and are refused"

@@ -47,6 +47,17 @@ def raw(tmp_path: Path) -> Path:
     return raw
 
 
+@pytest.mark.parametrize(("written", "stated"), [(-90.0, True), (0.0, False)])
+def test_an_angle_that_stands_for_another_is_stated_as_written(
+    tmp_path: Path, written: float, stated: bool
+) -> None:
+    write(tmp_path / "raw/h26", content(zenith_angle=written))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (line,) = (line for line in text.splitlines() if "zenith_angle: 0 " in line)
+    assert ("zenith angle -90 taken as vertical" in line) == stated
+    assert campaign.instruments["coast-lidar"].facts[0].zenith_angle == 0.0
+
+
 def test_every_good_file_gets_its_instrument_and_role(raw: Path, tmp_path: Path) -> None:
     campaign, text = drafted(raw, tmp_path / "campaign.yaml")
     known = granules(campaign)
