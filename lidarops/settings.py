@@ -225,11 +225,28 @@ def signal_to_noise_limit() -> Any:
     )
 
 
+def background_method() -> Any:
+    """Return the field ``background`` of a kind of product that knows the shape of its signal."""
+    return Field(
+        default="known_shape",
+        description="known_shape fits background and a signal of clean air to the far range;"
+        " tail_mean is the mean of the last tenth of the bins",
+    )
+
+
+def average_interval() -> Any:
+    """Return the field ``average`` of a kind of product of vertical profiles."""
+    return Field(
+        default=timedelta(minutes=30), description="interval over which signals are averaged"
+    )
+
+
 class ChannelProduct(SettingsModel):
     """Base of the settings of a kind of product that is made of one channel."""
 
-    channels: list[str] | Literal["all"]
-    """Names of channels; ``all`` means every channel of the files, without glued ones."""
+    channels: list[str] | Literal["all"] = Field(
+        description="names of channels; all means every channel of the files, without glued ones"
+    )
 
     @property
     def named(self) -> list[str]:
@@ -269,7 +286,9 @@ class VisibilitySettings(SettingsModel):
         description="conversion of extinction from the wavelength of the lidar to 550 nm; none"
         " keeps the wavelength of the lidar",
     )
-    angstrom_exponent: float | None = quantity(None, unit="1", ge=-1, le=5)
+    angstrom_exponent: float | None = quantity(
+        None, unit="1", ge=-1, le=5, description="of extinction, for law: angstrom"
+    )
     exponent_standard_error: float = quantity(
         0.0, unit="1", ge=0, le=5, description="standard error of the exponent of the law"
     )
@@ -296,10 +315,20 @@ class VisibilitySettings(SettingsModel):
 class ReferenceSettings(SettingsModel):
     """Limits of the reference window, and the scattering ratio there."""
 
-    lowest: Metres = quantity(3000.0, unit="m", description="above the station")
-    highest: Metres = quantity(12_000.0, unit="m", description="above the station")
-    width: float = quantity(1000.0, unit="m", ge=100, le=20_000)
-    scattering_ratio: float = quantity(1.0, unit="1", ge=1, le=10)
+    lowest: Metres = quantity(
+        3000.0, unit="m", description="least height of the window above the station"
+    )
+    highest: Metres = quantity(
+        12_000.0, unit="m", description="largest height of the window above the station"
+    )
+    width: float = quantity(1000.0, unit="m", ge=100, le=20_000, description="of the window")
+    scattering_ratio: float = quantity(
+        1.0,
+        unit="1",
+        ge=1,
+        le=10,
+        description="backscatter of all over that of molecules in the window; 1 for clean air",
+    )
     relative_error: float = quantity(
         0.02, unit="1", ge=0, le=1, description="standard error of the scattering ratio, relative"
     )

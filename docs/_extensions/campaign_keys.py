@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from datetime import timedelta
 from typing import Any, Final
 
+from pydantic import TypeAdapter
 from tables import first_paragraph, table
 
 from lidarops.campaign.model import campaign_schema
@@ -16,16 +19,16 @@ _BOUNDS: Final = {
     "exclusiveMinimum": "> {}",
     "maximum": "≤ {}",
     "exclusiveMaximum": "< {}",
-    "minLength": "at least {} characters",
     "minItems": "at least {}",
     "maxItems": "at most {}",
 }
 _TYPES: Final = {
     "boolean": "true or false",
     "integer": "whole number",
-    "null": "none",
     "string": "text",
 }
+_DURATION: Final = re.compile(r"PT?\d")
+_TIMEDELTA: Final = TypeAdapter(timedelta)
 _LONGEST_DEFAULT: Final = 60
 """Characters; a longer default is that of the mapping that the key names."""
 
@@ -80,25 +83,46 @@ def _keys(section: dict[str, Any]) -> Iterator[str]:
                 f"`{key}`",
                 _value(field),
                 "required" if key in required else _default(field),
-                str(field.get("description", "")).replace("\n", " "),
+                _meaning(field),
             )
             for key, field in section["properties"].items()
         ],
     )
 
 
+def _meaning(field: dict[str, Any]) -> str:
+    """Return what a key means: its own description, or that of the one section it leads to."""
+    unit = f"[{field.get('unit')}]"
+    # The value states the unit.
+    if text := str(field.get("description", "")).removesuffix(unit).strip():
+        return text
+    names = set(_references(field))
+    definition = campaign_schema()["$defs"][names.pop()] if len(names) == 1 else {}
+    text = first_paragraph(definition.get("description")).rstrip(".")
+    return text[:1].lower() + text[1:]
+
+
 def _default(field: dict[str, Any]) -> str:
     value = field.get("default")
+    if isinstance(value, str) and _DURATION.match(value):
+        value = _interval(_TIMEDELTA.validate_python(value))
     text = json.dumps(value, ensure_ascii=False)
     if value in (None, "", [], {}) or isinstance(value, dict) or len(text) > _LONGEST_DEFAULT:
         return ""
     return f"`{text}`" if isinstance(value, list) else f"`{text.strip(chr(34))}`"
 
 
+def _interval(duration: timedelta) -> str:
+    """Return an interval as campaign files write it, in the largest unit that divides it."""
+    seconds = round(duration.total_seconds())
+    units = {"d": 86400, "h": 3600, "min": 60, "s": 1}
+    return next(f"{seconds // size}{unit}" for unit, size in units.items() if seconds % size == 0)
+
+
 def _value(field: dict[str, Any]) -> str:
     if "$ref" in field:
         definition = campaign_schema()["$defs"][_name(field)]
-        linked = f"[{_name(field)}](#{_name(field).lower()})"
+        linked = f"[{_name(field)}](#{_name(field).lower()}){_unit(field)}"
         return linked if "properties" in definition else _value(definition)
     if "enum" in field or "const" in field:
         return ", ".join(f"`{value}`" for value in field.get("enum", [field.get("const")]))
@@ -126,9 +150,13 @@ def _mapping(field: dict[str, Any]) -> str:
 def _plain(field: dict[str, Any]) -> str:
     kind = field.get("type", "")
     text = str(field.get("words") or _TYPES.get(kind, kind))
-    unit = field.get("unit")
-    shown = f"{text} in {unit}" if unit and unit != "1" and kind == "number" else text
+    shown = text + _unit(field) if kind in {"number", "integer"} else text
     return ", ".join([shown, *_bounds(field)])
+
+
+def _unit(field: dict[str, Any]) -> str:
+    unit = field.get("unit")
+    return f" in {unit}" if unit and unit != "1" else ""
 
 
 def _bounds(field: dict[str, Any]) -> list[str]:

@@ -68,7 +68,7 @@ CATALOG_VARIABLE = "LIDAROPS_CATALOG"
 class Station(SettingsModel):
     """A site of instruments."""
 
-    name: str
+    name: str = Field(description="in words, for products and pages")
     latitude: float = quantity(unit="degree", ge=-90, le=90, description="north")
     longitude: float = quantity(unit="degree", ge=-180, le=180, description="east")
     altitude: float = quantity(0.0, unit="m", ge=-500, le=9000, description="above the geoid")
@@ -130,7 +130,9 @@ class ChannelFacts(SettingsModel):
         description="of particles, instead of that of elastic; for a glued channel, that of its"
         " photon-counting channel",
     )
-    lidar_ratio_standard_error: float | None = quantity(None, unit="sr", ge=0, le=100)
+    lidar_ratio_standard_error: float | None = quantity(
+        None, unit="sr", ge=0, le=100, description="of lidar_ratio, instead of that of elastic"
+    )
     lidar_ratio_profile: Inside | None = Field(
         default=None,
         description="in place of both: CSV or NetCDF file of altitude (m above mean sea level),"
@@ -152,10 +154,26 @@ class ChannelFacts(SettingsModel):
 class InstrumentFacts(SettingsModel):
     """Facts about an instrument in a validity period."""
 
-    valid_from: Instant = datetime.min.replace(tzinfo=UTC)
-    valid_to: Instant = datetime.max.replace(tzinfo=UTC)
-    zenith_angle: float | None = quantity(None, unit="degree", ge=0, le=180)
-    azimuth: float | None = quantity(None, unit="degree", ge=0, lt=360)
+    valid_from: Instant = Field(
+        default=datetime.min.replace(tzinfo=UTC), description="first time to which the facts apply"
+    )
+    valid_to: Instant = Field(
+        default=datetime.max.replace(tzinfo=UTC), description="end of the period, not included"
+    )
+    zenith_angle: float | None = quantity(
+        None,
+        unit="degree",
+        ge=0,
+        le=180,
+        description="of the beam, 0 upwards, 90 horizontal; by default that of the headers",
+    )
+    azimuth: float | None = quantity(
+        None,
+        unit="degree",
+        ge=0,
+        lt=360,
+        description="of the beam, clockwise from north; by default that of the headers",
+    )
     clock_offset: float = quantity(
         0.0,
         unit="s",
@@ -163,7 +181,12 @@ class InstrumentFacts(SettingsModel):
         le=86400,
         description="clock of the raw files minus UTC; -18000 for files in the time of UTC-5",
     )
-    full_overlap_range: Metres = quantity(0.0, unit="m")
+    full_overlap_range: Metres = quantity(
+        0.0,
+        unit="m",
+        description="range from which the telescope receives the whole beam; nearer values are"
+        " flagged or left out",
+    )
     overlap_profile: Inside | None = Field(
         default=None,
         description="CSV or NetCDF file of range (m) and overlap (0 to 1), or a product raman,"
@@ -174,7 +197,9 @@ class InstrumentFacts(SettingsModel):
         description="CSV or NetCDF file of altitude (m), pressure (Pa or hPa), temperature (K); its"
         " path is relative to the campaign file",
     )
-    channels: dict[str, ChannelFacts] = Field(default={})
+    channels: dict[str, ChannelFacts] = Field(
+        default={}, description="facts about channels, by their names such as photon_532o"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -231,22 +256,36 @@ else:
 class Instrument(SettingsModel):
     """A lidar: its station, its files, the facts about it and its requested products."""
 
-    station: Identifier
-    name: str = ""
-    files: Patterns
-    dark_files: Patterns = Field(default=[])
+    station: Identifier = Field(description="key of one of stations")
+    name: str = Field(default="", description="in words, for products and pages")
+    files: Patterns = Field(
+        description="patterns of the raw files below archive; ** crosses folders"
+    )
+    dark_files: Patterns = Field(
+        default=[], description="patterns of the files with a covered telescope"
+    )
     header_position: Literal["longitude_first", "latitude_first", "ignore"] = Field(
         default="longitude_first",
         description="order of the coordinates in headers; with ignore, a header may state any"
         " position and altitude",
     )
     position_tolerance: float = quantity(
-        0.5, unit="degree", ge=0, le=180, description="of headers that differ from the station"
+        0.5,
+        unit="degree",
+        ge=0,
+        le=180,
+        description="largest difference between headers and station in latitude and longitude",
     )
     altitude_tolerance: float = quantity(
-        100.0, unit="m", ge=0, le=1e4, description="of headers that differ from the station"
+        100.0,
+        unit="m",
+        ge=0,
+        le=1e4,
+        description="largest difference between headers and station in altitude",
     )
-    facts: list[InstrumentFacts] = Field(default=[InstrumentFacts()])
+    facts: list[InstrumentFacts] = Field(
+        default=[InstrumentFacts()], description="about the instrument, one entry for each period"
+    )
     products: Products = Products()
 
     @model_validator(mode="after")
@@ -271,8 +310,10 @@ class NetworkMembers(SettingsModel):
     `Network` has a field for every kind of product of a network.
     """
 
-    name: str = ""
-    instruments: list[Identifier] = Field(min_length=2)
+    name: str = Field(default="", description="in words, for products and pages")
+    instruments: list[Identifier] = Field(
+        min_length=2, description="keys of the instruments whose beams cross"
+    )
 
     @model_validator(mode="after")
     def _fitting_instruments(self) -> Self:
@@ -317,21 +358,32 @@ class Metadata(SettingsModel):
     Products lack the attributes of what is not given.
     """
 
-    institution: str = ""
-    project: str = ""
-    creator_name: str = ""
-    creator_email: str = ""
-    creator_url: str = ""
-    principal_investigator: str = ""
-    publisher_name: str = ""
-    publisher_email: str = ""
-    publisher_url: str = ""
-    naming_authority: str = ""
-    license: str = ""
-    acknowledgement: str = ""
-    references: str = ""
-    comment: str = ""
-    program: str = ""
+    institution: str = Field(default="", description="of the creator")
+    project: str = Field(default="", description="in which the data were taken")
+    creator_name: str = Field(default="", description="who made the data")
+    creator_email: str = Field(default="", description="address of the creator")
+    creator_url: str = Field(default="", description="page of the creator")
+    principal_investigator: str = Field(default="", description="who leads the measurements")
+    publisher_name: str = Field(
+        default="",
+        description="who distributes the data; by default the creator",
+    )
+    publisher_email: str = Field(
+        default="", description="address of the publisher; by default that of the creator"
+    )
+    publisher_url: str = Field(
+        default="", description="page of the publisher; by default that of the creator"
+    )
+    naming_authority: str = Field(
+        default="", description="who makes the id of a product unique, such as int.example.lidar"
+    )
+    license: str = Field(default="", description="terms of use, as a name or an address")
+    acknowledgement: str = Field(default="", description="whom users are to thank")
+    references: str = Field(default="", description="papers about the data, besides the methods")
+    comment: str = Field(default="", description="what else users are to know")
+    program: str = Field(
+        default="", description="programme of the project; by default the project itself"
+    )
 
     @property
     def lacking(self) -> tuple[str, ...]:
@@ -346,7 +398,9 @@ class Metadata(SettingsModel):
 class Scenes(SettingsModel):
     """How granules are grouped into scenes."""
 
-    window: Literal["day"] | Interval = "day"
+    window: Literal["day"] | Interval = Field(
+        default="day", description="length of a scene, which divides a day; at least 1 min"
+    )
 
     @model_validator(mode="after")
     def _divides_day(self) -> Self:
@@ -360,7 +414,7 @@ class Scenes(SettingsModel):
 class CampaignPeriod(SettingsModel):
     """A period of a campaign."""
 
-    since: Instant
+    since: Instant = Field(description="start")
     until: Instant = Field(description="end, not included")
     frozen: bool = Field(
         default=False,
@@ -377,18 +431,28 @@ class CampaignPeriod(SettingsModel):
 class Campaign(SettingsModel):
     """One campaign: stations, instruments, networks, raw files and requested products."""
 
-    name: Identifier
-    title: str
-    summary: str = ""
+    name: Identifier = Field(description="of the campaign, in products and the ledger")
+    title: str = Field(description="of the campaign, in a line")
+    summary: str = Field(default="", description="what was measured, in some sentences")
     archive: str = Field(description="folder of the raw files, relative to the campaign file")
     output: str = Field(description="folder of catalog, products and reports")
     metadata: Metadata = Metadata()
-    stations: dict[Identifier, Station] = Field(min_length=1)
-    instruments: dict[Identifier, Instrument] = Field(min_length=1)
-    networks: dict[Identifier, Network] = Field(default={})
+    stations: dict[Identifier, Station] = Field(
+        min_length=1, description="sites of the instruments, by a key of your choice"
+    )
+    instruments: dict[Identifier, Instrument] = Field(
+        min_length=1, description="lidars, by a key of your choice"
+    )
+    networks: dict[Identifier, Network] = Field(
+        default={}, description="instruments whose beams cross, by a key of your choice"
+    )
     scenes: Scenes = Scenes()
-    periods: list[CampaignPeriod] = Field(default=[])
-    simulation: SimulationSettings | None = None
+    periods: list[CampaignPeriod] = Field(
+        default=[], description="periods whose products can be frozen"
+    )
+    simulation: SimulationSettings | None = Field(
+        default=None, description="what lidarops simulate makes the raw files of"
+    )
     catalog: str | None = Field(
         default=None,
         description="SQLAlchemy URL of catalog and ledger; by default a file in the output folder",

@@ -26,7 +26,9 @@ from lidarops.settings import SettingsModel, quantity
 class Aerosol(SettingsModel):
     """Optical properties of an aerosol type."""
 
-    lidar_ratio: float = quantity(50.0, unit="sr", ge=5, le=150)
+    lidar_ratio: float = quantity(
+        50.0, unit="sr", ge=5, le=150, description="extinction over backscatter"
+    )
     angstrom_exponent: float = quantity(1.3, unit="1", ge=-1, le=4, description="of extinction")
 
 
@@ -40,13 +42,19 @@ class BoundaryLayer(SettingsModel):
         unit="m",
         description="above the ground",
     )
-    entrainment_depth: float = quantity(100.0, unit="m", gt=0, le=2000)
+    entrainment_depth: float = quantity(
+        100.0,
+        unit="m",
+        gt=0,
+        le=2000,
+        description="scale of the gradual decrease at the top",
+    )
 
 
 class Layer(Period):
     """Elevated layer of Gaussian shape that exists for a period."""
 
-    name: str
+    name: str = Field(description="your word for the layer")
     aerosol: Aerosol = Aerosol()
     extinction: float = quantity(unit="m-1", gt=0, le=1.0, description="at 532 nm at the centre")
     height: float = quantity(
@@ -60,7 +68,7 @@ class Layer(Period):
 class Cloud(Period):
     """Layer of constant extinction between a sharp base and top that exists for a period."""
 
-    name: str = "cloud"
+    name: str = Field(default="cloud", description="your word for the cloud")
     extinction: float = quantity(
         unit="m-1", gt=0, le=1.0, description="the same at every wavelength"
     )
@@ -100,8 +108,12 @@ class Plume(SettingsModel):
     height: NotNegative = quantity(0.0, unit="m", description="above the ground, of the centre")
     horizontal_depth: Length = quantity(unit="m", description="standard deviation")
     vertical_depth: Length = quantity(unit="m", description="standard deviation")
-    wind_east: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
-    wind_north: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
+    wind_east: float = quantity(
+        0.0, unit="m s-1", ge=-100, le=100, description="wind towards the east"
+    )
+    wind_north: float = quantity(
+        0.0, unit="m s-1", ge=-100, le=100, description="wind towards the north"
+    )
 
 
 class Turbulence(SettingsModel):
@@ -112,8 +124,12 @@ class Turbulence(SettingsModel):
     )
     horizontal_length: Length = quantity(unit="m", description="correlation length")
     vertical_length: Length = quantity(unit="m", description="correlation length")
-    wind_east: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
-    wind_north: float = quantity(0.0, unit="m s-1", ge=-100, le=100)
+    wind_east: float = quantity(
+        0.0, unit="m s-1", ge=-100, le=100, description="wind towards the east"
+    )
+    wind_north: float = quantity(
+        0.0, unit="m s-1", ge=-100, le=100, description="wind towards the north"
+    )
 
 
 class Profile(SettingsModel):
@@ -140,8 +156,8 @@ class Sounding(SettingsModel):
     altitude: list[float] = quantity(
         unit="m", min_length=2, description="above mean sea level, ascending"
     )
-    pressure: list[float] = quantity(unit="Pa", min_length=2)
-    temperature: list[float] = quantity(unit="K", min_length=2)
+    pressure: list[float] = quantity(unit="Pa", min_length=2, description="at the altitudes")
+    temperature: list[float] = quantity(unit="K", min_length=2, description="at the altitudes")
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

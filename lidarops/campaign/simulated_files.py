@@ -103,7 +103,7 @@ _HANDLING = {
 class Damage(SettingsModel):
     """Damage of one file."""
 
-    kind: DamageKind
+    kind: DamageKind = Field(description="what is wrong with the file")
     index: int = quantity(
         unit="1", ge=0, description="index of the signal file of the instrument, from 0"
     )
@@ -113,7 +113,9 @@ class RandomDamage(SettingsModel):
     """Damage of files that the seed of the simulation selects."""
 
     fraction: float = quantity(unit="1", gt=0, le=1, description="share of the signal files")
-    kinds: list[DamageKind] = Field(min_length=1)
+    kinds: list[DamageKind] = Field(
+        min_length=1, description="what can be wrong, drawn with equal chances"
+    )
 
 
 class Pointing(SettingsModel):
@@ -166,10 +168,16 @@ class ClockJump(SettingsModel):
 class Change(SettingsModel):
     """From a given time on, files have other bins or shots."""
 
-    at: Instant
-    bins: int | None = quantity(None, unit="1", ge=16, le=16_384)
-    bin_width: BinWidth | None = quantity(None, unit="m")
-    shots: int | None = quantity(None, unit="1", ge=1, le=999_999)
+    at: Instant = Field(description="when the change happens")
+    bins: int | None = quantity(
+        None, unit="1", ge=16, le=16_384, description="range bins; by default as before"
+    )
+    bin_width: BinWidth | None = quantity(
+        None, unit="m", description="length of a bin; by default as before"
+    )
+    shots: int | None = quantity(
+        None, unit="1", ge=1, le=999_999, description="laser shots in a file; by default as before"
+    )
 
 
 class Acquisition(SettingsModel):
@@ -177,9 +185,11 @@ class Acquisition(SettingsModel):
 
     interval: float = quantity(300.0, unit="s", ge=1, le=86400, description="from start to start")
     shots: int = quantity(600, unit="1", ge=1, le=999_999, description="laser shots in a file")
-    repetition_rate: float = quantity(10.0, unit="Hz", gt=0, le=10_000)
-    bins: int = quantity(2000, unit="1", ge=16, le=16_384)
-    bin_width: BinWidth = quantity(7.5, unit="m")
+    repetition_rate: float = quantity(
+        10.0, unit="Hz", gt=0, le=10_000, description="laser shots per second"
+    )
+    bins: int = quantity(2000, unit="1", ge=16, le=16_384, description="range bins of a profile")
+    bin_width: BinWidth = quantity(7.5, unit="m", description="length of a bin")
     dark_files: int = quantity(
         0,
         unit="1",

@@ -38,8 +38,10 @@ class AnalogRecorder(SettingsModel):
     dark_drift: float = quantity(
         0.0, unit="mV h-1", ge=-100, le=100, description="drift of the dark offset"
     )
-    adc_range: float = quantity(500.0, unit="mV", ge=1, le=10_000, description="at full scale")
-    adc_bits: int = quantity(12, unit="1", ge=8, le=16)
+    adc_range: float = quantity(
+        500.0, unit="mV", ge=1, le=10_000, description="signal at full scale"
+    )
+    adc_bits: int = quantity(12, unit="1", ge=8, le=16, description="of the digitiser")
 
     @property
     def step(self) -> float:
@@ -101,7 +103,7 @@ class Optics(SettingsModel):
 class RamanLines(SettingsModel):
     """Vibrational Raman lines that a detector receives, instead of elastic light."""
 
-    gas: Literal["nitrogen", "water_vapour"]
+    gas: Literal["nitrogen", "water_vapour"] = Field(description="that scatters the light")
     laser: int = quantity(unit="nm", ge=200, le=3000, description="wavelength of the laser")
     surface_mixing_ratio: float = quantity(
         0.01, unit="kg kg-1", gt=0, le=0.05, description="of water vapour at the origin"
@@ -115,8 +117,12 @@ class Detector(SettingsModel):
     """Detector of one wavelength with an analog recorder, a photon counter or both."""
 
     wavelength: int = quantity(unit="nm", ge=200, le=3000, description="as in the headers")
-    polarisation: Literal["o", "p", "s"] = "o"
-    high_voltage: int = quantity(800, unit="V", ge=0, le=9999)
+    polarisation: Literal["o", "p", "s"] = Field(
+        default="o", description="as in the headers: o none, p parallel, s perpendicular"
+    )
+    high_voltage: int = quantity(
+        800, unit="V", ge=0, le=9999, description="of the photomultiplier, as in the headers"
+    )
     signal_rate: float | None = quantity(
         None,
         unit="MHz",
@@ -181,7 +187,9 @@ class LaserDrift(SettingsModel):
 class Pulse(SettingsModel):
     """Shape of the laser pulse in time; time zero is its centroid."""
 
-    shape: Literal["rectangle", "gaussian", "exponential"] = "gaussian"
+    shape: Literal["rectangle", "gaussian", "exponential"] = Field(
+        default="gaussian", description="course of the power"
+    )
     width: float = quantity(
         unit="s", gt=0, le=1e-5, description="full width at half maximum; decay time of exponential"
     )

@@ -77,10 +77,14 @@ _DAMAGE_OF_OUTPUT = {
 
 class _Instrument(SettingsModel):
     acquisition: Acquisition = Acquisition()
-    detectors: list[Detector] = Field(min_length=1)
-    damage: tuple[Damage, ...] = ()
+    detectors: list[Detector] = Field(
+        min_length=1, description="one for each wavelength and polarisation"
+    )
+    damage: tuple[Damage, ...] = Field(default=(), description="files to damage, by their index")
     random_damage: RandomDamage | None = None
-    pulse: Pulse | None = None
+    pulse: Pulse | None = Field(
+        default=None, description="shape of the laser pulse in time; by default infinitely short"
+    )
     laser: LaserDrift = LaserDrift()
 
     @model_validator(mode="after")
@@ -145,9 +149,9 @@ class _Instrument(SettingsModel):
 class HorizontalPath(_Instrument):
     """Lidar on a homogeneous path."""
 
-    kind: Literal["horizontal"]
+    kind: Literal["horizontal"] = Field(description="a homogeneous path")
     aerosol: Aerosol = Aerosol()
-    aerosol_extinction: DiurnalCourse = quantity(unit="m-1", description="at 532 nm")
+    aerosol_extinction: DiurnalCourse = quantity(unit="m-1", description="of aerosol, at 532 nm")
 
     @property
     def air(self) -> AtmosphereSettings:
@@ -178,9 +182,9 @@ class HorizontalPath(_Instrument):
 class VerticalColumn(_Instrument):
     """Vertical lidar below a layered atmosphere."""
 
-    kind: Literal["vertical"]
+    kind: Literal["vertical"] = Field(description="a vertical beam in layered air")
     boundary_layer: BoundaryLayer = BoundaryLayer()
-    layers: tuple[Layer, ...] = ()
+    layers: tuple[Layer, ...] = Field(default=(), description="elevated layers")
 
     @property
     def air(self) -> AtmosphereSettings:
@@ -191,7 +195,7 @@ class VerticalColumn(_Instrument):
 class Lidar(_Instrument):
     """Lidar with any pointing, in its own atmosphere or in the shared one."""
 
-    kind: Literal["lidar"]
+    kind: Literal["lidar"] = Field(description="any pointing, in any air")
     atmosphere: AtmosphereSettings | None = Field(
         default=None, description="its own atmosphere; by default that of the simulation"
     )
@@ -238,9 +242,11 @@ class TruthSettings(SettingsModel):
 class SimulationSettings(SettingsModel):
     """Settings of a simulated campaign."""
 
-    seed: int = quantity(unit="1", ge=0, lt=2**63)
-    start: Instant
-    duration: float = quantity(unit="s", gt=0, le=366 * 86400.0 * 30)
+    seed: int = quantity(unit="1", ge=0, lt=2**63, description="of all random numbers")
+    start: Instant = Field(description="of the first file")
+    duration: float = quantity(
+        unit="s", gt=0, le=366 * 86400.0 * 30, description="within which all files end"
+    )
     atmosphere: AtmosphereSettings | None = Field(
         default=None, description="shared by instruments of kind 'lidar'"
     )
@@ -254,7 +260,9 @@ class SimulationSettings(SettingsModel):
         description="whether noise is drawn in a fast, approximate way, for large archives",
     )
     truth: TruthSettings = TruthSettings()
-    instruments: dict[str, InstrumentSimulation] = Field(min_length=1)
+    instruments: dict[str, InstrumentSimulation] = Field(
+        min_length=1, description="by the keys of instruments of the campaign"
+    )
 
     @model_validator(mode="after")
     def _damage_exists(self) -> Self:

@@ -47,8 +47,8 @@ Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 class Period(SettingsModel):
     """Time interval from `start` to `stop`, without `stop`."""
 
-    start: Instant
-    stop: Instant
+    start: Instant = Field(description="first time of the period")
+    stop: Instant = Field(description="end of the period, not included")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -65,9 +65,9 @@ class DiurnalCourse(SettingsModel):
     """A quantity that varies with the hour of the day (UTC) as a cosine."""
 
     # The unit of both is that of the field that holds the course.
-    minimum: NotNegative
-    maximum: NotNegative
-    hour_of_maximum: Hour = quantity(5.0, unit="h", description="UTC")
+    minimum: NotNegative = Field(description="least value, in the unit of the quantity")
+    maximum: NotNegative = Field(description="largest value, in the unit of the quantity")
+    hour_of_maximum: Hour = quantity(5.0, unit="h", description="UTC, when the value is largest")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 import campaign_keys
 import command_line
@@ -16,6 +17,7 @@ import pytest
 import python_api
 import stiff_cases
 import typer
+import yaml
 from support.stiff import CASES
 
 import flows
@@ -27,6 +29,8 @@ from lidarops.netcdf.variables import layout_of
 
 # Made of the settings of all kinds of product, and listed among the keys of a campaign file.
 ASSEMBLED = {"Products", "Network"}
+# Mappings whose keys are no keys of the schema.
+NAMES = {"stations", "instruments", "networks", "channels", "nitrogen", "water_vapour", "exponents"}
 OWN_KINDS = ("elastic", "homogeneous", "multiangle", "raman", "signal", "visibility")
 
 
@@ -80,18 +84,43 @@ def test_every_command_is_listed_with_its_options() -> None:
                 assert f"`{option}`" in section, (name, option)
 
 
+def _written(value: Any) -> Iterator[str]:
+    """Give the keys of a campaign file."""
+    for key, inner in value.items() if isinstance(value, dict) else ():
+        yield key
+        # Of these, the writer chooses the keys, or they are channels.
+        named = key in NAMES and isinstance(inner, dict)
+        for item in inner.values() if named else (inner,):
+            yield from _written(item)
+    for item in value if isinstance(value, list) else ():
+        yield from _written(item)
+
+
+def test_every_key_has_a_meaning() -> None:
+    """The description of its field, or that of the one section that it leads to."""
+    rows = re.findall(r"^\| `(\w+)` \|.*\|([^|]*)\|$", campaign_keys.page(), re.MULTILINE)
+    assert len(rows) > 250
+    assert [key for key, meaning in rows if not re.search("[a-z]{2}", meaning)] == []
+
+
 def test_every_key_is_listed_with_unit_bounds_and_default(repository) -> None:
     page = campaign_keys.page()
     (dead_time,) = re.findall(r"^\| `dead_time` \|.*\|$", page, re.MULTILINE)
     assert "number in s, ≥ 1e-10, ≤ 2e-07" in dead_time
     assert "| `latitude` | number in degree, ≥ -90, ≤ 90 | required |" in page
     assert "| `superseded` | `keep`, `remove` | `remove` |" in page
+    # Units once, and intervals as campaign files write them.
+    assert "range of every bin |" in page
+    assert "| `lidar_ratio` | number in sr, ≥ 5, ≤ 150 | `50.0` | extinction over" in page
+    assert "[DiurnalCourse](#diurnalcourse) in m-1 | required | at 532 nm |" in page
+    assert not re.search(r"\[[a-zA-Z0-9 -]+\] \|$", page, re.MULTILINE)
+    assert set(re.findall(r"or number in s \| `(\S+)` \|", page)) == {"10min", "30min", "6h", "day"}
     keys = _first_cells(page)
     for path in sorted((repository / "catalogs").glob("*.yaml")):
         load_campaign(path)
-        # Names that the writer chooses, and the channels, are no keys.
-        written = set(re.findall(r"^ *([a-z_]+): ", path.read_text(), re.MULTILINE))
-        assert len(written & keys) > 10
+        written = set(_written(yaml.safe_load(path.read_text())))
+        assert written <= keys
+        assert len(written) > 30
     sections = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
     links = set(re.findall(r"\]\(#(\w+)\)", page))
     assert links <= {section.lower() for section in sections}

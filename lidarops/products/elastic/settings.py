@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -11,6 +10,8 @@ from lidarops.settings import (
     ChannelProduct,
     PartOfDay,
     ReferenceSettings,
+    average_interval,
+    background_method,
     quantity,
     signal_to_noise_limit,
 )
@@ -23,10 +24,14 @@ class ElasticSettings(ChannelProduct):
         min_length=1,
         description="glued_532o is glued from analog_532o and photon_532o of the files",
     )
-    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = quantity(50.0, unit="sr")
-    lidar_ratio_standard_error: float = quantity(10.0, unit="sr", ge=0, le=100)
-    average: PartOfDay = timedelta(minutes=30)
-    background: Literal["known_shape", "tail_mean"] = "known_shape"
+    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = quantity(
+        50.0, unit="sr", description="of particles, extinction over backscatter, at all heights"
+    )
+    lidar_ratio_standard_error: float = quantity(
+        10.0, unit="sr", ge=0, le=100, description="of lidar_ratio"
+    )
+    average: PartOfDay = average_interval()
+    background: Literal["known_shape", "tail_mean"] = background_method()
     reference: ReferenceSettings = ReferenceSettings()
     molecular_relative_error: float = quantity(
         0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"

@@ -23,8 +23,12 @@ _GIVEN_EXTINCTION: Final = ("linearized", "known_extinction")
 class HomogeneousSettings(ChannelProduct):
     """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
 
-    channels: list[str] = Field(min_length=1)
-    sections: list[tuple[Metres, Metres]] = quantity(unit="m", min_length=1)
+    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
+    sections: list[tuple[Metres, Metres]] = quantity(
+        unit="m",
+        min_length=1,
+        description="near and far end of each section whose air is homogeneous",
+    )
     method: Method = Field(
         default="auto",
         description="known_background takes the background from the far range, for paths that end"

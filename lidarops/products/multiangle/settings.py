@@ -6,7 +6,14 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.settings import ChannelProduct, Metres, located_error, quantity, signal_to_noise_limit
+from lidarops.settings import (
+    ChannelProduct,
+    Metres,
+    background_method,
+    located_error,
+    quantity,
+    signal_to_noise_limit,
+)
 
 Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"]
 
@@ -14,10 +21,17 @@ Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prio
 class MultiAngleSettings(ChannelProduct):
     """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
 
-    channels: list[str] = Field(min_length=1)
-    highest: Metres = quantity(6000.0, unit="m", description="above the station")
-    step: float = quantity(60.0, unit="m", ge=5, le=1000, description="between altitudes")
-    method: Method = "auto"
+    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
+    highest: Metres = quantity(6000.0, unit="m", description="highest altitude above the station")
+    step: float = quantity(60.0, unit="m", ge=5, le=1000, description="distance of altitudes")
+    method: Method = Field(
+        default="auto",
+        description="two_angle uses the shortest and the longest path; kano_hamilton a regression"
+        " at each altitude; joint then one smooth profile through all altitudes; mld a regularised"
+        " derivative along the path; mld_prior the same on the difference from the altitude below."
+        " auto is two_angle for two beams, joint for more, kano_hamilton where the errors of joint"
+        " would be too small",
+    )
     regularisation: float | None = quantity(
         None,
         unit="1",
@@ -26,7 +40,7 @@ class MultiAngleSettings(ChannelProduct):
         description="strength of the penalty of mld and mld_prior; by default the largest with"
         " residuals not larger than the noise, at each altitude",
     )
-    background: Literal["known_shape", "tail_mean"] = "known_shape"
+    background: Literal["known_shape", "tail_mean"] = background_method()
     background_range: ClassVar[None] = None
     layers: list[tuple[float, float]] = quantity(
         [],

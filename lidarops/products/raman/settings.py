@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -12,6 +11,8 @@ from lidarops.settings import (
     Metres,
     PartOfDay,
     ReferenceSettings,
+    average_interval,
+    background_method,
     located_error,
     quantity,
     signal_to_noise_limit,
@@ -19,10 +20,12 @@ from lidarops.settings import (
 
 
 class RamanReferenceSettings(ReferenceSettings):
-    """The same, from higher up and wider: Raman signals are weak."""
+    """Limits of the reference window of Raman signals, which are weak: higher up and wider."""
 
-    lowest: Metres = quantity(6000.0, unit="m", description="above the station")
-    width: float = quantity(2000.0, unit="m", ge=100, le=20_000)
+    lowest: Metres = quantity(
+        6000.0, unit="m", description="least height of the window above the station"
+    )
+    width: float = quantity(2000.0, unit="m", ge=100, le=20_000, description="of the window")
 
 
 class RamanProductSettings(ChannelProduct):
@@ -41,12 +44,12 @@ class RamanProductSettings(ChannelProduct):
         description="elastic channel -> channel of the Raman lines of water vapour, whose facts"
         " give water_vapour_calibration",
     )
-    average: PartOfDay = timedelta(minutes=30)
+    average: PartOfDay = average_interval()
     cell: float = quantity(
         60.0, unit="m", ge=3, le=1000, description="length of the bins of values"
     )
     highest: Metres = quantity(15_000.0, unit="m", description="farthest range")
-    background: Literal["known_shape", "tail_mean"] = "known_shape"
+    background: Literal["known_shape", "tail_mean"] = background_method()
     reference: RamanReferenceSettings = RamanReferenceSettings()
     angstrom_exponent: float = quantity(
         1.2,
@@ -55,7 +58,9 @@ class RamanProductSettings(ChannelProduct):
         le=4,
         description="of particle extinction, elastic to Raman wavelength",
     )
-    angstrom_standard_error: float = quantity(0.5, unit="1", ge=0, le=3)
+    angstrom_standard_error: float = quantity(
+        0.5, unit="1", ge=0, le=3, description="of angstrom_exponent"
+    )
     molecular_relative_error: float = quantity(
         0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
     )

@@ -12,7 +12,10 @@ from lidarops.settings import BackgroundRange, ChannelProduct, quantity, signal_
 class SignalSettings(ChannelProduct):
     """The ``signal`` product: background-subtracted, range-corrected signals."""
 
-    channels: list[str] | Literal["all"] = "all"
+    channels: list[str] | Literal["all"] = Field(
+        default="all",
+        description="names of channels; all means every channel of the files, without glued ones",
+    )
     background_range: BackgroundRange | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
     )

@@ -33,7 +33,11 @@ class VisibilityProductSettings(NetworkProduct):
     block: PartOfDay = Field(
         default=timedelta(hours=6), description="interval of averages that share one prior"
     )
-    prior: PriorName = "block"
+    prior: PriorName = Field(
+        default="block",
+        description="block takes mean and spread of the extinction from the averages of the block"
+        " themselves; none solves each average alone",
+    )
     multiplier: MultiplierValue | None = quantity(
         None,
         unit="1",
@@ -44,7 +48,9 @@ class VisibilityProductSettings(NetworkProduct):
     tolerance: float = quantity(
         15.0, unit="m", gt=0, le=1000, description="largest distance of beams at a crossing"
     )
-    smallest_angle: float = quantity(2.0, unit="degree", gt=0, lt=90, description="between beams")
+    smallest_angle: float = quantity(
+        2.0, unit="degree", gt=0, lt=90, description="least angle between beams at a crossing"
+    )
     farthest: float | None = quantity(
         None, unit="m", ge=10, description="largest range used; by default the last bin"
     )
@@ -58,7 +64,9 @@ class VisibilityProductSettings(NetworkProduct):
     exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = quantity(
         {}, unit="1", description="exponent of instruments that differ"
     )
-    exponent_relative_error: float = quantity(0.1, unit="1", ge=0, le=0.5)
+    exponent_relative_error: float = quantity(
+        0.1, unit="1", ge=0, le=0.5, description="relative error of the exponent"
+    )
     lidar_ratio_relative_error: float = quantity(
         0.02,
         unit="1",
