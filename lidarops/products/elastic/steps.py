@@ -270,12 +270,15 @@ class _Inversion(RowProduct):
         if known_shape:
             inverted = inverted.assign_attrs(references=KNOWN_SHAPE_PAPERS)
         least = settings.least_signal_to_noise
-        return with_low_signal_to_noise(inverted, LAYOUT.weighed, least).assign(
-            **gluing(averages),
-            molecular_source=molecular_source(data[MOLECULES]),
-            background_method=BACKGROUND_METHOD.code(
-                "known_shape" if data.get(KNOWN_SHAPE) is True else "tail_mean"
-            ),
+        return (
+            with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
+            .assign(gluing(averages))
+            .assign(
+                molecular_source=molecular_source(data[MOLECULES]),
+                background_method=BACKGROUND_METHOD.code(
+                    "known_shape" if known_shape else "tail_mean"
+                ),
+            )
         )
 
 
