@@ -30,6 +30,20 @@ def no_scan(case: ChannelCase) -> str:
     return ""
 
 
+def moves(case: ChannelCase) -> bool:
+    """Return whether the files of a scene point to several directions, of any pattern."""
+    if case.facts.zenith_angle is not None:
+        return False
+    side, granules = case.facts.azimuth, case.scene.granules
+    zenith = [granule.zenith_angle for granule in granules]
+    azimuth = [granule.azimuth if side is None else side for granule in granules]
+    return any(
+        max(known) - min(known) > FIXED
+        for angles in (zenith, azimuth)
+        if (known := [angle for angle in angles if angle is not None])
+    )
+
+
 def fixed_zenith(case: ChannelCase) -> tuple[float, str]:
     """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
     if case.facts.zenith_angle is not None:

@@ -104,6 +104,48 @@ def test_a_level_beam_above_the_background_of_the_far_range(data_root, tmp_path)
     ).all()
 
 
+def test_low_beams_of_range_height_scans_give_extinction_by_direction(data_root, tmp_path):
+    """Beams 5 and 5.5 degrees above the horizon, of 30 shots; a fit of the section rejects all.
+
+    The reference has 0.19 per km below 300 m and 0.045 above; the section lies at 130 to 240 m.
+    """
+    tree = yaml.safe_load(CAMPAIGN.read_text())
+    section = [1500, 2500]
+    found = {}
+    for method in ("auto", "direct"):
+        products = {"channels": list(REFERENCE), "sections": [section], "method": method}
+        tree["instruments"]["savant"]["products"] = {"homogeneous": products}
+        campaign = tmp_path / f"{method}.yaml"
+        campaign.write_text(yaml.safe_dump(tree))
+        record = reprocess(
+            load_campaign(campaign, archive=data_root / "savant", output=tmp_path / method)
+        )
+        assert record is not None
+        (scene,) = record.scenes
+        (reason,) = {out.reason for out in scene.plan.left_out if out.rule == "beam_level"}
+        assert reason.startswith("section 1500-2500 m: values of 78 of 82 files are rejected")
+        found[method] = [
+            xr.load_dataset(Path(record.products) / product.path)
+            .set_index(time=["zenith_angle", "azimuth"])
+            .unstack("time")
+            for product in sorted(scene.products, key=lambda product: product.channel)
+        ]
+    beams = []
+    for product, own in zip(found["auto"], found["direct"], strict=True):
+        assert product.sizes["zenith_angle"] == 41
+        assert product["azimuth"].values.tolist() == [62.0, 137.0]
+        low = product["zenith_angle"] > 84.0
+        assert ((product["usable"] < 2) == low).all()
+        level, own_level = (one.isel(section=0).sel(zenith_angle=low) for one in (product, own))
+        assert (own_level["usable"] == 2).all()
+        error = level["total_extinction_standard_error"]
+        assert (error < 0.25 * own_level["total_extinction_standard_error"]).all()
+        assert 4.5e-5 < level["total_extinction"].mean() < 1.9e-4
+        beams.append((level["total_extinction"], error))
+    (one, error), (other, other_error) = beams
+    assert (np.abs(one - other) < 2.0 * np.hypot(error, other_error)).all()
+
+
 def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products):
     """A ray 3 degrees above the horizon, of 4 hours before; alone, analog is rejected."""
     archive = tmp_path / "archive"

@@ -15,6 +15,7 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.flags import Quality
 from lidarops.reports.findings import disagreement_rows
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
@@ -238,3 +239,51 @@ def test_a_scan_without_leverage_is_known_before_it_is_read(tmp_path, angles):
     (reason,) = record.empty_scenes.values()
     assert "beam directions rise less than 3.0 degree" in reason
     assert "no leverage" in reason
+
+
+def level_scan(folder: Path, sections: list[list[float]]) -> tuple[Campaign, xr.Dataset]:
+    """Return a simulated campaign with level and steep beams to two sides, and its truth."""
+    lidar, instrument = TREE["instruments"]["scanner"], TREE["simulation"]["instruments"]["scanner"]
+    scan = {"zenith_angles": [90, 89, 88.6, 88, 60, 45], "azimuth": 20, "further_azimuths": [140]}
+    homogeneous = {"channels": ["photon_532o"], "sections": sections}
+    tree = TREE | {
+        "instruments": {"scanner": lidar | {"products": {"homogeneous": homogeneous}}},
+        "simulation": TREE["simulation"]
+        | {"duration": 12 * 39 * 4, "instruments": {"scanner": instrument | {"scan": scan}}},
+    }
+    path = folder / "level.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    settings = load_campaign(path)
+    return settings, simulate_campaign(settings).truth
+
+
+def test_level_beams_of_a_scan_give_extinction_by_direction(tmp_path):
+    sections = [[1000.0, 2000.0], [2000.0, 4000.0]]
+    settings, truth = level_scan(tmp_path, sections)
+    (outcome,) = reprocess(settings).scenes
+    reasons = [out.reason for out in outcome.plan.left_out if out.rule == "beam_level"]
+    assert [reason.split(", whose")[0] for reason in reasons] == [
+        "section 1000-2000 m: values of 16 of 48 files are rejected",
+        "section 2000-4000 m: values of 16 of 48 files are rejected",
+    ]
+    (step,) = (step for step in outcome.plan.steps if step.name == "homogeneous")
+    assert "far range, because the beam moves" in step.reason
+    product = xr.load_dataset(settings.products_root / outcome.products[0].path)
+    means = product["total_extinction"].groupby(["zenith_angle", "azimuth"]).mean()
+    assert means.sizes == {"zenith_angle": 6, "azimuth": 2, "section": 2}
+    steep = product["quality_flag"] & int(HomogeneousQuality.NOT_LEVEL) != 0
+    assert (steep == (product["zenith_angle"] < 88.0)).all()
+    of_path = truth["total_extinction"].values
+    granule, ends = truth["profile_granule_scanner"].values, truth["range_end_scanner"].values
+    paths = truth["profile_path_optical_depth_scanner"].values[:, 0]
+    score = []
+    for number, (near, far) in enumerate(sections):
+        expected = of_path.copy()
+        expected[granule] = [
+            np.subtract(*np.interp([far, near], ends, path)) / (far - near) for path in paths
+        ]
+        part = product.isel(section=number, time=~steep[:, number].values)
+        deviation = part["total_extinction"] - expected[~steep[:, number].values]
+        score.append((deviation / part["total_extinction_standard_error"]).values)
+    assert (product["usable"].values[~steep.values] < 2).all()
+    assert 0.8 < np.sqrt(np.mean(np.square(score))) < 1.2

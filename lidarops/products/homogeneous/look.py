@@ -6,6 +6,7 @@ would set.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -42,13 +43,23 @@ REFINEMENTS: Final[Mapping[str, OmittedBit]] = {
 }
 """Rule that leaves a section out -> its quality bit."""
 
+LEVEL: Final = THRESHOLDS.level * (1.0 + 1e-6)
+"""m, largest climb along a section. Headers and campaign files round angles differently."""
+
 Section = tuple[float, float]
+
+
+def climb(zenith_angle: float, near: float, far: float) -> float:
+    """Return the change of height of a beam along a section, m."""
+    return (far - near) * abs(math.cos(math.radians(zenith_angle)))
 
 
 def omitted_sections(
     planned: PlannedStep, settings: PathSettings, look: Look, most: int
 ) -> dict[Section, LeftOut]:
     """Return the sections in which there is nothing to retrieve, and why.
+
+    Beams that climb too much along a section do not count: what they see is other air.
 
     Parameters
     ----------
@@ -65,8 +76,34 @@ def omitted_sections(
     dict
         Independent of chunks and workers.
     """
-    granules = look.scene.granules
-    sections = [section for section in settings.sections if section not in settings.omitted]
+    by_beams: dict[tuple[Granule, ...], list[Section]] = {}
+    for section in settings.sections:
+        if section not in settings.omitted:
+            by_beams.setdefault(_level_granules(look.scene.granules, *section), []).append(section)
+    omitted: dict[Section, LeftOut] = {}
+    for granules, sections in by_beams.items():
+        omitted |= _omitted(planned, sections, granules, look, most)
+    return omitted
+
+
+def _level_granules(granules: Sequence[Granule], near: float, far: float) -> tuple[Granule, ...]:
+    """Return the granules of level beams; all where the headers show none."""
+    level = tuple(
+        granule
+        for granule in granules
+        if granule.zenith_angle is not None and climb(granule.zenith_angle, near, far) <= LEVEL
+    )
+    return level or tuple(granules)
+
+
+def _omitted(
+    planned: PlannedStep,
+    sections: Sequence[Section],
+    granules: Sequence[Granule],
+    look: Look,
+    most: int,
+) -> dict[Section, LeftOut]:
+    """Return the sections without anything to retrieve, of the beams that are level there."""
     places = spaced_indices(len(granules), most)
     first = _looks(look.profiles(planned.channel, [granules[k] for k in places]), sections)
     doubtful = [

@@ -13,9 +13,11 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.products.homogeneous.look import (
+    LEVEL,
     LOOKED_AT,
     REFINEMENTS,
     OmittedBit,
+    climb,
     empty_sections,
     omitted_sections,
 )
@@ -31,6 +33,7 @@ from lidarops.settings import SettingsModel, VisibilitySettings, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
+from lidarops.steps.pointing import moves
 from lidarops.steps.preparation import FEWEST_BINS, tail
 from lidarops.steps.reading import ANALOG_NOISE, WAVELENGTH, Window, WindowSettings, bins_with_noise
 from lidarops.steps.step import (
@@ -48,9 +51,6 @@ from lidarops.steps.workload import Workload
 
 Case = ProductCase[HomogeneousSettings]
 
-_ROUNDING: Final = 1e-6
-"""Relative tolerance: headers and campaign files round angles differently."""
-
 Section = tuple[float, float]
 
 
@@ -64,26 +64,41 @@ def _inside(case: Case) -> list[Section]:
     ]
 
 
-def _climb(case: Case, near: float, far: float) -> float:
-    """Return the climb of the most level beam of a scene along a section, m.
+def _climbs(case: Case, near: float, far: float) -> list[float]:
+    """Return the climb of the beam of each file of a scene along a section, m.
 
     Infinite where the zenith angle is unknown, so that the beam does not count as level.
     """
     fixed = case.facts.zenith_angle
     angles = [granule.zenith_angle if fixed is None else fixed for granule in case.scene.granules]
-    return min(
-        math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
-        for angle in angles
-    )
+    return [math.inf if angle is None else climb(angle, near, far) for angle in angles]
+
+
+def _steep(case: Case, near: float, far: float) -> int:
+    """Return how many files of a scene have a beam that is not level along a section."""
+    return sum(height > LEVEL for height in _climbs(case, near, far))
 
 
 def _level(case: Case) -> list[Section]:
     """Return the sections that are retrieved: within the bins, along a nearly level path."""
+    files = len(case.scene.granules)
     return [
         (near, far)
         for near, far in _inside(case)
-        if case.all_steps or _climb(case, near, far) <= THRESHOLDS.level * (1.0 + _ROUNDING)
+        if case.all_steps or _steep(case, near, far) < files
     ]
+
+
+def _method(case: Case) -> Method:
+    """Return the method: `auto` of a moving beam takes the background of the far range.
+
+    A beam of a scan has few shots, and a section cannot tell its background from its extinction.
+    Bins of the far range are no part of a section.
+    """
+    requested = case.request.method
+    start = tail(case, None)[0]
+    apart = all(far <= start for _, far in _level(case))
+    return "known_background" if requested == "auto" and apart and moves(case) else requested
 
 
 class SectionWindow(Window, Choice[Case, WindowSettings]):
@@ -97,7 +112,7 @@ class SectionWindow(Window, Choice[Case, WindowSettings]):
         if case.all_steps:
             yield Leave(ALL_STEPS)
             return
-        if case.request.method == "known_background":
+        if _method(case) == "known_background":
             yield Leave("the background is that of the far range")
             return
         farthest = max(far for _, far in _level(case))
@@ -207,15 +222,19 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
         for near, far in inside:
             if (near, far) not in level:
                 yield _slanted(case, near, far)
+            elif _steep(case, near, far):
+                yield _partly_slanted(case, near, far)
         if level:
-            settings = case.request
+            settings, method = case.request, _method(case)
             definition = settings.visibility
-            known = settings.method == "known_background"
-            whence = _BACKGROUNDS.get(settings.method, "is retrieved together with extinction")
+            known = method == "known_background"
+            whence = _BACKGROUNDS.get(method, "is retrieved together with extinction")
+            if method != settings.method:
+                whence += ", because the beam moves and the sections end before it"
             yield Run(
                 f"{REQUESTED}; background {whence}",
                 PathSettings(
-                    method=settings.method,
+                    method=method,
                     extinction=settings.extinction,
                     sections=tuple(level),
                     background_range=tail(case, settings.background_range) if known else None,
@@ -271,14 +290,24 @@ def _outside(case: Case, near: float, far: float) -> Leave:
 
 
 def _slanted(case: Case, near: float, far: float) -> Leave:
-    climb = _climb(case, near, far)
+    least = min(_climbs(case, near, far))
     slope = (
         "neither headers nor campaign give the zenith angle"
-        if math.isinf(climb)
-        else f"the beam climbs {climb:.0f} m (limit {THRESHOLDS.level:g} m)"
+        if math.isinf(least)
+        else f"the beam climbs {least:.0f} m (limit {THRESHOLDS.level:g} m)"
     )
     reason = f"section {near:g}-{far:g} m: {slope}; a vertical gradient would mimic extinction"
-    return Leave(reason, number=None if math.isinf(climb) else climb, rule="section_level")
+    return Leave(reason, number=None if math.isinf(least) else least, rule="section_level")
+
+
+def _partly_slanted(case: Case, near: float, far: float) -> Leave:
+    steep = _steep(case, near, far)
+    reason = (
+        f"section {near:g}-{far:g} m: values of {steep} of {len(case.scene.granules)} files are"
+        f" rejected, whose beams climb more than {THRESHOLDS.level:g} m; a vertical gradient would"
+        " mimic extinction"
+    )
+    return Leave(reason, number=float(steep), rule="beam_level")
 
 
 def _with_settings(planned: PlannedStep, settings: SettingsModel) -> PlannedStep:

@@ -29,6 +29,7 @@ _SECOND_DIFFERENCE: Final = 6.0
 _DIFFERENCE_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
 _INDEPENDENT: Final = np.ones(1)
+_NOTHING: Final = np.zeros(1)
 _OUTSIDE: Final = 0.025
 """Probability beyond either end of an interval of 95 percent."""
 _FAR: Final = 4.0
@@ -132,6 +133,7 @@ def judge_fit(
     counts: CountMoments | None = None,
     unknowns: int = 3,
     correlation_length: Array = _INDEPENDENT,
+    added_variance: Array = _NOTHING,
 ) -> Verdict:
     """Judge a batch of fits.
 
@@ -148,6 +150,8 @@ def judge_fit(
         Number of fitted parameters.
     correlation_length : (profile or 1,) float
         Bins, of the noise.
+    added_variance : (profile or 1,) float
+        m-2, of the extinction, from sources other than the noise of the fit.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         noise = np.ones_like(fit.status)
@@ -159,7 +163,8 @@ def judge_fit(
         limits = _limits(fit, unknowns, known_variance=known_variance)
         if counts is not None:
             limits = _limits_of_counts(limits, fit.bins, counts, unknowns)
-        determined = _determined(fit, bin_width, mean_noise, limits.widening)
+        variance = fit.extinction_variance * mean_noise * limits.widening**2 + added_variance
+        determined = _determined(fit, bin_width, mean_noise, np.sqrt(variance))
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > THRESHOLDS.least_signal**2),
             (HomogeneousQuality.POORLY_DETERMINED, determined),
@@ -193,9 +198,8 @@ def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
 
 
 def _determined(
-    fit: PathEstimate, bin_width: float, noise: Array, widening: Array
+    fit: PathEstimate, bin_width: float, noise: Array, error: Array
 ) -> npt.NDArray[np.bool_]:
-    error = np.sqrt(fit.extinction_variance * noise) * widening
     # Where the signal dies within a bin, the error is that of the transmission of one bin.
     slope = np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width)
     largest = THRESHOLDS.largest_relative_error * slope

@@ -233,6 +233,7 @@ def _solution(
         counts=_count_moments(problem),
         unknowns=unknowns,
         correlation_length=length,
+        added_variance=added.extinction,
     )
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

@@ -174,6 +174,21 @@ def test_error_of_a_given_background_is_propagated(known):
     np.testing.assert_array_equal(fit.background, given)
 
 
+@pytest.mark.parametrize(("error", "poor"), [(0.0, False), (0.5, False), (30.0, True)])
+def test_a_poorly_known_background_makes_extinction_poorly_determined(error, poor):
+    fit = fit_homogeneous_path(
+        clean(100, 300.0, seed=6),
+        LONG,
+        variance=1.0,
+        method="known_background",
+        background=370.0,
+        background_standard_error=error,
+    )
+    limit = 0.15 * (fit.extinction + 1.0 / LONG.mean())
+    assert np.all((fit.extinction_standard_error > limit) == poor)
+    assert np.all((fit.quality & HomogeneousQuality.POORLY_DETERMINED != 0) == poor)
+
+
 def test_background_at_known_extinction_is_the_published_formula():
     power = clean(20, seed=7)
     fit = fit_homogeneous_path(power, LONG, method="known_extinction", extinction=0.03 * KM)
