@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _functional_tables
-from lidarops.retrieve.homogeneous._fit_quality import CommonLimits
+from lidarops.retrieve.homogeneous._fit_quality import CommonLimits, curved_widening
 from lidarops.retrieve.homogeneous._functional_tables import Tables
 from lidarops.retrieve.homogeneous._vector_loops import (
     STRIDE,
@@ -143,7 +143,8 @@ _P: Final = 2
 _TAU: Final = 3
 _TAU_ERROR: Final = 4
 _B_ERROR: Final = 5
-_P_ERROR: Final = 6
+_LEVEL_ERROR: Final = 6
+"""Of the background, at known extinction."""
 _CURVATURE: Final = 7
 _ENERGY: Final = 8
 _LARGEST: Final = 9
@@ -151,7 +152,9 @@ _DIFFERENCES: Final = 10
 _BOUNDED: Final = 11
 _NOISE: Final = 12
 _SQUARE: Final = 13
-_FIT_ROWS: Final = 14
+_SLOPE_ERROR: Final = 14
+"""Of the background, by the error of extinction."""
+_FIT_ROWS: Final = 15
 
 
 @_compiled
@@ -354,12 +357,13 @@ def _estimate(tables: Tables, s: _Scratch) -> None:
         error = inverse_slope / size
         # Extinction moves the logarithm of B, which is the amplitude at range zero.
         lever = (leverage - coupling / (inverse_norm * inverse_slope)) * error
-        shape, slope = c[_functional_tables.LEVEL_SHAPE, p], c[_functional_tables.LEVEL_SLOPE, p]
+        shape = c[_functional_tables.LEVEL_SHAPE, p]
         fit[_F, p] = size
         fit[_B, p] = s.sign[p] * size * inverse_norm
         fit[_TAU_ERROR, p] = error
         fit[_B_ERROR, p] = math.sqrt(1.0 / (size * size) + lever * lever)
-        fit[_P_ERROR, p] = math.sqrt(level + shape * shape + slope * slope)
+        fit[_LEVEL_ERROR, p] = math.sqrt(level + shape * shape)
+        fit[_SLOPE_ERROR, p] = c[_functional_tables.LEVEL_SLOPE, p]
 
 
 @_compiled
@@ -458,6 +462,18 @@ def _set_noise(tables: Tables, s: _Scratch, bins: int, mode: Mode) -> None:
         s.fit[_NOISE, p] = 1.0 if mode.known_variance else noise
 
 
+_curved_widening = _compiled(curved_widening)
+
+
+@_compiled
+def _relative_error(tables: Tables, s: _Scratch, bins: int, p: int) -> float:
+    """Return the error of extinction over its scale."""
+    # Where the signal dies within a bin, the error is that of the transmission of one bin.
+    steepest = 0.5 * (bins - 1) / tables.length
+    slope = min(s.results[4, p] + 1.0 / tables.mean_range, steepest)
+    return float(s.results[5, p] / slope)
+
+
 @_compiled
 def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
     """Fill the results in SI units."""
@@ -472,11 +488,12 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
         amplitude = size * results[2, p]
         results[0, p] = fit[_P, p]
         wide = root * widening
-        results[1, p] = fit[_P_ERROR, p] * wide
         results[2, p] = amplitude
         results[3, p] = abs(amplitude) * (fit[_B_ERROR, p] * wide)
         results[4, p] = fit[_TAU, p] / tables.length
         results[5, p] = fit[_TAU_ERROR, p] * wide / tables.length
+        slope = fit[_SLOPE_ERROR, p] * _curved_widening(_relative_error(tables, s, bins, p))
+        results[1, p] = math.sqrt(fit[_LEVEL_ERROR, p] ** 2 + slope**2) * wide
         results[6, p] = s.sign[p] * fit[_F, p] / root
         results[7, p] = fit[_ENERGY, p] / (noise * (bins - 3))
         curvature = fit[_CURVATURE, p]
@@ -489,10 +506,8 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
 def _judge(tables: Tables, s: _Scratch, bins: int, limits: CommonLimits) -> None:
     """Fill the quality bits. Tests are for a pass, so that NaN fails."""
     fit, results = s.fit, s.results
-    # Where the signal dies within a bin, the error is that of the transmission of one bin.
-    steepest = 0.5 * (bins - 1) / tables.length
     for p in range(BLOCK):
-        relative = results[5, p] / min(results[4, p] + 1.0 / tables.mean_range, steepest)
+        relative = _relative_error(tables, s, bins, p)
         determined = (relative >= 0.0) & (relative < limits.largest_relative_error)
         determined &= results[3, p] < HUGE * HUGE
         largest = limits.outlier * math.sqrt(fit[_NOISE, p])

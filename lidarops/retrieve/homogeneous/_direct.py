@@ -22,6 +22,7 @@ from lidarops.retrieve.homogeneous._estimate import (
     AMPLITUDE_RELATIVE_VARIANCE,
     BACKGROUND,
     BACKGROUND_BEND,
+    BACKGROUND_SLOPE_VARIANCE,
     BACKGROUND_VARIANCE,
     BINS,
     BOUNDED,
@@ -207,8 +208,9 @@ def describe(
     row[EXTINCTION] = tau
     row[SIGNAL_ENERGY] = p.b * p.b * p.norm
     row[EXTINCTION_VARIANCE] = 1.0 / (p.b * p.b * p.slope_norm)
+    row[BACKGROUND_SLOPE_VARIANCE] = p.mean_t * p.mean_t / p.slope_norm
     row[BACKGROUND_VARIANCE] = (
-        free / w0 + p.mean_phi * p.mean_phi / p.norm + p.mean_t * p.mean_t / p.slope_norm
+        free / w0 + p.mean_phi * p.mean_phi / p.norm + row[BACKGROUND_SLOPE_VARIANCE]
     )
     # Extinction moves the logarithm of B by twice the range of the centroid.
     lever = 2.0 * (g.start / g.length + p.centroid)
@@ -231,6 +233,7 @@ def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> 
     row[AMPLITUDE] = sign * math.exp(logarithm)
     row[EXTINCTION] /= g.length
     row[BACKGROUND_VARIANCE] /= unit
+    row[BACKGROUND_SLOPE_VARIANCE] /= unit
     row[AMPLITUDE_RELATIVE_VARIANCE] /= energy
     row[EXTINCTION_VARIANCE] /= energy * g.length * g.length
     row[SIGNAL_ENERGY] *= energy

@@ -32,6 +32,8 @@ class PathEstimate:
     amplitude: Array
     extinction: Array
     background_variance: Array
+    background_slope_variance: Array
+    """The part of it that the error of extinction makes."""
     amplitude_relative_variance: Array
     extinction_variance: Array
     signal_energy: Array
@@ -70,6 +72,7 @@ COLUMNS: Final = tuple(field.name for field in fields(PathEstimate))
     AMPLITUDE,
     EXTINCTION,
     BACKGROUND_VARIANCE,
+    BACKGROUND_SLOPE_VARIANCE,
     AMPLITUDE_RELATIVE_VARIANCE,
     EXTINCTION_VARIANCE,
     SIGNAL_ENERGY,

@@ -8,7 +8,7 @@ hardly affects; the tests allow for the scatter of that estimate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,9 @@ _OUTSIDE: Final = 0.025
 """Probability beyond either end of an interval of 95 percent."""
 _FAR: Final = 4.0
 """Standard errors beyond which the stability benchmark counts a value as false."""
+_SELECTED: Final = float(-special.ndtri(THRESHOLDS.false_curved))
+"""Standard errors by which a curvature is too large at that rate."""
+_LARGEST: Final = THRESHOLDS.largest_relative_error
 _RATIO: Final = 4.611
 """Quantile of the logarithm of the ratio of two estimates of one variance from the same residuals,
 3.353 sqrt(17 / 9), times the root of the number of bins."""
@@ -48,6 +51,8 @@ class Verdict:
     noise: Array
     widening: Array
     """Factor on standard errors, for the scatter of `noise`; 1 where the variance is known."""
+    relative_error: Array
+    """Standard error of extinction over its scale, as `Thresholds.largest_relative_error`."""
     reduced_chi2: Array
     quality: Flags
 
@@ -164,7 +169,11 @@ def judge_fit(
         if counts is not None:
             limits = _limits_of_counts(limits, fit.bins, counts, unknowns)
         variance = fit.extinction_variance * mean_noise * limits.widening**2 + added_variance
-        determined = _determined(fit, bin_width, mean_noise, np.sqrt(variance))
+        relative_error = _relative_error(fit, bin_width, np.sqrt(variance))
+        determined = np.isfinite(
+            fit.amplitude * np.sqrt(fit.amplitude_relative_variance * mean_noise)
+        )
+        determined &= relative_error < THRESHOLDS.largest_relative_error
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > THRESHOLDS.least_signal**2),
             (HomogeneousQuality.POORLY_DETERMINED, determined),
@@ -182,7 +191,7 @@ def judge_fit(
     quality[fit.status == _estimate.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
     quality[fit.status == _estimate.EMPTY] |= np.int32(Quality.INPUT_MISSING)
     quality[(fit.bins > 0) & (fit.bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
-    return Verdict(noise, limits.widening, reduced, quality)
+    return Verdict(noise, limits.widening, relative_error, reduced, quality)
 
 
 def _residual_dof(bins: Array, unknowns: int) -> Array:
@@ -197,15 +206,28 @@ def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
     return np.maximum(variance, fit.rounding)
 
 
-def _determined(
-    fit: PathEstimate, bin_width: float, noise: Array, error: Array
-) -> npt.NDArray[np.bool_]:
+def _relative_error(fit: PathEstimate, bin_width: float, error: Array) -> Array:
+    """Return the error of extinction over the scale on which the signal falls."""
     # Where the signal dies within a bin, the error is that of the transmission of one bin.
-    slope = np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width)
-    largest = THRESHOLDS.largest_relative_error * slope
-    finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
-    determined: npt.NDArray[np.bool_] = finite & (error < largest)
-    return determined
+    return np.asarray(error / np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width))
+
+
+def curved_widening(relative_error: Any) -> Any:
+    """Return the factor on the error of the background that the error of extinction makes.
+
+    In a thin section the background follows from the curvature of the signal, to whose inverse it
+    is proportional. With the relative error q of a curvature that came out z errors too large,
+    the background is off by ``z / (1 - q z)`` of the errors that follow from that curvature.
+    The factor holds such values within 4 stated errors at the rate of `Thresholds.false_curved`.
+    Also compiled for scalars.
+
+    Parameters
+    ----------
+    relative_error : (...) float
+        Of extinction; that of the curvature.
+    """
+    relative = np.minimum(relative_error, _LARGEST)
+    return np.maximum(_SELECTED / (_FAR * (1.0 - _SELECTED * relative)), 1.0)
 
 
 def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limits:

@@ -15,6 +15,7 @@ from lidarops.retrieve.homogeneous._estimate import (
     AMPLITUDE,
     AMPLITUDE_RELATIVE_VARIANCE,
     BACKGROUND,
+    BACKGROUND_SLOPE_VARIANCE,
     BACKGROUND_VARIANCE,
     BOUNDED,
     EXTINCTION,
@@ -41,6 +42,7 @@ Array = npt.NDArray[np.float64]
 def _describe_given(p: Point, w0: float, row: Array) -> None:
     """Overwrite the variances for a given extinction, whose variance is 0."""
     row[EXTINCTION_VARIANCE] = 0.0
+    row[BACKGROUND_SLOPE_VARIANCE] = 0.0
     row[BACKGROUND_VARIANCE] = 1.0 / w0 + p.mean_phi * p.mean_phi / p.norm
     row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / row[SIGNAL_ENERGY]
     row[BOUNDED] = 0.0

@@ -18,6 +18,7 @@ from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, P
 from lidarops.retrieve.homogeneous._fit_quality import (
     CountMoments,
     common_limits,
+    curved_widening,
     judge_fit,
 )
 from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
@@ -156,6 +157,7 @@ def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Arra
         status=np.where(np.isnan(background), np.nan, fit.status),
         background=background,
         background_variance=spread[:, 0],
+        background_slope_variance=np.zeros(1),
         amplitude_relative_variance=spread[:, 1],
         extinction_variance=spread[:, 2],
         background_bend=spread[:, 5],
@@ -238,7 +240,11 @@ def _solution(
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         level = verdict.noise * verdict.widening**2 * length
-        background_error = np.sqrt(fit.background_variance * level + added.background)
+        curved = fit.background_slope_variance * (
+            curved_widening(verdict.relative_error) ** 2 - 1.0
+        )
+        background_variance = fit.background_variance + np.where(fitted, curved, 0.0)
+        background_error = np.sqrt(background_variance * level + added.background)
         relative_error = np.sqrt(fit.amplitude_relative_variance * level + added.amplitude_relative)
         extinction_error = np.sqrt(fit.extinction_variance * level + added.extinction)
         signal_to_noise = np.copysign(

@@ -128,3 +128,21 @@ def test_labeled_profiles_take_their_exposures():
     )
     assert np.array_equal(result["quality_flag"][:, 0], fit.quality)
     assert np.array_equal(result["total_extinction"][:, 0], fit.extinction, equal_nan=True)
+
+
+@pytest.mark.parametrize("method", ["compressed", "direct"])
+@pytest.mark.parametrize("known", [True, False])
+def test_backgrounds_near_the_limit_of_determination_are_not_selected_by_their_noise(method, known):
+    """Noise that bends a signal makes background and error too small: 1 % were false."""
+    r, count = 2500.0 + 37.5 * np.arange(80), 16_000
+    rng = np.random.default_rng(11)
+    shape = r[0] ** 2 / r**2 * np.exp(-2e-5 * (r - r[0]))
+    signal = np.exp(rng.uniform(np.log(3.0), np.log(100.0), (count, 1)))
+    power = 100.0 + signal * shape + rng.standard_normal((count, r.size))
+    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None, method=method)
+    scale = fit.extinction + 1.0 / r.mean()
+    near = (fit.quality == 0) & (fit.extinction_standard_error > 0.1 * scale)
+    errors = np.abs(fit.background - 100.0)[near] / fit.background_standard_error[near]
+    assert errors.size > 1000
+    assert np.mean(errors > 4.0) < 6e-3
+    assert 0.93 < np.mean(errors < 1.96) < 0.97
