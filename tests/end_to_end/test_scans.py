@@ -287,3 +287,22 @@ def test_level_beams_of_a_scan_give_extinction_by_direction(tmp_path):
         score.append((deviation / part["total_extinction_standard_error"]).values)
     assert (product["usable"].values[~steep.values] < 2).all()
     assert 0.8 < np.sqrt(np.mean(np.square(score))) < 1.2
+
+
+def test_gradient_errors_of_planes_pool_over_the_scene_whatever_the_chunks(tmp_path):
+    instrument = TREE["simulation"]["instruments"]["scanner"]
+    scan = {"zenith_angles": [75, 60, 30], "azimuth": 20, "further_azimuths": [140, 260]}
+    settings, _ = campaign(
+        tmp_path, duration=18 * 39, instruments={"scanner": instrument | {"scan": scan}}
+    )
+    digests = []
+    for chunk in (1, 7, 100):
+        other = settings.model_copy(update={"output": str(tmp_path / f"by-{chunk}")})
+        (outcome,) = reprocess(other, options=Options(profiles_per_chunk=chunk)).scenes
+        digests.append(outcome.products[0].sha256)
+    assert digests == digests[:1] * 3
+    (step,) = (step for step in outcome.plan.steps if step.name == "gradient")
+    assert "scatter between them, pooled over all cycles of the scene and 15" in step.reason
+    product = xr.load_dataset(other.products_root / outcome.products[0].path)
+    assert product.sizes["plane"] == 3
+    assert product["plane_vertical_optical_depth_gradient_error"].notnull().any()

@@ -153,6 +153,12 @@ class Gradient(PartOfRetrieval):
         largest = case.request.largest_gradient
         if largest > 0:
             reason = "backscatter may vary horizontally: retrieved, or part of the error"
+            directions = beams(case)
+            if directions.surround and directions.pattern.startswith("a volume"):
+                reason += (
+                    "; of vertical planes, from the scatter between them, pooled over all cycles of"
+                    f" the scene and {THRESHOLDS.pooled} altitudes"
+                )
             yield Run(reason, number=largest)
         else:
             yield Leave(

@@ -20,6 +20,7 @@ from lidarops.netcdf.variables import (
 )
 from lidarops.products.multiangle.flags import FLAGS
 from lidarops.products.multiangle.settings import Method
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _LEVELS: Final = ("time", "altitude")
 _BITS: Final = 12
@@ -135,7 +136,12 @@ def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
         f" the value. {NO_STANDARD_NAME}",
     )
     error = _gradient_error(f"plane_{quantity}", f"{words} of a plane", units)
-    return value, replace(error, dims=dims, optional=True)
+    comment = (
+        f"Separate from plane_{quantity}_standard_error. Where planes point to all sides, the error"
+        " that explains the scatter between planes, pooled over all scans of the file and"
+        f" {THRESHOLDS.pooled} altitudes; else as {quantity}_gradient_error. {NO_STANDARD_NAME}"
+    )
+    return value, replace(error, dims=dims, optional=True, comment=comment)
 
 
 _STATION: Final = tuple(row for row in PLACE if row.name not in ("zenith_angle", "azimuth"))

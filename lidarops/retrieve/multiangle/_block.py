@@ -321,10 +321,10 @@ def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Arr
 
     Pooled over the block and a window of altitudes (`dersimonian1986`).
     """
-    freedom = _windowed(table[:, kh.FREEDOM].sum(axis=0))
+    freedom = windowed(table[:, kh.FREEDOM].sum(axis=0))
     trace = table[:, kh.TRACE].sum(axis=0)
     excess = (table[:, kh.CHI2] / of_chi2 - table[:, kh.EXPECTED]).sum(axis=0)
-    whole, total = _windowed(trace), _windowed(before * trace + excess)
+    whole, total = windowed(trace), windowed(before * trace + excess)
     known = whole > 0.0
     if not np.any(known):
         return np.zeros_like(before), freedom
@@ -333,7 +333,7 @@ def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Arr
     return np.interp(altitudes, altitudes[known], variance), freedom
 
 
-def _windowed(values: Array) -> Array:
+def windowed(values: Array) -> Array:
     """Return sums over the window around each altitude, cut at the ends of the grid."""
     half = THRESHOLDS.pooled // 2
     padded = np.pad(values, half)
@@ -342,7 +342,7 @@ def _windowed(values: Array) -> Array:
 
 def pooled_freedom(fit: Regression) -> Array:
     """Return the residual degrees of freedom in the window around each altitude, (altitude,)."""
-    return _windowed(fit.column(kh.FREEDOM).sum(axis=0))
+    return windowed(fit.column(kh.FREEDOM).sum(axis=0))
 
 
 def student_factor(freedom: Array) -> Array:
@@ -376,7 +376,7 @@ def _fit_robustly(beams: BeamBlock, inhomogeneity: float | None) -> Regression:
     robust_weights.start_residuals(y, noise, path, residual)
     if inhomogeneity is None:
         variance, samples = robust_weights.median_variance(residual, noise)
-        variance = _windowed(variance * samples) / np.maximum(_windowed(samples), 1.0)
+        variance = windowed(variance * samples) / np.maximum(windowed(samples), 1.0)
     else:
         variance = np.full(noise.shape[2], inhomogeneity**2)
     robust_weights.pair_residuals(y, noise, path, variance, residual)

@@ -18,6 +18,7 @@ from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
 )
+from lidarops.retrieve.multiangle.plane_gradients import gradient_scale
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical.monotone import project as monotone
 
@@ -192,7 +193,8 @@ def _plane_variables(
 ) -> dict[str, xr.Variable]:
     """Return the variables of the vertical planes of a volume; none where it has one plane only.
 
-    The inhomogeneity of a plane is its own. Values that a flag rejects are NaN.
+    The inhomogeneity of a plane is its own. Values that a flag rejects are NaN. Where the planes
+    surround the zenith, their scatter tells the gradient error.
     """
     if settings["azimuth"] is None:
         return {}
@@ -211,14 +213,23 @@ def _plane_variables(
         rejected = (quality & np.int32(REJECTING)) != 0
         for name, values in pieces.items():
             values.append(np.where(rejected, np.nan, getattr(retrieval, name)))
+    stacked = {name: np.stack(values) for name, values in pieces.items()}
+    every = np.concatenate(planes)
+    height = altitude - settings["station_altitude"]
+    scan = slant_paths.make_scan(zenith_angle[every], height, settings["azimuth"][every])
+    if slant_paths.surrounds_zenith(scan.tilted_azimuths):
+        depth = (f"optical_depth{error}" for error in ("", "_standard_error", "_gradient_error"))
+        scale = gradient_scale(*(stacked[name] for name in depth))
+        for quantity in ("optical_depth", "extinction"):
+            stacked[f"{quantity}_gradient_error"] *= scale
     cube = ("time", "plane", "altitude")
     azimuths = [_azimuth_of_plane(settings["azimuth"], zenith_angle, own) for own in planes]
     return {
         "plane": xr.Variable("plane", np.arange(len(planes), dtype=np.int32)),
         "plane_azimuth": xr.Variable("plane", np.array(azimuths)),
         **{
-            f"plane_{_variable(name)}": xr.Variable(cube, np.stack(values, axis=1))
-            for name, values in pieces.items()
+            f"plane_{_variable(name)}": xr.Variable(cube, values.swapaxes(0, 1))
+            for name, values in stacked.items()
         },
     }
 

@@ -404,6 +404,36 @@ def test_a_plume_in_one_plane_of_a_volume_does_not_widen_the_errors_of_another()
     assert np.sqrt((off**2).mean()) < 1.3
 
 
+@pytest.mark.parametrize("scatter", [0.0, 2e-5, 1e-4])
+def test_the_gradient_error_of_planes_to_all_sides_is_that_of_their_scatter(scatter):
+    """The declared gradient of 5 % per km would make it too large or too small."""
+    azimuths, cycles = np.arange(20.0, 360.0, 72.0), 4
+    zenith = np.tile(ONE_SIDE[1:], azimuths.size)
+    conditioned, pointing = scan(cycles, zenith)
+    pointing["azimuth"] = np.tile(np.repeat(azimuths, 9), cycles)
+    rng = np.random.default_rng(3)
+    east, north = rng.normal(0.0, scatter, (2, cycles)).repeat(zenith.size, axis=1)
+    bearing = np.radians(pointing["azimuth"])
+    gradient = east * np.sin(bearing) + north * np.cos(bearing)
+    away = RANGE * np.sin(np.radians(np.tile(zenith, cycles)))[:, np.newaxis]
+    sky = conditioned["power"].to_numpy()[:, -500:].mean(axis=1)[:, np.newaxis]
+    light = (conditioned["power"] - sky) * np.exp(gradient[:, np.newaxis] * away) + sky
+    product = solve(conditioned.assign(power=light), pointing)
+    depth = product["plane_vertical_optical_depth"]
+    noise, systematic = (
+        product[f"plane_vertical_optical_depth_{of}_error"] for of in ("standard", "gradient")
+    )
+    assert depth.sizes["plane"] == 5
+    total = np.hypot(noise, systematic)
+    weights = 1.0 / total.where(depth.notnull()) ** 2
+    share = weights / weights.sum("plane")
+    off = (depth - (share * depth).sum("plane")) / (total * np.sqrt(1.0 - share))
+    if scatter > 0.0:
+        assert 0.85 < np.sqrt((off**2).mean()) < 1.2
+    else:
+        assert systematic.median() < 0.5 * noise.median()
+
+
 def test_a_scan_in_one_plane_has_no_planes():
     for azimuth in (None, 20.0):
         conditioned, pointing = scan(2, ONE_SIDE)
