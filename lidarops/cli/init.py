@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -12,6 +13,7 @@ import typer
 from lidarops.cli.app import command, no_url, say
 
 _SCHEMA: Final = "campaign.schema.json"
+_OUTPUT: Final = "out"
 
 
 @command()
@@ -33,7 +35,7 @@ def init(
     """
     from lidarops.campaign.model import campaign_schema
     from lidarops.catalog.folder import read_folder
-    from lidarops.errors import CampaignError
+    from lidarops.errors import CampaignError, CatalogError
     from lidarops.plan.draft import draft_campaign
 
     if campaign.exists() and not force:
@@ -41,9 +43,17 @@ def init(
             "exists", file=campaign, remedy="give another name, or --force", wrong_use=True
         )
     root, base = Path(folder).resolve(), campaign.resolve().parent
+    if not root.is_dir():
+        raise CatalogError(
+            "is not a folder",
+            file=folder,
+            remedy="give the folder of the raw files",
+            wrong_use=True,
+        )
     text = draft_campaign(
         read_folder(str(root)),
         archive=Path(os.path.relpath(root, base)).as_posix(),
+        output=_free_output(campaign),
         name=root.name,
         schema=_SCHEMA,
     )
@@ -52,3 +62,13 @@ def init(
     campaign.write_text(text, encoding="utf-8")
     questions = sum("# ?" in line or "; ?" in line for line in text.splitlines())
     say(f"{campaign}: {questions} lines have a question; next: lidarops plan {campaign}")
+
+
+def _free_output(campaign: Path) -> str:
+    """Return a folder of output that no other campaign file beside this one states."""
+    others = (
+        path for path in campaign.resolve().parent.glob("*.yaml") if path != campaign.resolve()
+    )
+    stated = re.compile(rf"""^output:\s*["']?{_OUTPUT}["']?\s*(#|$)""", re.MULTILINE)
+    texts = (path.read_text(encoding="utf-8", errors="replace") for path in others)
+    return f"{_OUTPUT}-{campaign.stem}" if any(map(stated.search, texts)) else _OUTPUT

@@ -72,7 +72,9 @@ class _Site:
         yield f"    altitude: {self.altitude or 0.0:g}  # ? m above the geoid, {height}"
 
 
-def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema: str) -> str:
+def draft_campaign(
+    contents: FolderContents, *, archive: str, output: str, name: str, schema: str
+) -> str:
     """Return the text of a campaign file for the raw files of a folder.
 
     Parameters
@@ -80,6 +82,8 @@ def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema:
     contents : FolderContents
     archive : str
         Folder of the raw files, as the file states it.
+    output : str
+        Folder of catalog, products and reports, as the file states it.
     name : str
         From which the name of the campaign is made.
     schema : str
@@ -109,7 +113,7 @@ def draft_campaign(contents: FolderContents, *, archive: str, name: str, schema:
         f"name: {_key(name)}",
         f"title: {_text(f'Lidar measurements of {name}')}  # ?",
         f"archive: {_text(archive)}",
-        "output: out  # folder of catalog, products and reports, of this campaign alone",
+        f"output: {_text(output)}  # catalog, products and reports, of this campaign alone",
         "",
         "stations:",
         *(line for site in dict.fromkeys(sites) for line in site.lines()),

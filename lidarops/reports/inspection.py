@@ -27,7 +27,7 @@ from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
 from lidarops.raw.file import RawFile
-from lidarops.raw.formats import read_raw_header
+from lidarops.raw.formats import UNKNOWN_FORMAT, raw_formats, read_raw_header
 from lidarops.records import Role
 
 _LONG: Final = {"comment", "history", "references"}
@@ -141,7 +141,10 @@ def _raw(file: Path) -> dict[str, Any]:
         with RawFile(file) as opened:
             header = read_raw_header(opened)
     except RawFormatError as error:
-        error.remedy = error.remedy or "lidarops inspect reads raw files and NetCDF products"
+        if UNKNOWN_FORMAT in error.problem:
+            # That of an archive speaks of the patterns of a campaign.
+            formats = ", ".join(raw_formats())
+            error.remedy = f"lidarops inspect reads NetCDF products and raw files of {formats}"
         raise
     description: dict[str, Any] = _plain(header._asdict())
     # What only its format holds comes besides.

@@ -47,6 +47,27 @@ def raw(tmp_path: Path) -> Path:
     return raw
 
 
+def test_a_folder_that_is_absent_is_wrong_use_with_its_own_remedy(tmp_path: Path) -> None:
+    campaign = tmp_path / "campaign.yaml"
+    shown = CliRunner().invoke(app, ["init", str(tmp_path / "absent"), str(campaign)])
+    assert shown.exit_code == 2
+    assert "give the folder of the raw files" in " ".join(shown.output.split())
+    assert "LIDAROPS_ARCHIVE" not in shown.output
+    assert not campaign.exists()
+
+
+def test_a_second_campaign_beside_the_first_has_its_own_output(tmp_path: Path) -> None:
+    write(tmp_path / "raw/h26", content())
+    outputs = [
+        Path(drafted(tmp_path / "raw", tmp_path / name)[0].output).name
+        for name in ("first.yaml", "second.yaml")
+    ]
+    assert outputs == ["out", "out-second"]
+    options = ["init", str(tmp_path / "raw"), str(tmp_path / "first.yaml"), "--force"]
+    assert CliRunner().invoke(app, options).exit_code == 0
+    assert Path(load_campaign(tmp_path / "first.yaml").output).name == "out"
+
+
 @pytest.mark.parametrize(("written", "stated"), [(-90.0, True), (0.0, False)])
 def test_an_angle_that_stands_for_another_is_stated_as_written(
     tmp_path: Path, written: float, stated: bool

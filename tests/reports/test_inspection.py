@@ -99,5 +99,8 @@ def test_foreign_netcdf_is_shown_too(tmp_path: Path):
 def test_other_files_are_refused(tmp_path: Path):
     path = tmp_path / "text.txt"
     path.write_text("nothing")
-    with pytest.raises(LidarOpsError, match=r"text\.txt"):
+    with pytest.raises(LidarOpsError, match=r"text\.txt") as caught:
         describe(path)
+    # No campaign is concerned.
+    assert "pattern" not in str(caught.value)
+    assert "inspect reads NetCDF products and raw files" in str(caught.value)
