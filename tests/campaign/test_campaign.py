@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -163,6 +164,9 @@ def test_an_absent_file_is_named(tmp_path: Path) -> None:
         load_campaign(tmp_path / "none.yaml")
 
 
+KNOWN = {"method": "known_background"}
+
+
 def _with_facts(*facts: dict[str, object]) -> Campaign:
     raw = yaml.safe_load(MINIMAL)
     raw["instruments"]["lidar"]["facts"] = list(facts)
@@ -177,6 +181,30 @@ def test_facts_follow_time() -> None:
     lidar = campaign.instruments["lidar"]
     assert lidar.facts_at(datetime(2019, 12, 31, 23, 59, 59, tzinfo=UTC)).zenith_angle == 10
     assert lidar.facts_at(datetime(2020, 1, 1, tzinfo=UTC)).zenith_angle == 20
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"lag": 1}, "lag|method cubic only"),
+        ({"background": {"photon_532o": [2.0, 0.1]}}, "background|known_background only"),
+        ({**KNOWN, "background": {"photon_355o": [2.0, 0.1]}}, "background|photon_532o"),
+        ({**KNOWN, "background": {"photon_532o": [2.0, -0.1]}}, "background|greater than"),
+        (
+            {**KNOWN, "background": {"photon_532o": [2.0, 0.1]}, "background_range": [900, 1500]},
+            "background_range|give one",
+        ),
+    ],
+)
+def test_a_lag_and_a_background_need_their_method(settings: dict[str, Any], problem: str) -> None:
+    path = {"channels": ["photon_532o"], "sections": [[750, 4500]]}
+    with pytest.raises(ValidationError) as caught:
+        HomogeneousSettings.model_validate({**path, **settings})
+    (error,) = caught.value.errors()
+    key, words = problem.split("|")
+    located = [*error["loc"], *error.get("ctx", {}).get("keys", ())]
+    assert key in located
+    assert words in error["msg"]
 
 
 def test_overlapping_periods_are_refused() -> None:

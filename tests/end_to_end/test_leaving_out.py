@@ -622,3 +622,25 @@ def test_omissions_lose_and_change_no_good_value(tmp_path):
     assert good > 1000
     read = [sum(scene.bytes_read for scene in record.scenes) for record in (planned_run, whole)]
     assert read[0] <= 0.5 * read[1]
+
+
+def test_a_section_is_left_out_where_it_holds_no_triple_of_the_cubic():
+    cubic = {**SECTIONS, "method": "cubic", "lag": 300}
+    plan = planned(LEVEL, **with_products(homogeneous=cubic))
+    (step,) = (step for step in plan.steps if step.name == "homogeneous")
+    assert step.settings["sections"] == [[1500, 7500]]
+    assert step.settings["lag"] == 300
+    assert any("fewer than 601 bins" in reason for reason in decided(plan, "section_inside")[1])
+
+
+@pytest.mark.parametrize(("given", "windows"), [({"photon_532o": [2.0, 0.1]}, 1), (None, 0)])
+def test_far_bins_are_read_for_their_background_only(given, windows):
+    known = {
+        "channels": ["photon_532o"], "sections": [[750, 4500]],
+        "method": "known_background", "background": given,
+    }  # fmt: skip
+    plan = planned(LEVEL, **with_products(homogeneous=known))
+    assert len([step for step in plan.steps if step.name == "range_window"]) == windows
+    (step,) = (step for step in plan.steps if step.name == "homogeneous")
+    assert ("background" in step.settings) == bool(windows)
+    assert ("background_range" in step.settings) != bool(windows)

@@ -176,7 +176,7 @@ PathSolver = Callable[[Any, Scenario], Estimates]
 """Solver: returns estimates from powers (profile, range) and their scenario."""
 
 
-def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str, float]:
+def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str, Any]:
     """Return the arguments that a method needs besides the power.
 
     Known values are exact; the prior of "linearized" is 20 percent low.

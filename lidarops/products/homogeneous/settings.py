@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from lidarops.settings import (
+    NO_UNIT,
     BackgroundRange,
     ChannelProduct,
     Metres,
@@ -15,6 +16,7 @@ from lidarops.settings import (
     quantity,
 )
 
+NonNegative = Annotated[float, Field(ge=0)]
 Method = Literal["auto", "direct", "cubic", "known_background", "linearized", "known_extinction"]
 _GIVEN_EXTINCTION: Final = ("linearized", "known_extinction")
 """Methods that start from a given extinction."""
@@ -32,9 +34,9 @@ class HomogeneousSettings(ChannelProduct):
     method: Method = Field(
         default="auto",
         description="known_background takes the background from the far range, for paths that end"
-        " there, and so does auto where the beam moves and the sections end before the last tenth"
-        " of the bins; the other methods retrieve it from the section. linearized takes one step"
-        " from extinction, known_extinction takes it as exact",
+        " there, or from background; and so does auto from the far range where the beam moves and"
+        " the sections end before the last tenth of the bins; the other methods retrieve it from the"
+        " section. linearized takes one step from extinction, known_extinction takes it as exact",
     )
     extinction: float | None = quantity(
         None,
@@ -48,6 +50,20 @@ class HomogeneousSettings(ChannelProduct):
         None,
         unit="m",
         description="far range of known_background; the last tenth of the bins by default",
+    )
+    background: dict[str, tuple[float, NonNegative]] | None = quantity(
+        None,
+        unit="MHz or mV",
+        description="of known_background, in place of the far range: the background of each"
+        " channel, measured separately, and its standard error; MHz for photon counting, mV for"
+        " analog, with dead time and dark signal corrected",
+    )
+    lag: int | None = quantity(
+        None,
+        unit=NO_UNIT,
+        ge=1,
+        description="bins between those of a triple of the method cubic; by default 0.4 of the bins"
+        " of the section, at 1 the published cubic",
     )
     visibility: VisibilitySettings | None = Field(
         default=None, description="if given, adds visibility along the sections"
@@ -67,4 +83,19 @@ class HomogeneousSettings(ChannelProduct):
                 f"is required by {' and '.join(_GIVEN_EXTINCTION)}, and used by no other method",
                 "extinction",
             )
+        if self.lag is not None and self.method != "cubic":
+            raise located_error("is used by the method cubic only", "lag")
+        self._check_background()
         return self
+
+    def _check_background(self) -> None:
+        """Refuse a given background that no channel, or not every channel, uses."""
+        if self.background is None:
+            return
+        if self.method != "known_background":
+            raise located_error("is used by the method known_background only", "background")
+        if self.background_range is not None:
+            raise located_error("is given together with background; give one", "background_range")
+        if self.background.keys() != set(self.channels):
+            named = ", ".join(self.channels)
+            raise located_error(f"must state each of the channels: {named}", "background")

@@ -29,7 +29,7 @@ from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit, counts_per_power
-from lidarops.settings import SettingsModel, VisibilitySettings, quantity
+from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
 from lidarops.steps.data import Chunk, Data, WholeProduct, in_one_batch
@@ -60,8 +60,13 @@ def _inside(case: Case) -> list[Section]:
     return [
         (near, far)
         for near, far in case.request.sections
-        if far <= case.last and (far - near) / width >= FEWEST_BINS
+        if far <= case.last and (far - near) / width >= _fewest_bins(case.request)
     ]
+
+
+def _fewest_bins(request: HomogeneousSettings) -> int:
+    """Return the fewest bins of a section: those that a fit needs, and a triple of the cubic."""
+    return FEWEST_BINS if request.lag is None else max(FEWEST_BINS, 2 * request.lag + 1)
 
 
 def _climbs(case: Case, near: float, far: float) -> list[float]:
@@ -112,7 +117,7 @@ class SectionWindow(Window, Choice[Case, WindowSettings]):
         if case.all_steps:
             yield Leave(ALL_STEPS)
             return
-        if _method(case) == "known_background":
+        if _method(case) == "known_background" and not case.request.background:
             yield Leave("the background is that of the far range")
             return
         farthest = max(far for _, far in _level(case))
@@ -176,6 +181,10 @@ class PathSettings(SettingsModel):
     background_range: tuple[float, float] | None = quantity(
         None, unit="m", description="far range of `known_background`"
     )
+    background: tuple[float, float] | None = quantity(
+        None, unit="MHz or mV", description="given one of `known_background`, and its error"
+    )
+    lag: int | None = quantity(None, unit=NO_UNIT, description="of `cubic`, bins")
     visibility: VisibilitySettings | None = None
     left_out: tuple[tuple[float, float, OmittedBit], ...] = ()
     """Sections that are not retrieved, with the quality bit that says why."""
@@ -227,17 +236,17 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
         if level:
             settings, method = case.request, _method(case)
             definition = settings.visibility
-            known = method == "known_background"
-            whence = _BACKGROUNDS.get(method, "is retrieved together with extinction")
-            if method != settings.method:
-                whence += ", because the beam moves and the sections end before it"
+            given = (settings.background or {}).get(case.channel.name)
+            far = method == "known_background" and given is None
             yield Run(
-                f"{REQUESTED}; background {whence}",
+                f"{REQUESTED}; background {_whence(settings, method)}",
                 PathSettings(
                     method=method,
                     extinction=settings.extinction,
                     sections=tuple(level),
-                    background_range=tail(case, settings.background_range) if known else None,
+                    background_range=tail(case, settings.background_range) if far else None,
+                    background=given,
+                    lag=settings.lag,
                     visibility=definition and definition.resolved,
                 ),
                 number=float(len(level)),
@@ -280,11 +289,21 @@ _PARTS: Final = 64
 """Number of chunks whose sections are joined: a Dataset takes more than the few values in it."""
 
 
+def _whence(settings: HomogeneousSettings, method: Method) -> str:
+    """Return in words where the background comes from."""
+    if settings.background:
+        return "is given by the campaign"
+    whence = _BACKGROUNDS.get(method, "is retrieved together with extinction")
+    if method != settings.method:
+        return f"{whence}, because the beam moves and the sections end before it"
+    return whence if settings.lag is None else f"{whence} with a lag of {settings.lag} bins"
+
+
 def _outside(case: Case, near: float, far: float) -> Leave:
     bins = (min(far, case.last) - near) / case.channel.bin_width
     reason = (
         f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
-        f" holds fewer than {FEWEST_BINS} bins"
+        f" holds fewer than {_fewest_bins(case.request)} bins"
     )
     return Leave(reason, number=bins, rule="section_inside")
 
@@ -360,6 +379,8 @@ class _Sections(WholeProduct):
             conditioned["power"],
             sections=self._kept,
             background_range=far,
+            background=self._settings.background,
+            lag=self._settings.lag,
             variance=conditioned["variance"],
             quality=quality,
             method=self._settings.method,

@@ -139,7 +139,7 @@ def solve_by_cubic(problem: PathProblem) -> PathSolution:
     estimate, gradients = solve_cubic(
         problem.power,
         problem.range,
-        None,
+        problem.lag,
         variance,
         known_variance=problem.known_variance,
         want_gradients=True,

@@ -44,6 +44,8 @@ class PathProblem:
     """(profile or 1,): variance of the known background."""
     exposure: Array | None = None
     """(profile or 1,): counts per unit of power; None where the noise is not that of counts."""
+    lag: int | None = None
+    """Bins between those of a triple of the cubic; chosen by the number of bins if None."""
 
     @property
     def rounding(self) -> float:

@@ -50,6 +50,8 @@ def fit_homogeneous_path(
     background_range: tuple[float, float] | None = None,
     extinction: xr.DataArray | float | None = None,
     exposure: xr.DataArray | None = None,
+    background: tuple[float, float] | None = None,
+    lag: int | None = None,
 ) -> xr.Dataset:
     """Return background, amplitude and extinction of sections of range.
 
@@ -68,8 +70,8 @@ def fit_homogeneous_path(
         INCOMPLETE_OVERLAP from its bins.
     method : str
         A method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`;
-        "known_background" needs `background_range`, "linearized" and "known_extinction" need
-        `extinction`.
+        "known_background" needs `background_range` or `background`, "linearized" and
+        "known_extinction" need `extinction`.
     relative_variance : bool
         Whether `variance` is known up to a factor only, which each section estimates: for a
         variance estimated from the same data.
@@ -86,6 +88,11 @@ def fit_homogeneous_path(
     exposure : xr.DataArray, optional
         Of Poisson counts: counts per unit of power, over the dimensions of `power` but range; not
         with `relative_variance`.
+    background : (float, float), optional
+        Of "known_background", in place of `background_range`: the background and its standard
+        error, in the unit of the power.
+    lag : int, optional
+        Bins, of "cubic"; see `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`.
 
     Returns
     -------
@@ -115,7 +122,9 @@ def fit_homogeneous_path(
     if exposure is not None:
         _check_dimensions(exposure, power, "exposure")
         inputs["exposure"] = exposure
-    if background_range is not None:
+    if background is not None:
+        inputs |= _given_background(background, background_range)
+    elif background_range is not None:
         inputs |= _far_background(checked, distance, background_range)
     outputs = xr.apply_ufunc(
         _solve,
@@ -128,6 +137,7 @@ def fit_homogeneous_path(
             "sections": [slice(b.start - used.start, b.stop - used.start) for b in bins],
             "method": method,
             "relative": relative_variance,
+            "lag": lag,
         },
         dask="parallelized",
         output_dtypes=[np.float64] * len(_VALUES) + [np.int32] * len(_COUNTS),
@@ -236,6 +246,18 @@ def _checked_inputs(
     }
 
 
+def _given_background(
+    background: tuple[float, float], background_range: tuple[float, float] | None
+) -> dict[str, xr.DataArray]:
+    """Return a background that is given for all profiles, and its standard error."""
+    if background_range is not None:
+        raise RetrievalInputError(
+            "is given together with background_range", field="background", remedy="give one of them"
+        )
+    value, error = background
+    return {"background": xr.DataArray(value), "background_error": xr.DataArray(error)}
+
+
 def _far_background(
     inputs: Mapping[str, xr.DataArray],
     distance: npt.NDArray[np.float64],
@@ -293,6 +315,7 @@ def _solve(
     sections: Sequence[slice],
     method: str,
     relative: bool,
+    lag: int | None,
 ) -> tuple[_Block, ...]:
     """Return the values of all sections, stacked along a last axis."""
     # Values of whole profiles broadcast along range.
@@ -306,6 +329,7 @@ def _solve(
             range=range[bins],
             method=method,
             relative=relative,
+            lag=lag,
         )
         for bins in sections
     ]
@@ -326,6 +350,7 @@ def _solve_section(
     range: _Block,  # noqa: A002 - the field's word
     method: str,
     relative: bool,
+    lag: int | None,
 ) -> tuple[_Block, ...]:
     carried = np.int32(0)
     if quality is not None:
@@ -353,6 +378,7 @@ def _solve_section(
         background_standard_error=error,
         extinction=prior,
         exposure=counted,
+        lag=lag,
     )
     values = tuple(getattr(fit, name.removeprefix("total_")) for name in _VALUES)
     bits = fit.quality | carried

@@ -44,7 +44,10 @@ _NEEDS: Final[dict[str, set[HomogeneousMethod]]] = {
     "background": {HomogeneousMethod.KNOWN_BACKGROUND},
 }
 """Arguments that these methods require and no other accepts."""
-_TAKES: Final = {"background_standard_error": {HomogeneousMethod.KNOWN_BACKGROUND}}
+_TAKES: Final = {
+    "background_standard_error": {HomogeneousMethod.KNOWN_BACKGROUND},
+    "lag": {HomogeneousMethod.CUBIC},
+}
 """Arguments that only these methods accept."""
 
 
@@ -108,6 +111,7 @@ def fit_homogeneous_path(
     background_standard_error: npt.ArrayLike | None = None,
     noise_correlation_length: npt.ArrayLike | None = None,
     exposure: npt.ArrayLike | None = None,
+    lag: int | None = None,
 ) -> HomogeneousResult:
     r"""Return background, amplitude and extinction of a homogeneous path.
 
@@ -142,6 +146,9 @@ def fit_homogeneous_path(
         For Poisson counts: counts per unit of power, as for
         `lidarops.retrieve.background.known_shape.fit_known_shape`. With few counts, the limits of
         OUTLIER and POOR_FIT are those of Poisson noise of the given variance, which is required.
+    lag : int, optional
+        Of "cubic": bins between those of a triple, by default that of
+        `lidarops.retrieve.background.cubic`.
 
     Returns
     -------
@@ -223,6 +230,7 @@ def fit_homogeneous_path(
             "extinction": extinction,
             "background": background,
             "background_standard_error": background_standard_error,
+            "lag": lag,
         },
     )
     grid = inputs.range_grid(range)
@@ -259,6 +267,7 @@ def fit_homogeneous_path(
         background=inputs.profile_values(background, "background", leading),
         background_variance=None if error is None else error**2,
         exposure=counted,
+        lag=lag,
     )
     return _result(_SOLVERS[chosen_method](problem), leading)
 

@@ -432,6 +432,9 @@ def test_model_error_and_signal_to_noise_are_reported():
         ({"method": "known_background", "background": np.nan}, "background"),
         ({"method": "known_background", "background": np.ones(3)}, "background"),
         ({"method": "linearized", "extinction": 0.1}, "extinction"),
+        ({"lag": 1}, "lag"),
+        ({"method": "cubic", "lag": 0}, "lag"),
+        ({"method": "cubic", "lag": LONG.size // 2 + 1}, "lag"),
     ],
 )
 def test_arguments_that_a_method_does_not_accept_are_refused(arguments, field):
@@ -439,6 +442,14 @@ def test_arguments_that_a_method_does_not_accept_are_refused(arguments, field):
     with pytest.raises(RetrievalInputError) as caught:
         fit_homogeneous_path(given.pop("power"), LONG, **given)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("lag", [1, 30, None])
+def test_the_cubic_takes_its_lag(lag):
+    power = clean(20, 107.0, seed=1)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0, method="cubic", lag=lag)
+    expected = cubic_and_tail.cubic(power, LONG, variance=1.0, lag=lag).background
+    np.testing.assert_array_equal(fit.background, expected)
 
 
 @pytest.mark.parametrize("near", [750.0, 2500.0])

@@ -319,6 +319,23 @@ def test_the_far_background_is_the_same_for_any_chunking():
     xr.testing.assert_identical(expected, chunked.compute())
 
 
+def test_a_given_background_is_that_of_all_profiles_with_its_error():
+    power = far_path(2e-4, profiles=7)
+    options = {
+        "sections": [(1500.0, 4000.0)],
+        "variance": 0.25,
+        "method": "known_background",
+        "background": (370.0, 0.2),
+    }
+    fit = labeled.fit_homogeneous_path(power, **options)
+    assert (fit["background"] == 370.0).all()
+    np.testing.assert_allclose(fit["background_standard_error"], 0.2)
+    chunked = labeled.fit_homogeneous_path(power.chunk(time=3, range=500), **options)
+    xr.testing.assert_identical(fit, chunked.compute())
+    with pytest.raises(RetrievalInputError, match="background: is given together"):
+        labeled.fit_homogeneous_path(power, **options, background_range=(27_000.0, 30_000.0))
+
+
 def test_the_far_background_needs_variances():
     with pytest.raises(RetrievalInputError, match="variance: is needed"):
         labeled.fit_homogeneous_path(
