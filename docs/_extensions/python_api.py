@@ -17,6 +17,7 @@ REPOSITORY: Final = Path(__file__).resolve().parents[2]
 MODULES: Final = (
     "lidarops",
     "lidarops.aggregate.virtual_dataset",
+    "lidarops.campaign.model",
     "lidarops.raw.licel",
     "lidarops.retrieve.air.molecular",
     "lidarops.retrieve.air.visibility",
@@ -40,6 +41,7 @@ MODULES: Final = (
     "lidarops.retrieve.network.triangles",
     "lidarops.retrieve.network.geometry",
     "lidarops.retrieve.network.labeled",
+    "lidarops.simulate.atmosphere",
     "lidarops.simulate.campaign",
     "lidarops.simulate.signal",
     "lidarops.simulate.pulse",
