@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterator
 from importlib import import_module
@@ -30,13 +31,6 @@ def _page(repository: Path, name: str) -> str:
     return (repository / "docs" / "papers" / f"{name}.md").read_text(encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def tests_of_the_suite(repository: Path) -> set[str]:
-    """Return the names of all tests."""
-    texts = (path.read_text(encoding="utf-8") for path in (repository / "tests").rglob("test_*.py"))
-    return {name for text in texts for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)}
-
-
 def _resolved(dotted: str) -> object:
     """Return a module or what it holds."""
     parts = dotted.split(".")
@@ -51,20 +45,43 @@ def _resolved(dotted: str) -> object:
     raise ModuleNotFoundError(dotted)
 
 
+def _words_of(package: str, repository: Path) -> set[str]:
+    """Return the names of modules, functions, classes and arguments of a package, and its texts."""
+    words: set[str] = set()
+    for path in (repository / package.replace(".", "/")).rglob("*.py"):
+        words |= {path.stem, path.parent.name}
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                words.add(node.name)
+            elif isinstance(node, ast.arg):
+                words.add(node.arg)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                words.add(node.value)
+    return words
+
+
 @pytest.mark.parametrize("name", PAGES)
-def test_a_page_names_functions_and_tests_that_exist(
-    name: str, repository: Path, tests_of_the_suite: set[str]
-) -> None:
+def test_a_page_names_functions_and_tests_that_exist(name: str, repository: Path) -> None:
     text = _page(repository, name)
-    prefix = re.search(r"^Names begin with `([\w.]+)\.`$", text, re.MULTILINE)
+    prefix = re.search(
+        r"^Names begin with `([\w.]+)\.`, tests with `([\w/]+)/`\.$", text, re.MULTILINE
+    )
     assert prefix
     functions = re.findall(r"`((?:\w+\.)+\w+)`", text)
     assert len(functions) > 1
     for dotted in functions:
         assert _resolved(f"{prefix[1]}.{dotted}") is not None
-    named = set(re.findall(r"`(test_\w+)`", text))
-    assert len(named) > 5
-    assert named <= tests_of_the_suite
+    tests = set(re.findall(r"`([\w/]+\.py)::(test_\w+)`", text))
+    assert len(tests) > 5
+    for file, test in tests:
+        assert f"\ndef {test}(" in (repository / prefix[2] / file).read_text("utf-8"), (file, test)
+    assert not re.search(r"`test_\w+`", text)
+    # Arguments, methods, and functions of a module that the same row names.
+    table = text.partition("## Where each formula is")[2].partition("\n## ")[0]
+    cells = [line.split(" | ")[2] for line in table.splitlines() if line.count(" | ") == 3]
+    assert len(cells) > 5
+    words = {word for cell in cells for word in re.findall(r'[`"](\w+)(?=[`="])', cell)}
+    assert words - {"auto"} <= _words_of(prefix[1], repository)
 
 
 def _variables() -> dict[str, Any]:
