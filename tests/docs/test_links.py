@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 from collections.abc import Sequence
@@ -59,6 +60,29 @@ def test_files_named_in_code_exist() -> None:
             r"`([\w./-]+\.(?:py|toml|bib|md|cff|lock))`", page.read_text("utf-8")
         ):
             assert _exists(name, tracked), (name_of(page), name)
+
+
+def _defined() -> set[str]:
+    """Return the names of packages, modules, functions, classes and variables."""
+    paths = [path for root in ("lidarops", "flows") for path in (REPOSITORY / root).rglob("*.py")]
+    names = {part for path in paths for part in path.relative_to(REPOSITORY).with_suffix("").parts}
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.add(node.name)
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                names.add(node.id)
+    return names
+
+
+def test_names_of_code_in_the_architecture_exist() -> None:
+    text = (REPOSITORY / "docs/architecture.md").read_text("utf-8")
+    named = {
+        name for name in re.findall(r"`([\w.]+)`", text) if not re.search(r"\.(py|toml|md)$", name)
+    }
+    assert len(named) > 40
+    last = {name.rpartition(".")[2] for name in named - {"prefect"}}
+    assert last - _defined() == set()
 
 
 def test_a_wrong_folder_or_a_built_file_is_no_file() -> None:
