@@ -38,7 +38,7 @@ default_role = "code"
 # Names in types of docstrings that several classes have as an attribute.
 suppress_warnings = ["ref.python"]
 
-myst_enable_extensions = ["amsmath", "dollarmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["amsmath", "dollarmath"]
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 

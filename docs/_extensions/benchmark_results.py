@@ -7,7 +7,6 @@ BENCH`` wrote into ``docs/results/NAME.json``, and the figures that the page sho
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 from collections.abc import Iterator
@@ -40,6 +39,10 @@ SELECTIONS: Final = {
         figures=("all-homogeneous-path", "all-elastic-inversion", "all-scans-over-zenith-angle",
                  "all-networks-of-lidars"),
     ),
+    "background": Selection(
+        "lidarops bench accuracy --case homogeneous --quick --out bench",
+        ("Mean error of the background",),
+    ),
     "memory": Selection("lidarops bench throughput --case memory --out bench", ("Peak memory",)),
     "published": Selection(
         "lidarops bench accuracy --case elastic --quick --data boeckmann --out bench",
@@ -69,7 +72,7 @@ def take(name: str, folder: Path) -> None:
     head = {
         "command": selection.command,
         "date": result["date"],
-        "machine": {**result["machine"], "cores": os.cpu_count()},
+        "machine": result["machine"],
     }
     rows = ",\n".join(
         f" {json.dumps(title)}: [\n  "
@@ -132,7 +135,7 @@ def facts(result: dict[str, Any]) -> str:
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
     return (
         f"`{result['command']}`, {result['date']}: {machine['processor']}, {machine['cores']} "
-        f"cores shared with other work, Python {machine['python']}, {packages}."
+        f"cores, Python {machine['python']}, {packages}."
     )
 
 
@@ -143,10 +146,11 @@ def scoreboard() -> str:
 
 
 def _scoreboard(ours: dict[str, list[Row]], others: dict[str, Any]) -> Iterator[str]:
-    for score, form in zip(others["scores"], _FORMS, strict=True):
+    for score in others["scores"]:
+        factor, digits = score["factor"], score["digits"]
         (rows,) = (rows for title, rows in ours.items() if title.startswith(score["table"]))
         values = {
-            (row.case, row.method): _signed(row.value, form)
+            (row.case, row.method): _signed(row.value, factor, digits)
             for row in rows
             if row.quantity == score["quantity"]
         }
@@ -158,10 +162,7 @@ def _scoreboard(ours: dict[str, list[Row]], others: dict[str, Any]) -> Iterator[
                 (
                     f"{level} counts",
                     *(values[level, method] for method in score["methods"]),
-                    *(
-                        _signed(chain[level], form._replace(factor=1.0))
-                        for chain in chains.values()
-                    ),
+                    *(_signed(chain[level], 1.0, digits) for chain in chains.values()),
                 )
                 for level in dict.fromkeys(row.case for row in rows)
             ],
@@ -171,19 +172,12 @@ def _scoreboard(ours: dict[str, list[Row]], others: dict[str, Any]) -> Iterator[
     yield others["origin"]
 
 
-class _Form(NamedTuple):
-    """How an error is written."""
-
-    factor: float
-    digits: int
-
-
-_FORMS: Final = (_Form(1.0, 2), _Form(100.0, 1))
-"""Of background in counts, and of backscatter in percent."""
-
-
-def _signed(value: Any, form: _Form) -> str:
-    return "no value" if value is None else f"{value * form.factor:+.{form.digits}f}"
+def _signed(value: float | None, factor: float, digits: int) -> str:
+    """Return a number with its sign; zero has none."""
+    if value is None:
+        return "no value"
+    number = round(value * factor, digits)
+    return f"{number:+.{digits}f}" if number else f"{0:.{digits}f}"
 
 
 if __name__ == "__main__":

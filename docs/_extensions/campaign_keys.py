@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from datetime import timedelta
 from typing import Any, Final
 
+from product_variables import own_kinds
 from pydantic import TypeAdapter
 from tables import first_paragraph, table
 
@@ -37,9 +38,8 @@ def page() -> str:
     """Return a section for the file, and for each mapping within it in the order of mention."""
     schema = campaign_schema()
     definitions = schema["$defs"]
-    for name, kind in kinds().items():
-        if not kind.package.startswith("lidarops."):
-            definitions["Products"]["properties"].pop(name, None)
+    for name in kinds().keys() - own_kinds():
+        definitions["Products"]["properties"].pop(name, None)
     lines = ["## The file", *_keys(schema)]
     for name in _mentioned(schema, definitions):
         section = definitions[name]

@@ -34,6 +34,7 @@ def _section(name: str, command: Any) -> Iterator[str]:
     rows = [_row(item) for item in command.params if item.help]
     if rows:
         yield from table(("", "default", "meaning"), rows)
+    yield ""
 
 
 def _argument(parameter: Any) -> str:

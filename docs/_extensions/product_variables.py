@@ -17,14 +17,14 @@ def page() -> str:
 
 
 def _kinds() -> Iterator[str]:
-    for kind in _own_kinds():
+    for kind in own_kinds():
         layout = layout_of(kind)
         yield f"\n## Variables of `{kind}`\n\n{layout.title}. {layout.comment}"
         rows = map(_cells, (*layout.coordinates, *layout.variables))
         yield from table(("variable", "dimensions", "unit", "standard name", "what it is"), rows)
 
 
-def _own_kinds() -> list[str]:
+def own_kinds() -> list[str]:
     """Return the kinds of product of lidarops, without those that other packages add."""
     return [name for name, kind in kinds().items() if kind.package.startswith("lidarops.")]
 
@@ -43,7 +43,7 @@ def _cells(row: Row) -> tuple[str, ...]:
 def _bits() -> Iterator[str]:
     yield "\n## Bits of `quality_flag`"
     carriers: dict[tuple[int, str, str, str], list[str]] = {}
-    for kind in _own_kinds():
+    for kind in own_kinds():
         for bit in flags_of(kind):
             row = (int(bit), bit.word, bit.severity.name.lower(), bit.description)
             carriers.setdefault(row, []).append(kind)
@@ -54,6 +54,6 @@ def _bits() -> Iterator[str]:
             for (value, word, severity, description), names in sorted(carriers.items())
         ],
     )
-    own = {kind: sum(bit >= 1 << FIRST_OWN for bit in flags_of(kind)) for kind in _own_kinds()}
+    own = {kind: sum(bit >= 1 << FIRST_OWN for bit in flags_of(kind)) for kind in own_kinds()}
     left = [f"{PLACES - FIRST_OWN - count} in `{kind}`" for kind, count in own.items()]
     yield f"\nPlaces left for new bits: {FIRST_OWN - len(Quality)} in all kinds, {', '.join(left)}."

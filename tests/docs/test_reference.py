@@ -18,14 +18,13 @@ import python_api
 import stiff_cases
 import typer
 import yaml
-from support.stiff import CASES
+from support.pages import blocks, name_of, pages
 
 import flows
 import lidarops
 from lidarops.campaign.model import load_campaign
 from lidarops.cli import app
 from lidarops.kinds import flags_of
-from lidarops.netcdf.variables import layout_of
 
 # Made of the settings of all kinds of product, and listed among the keys of a campaign file.
 ASSEMBLED = {"Products", "Network"}
@@ -128,17 +127,23 @@ def test_every_key_is_listed_with_unit_bounds_and_default(repository) -> None:
     assert "integrated" not in keys
 
 
-def test_every_variable_and_flag_is_listed() -> None:
+def test_variables_and_flags_of_the_golden_products_are_listed(repository) -> None:
     page = product_variables.page()
-    for kind in OWN_KINDS:
-        section = page.partition(f"## Variables of `{kind}`")[2].partition("\n## ")[0]
-        layout = layout_of(kind)
-        names = {row.name for row in (*layout.coordinates, *layout.variables)}
-        assert names == _first_cells(section)
     bits = page.partition("## Bits of")[2]
-    for kind in OWN_KINDS:
-        for bit in flags_of(kind):
-            assert f"| `{bit.word}` | {int(bit)} |" in bits
+    files = sorted((repository / "tests/golden").glob("*.cdl"))
+    assert {path.stem.partition("_")[0] for path in files} == set(OWN_KINDS)
+    for path in files:
+        text = path.read_text(encoding="utf-8")
+        section = page.partition(f"## Variables of `{path.stem.partition('_')[0]}`")[2]
+        described = set(re.findall(r"^    (\w+):long_name", text, re.MULTILINE))
+        assert len(described) > 10
+        # These three describe the file, and are the same in all kinds.
+        described -= {"station", "provenance", "quantization_info"}
+        assert described <= _first_cells(section.partition("\n## ")[0]), path.name
+        (masks,) = re.findall(r"quality_flag:flag_masks = (.*) ;", text)
+        (words,) = re.findall(r'quality_flag:flag_meanings = "(.*)" ;', text)
+        for mask, word in zip(masks.split(", "), words.split(), strict=True):
+            assert f"| `{word}` | {mask} |" in bits, path.name
 
 
 def test_the_flags_that_point_to_facts_exist(repository) -> None:
@@ -150,7 +155,38 @@ def test_the_flags_that_point_to_facts_exist(repository) -> None:
     assert named <= {bit.word for kind in OWN_KINDS for bit in flags_of(kind)}
 
 
-def test_every_stiff_case_is_listed() -> None:
-    page = stiff_cases.page()
-    for case in CASES:
-        assert f"| {case.name.replace('|', chr(92) + '|')} |" in page
+def test_stiff_cases_of_every_retrieval_are_listed_with_what_they_expect() -> None:
+    sections = stiff_cases.page().split("## ")[1:]
+    titles = [section.partition("\n")[0] for section in sections]
+    assert titles == [
+        "Homogeneous", "Signal chain", "Elastic", "Multi-angle", "Network", "Forward model",
+    ]  # fmt: skip
+    rows = [
+        re.findall(r"^\| (?!case |---)(.+) \| (.+) \|$", text, re.MULTILINE) for text in sections
+    ]
+    assert all(len(cases) >= 5 for cases in rows)
+    # A case without expectation cannot fail.
+    assert all(expected.strip() for cases in rows for _, expected in cases)
+
+
+def test_commands_are_apart() -> None:
+    """A heading of Markdown needs an empty line before it."""
+    assert not re.search(r"[^\n]\n## ", command_line.page())
+
+
+def test_scripts_and_pages_import_what_users_may_call(repository) -> None:
+    texts = {path.name: path.read_text() for path in (repository / "examples").glob("*.py")}
+    for page in pages():
+        code = [
+            block.text for block in blocks(page) if re.search(r"python|code-cell", block.language)
+        ]
+        texts[name_of(page)] = "\n".join(code)
+    imported = {
+        (name, module)
+        for name, text in texts.items()
+        for module in re.findall(r"^(?:from|import) (lidarops[\w.]*)", text, re.MULTILINE)
+    }
+    assert len(imported) > 20
+    assert {
+        (name, module) for name, module in imported if module not in python_api.MODULES
+    } == set()

@@ -6,6 +6,11 @@ import json
 
 import benchmark_results
 import pytest
+import typer
+
+from lidarops.bench.harness.benchmark import BenchmarkKind
+from lidarops.bench.registry import Benchmark
+from lidarops.cli import app
 
 
 @pytest.fixture
@@ -14,7 +19,7 @@ def taken(tmp_path, monkeypatch):
     row = {"case": "path", "method": "ours", "error": 0.0}
     result = {
         "date": "2026-01-01",
-        "machine": {"processor": "one", "python": "3", "packages": {"numpy": "2"}},
+        "machine": {"processor": "one", "cores": 3, "python": "3", "packages": {"numpy": "2"}},
         "tables": {
             "The most accurate of all": [
                 {**row, "method": "peer", "quantity": "RMSE", "value": 2.0, "unit": ""},
@@ -49,7 +54,7 @@ def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
     assert (taken / "accuracy-all-homogeneous-path.svg").read_text() == "all-homogeneous-path"
     page = benchmark_results.page("accuracy")
     assert "| ours | 1.25(1) | 95.1 % | 2.5 µs |" in page
-    assert "2026-01-01: one, " in page
+    assert "2026-01-01: one, 3 cores, Python 3" in page
 
 
 @pytest.mark.parametrize("name", sorted(benchmark_results.SELECTIONS))
@@ -59,7 +64,13 @@ def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
     result = benchmark_results.read(name)
     assert result["machine"]["cores"]
     assert result["tables"]
-    assert result["command"] in benchmark_results.page(name)
+    # What is committed was made by the command of today, which the command line accepts.
+    assert result["command"] == benchmark_results.SELECTIONS[name].command
+    program, command, *words = result["command"].split()
+    assert (program, command) == ("lidarops", "bench")
+    values = typer.main.get_command(app).commands["bench"].make_context("bench", words).params
+    assert values["what"] in list(BenchmarkKind)
+    assert values["case"] in [*Benchmark, None]
 
 
 def test_the_scoreboard_shows_ours_beside_all_others() -> None:
@@ -72,3 +83,6 @@ def test_the_scoreboard_shows_ours_beside_all_others() -> None:
     # `test_elastic_published.py` and `test_known_shape.py` hold these files to 1 % and 3.5 errors.
     assert "| 1e4 counts | +0.03 | +2.72 |" in text
     assert "| 1e8 counts | no value |" in text
+    # Zero has no sign.
+    assert "-0.0 " not in text
+    assert "+0.0 " not in text

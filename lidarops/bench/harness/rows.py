@@ -439,8 +439,8 @@ class Study:
         """Date, machine and software, as far as known."""
         about = self.machine
         packages = ", ".join(f"{name} {version}" for name, version in about.packages.items())
-        values = (self.date, about.processor, about.python, packages)
-        terms = ("Date", "Processor", "Python", "Packages")
+        values = (self.date, about.processor, str(about.cores), about.python, packages)
+        terms = ("Date", "Processor", "Cores", "Python", "Packages")
         return [fact for fact in zip(terms, values, strict=True) if fact[1]]
 
     def json(self) -> str:

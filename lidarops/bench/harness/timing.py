@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import platform
 import resource
 import sys
@@ -33,6 +34,7 @@ class Machine:
     """Machine and software of a benchmark run."""
 
     processor: str
+    cores: int
     python: str
     packages: Mapping[str, str]
     """Versions of installed packages by name."""
@@ -42,6 +44,7 @@ def machine() -> Machine:
     """Return the machine and the packages of this process."""
     return Machine(
         processor=_processor(),
+        cores=os.cpu_count() or 1,
         python=platform.python_version(),
         packages={name: number for name in _PACKAGES if (number := _version(name))},
     )
