@@ -22,7 +22,7 @@ from lidarops.netcdf.sizes import check_contents
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 RELEASE_DATE: Final = date(2026, 11, 21)
-"""Release date of this version of lidarops; a product is dated no earlier."""
+"""Release date of this version of lidarops, set with the version; a product is dated no earlier."""
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")

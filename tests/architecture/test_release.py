@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import subprocess
 import tomllib
+from datetime import date
 from pathlib import Path
 
 import pytest
 import yaml
+
+from lidarops.netcdf.provenance import RELEASE_DATE
 
 
 @pytest.fixture
@@ -27,9 +30,28 @@ def test_the_citation_and_the_changelog_name_the_version(repository: Path, versi
     assert newest[1] == version
 
 
+def test_images_have_the_version(repository: Path, version: str) -> None:
+    pages = [path for name in ("deploy", "docs") for path in (repository / name).rglob("*.[my]*")]
+    named = [
+        number
+        for path in pages
+        if path.is_file() and not {"_build", "made"} & set(path.parts)
+        for number in re.findall(
+            r"(?:lidarops:|newTag: )(\d+\.\d+\.\d+)", path.read_text(encoding="utf-8")
+        )
+    ]
+    # deploy/kubernetes/kustomization.yaml and docs/howto/cluster.md.
+    assert len(named) >= 2
+    assert set(named) == {version}
+
+
 def test_a_tagged_commit_has_the_version_of_its_tag(repository: Path, version: str) -> None:
     command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
     tags = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
     if tags.returncode or not tags.stdout.split():
         pytest.skip("this commit has no tag of a release")
     assert tags.stdout.split() == [f"v{version}"]
+    changelog = (repository / "CHANGELOG.md").read_text(encoding="utf-8")
+    heading = re.search(rf"^## {re.escape(version)} - (\S+)$", changelog, re.MULTILINE)
+    assert heading
+    assert date.fromisoformat(heading[1]) == RELEASE_DATE
