@@ -210,10 +210,20 @@ def _narrowed(panel: Panel, width: int, lower: float) -> Panel:
 
 def _margins(panels: Sequence[Panel]) -> tuple[float, float]:
     """Return the space left and right of panels."""
-    labels = [tick.label for panel in panels for tick in panel.y.ticks or ()]
-    left = max(_LEFT, 24 + 1.1 * _LETTER * max(map(len, labels), default=0))
+    left = max(_LEFT, *(_label_width(panel) + (31 if panel.y.label else 24) for panel in panels))
     right = _RIGHT * any(panel.right for panel in panels) + _BAR * any(p.bar for p in panels)
     return left, right or 18
+
+
+def _label_width(panel: Panel) -> float:
+    """Return the width of the widest label of the vertical axis of a panel."""
+    ticks = _Scale(panel.y, panel.height, 0).ticks(_most_ticks(panel.height))
+    return 1.1 * _LETTER * max((len(label) for _, label in ticks), default=0)
+
+
+def _most_ticks(height: float) -> int:
+    """Return the most ticks of a vertical axis."""
+    return max(3, round(height / 45))
 
 
 def _stacked(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
@@ -269,7 +279,7 @@ def _below(box: _Box) -> float:
 def _panel(box: _Box) -> str:
     panel, height = box.panel, box.panel.height
     grid, edge, words = "", f"M{box.left:.1f} {box.top:.1f}v{height:.1f}h{box.width:.1f}", []
-    for y, label in box.y.ticks(max(3, round(height / 45))):
+    for y, label in box.y.ticks(_most_ticks(height)):
         grid += f"M{box.left:.1f} {y:.1f}h{box.width:.1f}"
         edge += f"M{box.left:.1f} {y:.1f}h-4"
         words.append(text(box.left - 9, y + 4, label, "e"))
@@ -281,7 +291,8 @@ def _panel(box: _Box) -> str:
     for x in box.x(np.array(panel.x.breaks)).tolist():
         edge += f"M{x - 5:.1f} {box.foot + 5:.1f}l4-10m2 10l4-10"
     middle = box.top + height / 2
-    words.append(text(box.left - 56, middle, panel.y.label, "m s", turned=True))
+    aside = max(56, _label_width(panel) + 20)
+    words.append(text(box.left - aside, middle, panel.y.label, "m s", turned=True))
     if box.labelled and panel.x.label:
         below = box.foot + _below(box) - 8
         words.append(text(box.left + box.width / 2, below, panel.x.label, "m s"))

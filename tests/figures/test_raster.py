@@ -157,6 +157,9 @@ def test_share_with_care_is_over_all_bins():
     product["quality_flag"].values[:] = 0
     product["quality_flag"].values[:, :25] = int(Quality.PILE_UP)
     assert share_with_care([read(product)]) == 0.25
+    # A rejected value is not one to use with care, as on all other pages.
+    product["quality_flag"].values[:, :10] |= int(Quality.SATURATED)
+    assert share_with_care([read(product)]) == pytest.approx(0.15)
     assert share_with_care([]) == 0.0
 
 

@@ -128,6 +128,17 @@ def test_names_are_text():
     assert "aria-label" in svg.inline(Figure(nasty, nasty, (panel(),)))
 
 
+@pytest.mark.parametrize("values", [[1e-5, 7e-5], [0.0123, 0.0124], [0.1, 0.9]])
+def test_the_title_of_an_axis_stands_clear_of_its_labels(values):
+    axis = percentile_axis("background (MHz)", [np.linspace(*values, 50)])
+    document = drawn(panel(y=axis, height=110))
+    labels = re.findall(r'<text class="t e" x="([\d.]+)" y="[\d.]+">([^<]+)<', document)
+    title = float(re.search(r'x="([\d.]+)"[^>]*>background', document)[1])
+    # Letters are 7 wide, and half the height of the title is 7.
+    assert title >= 7.0
+    assert all(title + 7.0 <= float(end) - 7.0 * len(label) for end, label in labels)
+
+
 def test_ticks_are_round_and_have_equal_decimals():
     words = texts(drawn(panel(y=Axis("up", -0.13, 0.93))))
     assert {"0.0", "0.2", "0.4", "0.6", "0.8"} <= set(words)
