@@ -51,7 +51,8 @@ SELECTIONS: Final = {
     "stability": Selection(
         "lidarops bench stability --quick --out bench",
         ("",),
-        ("scenes", "values", "not rejected", "and not uncertain", "without any flag", "target"),
+        ("scenes", "values", "not rejected", "within 1.96", "and not uncertain",
+         "without any flag", "target"),
     ),
     "throughput": Selection(
         "lidarops bench throughput --quick --out bench", ("float32, dense", "float32, 30 %"),

@@ -109,7 +109,7 @@ def _chapter(name: str, scores: Scores) -> Chapter:
         f"excluding values that flags mark as uncertain. {targets(scores)}",
         [
             Results(
-                f"Values that differ by more than {FALSE:g} stated errors: {name}",
+                results_title(name),
                 rows_of_scores(scores),
                 _NOTE,
                 case="quantity",
@@ -117,6 +117,11 @@ def _chapter(name: str, scores: Scores) -> Chapter:
             )
         ],
     )
+
+
+def results_title(retrieval: str) -> str:
+    """Return the title of the table of a retrieval."""
+    return f"Values that differ by more than {FALSE:g} stated errors: {retrieval}"
 
 
 def targets(scores: Scores) -> str:

@@ -183,7 +183,7 @@ def test_difficulty_of_random_paths_is_that_of_the_information_matrix():
 
 
 @pytest.mark.parametrize("draws", study.DRAWS, ids=lambda rate: rate.retrieval)
-def test_the_same_numbers_give_the_same_scenes(draws):
+def test_the_same_numbers_give_the_same_scenes(draws, repository):
     profiles = min(draws.profiles, 20)
 
     def rates():
@@ -194,6 +194,9 @@ def test_the_same_numbers_give_the_same_scenes(draws):
     assert first == rates()
     pooled = [score for (_, failure), score in first.items() if failure in {HELD, BROKEN}]
     assert sum(score["values"] for score in pooled) > 0
+    published = json.loads((repository / "docs/results/stability.json").read_text())["tables"]
+    rows = published[study.results_title(draws.retrieval)]
+    assert {(quantity, failure) for quantity, failure, *_ in rows} == set(first)
 
 
 def test_where_the_model_holds_homogeneous_paths_are_not_false():
