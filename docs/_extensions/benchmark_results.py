@@ -77,7 +77,7 @@ def take(name: str, folder: Path) -> None:
     }
     rows = ",\n".join(
         f" {json.dumps(title)}: [\n  "
-        + ",\n  ".join(json.dumps(row, ensure_ascii=False) for row in rows)
+        + ",\n  ".join(json.dumps(row, ensure_ascii=False, separators=(",", ":")) for row in rows)
         + "]"
         for title, rows in kept.items()
     )

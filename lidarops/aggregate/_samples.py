@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened
-from lidarops.aggregate.means_variables import averaged, budget_of, systematic
+from lidarops.aggregate.means_variables import averaged, budget_of, systematic_terms
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
 from lidarops.netcdf.stored_flags import with_current_flags
@@ -91,12 +91,17 @@ def _systematic_error(
     """Return the systematic error that is not part of the standard error; None without one."""
     if row.lower_end:
         with np.errstate(divide="ignore", invalid="ignore"):
-            whole = values / numbers(product, row.lower_end) - 1.0
+            relative = values / numbers(product, row.lower_end) - 1.0
             # With hardly any systematic error, rounding may give a negative difference.
-            error: Array = values * np.sqrt(np.maximum(whole**2 - (errors / values) ** 2, 0.0))
+            error: Array = values * np.sqrt(np.maximum(relative**2 - (errors / values) ** 2, 0.0))
         return error
-    variable = systematic(kind, row.name)
-    return numbers(product, variable) if variable and variable in product else None
+    terms = [numbers(product, name) for name in systematic_terms(kind, row.name) if name in product]
+    if not terms:
+        return None
+    # A term that does not apply, as that of the dead time to analog signals, is missing.
+    known = np.any([np.isfinite(term) for term in terms], axis=0)
+    whole: Array = np.sqrt(np.nansum(np.square(terms), axis=0))
+    return np.where(known, whole, np.nan)
 
 
 def _divide(

@@ -6,7 +6,7 @@ names.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -94,9 +94,18 @@ def systematic(kind: str, name: str) -> str | None:
     table = layout_of(kind)
     if table.row(name).lower_end:
         return f"{name}_systematic_error"
-    names = (row.name for row in table.data)
-    errors = (error for error in names if error.startswith(f"{name}_") and error.endswith("_error"))
-    return next(errors, None)
+    return next(iter(systematic_terms(kind, name)), None)
+
+
+def systematic_terms(kind: str, name: str) -> tuple[str, ...]:
+    """Return the variables of all systematic errors that are not part of the standard error.
+
+    In means they are one error, under the name of the first.
+    """
+    names = (row.name for row in layout_of(kind).data)
+    return tuple(
+        error for error in names if error.startswith(f"{name}_") and error.endswith("_error")
+    )
 
 
 _INDEPENDENT: Final = (
@@ -174,7 +183,7 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
         yield from _mean_rows(row, weights, error)
         if error:
             systematic_row = _interval_error(row, error) if row.lower_end else source.row(error)
-            yield _averaged_error(systematic_row, row)
+            yield _averaged_error(systematic_row, row, systematic_terms(kind, row.name)[1:])
     yield Row(
         name="usable_share",
         dims=flags.dims,
@@ -260,13 +269,14 @@ def _interval_error(row: Row, name: str) -> Row:
     )
 
 
-def _averaged_error(row: Row, quantity: Row) -> Row:
+def _averaged_error(row: Row, quantity: Row, others: Sequence[str]) -> Row:
+    within = f" Together with {', '.join(others)}." if others else ""
     return replace(
         row,
         long_name=f"mean over time of {row.long_name}",
         cell_methods=_cell_methods(quantity, "mean"),
         comment=f"{row.comment} Averaged with the weights of {quantity.name}: it does not decrease"
-        " with the number of profiles.",
+        f" with the number of profiles.{within}",
     )
 
 

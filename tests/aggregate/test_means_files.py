@@ -21,7 +21,7 @@ from lidarops.aggregate.means_variables import (
     Weights,
     averaged,
     layout,
-    systematic,
+    systematic_terms,
 )
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
@@ -382,7 +382,7 @@ def test_means_are_no_products(tmp_path: Path):
 @pytest.mark.parametrize("kind", list(kinds()))
 def test_every_systematic_error_is_averaged(kind: str):
     source = layout_of(kind)
-    covered = {systematic(kind, row.name) for row in averaged(kind)}
+    covered = {name for row in averaged(kind) for name in systematic_terms(kind, row.name)}
     covered |= {name for row in averaged(kind) if row.budget for name in row.budget.shared}
     for row in source.data:
         if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:

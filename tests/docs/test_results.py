@@ -9,12 +9,11 @@ import pytest
 import typer
 
 from lidarops.bench.harness.benchmark import BenchmarkKind
-from lidarops.bench.registry import Benchmark
-from lidarops.cli import app
-
 from lidarops.bench.harness.rows import share_text
+from lidarops.bench.registry import Benchmark
 from lidarops.bench.stability import study
 from lidarops.bench.stability.random_scenes import BROKEN, VIOLATED, Verdict
+from lidarops.cli import app
 
 
 @pytest.fixture
