@@ -38,5 +38,5 @@ def test_examples_and_the_forward_model_name_modules_that_users_may_call(reposit
     rows = "\n".join(line.split("|")[3] for line in page.splitlines() if line.count("|") == 5)
     modules = {f"lidarops.simulate.{name}" for name in re.findall(r"`([a-z_]+)(?:\.\w+)*`", rows)}
     known = {name for name in modules if (repository / f"{name.replace('.', '/')}.py").exists()}
-    assert "lidarops.simulate.atmosphere" in known
+    assert "lidarops.simulate.pulse" in known
     assert named | known <= set(python_api.MODULES)
