@@ -160,13 +160,7 @@ class RemoteStore:
         with self._errors_as(CatalogError, "cannot be listed"):
             # Another process may have written since the last listing.
             self._fs.invalidate_cache()
-            listing = self._find()
-            # The index of a web server has no sizes.
-            listing |= {
-                name: self._fs.info(name)
-                for name, info in listing.items()
-                if info.get("size") is None and is_confined(self._path(name))
-            }
+            listing = dict(self._sized(self._find()))
         outside = sorted(path for path in map(self._path, listing) if not is_confined(path))
         if outside:
             named = ", ".join(map(repr, outside[:_NAMES_SHOWN]))
@@ -179,6 +173,17 @@ class RemoteStore:
         for name in sorted(listing):
             info = listing[name]
             yield Stored(self._path(name), int(info["size"] or 0), _stamp(info))
+
+    def _sized(self, listing: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+        """Yield names with their sizes, which the index of a web server lacks."""
+        for name, info in listing.items():
+            if info.get("size") is not None or not is_confined(self._path(name)):
+                yield name, info
+                continue
+            try:
+                yield name, self._fs.info(name)
+            except FileNotFoundError:
+                _LOG.warning("%s lists %r, which it does not have", self.url, self._path(name))
 
     def _path(self, name: str) -> str:
         return name.removeprefix(self._prefix).removeprefix("/")

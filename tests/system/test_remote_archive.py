@@ -154,6 +154,18 @@ def test_a_link_that_leads_out_of_the_archive_is_refused(
     assert f"lists {len(granules)} names that lead out of it" in caplog.text
 
 
+def test_a_dead_link_costs_no_other_file(
+    campaign: Campaign, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    links = "".join(f'<a href="{link}">x</a>' for link in ("coast/gone", "coast/h0"))
+    (tmp_path / "raw" / "index.html").write_text(links)
+    everything = _campaign_of_everything(campaign, campaign.archive)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(everything, store)
+        assert [granule.path for granule in store.granules()] == ["coast/h0"]
+    assert "lists 'coast/gone', which it does not have" in caplog.text
+
+
 @pytest.fixture(params=["http", "s3", "memory", "file"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> RemoteStore:
     """A store of each kind with the raw file ``coast/h0``."""
