@@ -11,6 +11,7 @@ import xarray as xr
 import yaml
 
 from lidarops.campaign.model import load_campaign
+from lidarops.records import SceneOutcome
 from lidarops.run.archive import Options, reprocess
 
 CAMPAIGN = Path(__file__).parent / "campaigns" / "rhis.yaml"
@@ -72,33 +73,43 @@ def test_distorted_analog_signals_are_rejected(channel, products):
     assert product["total_extinction"].isnull().all()
 
 
+def homogeneous(
+    data_root: Path, folder: Path, method: str, sections: list[list[int]], files: str = ""
+) -> tuple[SceneOutcome, list[xr.Dataset]]:
+    """Retrieve homogeneous paths; return the only scene and its products, by channel."""
+    tree = yaml.safe_load(CAMPAIGN.read_text())
+    lidar = tree["instruments"]["savant"]
+    lidar["files"] = files or lidar["files"]
+    request = {"channels": list(REFERENCE), "sections": sections, "method": method}
+    lidar["products"] = {"homogeneous": request}
+    campaign = folder / f"{method}.yaml"
+    campaign.write_text(yaml.safe_dump(tree))
+    record = reprocess(
+        load_campaign(campaign, archive=data_root / "savant", output=folder / method)
+    )
+    assert record is not None
+    (scene,) = record.scenes
+    products = sorted(scene.products, key=lambda product: product.channel)
+    return scene, [xr.load_dataset(Path(record.products) / product.path) for product in products]
+
+
 def test_a_level_beam_above_the_background_of_the_far_range(data_root, tmp_path):
     """Both polarisations see one extinction, four times more certain than with own backgrounds."""
-    tree = yaml.safe_load(CAMPAIGN.read_text())
-    path = {"channels": list(REFERENCE), "sections": [[1500, 4000], [2000, 6000]]}
-    tree["instruments"]["savant"]["files"] = "2018-10-18-0340hORIZONTALsCAN/R18*"
-    found = {}
+    sections = [[1500, 4000], [2000, 6000]]
+    made = {}
     for method in ("auto", "known_background"):
-        tree["instruments"]["savant"]["products"] = {"homogeneous": path | {"method": method}}
-        campaign = tmp_path / f"{method}.yaml"
-        campaign.write_text(yaml.safe_dump(tree))
-        record = reprocess(
-            load_campaign(campaign, archive=data_root / "savant", output=tmp_path / method)
+        _, products = homogeneous(
+            data_root, tmp_path, method, sections, "2018-10-18-0340hORIZONTALsCAN/R18*"
         )
-        assert record is not None
-        (scene,) = record.scenes
-        found[method] = [
-            xr.load_dataset(Path(record.products) / product.path).isel(time=0)
-            for product in sorted(scene.products, key=lambda product: product.channel)
-        ]
-    one, other = found["known_background"]
+        made[method] = [product.isel(time=0) for product in products]
+    one, other = made["known_background"]
     spread = np.hypot(
         one["total_extinction_standard_error"], other["total_extinction_standard_error"]
     )
     assert (np.abs(one["total_extinction"] - other["total_extinction"]) < 2.0 * spread).all()
     assert (one["total_extinction"] == pytest.approx(1e-4, abs=2e-5)).all()
     assert (np.abs(one["background"]) < 3.0 * one["background_standard_error"]).all()
-    own = found["auto"][0]
+    own = made["auto"][0]
     assert (
         own["total_extinction_standard_error"] > 3.0 * one["total_extinction_standard_error"]
     ).all()
@@ -109,29 +120,17 @@ def test_low_beams_of_range_height_scans_give_extinction_by_direction(data_root,
 
     The reference has 0.19 per km below 300 m and 0.045 above; the section lies at 130 to 240 m.
     """
-    tree = yaml.safe_load(CAMPAIGN.read_text())
-    section = [1500, 2500]
-    found = {}
+    made = {}
     for method in ("auto", "direct"):
-        products = {"channels": list(REFERENCE), "sections": [section], "method": method}
-        tree["instruments"]["savant"]["products"] = {"homogeneous": products}
-        campaign = tmp_path / f"{method}.yaml"
-        campaign.write_text(yaml.safe_dump(tree))
-        record = reprocess(
-            load_campaign(campaign, archive=data_root / "savant", output=tmp_path / method)
-        )
-        assert record is not None
-        (scene,) = record.scenes
+        scene, products = homogeneous(data_root, tmp_path, method, [[1500, 2500]])
         (reason,) = {out.reason for out in scene.plan.left_out if out.rule == "beam_level"}
         assert reason.startswith("section 1500-2500 m: values of 78 of 82 files are rejected")
-        found[method] = [
-            xr.load_dataset(Path(record.products) / product.path)
-            .set_index(time=["zenith_angle", "azimuth"])
-            .unstack("time")
-            for product in sorted(scene.products, key=lambda product: product.channel)
+        made[method] = [
+            product.set_index(time=["zenith_angle", "azimuth"]).unstack("time")
+            for product in products
         ]
     beams = []
-    for product, own in zip(found["auto"], found["direct"], strict=True):
+    for product, own in zip(made["auto"], made["direct"], strict=True):
         assert product.sizes["zenith_angle"] == 41
         assert product["azimuth"].values.tolist() == [62.0, 137.0]
         low = product["zenith_angle"] > 84.0
