@@ -7,7 +7,6 @@ products are replaced. Products are copied, because a reference to a replaced fi
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -34,6 +33,7 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
+from lidarops.system.files import only_one
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
@@ -139,12 +139,11 @@ def update_store(
 def _only_writer(target: Path) -> Iterator[None]:
     """Refuse a second writer, whose commit a folder could not tell from the first one's."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with (target.parent / f".{target.name}.lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise _conflict(target) from error
-        yield
+    try:
+        with only_one(target.parent / f".{target.name}.lock", wait=False):
+            yield
+    except BlockingIOError as error:
+        raise _conflict(target) from error
 
 
 @contextmanager

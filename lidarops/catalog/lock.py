@@ -9,6 +9,7 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -109,17 +110,36 @@ class Lock:
         """
         if self.held:
             return False
-        until = time.monotonic() + self._wait
-        waited = False
-        while not self._try():
-            if time.monotonic() >= until:
-                raise self.refusal()
-            waited = True
-            time.sleep(_POLL)
+        waited = self._wait_for(self._try)
         self.held = True
         _held.add(self.token)
         self._thread = threading.Thread(target=self._beat, name="lidarops-lock", daemon=True)
         self._thread.start()
+        return waited
+
+    def wait_until_free(self) -> None:
+        """Wait until no other process holds the lock, without acquiring it.
+
+        Raises
+        ------
+        CatalogError
+            If the holder, which the message names, does not release the lock in time.
+        """
+        self._wait_for(self._is_free)
+
+    def _is_free(self) -> bool:
+        holder = self.holder()
+        return holder is None or holder.dead
+
+    def _wait_for(self, attempt: Callable[[], bool]) -> bool:
+        """Repeat an attempt until it succeeds; return whether it failed at first."""
+        until = time.monotonic() + self._wait
+        waited = False
+        while not attempt():
+            if time.monotonic() >= until:
+                raise self.refusal()
+            waited = True
+            time.sleep(_POLL)
         return waited
 
     def release(self) -> None:

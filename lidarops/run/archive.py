@@ -10,7 +10,6 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import versions
-from lidarops.catalog.ledger import Run, RunStatus, Verdict
+from lidarops.catalog.ledger import RunStatus, Verdict
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
@@ -40,6 +39,7 @@ from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
+from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
 
 if TYPE_CHECKING:
@@ -70,8 +70,8 @@ other days are only counted."""
 
 MOST_RUNS_REPORTED: Final = 20
 """Last runs whose missing reports are made; older ones are left to ``lidarops report``."""
-DRAWING: Final = timedelta(hours=1)
-"""Time after its end in which the page of a run is left to the process of that run; assumed."""
+PAGE_LOCK: Final = ".index.lock"
+"""File in the folder of a report that is locked while its page is built."""
 
 _WORKER_MODULES: Final = (
     "distributed.nanny",
@@ -139,9 +139,8 @@ def bring_up_to_date(
         Lock(store, wait=options.wait) as lock,
         objects_frozen(),
     ):
-        if not options.wait and store.in_use():
-            # At once: "nothing to do" would not count what the other run is about to do.
-            raise lock.refusal()
+        # "Nothing to do" would not count what another run is about to do.
+        lock.wait_until_free()
         while True:
             try:
                 return _Pass(campaign, store, lock, selection, options).carry_out(client)
@@ -659,7 +658,9 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
 
 
 def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> RunReport:
-    """Save the record of a run and build its report page.
+    """Save the record of a run, unless the run has, and build its report page.
+
+    While another process builds it, this one waits.
 
     Parameters
     ----------
@@ -672,18 +673,24 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> RunRe
     -------
     Report
     """
+    folder = campaign.report_root / run.id
+    if not (folder / run_record.FILE_NAME).exists():
+        run_record.save_run_record(run, folder)
+    with only_one(folder / PAGE_LOCK, wait=True):
+        return _build_page(run, folder, workers)
+
+
+def _build_page(run: RunRecord, folder: Path, workers: int) -> RunReport:
     from lidarops.reports import run_page  # noqa: PLC0415 - loads what draws
 
-    folder = campaign.report_root / run.id
-    run_record.save_run_record(run, folder)
     return run_page.build_report(run, folder, workers=workers)
 
 
 def report_earlier_runs(campaign: Campaign, *, without: str = "", workers: int = 1) -> list[Path]:
     """Build the missing report pages of runs that were killed or met a full disk; return them.
 
-    A record that cannot be read, and a page that cannot be made, is logged and left. While another
-    run holds the catalog, nothing is built.
+    A record that cannot be read, and a page that cannot be made, is logged and left. So is a page
+    that another process builds.
 
     Parameters
     ----------
@@ -693,40 +700,27 @@ def report_earlier_runs(campaign: Campaign, *, without: str = "", workers: int =
         Id of a run that is left out.
     workers : int, optional
     """
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        runs = store.runs(limit=MOST_RUNS_REPORTED)
     pages = []
-    with Store(campaign.catalog_url, campaign.name, create=False) as store, Lock(store) as lock:
-        runs = [
-            run
-            for run in store.runs(limit=MOST_RUNS_REPORTED)
-            if run.id != without and not _is_at_work(run) and _lacks_page(campaign, run)
-        ]
-        if not runs:
-            return []
+    for run in runs:
+        folder = campaign.report_root / run.id
+        if run.id == without or run.status is RunStatus.RUNNING or not _lacks_page(folder):
+            continue
         try:
-            lock.acquire()
-        except CatalogError as error:
-            _LOG.info("the next run reports earlier ones: %s", error)
-            return []
-        for run in runs:
-            try:
-                # Another process may have reported it before this one had the lock.
-                if _lacks_page(campaign, run):
-                    record = run_record.load_run_record(campaign.report_root / run.id)
-                    pages.append(report_run(campaign, record, workers=workers).page)
-            except LidarOpsError as error:
-                _LOG.warning("run %s has no report: %s", run.id, error)
+            with only_one(folder / PAGE_LOCK, wait=False):
+                # Another process may have built it before.
+                if _lacks_page(folder):
+                    record = run_record.load_run_record(folder)
+                    run_record.save_run_record(record, folder)
+                    pages.append(_build_page(record, folder, workers).page)
+        except BlockingIOError:
+            _LOG.info("the report of run %s is being built by another process", run.id)
+        except LidarOpsError as error:
+            _LOG.warning("run %s has no report: %s", run.id, error)
     return pages
 
 
-def _lacks_page(campaign: Campaign, run: Run) -> bool:
+def _lacks_page(folder: Path) -> bool:
     """Return whether a run has a record and no page."""
-    folder = campaign.report_root / run.id
     return run_record.exists(folder) and not (folder / run_record.INDEX).exists()
-
-
-def _is_at_work(run: Run) -> bool:
-    """Return whether the process of a run works on it, or may yet draw its page."""
-    if run.status is RunStatus.RUNNING:
-        return True
-    recent = run.finished is not None and datetime.now(UTC) - run.finished < DRAWING
-    return recent and run.holder != Lock.holder_name()

@@ -56,6 +56,30 @@ def within(folder: Path, path: str) -> Path:
     return file
 
 
+@contextmanager
+def only_one(lock: Path, *, wait: bool) -> Iterator[None]:
+    """Let one process at a time through, by the lock on a file, which ends with its process.
+
+    Parameters
+    ----------
+    lock : Path
+        Made if absent, and left; its folder must exist.
+    wait : bool
+        Whether to wait for another process.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process is through, unless this one waits.
+    """
+    # Who only reads products needs no locks, nor a system that has them.
+    import fcntl  # noqa: PLC0415
+
+    with lock.open("a") as opened:
+        fcntl.flock(opened, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
+
+
 def write_atomically(target: Path, content: bytes) -> None:
     """Write `content` to a temporary file beside `target`, sync it and rename it.
 

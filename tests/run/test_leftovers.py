@@ -8,7 +8,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import NoReturn
 
 import pytest
@@ -34,6 +34,7 @@ from lidarops.run.archive import (
 )
 from lidarops.run.session import Session
 from lidarops.steps.dependence import plan_closure, planned_products
+from lidarops.system.files import only_one
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -593,20 +594,24 @@ def test_the_record_of_a_run_is_saved_before_others_see_that_it_has_ended(
     assert [scene.scene for scene in record.scenes] == ["poor_20260301T000000"]
 
 
-def test_a_page_that_another_process_may_draw_is_left_to_it(
-    archive: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_that_another_process_builds_is_left_to_it(archive: Archive) -> None:
     archive.raw("poor/h09", 630, seed=9)
     campaign = archive.write()
-    with monkeypatch.context() as patch:
-        patch.setattr(Lock, "holder_name", staticmethod(lambda: "me@elsewhere process 1"))
-        _reprocess_without_page(archive)
+    _reprocess_without_page(archive)
+    (folder,) = (archive.folder / "out/report").glob("*")
+    with only_one(folder / pipeline.PAGE_LOCK, wait=False):
+        assert pipeline.report_earlier_runs(campaign) == []
+    assert pipeline.report_earlier_runs(campaign) == [folder / "index.html"]
     assert pipeline.report_earlier_runs(campaign) == []
-    monkeypatch.setattr(pipeline, "DRAWING", timedelta())
+
+
+def test_pages_are_built_beside_a_run_at_work(archive: Archive) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    campaign = archive.write()
+    _reprocess_without_page(archive)
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
-        assert pipeline.report_earlier_runs(campaign) == []
-    assert len(pipeline.report_earlier_runs(campaign)) == 1
+        assert len(pipeline.report_earlier_runs(campaign)) == 1
 
 
 def test_temporary_files_of_a_killed_run_are_named_by_verify_and_removed_by_the_next_run(
@@ -633,7 +638,8 @@ def test_temporary_files_of_a_run_at_work_are_left_alone(archive: Archive) -> No
         lock.acquire()
         run = Run("works", FIRST, None, RunStatus.RUNNING, "me", "0", "0", "", "")
         store.begin_run(run, lock.token)
-        assert reprocess(campaign, options=Options(wait=0.1)) is None
+        with pytest.raises(CatalogError, match="held by"):
+            reprocess(campaign, options=Options(wait=0.1))
         assert CliRunner().invoke(app, ["verify", str(archive.file)]).exit_code == 0
     assert left.exists()
 
