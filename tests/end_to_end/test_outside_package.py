@@ -398,6 +398,8 @@ def test_nothing_of_lidarops_names_the_package(repository: Path) -> None:
         for folder in ("lidarops", "flows", "docs")
         for path in sorted((repository / folder).rglob("*"))
         if path.suffix in {".py", ".md", ".html", ".svg", ".css"}
+        # Pages that are built show the keys of all kinds that are installed.
+        if "_build" not in path.parts
     ]
     assert len(texts) > 250
     assert not [path for path in texts if name.search(path.read_text(encoding="utf-8"))]
