@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -42,6 +42,7 @@ SELECTIONS: Final = {
     "background": Selection(
         "lidarops bench accuracy --case homogeneous --quick --out bench",
         ("Mean error of the background",),
+        ("length of the section (km)", "lag 1", "compressed", "scatter", "flagged", "published"),
     ),
     "memory": Selection("lidarops bench throughput --case memory --out bench", ("Peak memory",)),
     "published": Selection(
@@ -74,6 +75,8 @@ def take(name: str, folder: Path) -> None:
         "command": selection.command,
         "date": result["date"],
         "machine": result["machine"],
+        "headings": {title: result["headings"][title] for title in kept},
+        "notes": _notes(result["notes"], kept),
     }
     rows = ",\n".join(
         f" {json.dumps(title)}: [\n  "
@@ -85,6 +88,12 @@ def take(name: str, folder: Path) -> None:
     (RESULTS / f"{name}.json").write_text(text, encoding="utf-8")
     for figure in selection.figures:
         shutil.copy(folder / f"{figure}.svg", RESULTS / f"{name}-{figure}.svg")
+
+
+def _notes(notes: dict[str, str], titles: Iterable[str]) -> dict[str, str]:
+    """Return the notes of tables, each with the first table that has it."""
+    titles_by_note = {notes[title]: title for title in reversed(list(titles)) if notes[title]}
+    return {title: note for note, title in titles_by_note.items()}
 
 
 def _is_kept(row: dict[str, Any], selection: Selection) -> bool:
@@ -113,8 +122,10 @@ def page(name: str) -> str:
     result = read(name)
     lines = [facts(result)]
     for title, rows in result["tables"].items():
-        shown = table(title, rows)
+        case, method = result["headings"][title]
+        shown = table(title, rows, case=case, method=method)
         lines += ["", f"*{title}*", *tables.table(shown.columns, shown.rows)]
+        lines += [result["notes"].get(title, "")]
     return "\n".join(lines)
 
 
@@ -136,7 +147,7 @@ def facts(result: dict[str, Any]) -> str:
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
     return (
         f"`{result['command']}`, {result['date']}: {machine['processor']}, {machine['cores']} "
-        f"cores, Python {machine['python']}, {packages}."
+        f"cores, Python {machine['python']}, {packages}, code {machine['code']}."
     )
 
 

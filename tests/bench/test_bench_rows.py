@@ -54,6 +54,7 @@ def results():
         (2.737, 0.0, "2.74"),
         (2.737, 1e-16, "2.74"),
         (12345.6, 0.0, "12,346"),
+        (-0.00001, 0.0005, "0.0000(5)"),
     ],
 )
 def test_errors_are_given_in_units_of_the_last_digit(value, error, text):

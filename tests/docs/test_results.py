@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import benchmark_results
 import pytest
@@ -22,13 +23,32 @@ def taken(tmp_path, monkeypatch):
     row = {"case": "path", "method": "ours", "error": 0.0}
     result = {
         "date": "2026-01-01",
-        "machine": {"processor": "one", "cores": 3, "python": "3", "packages": {"numpy": "2"}},
+        "machine": {
+            "processor": "one",
+            "cores": 3,
+            "python": "3",
+            "packages": {"numpy": "2"},
+            "code": "0123456789abcdef",
+        },
+        "headings": {
+            "The most accurate of all": ["scene", "solver"],
+            "The most accurate of one": ["case", "method"],
+            "Another": ["case", "method"],
+        },
+        "notes": {
+            "The most accurate of all": "Of all scenes.",
+            "The most accurate of one": "Of all scenes.",
+            "Another": "",
+        },
         "tables": {
             "The most accurate of all": [
                 {**row, "method": "peer", "quantity": "RMSE", "value": 2.0, "unit": ""},
                 {**row, "quantity": "RMSE", "value": 1.2500001, "error": 0.01, "unit": ""},
                 {**row, "quantity": "95 %", "value": 0.951, "unit": "1"},
                 {**row, "quantity": "CPU time", "value": 2500.0, "unit": "ns"},
+            ],
+            "The most accurate of one": [
+                {**row, "quantity": "RMSE", "value": 1.0, "unit": ""},
             ],
             "Another": [],
         },
@@ -52,12 +72,16 @@ def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
             ["path", "ours", "RMSE", 1.25, 0.01, ""],
             ["path", "ours", "95 %", 0.951, 0.0, "1"],
             ["path", "ours", "CPU time", 2500.0, 0.0, "ns"],
-        ]
+        ],
+        "The most accurate of one": [["path", "ours", "RMSE", 1.0, 0.0, ""]],
     }
     assert (taken / "accuracy-all-homogeneous-path.svg").read_text() == "all-homogeneous-path"
     page = benchmark_results.page("accuracy")
     assert "| ours | 1.25(1) | 95.1 % | 2.5 µs |" in page
     assert "2026-01-01: one, 3 cores, Python 3" in page
+    assert "code 0123456789abcdef." in page
+    assert "| solver |" in page
+    assert page.count("Of all scenes.") == 1
 
 
 @pytest.mark.parametrize("name", sorted(benchmark_results.SELECTIONS))
@@ -66,6 +90,7 @@ def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
     assert path.stat().st_size < 60_000
     result = benchmark_results.read(name)
     assert result["machine"]["cores"]
+    assert re.fullmatch("[0-9a-f]{16}", result["machine"]["code"])
     assert result["tables"]
     # What is committed was made by the command of today, which the command line accepts.
     assert result["command"] == benchmark_results.SELECTIONS[name].command

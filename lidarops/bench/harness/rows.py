@@ -121,7 +121,9 @@ def with_error(value: float, error: float) -> str:
     if not error > _ROUNDING * abs(value):
         return f"{value:,.0f}" if abs(value) >= 1e3 else f"{value:.3g}"
     digits = max(-math.floor(math.log10(error)), 0)
-    return f"{value:.{digits}f}({error * 10**digits:.0f})"
+    # Zero has no sign.
+    shown = round(value, digits) + 0.0
+    return f"{shown:.{digits}f}({error * 10**digits:.0f})"
 
 
 def share_text(share: float) -> str:
@@ -445,9 +447,16 @@ class Study:
 
     def json(self) -> str:
         """Return all rows, by the headings of their tables, as JSON."""
-        tables = {r.title: [asdict(w) for w in r.rows] for c in self.chapters for r in c.results}
-        about = {"title": self.title, "date": self.date, "machine": asdict(self.machine)}
-        return json.dumps({**about, "tables": tables}, indent=1, allow_nan=False)
+        shown = [results for chapter in self.chapters for results in chapter.results]
+        document = {
+            "title": self.title,
+            "date": self.date,
+            "machine": asdict(self.machine),
+            "tables": {results.title: [asdict(row) for row in results.rows] for results in shown},
+            "headings": {results.title: [results.case, results.method] for results in shown},
+            "notes": {results.title: results.note for results in shown},
+        }
+        return json.dumps(document, indent=1, allow_nan=False)
 
     def write(self, folder: Path) -> Path:
         """Write the page with its charts, and the JSON; return the path of the page.

@@ -15,6 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
+from lidarops.system.code_version import source_version
+
 READ: Final = "read (np.max)"
 """Name of the floor of all times: a vectorised read of the same array in the same run."""
 _SHORTEST: Final = 1e-9
@@ -38,6 +40,8 @@ class Machine:
     python: str
     packages: Mapping[str, str]
     """Versions of installed packages by name."""
+    code: str
+    """Digest of the code that was measured (`lidarops.system.code_version.source_version`)."""
 
 
 def machine() -> Machine:
@@ -47,6 +51,7 @@ def machine() -> Machine:
         cores=os.cpu_count() or 1,
         python=platform.python_version(),
         packages={name: number for name in _PACKAGES if (number := _version(name))},
+        code=source_version(),
     )
 
 
