@@ -19,6 +19,7 @@ from lidarops.bench.harness.rows import Row, Unit, table
 
 RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
 DIGITS: Final = 4
+ERROR_DIGITS: Final = 2
 
 
 class Selection(NamedTuple):
@@ -52,7 +53,7 @@ SELECTIONS: Final = {
     "stability": Selection(
         "lidarops bench stability --quick --out bench",
         ("",),
-        ("scenes", "values", "not rejected", "within 1.96", "and not uncertain",
+        ("values", "not rejected", "within 1.96", "false, random error", "and not uncertain",
          "without any flag", "target"),
     ),
     "throughput": Selection(
@@ -102,19 +103,19 @@ def _is_kept(row: dict[str, Any], selection: Selection) -> bool:
 
 def _row(row: dict[str, Any]) -> list[Any]:
     value = row["value"]
-    number = _rounded(value) if isinstance(value, float) else value
+    number = _rounded(value, DIGITS) if isinstance(value, float) else value
     return [
         row["case"],
         row["method"],
         row["quantity"],
         number,
-        _rounded(row["error"]),
+        _rounded(row["error"], ERROR_DIGITS),
         row["unit"],
     ]
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
+def _rounded(value: float, digits: int) -> float:
+    return float(f"{value:.{digits}g}")
 
 
 def page(name: str) -> str:

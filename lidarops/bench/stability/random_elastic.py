@@ -79,6 +79,10 @@ _ALIKE: Final = (
     "haze that falls with height nearly as air does looks like air in the window: only the stated"
     " error of the scattering ratio there can cover it"
 )
+_HIDDEN: Final = (
+    "noise hides few particles in the window: only the stated error of the scattering ratio there"
+    " can cover them"
+)
 _NEAR: Final = "a signal that is too low near the lidar looks like less haze"
 _Change = Callable[[RandomSky, Random], RandomSky]
 
@@ -93,14 +97,25 @@ def _hazy(least: float) -> _Change:
     return change
 
 
+def _clean(sky: RandomSky, _: Random) -> RandomSky:
+    """Return the sky without particles at the heights of possible reference windows."""
+    z, lowest = elastic_cases.RANGE, min(bottom for bottom, _ in elastic_cases.CANDIDATES)
+    # Smoothly, as in air: 1e-7 of them are left there.
+    left = 1.0 / (1.0 + np.exp((z - lowest + 1000.0) / 60.0))
+    return replace(sky, particles=np.where(z < lowest, left * sky.particles, 0.0))
+
+
 def _off(rng: Random, error: float) -> float:
     """Return a factor that deviates by this standard error, at most by 3 of them."""
     return 1.0 + error * float(np.clip(rng.normal(), -3.0, 3.0))
 
 
 FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
-    (Failure("none", satisfied=True), lambda sky, _: sky),
-    (Failure("gaps", satisfied=True), lambda sky, rng: replace(sky, gaps=rng.uniform(0.0, 0.2))),
+    (Failure("none", satisfied=True), _clean),
+    (
+        Failure("gaps", satisfied=True),
+        lambda sky, rng: replace(_clean(sky, rng), gaps=rng.uniform(0.0, 0.2)),
+    ),
     (
         Failure("lidar ratio off as stated", unseen=_STATED),
         lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * _off(rng, _RATIO_ERROR)),
@@ -125,6 +140,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
     ),
     (Failure("more haze than stated", unseen=_ALIKE), _hazy(1e-8)),
     (Failure("outliers"), lambda sky, rng: replace(sky, outlying=rng.uniform(0.0, 0.02))),
+    (Failure("particles in the reference window", unseen=_HIDDEN), lambda sky, _: sky),
 )
 
 
