@@ -21,6 +21,7 @@ from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import HeaderOrder
 from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.steps.channels import file_channels
 from lidarops.steps.pointing import LEAST_SPREAD
 
 _SCRATCH: Final = "temp"
@@ -190,18 +191,26 @@ def _facts(headers: InstrumentHeaders) -> Iterator[str]:
     if len({group.layout for group in headers.signal}) > 1:
         yield "        # ? Other files have other bins: each set of bins makes scenes of its own."
     yield "        channels:"
+    # Without dead times, all values of a scan are rejected where rates are high (SAVANT).
+    scans = headers.zenith_span >= LEAST_SPREAD
+    estimated = {name for pair in headers.pairs if scans for name in file_channels(pair)}
     for channel in headers.layout:
+        photon = channel.mode is DetectionMode.PHOTON
+        facts = "{dead_time: estimate}" if photon and channel.name in estimated else "{}"
         grid = f"{channel.bins} bins of {channel.bin_width:g} m"
-        yield f"          {channel.name}: {{}}  # {grid}{_unknown(channel)}"
+        question = _unknown(channel, estimated=channel.name in estimated)
+        yield f"          {channel.name}: {facts}  # {grid}{question}"
 
 
-def _unknown(channel: ChannelLayout) -> str:
+def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:
     """Return the question on a channel; empty where there is none."""
     if not channel.wavelength > 0:
         return "; ? wavelength in m, such as 5.32e-7: that of the header is not plausible"
-    if channel.mode is DetectionMode.PHOTON:
-        return "; ? dead_time in s, such as 4.0e-9, or estimate: without it, high rates are too low"
-    return ""
+    if channel.mode is not DetectionMode.PHOTON:
+        return ""
+    if estimated:
+        return "; ? dead_time in s, such as 4.0e-9, where it is known"
+    return "; ? dead_time in s, such as 4.0e-9, or estimate: without it, high rates are too low"
 
 
 def _pointing(headers: InstrumentHeaders) -> Iterator[str]:

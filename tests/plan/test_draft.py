@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,8 @@ def test_products_follow_from_the_pointing(raw: Path, tmp_path: Path) -> None:
     assert steep.products.requested()["elastic"].channels == ["glued_532o"]
     assert "pairs that can be joined: glued_532o" in text
     assert level.facts[0].zenith_angle == 90.0
+    # Gluing takes high rates from the analog channel.
+    assert all(lidar.facts[0].channels["photon_532o"].dead_time is None for lidar in (level, steep))
 
 
 def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
@@ -109,6 +112,9 @@ def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
     campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     (lidar,) = campaign.instruments.values()
     assert set(lidar.products.requested()) == {"signal", "multiangle"}
+    facts = lidar.facts[0].channels
+    assert facts["photon_532o"].dead_time == "estimate"
+    assert facts["analog_532o"].dead_time is None
     assert [granule.zenith_angle for granule in granules(campaign)] == [0.0, 30.0, 60.0]
 
 
@@ -212,3 +218,14 @@ def test_files_of_real_archives_are_those_of_their_headers(
         assert sum(granule.role is Role.DARK for granule in known) == 12
     if name == "manaus_raman":
         assert "nitrogen: {photon_355o: photon_387o}" in text
+
+
+def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path: Path) -> None:
+    """Without dead time, `poor_stratification` rejects all its cycles."""
+    drafted(data_root / "savant", tmp_path / "campaign.yaml")
+    options = ["--product", "multiangle", "--instrument", "u-c-vol-lidar", "--json"]
+    shown = CliRunner().invoke(app, ["reprocess", str(tmp_path / "campaign.yaml"), *options])
+    (quality,) = json.loads(shown.stdout)["quality"].values()
+    assert quality["good"] + quality["care"] == 100
+    # Of four lone records.
+    assert quality["reject"] == 200
