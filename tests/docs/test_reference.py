@@ -24,6 +24,7 @@ import flows
 import lidarops
 from lidarops.campaign.model import load_campaign
 from lidarops.cli import app
+from lidarops.flags import Severity
 from lidarops.kinds import flags_of
 
 # Made of the settings of all kinds of product, and listed among the keys of a campaign file.
@@ -146,13 +147,17 @@ def test_variables_and_flags_of_the_golden_products_are_listed(repository) -> No
             assert f"| `{word}` | {mask} |" in bits, path.name
 
 
-def test_the_flags_that_point_to_facts_exist(repository) -> None:
+def test_every_flag_that_rejects_values_points_to_facts_or_is_named_as_of_none(repository) -> None:
     page = (repository / "docs/howto/campaign.md").read_text(encoding="utf-8")
     section = page.partition("## Most values are rejected")[2]
-    cells = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
-    named = {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
-    assert len(named) > 10
-    assert named <= {bit.word for kind in OWN_KINDS for bit in flags_of(kind)}
+    (of_none,) = re.findall(r"^Of no fact: (.*)$", section, re.MULTILINE)
+    cells = [*re.findall(r"^\| (`.*?) \|", section, re.MULTILINE), of_none]
+    named = [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
+    bits = [bit for kind in OWN_KINDS for bit in flags_of(kind)]
+    rejecting = {bit.word for bit in bits if bit.severity is Severity.REJECT}
+    assert rejecting <= set(named)
+    assert set(named) <= {bit.word for bit in bits}
+    assert len(named) == len(set(named))
 
 
 def test_stiff_cases_of_every_retrieval_are_listed_with_what_they_expect() -> None:
