@@ -32,7 +32,7 @@ _ALTITUDES: Final = (-500.0, 9000.0)
 """m; those that a station of a campaign may have."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
-_POINTING: Final = "zenith angle"
+_POINTING: Final = "taken as"
 """Words of the notes on headers that tell how their pointing is read."""
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
@@ -225,8 +225,8 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
         )
     else:
         notes = {note for group in headers.signal for note in group.notes if _POINTING in note}
-        taken = f" ({'; '.join(sorted(notes))})" if notes else ""
-        yield f"zenith_angle: {abs(angles[0]):g}  # ? degree, {angles[0]:g} by all headers{taken}"
+        source = "; ".join(sorted(notes)) or f"headers state {angles[0]:g}"
+        yield f"zenith_angle: {abs(angles[0]):g}  # ? degree, {source}"
     if angles and headers.without_zenith:
         doubts = [doubt for group in headers.signal for doubt in group.doubts]
         yield f"# ? {headers.without_zenith} files state no sure pointing and are refused"
