@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ class AnalogBaseline:
     """Power without light over range, minus that of the far range."""
 
     range: Array
-    """(block,) m, middles of the blocks; rising."""
+    """(block,) m, middles of the blocks and of the far range; rising."""
     power: Array
     """(block,) mV."""
     standard_error: Array
@@ -30,8 +30,14 @@ class AnalogBaseline:
     """(blocked,) m, range from which each of them is blocked."""
 
     def at(self, distance: Array) -> Array:
-        """Return the baseline at ranges in m; nearer and farther than all blocks as in the last."""
-        return np.interp(distance, self.range, self.power)
+        """Return the baseline at ranges in m.
+
+        Nearer than the first block it is as there. The line to the middle of the far range goes on
+        beyond, so that the mean of the far range is 0.
+        """
+        slope = (self.power[-1] - self.power[-2]) / (self.range[-1] - self.range[-2])
+        beyond = np.maximum(distance - self.range[-1], 0.0)
+        return np.asarray(np.interp(distance, self.range, self.power) + slope * beyond)
 
     def error_within(self, distance: Array) -> float:
         """Return the root mean square of the standard error over ranges in m."""
@@ -48,6 +54,8 @@ class _Profile(NamedTuple):
     """m; inf for a free beam."""
     mean: Array
     variance: Array
+    of_tail: float
+    """Variance of the mean of the tail."""
 
 
 class BlockedBeams:
@@ -56,7 +64,8 @@ class BlockedBeams:
     Behind an obstruction (`_obstructions.obstruction_range`, and a guard of 300 m for the echo of a
     strong target) there is no light, which is tested: the power in the first block is less than a
     tenth of the median of the free beams. The power there minus that of the tail is averaged over
-    blocks of 300 m or a fifth of the range. With the variances :math:`v_{ib}` of profile :math:`i`
+    blocks of 300 m or a fifth of the range, the last of which ends where the tail begins; in the
+    middle of the tail the baseline is 0. With the variances :math:`v_{ib}` of profile :math:`i`
     in block :math:`b`, and a variance :math:`e^2` between profiles by the moments of
     `dersimonian1986`, pooled over blocks, the mean has weights :math:`1 / (v + e^2)`, and the
     variance :math:`1 / \sum w + e^2`: the baseline of a free beam differs from the mean too.
@@ -74,10 +83,7 @@ class BlockedBeams:
         self._front = slice(first, None)
         self._distance = distance[self._front]
         self._tail = (self._distance >= tail[0]) & (self._distance <= tail[1])
-        edges = [0.0]
-        while edges[-1] < tail[0]:
-            edges.append(edges[-1] + max(_BLOCK, _SHARE * edges[-1]))
-        self._edges = np.array(edges[:-1])
+        self._edges = _block_edges(tail[0])
         self._places = np.searchsorted(self._distance, self._edges)
         self._profiles: list[_Profile] = []
 
@@ -95,10 +101,12 @@ class BlockedBeams:
         sky, of_sky, _ = _means(values[:, self._tail], spread[:, self._tail], np.zeros(1, np.intp))
         net = values - sky
         ends = obstruction_range(net, spread, self._distance)
-        means, of_means, full = _means(net, spread, self._places)
+        means, of_means, full = (part[:, :-1] for part in _means(net, spread, self._places))
         means = np.where(full, means, np.nan)
-        for number, *parts in zip(profile, ends, means, of_means + of_sky, strict=True):
-            self._profiles.append(_Profile(int(number), float(parts[0]), *parts[1:]))
+        columns = zip(profile, ends, means, of_means + of_sky, of_sky[:, 0], strict=True)
+        for number, end, mean, of_mean, of_tail in columns:
+            part = _Profile(int(number), float(end), mean, of_mean, float(of_tail))
+            self._profiles.append(part)
 
     def baseline(self) -> AnalogBaseline | None:
         """Return the baseline; None where no profile is blocked, or all are."""
@@ -116,19 +124,33 @@ class BlockedBeams:
         variance = np.stack([part.variance for part in blocked])
         known = np.isfinite(mean).any(axis=0)
         power, of_power = _combined(mean[:, known], variance[:, known])
-        past = np.append(self._edges[1:], self._distance[self._tail][0])
+        middles = 0.5 * (self._edges[:-1] + self._edges[1:])
+        of_tail = 1.0 / sum(1.0 / part.of_tail for part in blocked)
         return AnalogBaseline(
-            range=(0.5 * (self._edges + past))[known],
-            power=power,
-            standard_error=np.sqrt(of_power),
+            range=np.append(middles[known], self._distance[self._tail].mean()),
+            power=np.append(power, 0.0),
+            standard_error=np.sqrt(np.append(of_power, of_tail)),
             profile=np.array([part.number for part in blocked], dtype=np.int64),
             obstruction=np.array([part.obstruction for part in blocked]),
         )
 
     def _behind(self, part: _Profile) -> Array:
         """Return the means of the blocks behind the obstruction, NaN in front."""
-        dark = self._edges >= part.obstruction + THRESHOLDS.baseline_guard
+        dark = self._edges[:-1] >= part.obstruction + THRESHOLDS.baseline_guard
         return np.where(dark, part.mean, np.nan)
+
+
+def _block_edges(end: float) -> Array:
+    """Return the edges of the blocks up to `end`, m; the last one may be half as long as others."""
+    edges = [0.0]
+    while edges[-1] + 1.5 * _length(edges[-1]) < end:
+        edges.append(edges[-1] + _length(edges[-1]))
+    return np.array([*edges, end])
+
+
+def _length(start: float) -> float:
+    """Return the length of the block that begins at a range, m."""
+    return max(THRESHOLDS.baseline_block, THRESHOLDS.baseline_share * start)
 
 
 def _median(values: Array) -> Array:
@@ -146,10 +168,6 @@ def _is_dark(behind: Array, light: Array) -> bool:
         return False
     first = known[0]
     return bool(abs(behind[first]) < THRESHOLDS.baseline_light * light[first])
-
-
-_BLOCK: Final = THRESHOLDS.baseline_block
-_SHARE: Final = THRESHOLDS.baseline_share
 
 
 def _means(
