@@ -16,7 +16,7 @@ TRUE = 4e-3 * np.exp(-DISTANCE / 6000.0) + 4e-7 * DISTANCE
 """mV."""
 
 
-def scan(rng, targets, *, echo=30.0, scatter=0.0, light=60.0):
+def scan(rng, targets, *, true=TRUE, echo=30.0, scatter=0.0, light=60.0):
     """Return power and variance of analog profiles, each blocked at its target, in mV."""
     power = np.empty((len(targets), DISTANCE.size))
     for row, target in enumerate(targets):
@@ -24,7 +24,7 @@ def scan(rng, targets, *, echo=30.0, scatter=0.0, light=60.0):
         falling = np.where(target > DISTANCE, falling, 0.0)
         falling[(target <= DISTANCE) & (target + 40.0 > DISTANCE)] = echo
         own = scatter * rng.normal() * np.exp(-DISTANCE / 15000.0)
-        power[row] = 4.8 + TRUE + own + falling + rng.normal(0.0, NOISE, DISTANCE.size)
+        power[row] = 4.8 + true + own + falling + rng.normal(0.0, NOISE, DISTANCE.size)
     return power, np.full(power.shape, NOISE**2)
 
 
@@ -61,8 +61,24 @@ def test_a_record_without_light_becomes_zero():
     net -= net[IN_TAIL].mean()
     assert found.at(DISTANCE[IN_TAIL]).mean() == pytest.approx(0.0, abs=1e-9)
     beyond = (found.range[0] < DISTANCE) & (TAIL[1] > DISTANCE)
-    error = np.interp(DISTANCE, found.range, found.standard_error)
-    assert (np.abs(net) < 4.0 * error)[beyond].all()
+    assert (np.abs(net) < 4.0 * found.error_at(DISTANCE))[beyond].all()
+
+
+# The faster the recovery, the less of it the first two blocks show.
+@pytest.mark.parametrize(("recovery", "most"), [(300.0, 2.2), (1000.0, 1.5), (6000.0, 1.0)])
+def test_the_error_covers_a_recovery_before_the_first_block(recovery, most):
+    """Beams are blocked at 200 to 300 m, so that the first block begins at 600 m."""
+    true = 8e-3 * np.exp(-DISTANCE / recovery)
+    near = (DISTANCE > 200.0) & (DISTANCE < 900.0)
+    rng = np.random.default_rng(6)
+    ratios = []
+    for _ in range(30):
+        targets = [*rng.uniform(200.0, 300.0, 6), np.inf, np.inf]
+        found = baseline(*scan(rng, targets, true=true))
+        assert found.range[0] == 750.0
+        net = true - true[IN_TAIL].mean() - found.at(DISTANCE)
+        ratios.append((net / found.error_at(DISTANCE))[near])
+    assert 0.5 < np.sqrt(np.square(ratios).mean()) < most
 
 
 def test_profiles_taken_together_change_no_bit():
