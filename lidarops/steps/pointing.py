@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import numpy as np
+
+from lidarops.retrieve.multiangle.slant_paths import widest_azimuth_gap
 from lidarops.steps.case import ChannelCase
 
 STEEPEST: Final = 80.0
@@ -34,14 +37,14 @@ def moves(case: ChannelCase) -> bool:
     """Return whether the files of a scene point to several directions, of any pattern."""
     if case.facts.zenith_angle is not None:
         return False
-    side, granules = case.facts.azimuth, case.scene.granules
-    zenith = [granule.zenith_angle for granule in granules]
-    azimuth = [granule.azimuth if side is None else side for granule in granules]
-    return any(
-        max(known) - min(known) > FIXED
-        for angles in (zenith, azimuth)
-        if (known := [angle for angle in angles if angle is not None])
-    )
+    granules, side = case.scene.granules, case.facts.azimuth
+    zenith = [granule.zenith_angle for granule in granules if granule.zenith_angle is not None]
+    if zenith and max(zenith) - min(zenith) > FIXED:
+        return True
+    azimuth = [granule.azimuth for granule in granules if granule.azimuth is not None]
+    # The sector of all beams may hold north.
+    sector = 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
+    return side is None and sector > FIXED
 
 
 def fixed_zenith(case: ChannelCase) -> tuple[float, str]:

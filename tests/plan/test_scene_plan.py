@@ -135,6 +135,8 @@ def test_a_section_outside_the_bins_is_left_out(section: list[float]) -> None:
         ([(90.0, 20.0), (90.0, 20.0)], 4500, "auto"),
         ([(90.0, 20.0), (60.0, 20.0)], 4500, "known_background"),
         ([(90.0, 20.0), (90.0, 25.0)], 4500, "known_background"),
+        ([(90.0, 359.99), (90.0, 0.01)], 4500, "auto"),
+        ([(90.0, 358.0), (90.0, 3.0)], 4500, "known_background"),
         # The last tenth of the bins begins before.
         ([(90.0, 20.0), (90.0, 25.0)], 14_500, "auto"),
     ],
