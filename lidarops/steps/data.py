@@ -192,4 +192,5 @@ class Data:
 
     def of_product(self) -> Data:
         """Return a copy for the steps of one product, which other products do not see."""
-        return Data(self.source, self.channel, self.channels, self.statements, dict(self._values))
+        words, values = list(self.statements), dict(self._values)
+        return Data(self.source, self.channel, self.channels, words, values)

@@ -248,6 +248,14 @@ def test_steps_take_no_data_but_their_inputs(kind, request_, monkeypatch) -> Non
     assert {name for name, _ in taken} >= {kind, "noise"}
 
 
+def test_what_a_product_states_is_not_stated_by_others() -> None:
+    source = Source(archive(profiles=1), None, NONE, STATION)
+    steps = planned(campaign({"elastic": ELASTIC})).steps
+    data = execution.channel_data(source, steps, "photon_532o")
+    data["elastic"].statements.append("words")
+    assert data["signal"].statements == []
+
+
 @pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
 def test_elastic_recovers_the_truth(channel: str) -> None:
     product = elastic_products()[channel]
