@@ -218,8 +218,8 @@ def _plane_variables(
     height = altitude - settings["station_altitude"]
     scan = slant_paths.make_scan(zenith_angle[every], height, settings["azimuth"][every])
     if slant_paths.surrounds_zenith(scan.tilted_azimuths):
-        depth = (f"optical_depth{error}" for error in ("", "_standard_error", "_gradient_error"))
-        scale = gradient_scale(*(stacked[name] for name in depth))
+        names = (f"optical_depth{error}" for error in ("", "_standard_error", "_gradient_error"))
+        scale = gradient_scale(*(stacked[name] for name in names))
         for quantity in ("optical_depth", "extinction"):
             stacked[f"{quantity}_gradient_error"] *= scale
     cube = ("time", "plane", "altitude")
@@ -241,10 +241,10 @@ def _dead_time_variables(
     if "dead_time_error" not in beams:
         return {}
     shift = signals.shift_by(retrieval, beams["dead_time_error"].to_numpy())
-    depth = np.diff(beams["altitude"].to_numpy(), prepend=station_altitude)
+    thickness = np.diff(beams["altitude"].to_numpy(), prepend=station_altitude)
     errors = {
         "optical_depth": np.abs(shift),
-        "extinction": np.abs(np.diff(shift, axis=1, prepend=0.0)) / depth,
+        "extinction": np.abs(np.diff(shift, axis=1, prepend=0.0)) / thickness,
     }
     return {
         f"{_variable(name)}_dead_time_error": xr.Variable(
@@ -299,8 +299,8 @@ def _solve_all(
 ) -> MultiAngleResult:
     """Return the result of the method, with errors by what the backgrounds may hold."""
     retrieval = _solve(beams, zenith_angle, altitude, **settings)
-    depth = np.diff(altitude, prepend=settings["station_altitude"])
-    return _with_background_errors(retrieval, beams, depth, levels)
+    thickness = np.diff(altitude, prepend=settings["station_altitude"])
+    return _with_background_errors(retrieval, beams, thickness, levels)
 
 
 def _solve(
@@ -366,12 +366,12 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
 def _with_background_errors(
     retrieval: MultiAngleResult,
     beams: ScanSignals,
-    depth: Array,
+    thickness: Array,
     levels: npt.NDArray[np.intp],
 ) -> MultiAngleResult:
     """Return the result with standard errors that include signal in the background of all beams.
 
-    `depth` is that of the layers between altitudes in m; `levels` are the bottom and top of
+    `thickness` is that of the layers between altitudes in m; `levels` are the bottom and top of
     requested layers, 0 for the station and k + 1 for altitude k.
     """
     shift = np.pad(beams.shift(retrieval), ((0, 0), (1, 0)))
@@ -380,7 +380,7 @@ def _with_background_errors(
         retrieval,
         optical_depth_standard_error=np.hypot(retrieval.optical_depth_standard_error, shift[:, 1:]),
         extinction_standard_error=np.hypot(
-            retrieval.extinction_standard_error, np.diff(shift, axis=1) / depth
+            retrieval.extinction_standard_error, np.diff(shift, axis=1) / thickness
         ),
         layer_optical_depth_standard_error=np.hypot(
             retrieval.layer_optical_depth_standard_error, of_layers
