@@ -32,6 +32,16 @@ WITHHELD: Final = (
 """A bin with one of these bits is not used."""
 CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
+_CUBE: Final = ("time", "beam", "altitude")
+_DIMENSIONS: Final = {
+    "signal": _CUBE,
+    "variance": _CUBE,
+    "quality": ("time", "altitude"),
+    "left": ("time", "beam"),
+    "obstruction": ("time", "beam"),
+    "dead_time_error": _CUBE,
+}
+"""Of the arrays of cycles; see `AltitudeCycles.result`."""
 BATCH: Final = 64
 """Profiles averaged together, unless one cycle has more."""
 _BESIDE: Final = 4
@@ -121,7 +131,7 @@ class AltitudeCycles:
             azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any()
         )
         self._batches = list(_batches(order))
-        self._pieces: list[tuple[_Block, ...]] = []
+        self._pieces: list[dict[str, _Block]] = []
 
     def ends(self) -> Integers:
         """Return the profiles before which a chunk may end: those that begin a cycle."""
@@ -180,10 +190,10 @@ class AltitudeCycles:
             ``time`` is the middle of ``time_bnds``, which span the profiles of a cycle.
         """
         order = self._order
-        arrays = [np.concatenate(pieces) for pieces in zip(*self._pieces, strict=True)]
-        cube = ("time", "beam", "altitude")
-        dims = (cube, cube, ("time", "altitude"), ("time", "beam"), ("time", "beam"), cube)
-        names = ("signal", "variance", "quality", "left", "obstruction", "dead_time_error")
+        cycles = {
+            name: (_DIMENSIONS[name], np.concatenate([piece[name] for piece in self._pieces]))
+            for name in self._pieces[0]
+        }
         bounds = _cycle_bounds(self._bounds, order)
         coordinates = {
             "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
@@ -197,7 +207,7 @@ class AltitudeCycles:
         total = np.bincount(order.cycle, weights=self._weights[order.profile])
         return xr.Dataset(
             {
-                **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=False)},
+                **cycles,
                 "response": (("beam", "altitude"), self._settings.response()),
                 "shots": ("time", np.rint(total).astype(np.int32)),
             },
@@ -336,12 +346,11 @@ def _batch_on_altitudes(
     cycle: Integers,
     beam: Integers,
     settings: _Settings,
-) -> tuple[_Block, ...]:
-    """Return signal and variance as (cycle, beam, altitude), quality as (cycle, altitude).
+) -> dict[str, _Block]:
+    """Return the arrays of the cycles of a batch by name.
 
-    The fourth and fifth arrays are, as (cycle, beam), the signal that may have been subtracted with
-    the background, and the range from which the beam is blocked, m. A sixth one, with a change of
-    the power by the dead time and of the background over its square, is that of the signal.
+    `dead_time` holds the change of the power by the dead time, and that of the background over its
+    square; None for analog.
     """
     power, variance, quality, length = profiles
     bins = _net_bins(power, variance, quality, length, beam, settings)
@@ -388,8 +397,14 @@ def _batch_on_altitudes(
                 settings.distance[near],
                 settings.slant_edges[number],
             ).signal
-    known: tuple[_Block, ...] = (signal, spread, flags, left_by_beam, blocked)
-    return known if changed is None else (*known, changed)
+    cycles: dict[str, _Block] = {
+        "signal": signal,
+        "variance": spread,
+        "quality": flags,
+        "left": left_by_beam,
+        "obstruction": blocked,
+    }
+    return cycles if changed is None else cycles | {"dead_time_error": changed}
 
 
 class _Bins(NamedTuple):
