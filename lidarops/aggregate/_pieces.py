@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names
+from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, refuse_changed
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
@@ -27,12 +27,13 @@ def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        Lazy, not decoded, with ``product`` (product,) and ``product_index`` (time,).
+        Lazy, not decoded, with ``product`` (product,) and ``product_index`` (time,). The caller
+        closes it.
 
     Raises
     ------
     ProductError
-        If the file cannot be read.
+        If the file cannot be read, or has changed since its facts were read.
     """
     chunks: dict[str, int] | None = {} if dask else None
     try:
@@ -41,6 +42,11 @@ def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
         )
     except (OSError, RuntimeError, ValueError) as error:
         raise ProductError(f"cannot be read: {error}", file=file) from error
+    try:
+        refuse_changed(opened, facts)
+    except ProductError:
+        opened.close()
+        raise
     static = coordinate_names(facts.kind)
     variables = {}
     for name, variable in opened.variables.items():
@@ -54,4 +60,6 @@ def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
         PRODUCT.name: (PRODUCT.dims, np.array([facts.id]), about[PRODUCT.name]),
         PRODUCT_INDEX.name: (PRODUCT_INDEX.dims, index, about[PRODUCT_INDEX.name]),
     }
-    return xr.Dataset(variables, coords=own, attrs=opened.attrs)
+    piece = xr.Dataset(variables, coords=own, attrs=opened.attrs)
+    piece.set_close(opened.close)
+    return piece

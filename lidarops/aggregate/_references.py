@@ -20,7 +20,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, opened, plain
+from lidarops.aggregate.facts import (
+    UNSHARED,
+    Facts,
+    coordinate_names,
+    opened,
+    plain,
+    refuse_changed,
+)
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
@@ -117,8 +124,7 @@ def read_source(root: Path, facts: Facts, alike: Template) -> Source:
     """
     file = within(root, facts.path)
     with opened(file) as product:
-        if product.attrs["id"] != facts.id:
-            raise ProductError("changed while it was read", file=facts.path, remedy="run again")
+        refuse_changed(product, facts)
         names = [name for name in alike.variables if not alike.is_static(name)]
         attrs = dict(product.attrs)
         inline = {n: product.variables[n].values for n in names if alike.is_inline(n)}

@@ -12,9 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
-from lidarops.aggregate.facts import Facts, opened
+from lidarops.aggregate.facts import Facts, opened, refuse_changed
 from lidarops.aggregate.means_variables import averaged, budget_of, systematic_terms
-from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
@@ -54,8 +53,7 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
         bit that its kind does not have.
     """
     with opened(within(root, facts.path)) as product:
-        if product.attrs["id"] != facts.id:
-            raise ProductError("changed while it was read", file=facts.path, remedy="run again")
+        refuse_changed(product, facts)
         flags = with_current_flags(product)[QUALITY_FLAG].values
         usable = (flags & np.int32(flags_of(facts.kind).rejecting)) == 0
         rows = [row for row in averaged(facts.kind) if row.name in product]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarops.aggregate._join import shared_attributes
 from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate._pieces import open_piece
-from lidarops.aggregate.facts import Facts, opened, plain, refuse_duplicates
+from lidarops.aggregate.facts import Facts, opened, plain, refuse_changed, refuse_duplicates
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.system.files import within
@@ -37,7 +37,7 @@ class Changes:
 
 
 class UnreadableProductError(Exception):
-    """A product that cannot be read, though its facts could."""
+    """A product that cannot be read or has changed, though its facts could be read."""
 
     def __init__(self, facts: Facts, reason: str) -> None:
         super().__init__(reason)
@@ -70,9 +70,9 @@ def write_group(
     Raises
     ------
     ProductError
-        If a time occurs twice, or a product has changed. Nothing is written then.
+        If a time occurs twice. Nothing is written then.
     UnreadableProductError
-        If a product cannot be read. Part of the group may be written then.
+        If a product cannot be read or has changed since. Part of the group may be written then.
     """
     held = _held(store, name)
     ids = [product.id for product in products]
@@ -91,7 +91,8 @@ def write_group(
     known = [] if gone or 0 in lacking else [held.attributes]
     shared = shared_attributes([*known, *(stated.attributes for stated in about.values())])
     if 0 in lacking:
-        _create(store, name, _piece(root, products[0]))
+        with _piece(root, products[0]) as piece:
+            _create(store, name, piece)
     group = root_of(store)[name]
     group.attrs.put({key: plain(value) for key, value in shared.items()})
     _write_rows(group, root, products, lacking, starts)
@@ -133,12 +134,10 @@ class _About:
 def _about(root: Path, facts: Facts) -> _About:
     try:
         with opened(within(root, facts.path)) as product:
-            about = _About(dict(product.attrs), product["time"].values)
+            refuse_changed(product, facts)
+            return _About(dict(product.attrs), product["time"].values)
     except ProductError as error:
         raise UnreadableProductError(facts, error.problem) from error
-    if about.attributes["id"] != facts.id:
-        raise ProductError("changed while it was read", file=facts.path, remedy="run again")
-    return about
 
 
 def _refuse_duplicates(
@@ -228,15 +227,15 @@ class _Rows:
 def _write_product(
     rows: Mapping[str, _Rows], root: Path, facts: Facts, number: int, start: int
 ) -> None:
-    piece = _piece(root, facts)
-    piece[PRODUCT_INDEX.name] = piece[PRODUCT_INDEX.name] + np.int32(number)
-    for name, variable in piece.variables.items():
-        if not _is_long(variable):
-            continue
-        array = rows[str(name)]
-        first = start if "time" in variable.dims else number
-        for low, high in _blocks(first, first + variable.shape[0], array.array.chunks[0]):
-            array.add(low, _values(variable[low - first : high - first], facts))
+    with _piece(root, facts) as piece:
+        piece[PRODUCT_INDEX.name] = piece[PRODUCT_INDEX.name] + np.int32(number)
+        for name, variable in piece.variables.items():
+            if not _is_long(variable):
+                continue
+            array = rows[str(name)]
+            first = start if "time" in variable.dims else number
+            for low, high in _blocks(first, first + variable.shape[0], array.array.chunks[0]):
+                array.add(low, _values(variable[low - first : high - first], facts))
 
 
 def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:

@@ -288,6 +288,18 @@ def opened(file: Path) -> Iterator[xr.Dataset]:
         raise ProductError(f"cannot be read: {error}", file=file) from error
 
 
+def refuse_changed(product: xr.Dataset, facts: Facts) -> None:
+    """Refuse an open product that is no longer the one whose facts were read.
+
+    Raises
+    ------
+    ProductError
+        If its id is another one.
+    """
+    if product.attrs.get("id") != facts.id:
+        raise ProductError("changed while it was read", file=facts.path, remedy="run again")
+
+
 def _kind_of(product: xr.Dataset, file: Path) -> str:
     """Return the kind of a product.
 

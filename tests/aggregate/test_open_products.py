@@ -10,6 +10,8 @@ import pytest
 import xarray as xr
 from support.archives.aggregate_archive import add_day, facts_of
 
+from lidarops.aggregate import open_products as opening
+from lidarops.aggregate.facts import Facts, Group
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
@@ -120,6 +122,22 @@ def test_a_damaged_chunk_raises_an_error(tmp_path: Path):
     path.write_bytes(content)
     with pytest.raises((ProductError, RuntimeError)):
         open_products(path, usable=2).load()
+
+
+@pytest.mark.parametrize("profiles", [5, 6])
+def test_a_product_that_changes_while_it_is_opened_is_named(
+    profiles: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = add_day(tmp_path, 0)
+    groups = opening.groups
+
+    def replace_the_product(products: list[Facts]) -> dict[Group, list[Facts]]:
+        add_day(tmp_path, 0, version=2, profiles=profiles)
+        return groups(products)
+
+    monkeypatch.setattr(opening, "groups", replace_the_product)
+    with pytest.raises(ProductError, match=f"{path}: changed while it was read"):
+        open_products(tmp_path)
 
 
 def test_wrong_arguments_raise_clear_errors(archive: Path, tmp_path: Path):

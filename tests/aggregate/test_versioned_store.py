@@ -17,8 +17,8 @@ import xarray as xr
 from support.archives.aggregate_archive import add_day, facts_of
 from support.products.made_products import MAKERS
 
-from lidarops.aggregate import versioned_store
-from lidarops.aggregate.facts import EVERYTHING, UNSHARED, ProductSelection
+from lidarops.aggregate import _store_group, versioned_store
+from lidarops.aggregate.facts import EVERYTHING, UNSHARED, ProductSelection, Refused
 from lidarops.aggregate.open_products import open_products
 from lidarops.aggregate.versioned_store import StoreUpdate, store_path, update_store
 from lidarops.errors import ProductError, RetrievalInputError
@@ -251,6 +251,27 @@ def test_a_product_with_a_damaged_chunk_is_left_out(tmp_path: Path):
     assert [product.path for product in done.refused] == [paths[1]]
     assert "cannot be read" in done.refused[0].reason
     (tmp_path / paths[1]).unlink()
+    assert_like_products(tmp_path)
+
+
+@pytest.mark.parametrize("profiles", [5, 6])
+def test_a_product_that_changes_while_it_is_copied_is_left_out(
+    profiles: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    paths = [add_day(tmp_path, day, KIND) for day in range(3)]
+    refuse_duplicates = _store_group.refuse_duplicates
+
+    def replace_a_product(*known: Any) -> None:
+        refuse_duplicates(*known)
+        add_day(tmp_path, 1, KIND, version=2, profiles=profiles)
+
+    # The last that happens before rows are copied.
+    monkeypatch.setattr(_store_group, "refuse_duplicates", replace_a_product)
+    done = update(tmp_path)
+    monkeypatch.undo()
+    assert done.refused == (Refused(paths[1], "changed while it was read"),)
+    assert open_products(store_path(tmp_path, KIND)).sizes["product"] == 2
+    assert update(tmp_path).added == 1
     assert_like_products(tmp_path)
 
 
