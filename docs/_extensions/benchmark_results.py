@@ -54,7 +54,7 @@ SELECTIONS: Final = {
         "lidarops bench stability --quick --out bench",
         ("",),
         ("values", "not rejected", "within 1.96", "false, random error", "and not uncertain",
-         "without any flag", "target"),
+         "of these undetectable", "without any flag", "target"),
     ),
     "throughput": Selection(
         "lidarops bench throughput --quick --out bench", ("float32, dense", "float32, 30 %"),

@@ -699,7 +699,10 @@ BACKGROUND_METHOD: Final = Row(
     states=("tail_mean", "cubic", "known_shape"),
     comment="tail_mean: mean of the far range. cubic: from the cubic of a homogeneous section."
     " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
-    f" the far range where the fit fails. {NO_STANDARD_NAME}",
+    " the far range where the fit fails. Haze that falls with height nearly as air does leaves no"
+    " trace in that fit: with simulated haze of 0.6 to 3 times the backscatter of air at the ground"
+    " and a scale height of 3 km, 12 percent of the backgrounds deviated by more than 4 standard"
+    f" errors. {NO_STANDARD_NAME}",
 )
 
 AVERAGED_PROFILES: Final = Row(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
@@ -27,12 +28,25 @@ _DEAD_TIME: Final = 4e-9
 _BITS: Final = 12
 _STEP: Final = 500.0 / 2**_BITS
 """mV."""
+_PER_MEGAHERTZ_SQUARED: Final = 1e6
+"""Rates are in MHz and dead times in s."""
 _MEAN_OF: Final = slice(100, 300)
 """Bins whose mean is scored: single bins hold too few counts for Gaussian errors."""
 
-Errors = tuple[str, Array, Array, Any, Any]
-"""Quantity, error, its stated random error, whether the violation is hidden (None where unknown),
-quality bits."""
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Errors of the values of some profiles."""
+
+    quantity: str
+    error: Array
+    random: Array
+    """Stated standard error."""
+    bits: Any
+    systematic: Any = 0.0
+    """Stated systematic error."""
+    hidden: Any = None
+    """Where the violation is hidden; None: unknown."""
 
 
 def _logarithmic(rng: Random, low: float, high: float) -> float:
@@ -48,7 +62,7 @@ def _mean(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Error
         error = np.where(valid, power, 0.0).sum(axis=1) / count - truth
         variance = np.where(valid, signal.variance[:, _MEAN_OF], 0.0).sum(axis=1) / count**2
     bits = np.bitwise_or.reduce(signal.quality[:, _MEAN_OF], axis=1)
-    return quantity, error, np.sqrt(variance), None, bits
+    return Errors(quantity, error, np.sqrt(variance), bits)
 
 
 def _bin(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Errors:
@@ -56,7 +70,7 @@ def _bin(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Errors
     k = _BINS // 2
     error = np.asarray(signal.power[:, k] - truth, dtype=np.float64)
     stated = np.sqrt(np.asarray(signal.variance[:, k], dtype=np.float64))
-    return f"{quantity} of a bin", error, stated, None, signal.quality[:, k]
+    return Errors(f"{quantity} of a bin", error, stated, signal.quality[:, k])
 
 
 def _counts(rng: Random, rate: float, dead_time: float, shots: int, profiles: int, *,
@@ -80,7 +94,12 @@ def _photon(
         counts, np.full(profiles, shots), _RANGE[:_BINS], bin_width=_BIN_WIDTH,
         dead_time=_DEAD_TIME,
     )  # fmt: skip
-    return _mean(signal, rate, "count rate")
+    errors = _mean(signal, rate, "count rate")
+    # As products state it (`signal_dead_time_error`), from the rate that was found.
+    change = (errors.error + rate) ** 2 * _PER_MEGAHERTZ_SQUARED
+    return replace(
+        errors, systematic=change * counts_to_signal.dead_time_standard_error(_DEAD_TIME)
+    )
 
 
 def _analog(
@@ -135,14 +154,16 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Errors:
         )
         hidden = np.sqrt(noise_free_fit.chi2) < VISIBLE
     error = fit.background - level
-    return "background, known shape", error, fit.background_standard_error, hidden, bits
+    return Errors(
+        "background, known shape", error, fit.background_standard_error, bits, hidden=hidden
+    )
 
 
 def _tail(rng: Random, profiles: int) -> Errors:
     sky, _, counts, variance, level = _far(rng, profiles)
     result = estimate.from_tail(counts, sky.range, np.broadcast_to(variance, counts.shape))
     error = result.background - level
-    return "background, mean of the tail", error, result.standard_error, None, result.quality
+    return Errors("background, mean of the tail", error, result.standard_error, result.quality)
 
 
 def _cubic(rng: Random, profiles: int) -> Errors:
@@ -154,7 +175,7 @@ def _cubic(rng: Random, profiles: int) -> Errors:
     power = model + rng.standard_normal((profiles, from_range.size))
     result = cubic_and_tail.cubic(power, from_range, variance=1.0)
     error = result.background - level
-    return "background, cubic", error, result.background_standard_error, None, result.quality
+    return Errors("background, cubic", error, result.background_standard_error, result.quality)
 
 
 _WRONG_DEAD_TIME: Final = "a wrong dead time distorts the rates and leaves no trace in one profile"
@@ -197,13 +218,14 @@ def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
     """Yield the scored values of random counts, class by class."""
     for number, (failure, process) in enumerate(FAILURES):
         rng = np.random.default_rng((75, cluster, number))
-        quantity, error, random, hidden, bits = process(rng, profiles)
-        solvable = np.isfinite(error) if failure.satisfied and "cubic" not in failure.name else None
+        errors = process(rng, profiles)
+        clean = failure.satisfied and "cubic" not in failure.name
         yield (
             ScoredValues(
-                failure, quantity, error, random, 0.0, np.asarray(bits), HomogeneousQuality,
-                solvable=solvable, hidden=hidden,
-                uncertain=(bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
+                failure, errors.quantity, errors.error, errors.random, errors.systematic,
+                np.asarray(errors.bits), HomogeneousQuality,
+                solvable=np.isfinite(errors.error) if clean else None, hidden=errors.hidden,
+                uncertain=(errors.bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
             ),
             profiles,
         )  # fmt: skip

@@ -29,7 +29,10 @@ LAYOUT: Final = Layout(
     processing_level="L1: calibrated in range and time, not in power",
     references=("Licel GmbH (2023): Licel raw data format.",),
     comment="The standard errors of all range bins of a profile include the error of its"
-    " background, which is common to them. lidarops_steps states the method of the background.",
+    " background, which is common to them. lidarops_steps states the method of the background."
+    " Where the noise of an analog record is below half a step of the digitizer, its bins share"
+    " their rounding error: the standard error of a bin covers it, that of a mean over bins does"
+    " not (52 percent of such simulated means deviated by more than 4 of them).",
     sampled="range",
     weighed=("signal",),
     coordinates=coordinates((RANGE,), altitude("range")),

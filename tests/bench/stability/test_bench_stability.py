@@ -341,7 +341,10 @@ def test_haze_in_the_shape_of_the_background_is_flagged_where_it_is_not_hidden()
         random_signals._known_shape(np.random.default_rng((75, cluster)), 5, haze=3.0)
         for cluster in range(150)
     ]
-    _, error, random, hidden, bits = (np.array(column) for column in zip(*scenes, strict=True))
+    error, random, hidden, bits = (
+        np.array([getattr(scene, name) for scene in scenes])
+        for name in ("error", "random", "hidden", "bits")
+    )
     flagged = (bits & int(Quality.NOT_HOMOGENEOUS)) != 0
     assert 0.5 < hidden.mean() < 1.0
     assert np.any(np.abs(error[hidden]) > 4.0 * random[hidden])
