@@ -50,7 +50,7 @@ class AnalogBaseline:
         (first, second), (power, other) = self.range[:2], self.power[:2]
         rise = np.hypot(other - power, np.hypot(*self.standard_error[:2]))
         nearer = np.maximum(first - distance, 0.0) * rise / (second - first)
-        return np.hypot(np.interp(distance, self.range, self.standard_error), nearer)
+        return np.asarray(np.hypot(np.interp(distance, self.range, self.standard_error), nearer))
 
     def error_within(self, distance: Array) -> float:
         """Return the root mean square of the standard error over ranges in m."""
