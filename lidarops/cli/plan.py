@@ -28,7 +28,7 @@ from lidarops.cli.app import (
     wrapped,
 )
 from lidarops.cli.findings import findings_document, show_findings
-from lidarops.cli.plan_summary import grouped, scene_title, show_scene, show_times
+from lidarops.cli.plan_summary import grouped, scene_title, show_refused, show_scene, show_times
 from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ def show_plan(
 
     Shows a summary of each scene; with --all every step with its settings and reasons. Also shows
     the estimated CPU time, and the memory that a process needs for each scene. Exit code 1 if a
-    scene cannot be planned, failed before or gave no usable value, a pattern or channel is in no
-    file, or headers contradict a station.
+    file is refused, a scene cannot be planned, failed before or gave no usable value, a pattern or
+    channel is in no file, or headers contradict a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
@@ -90,12 +90,15 @@ def _plan(
     wait: float,
     as_json: bool,
 ) -> None:
+    from lidarops.catalog.store import Store
     from lidarops.plan.cost_estimate import RunTime
     from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
 
     findings = survey(settings, selection=selection, wait=wait)
+    with Store(settings.catalog_url, settings.name) as store:
+        refused = store.refused()
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
     making, whole_run = RunTime(), RunTime()
     scenes = []
@@ -144,6 +147,7 @@ def _plan(
             **no_scene_found,
             "failed_before": earlier.failed,
             "without_a_usable_value": list(earlier.unusable),
+            "refused_files": {granule.path: granule.reason for granule in refused},
             **findings_document(findings),
             "lacking_metadata": list(settings.metadata.lacking),
             "estimated_cpu_seconds": estimate,
@@ -152,6 +156,7 @@ def _plan(
     else:
         if no_scene:
             say(NO_SCENE)
+        show_refused([granule.reason for granule in refused])
         show_findings(findings)
         if settings.metadata.lacking:
             names = ", ".join(settings.metadata.lacking)
@@ -159,7 +164,7 @@ def _plan(
                 say(line)
         _show_earlier(earlier)
         (_show_times if everything else show_times)(runs)
-    exit_with_status(failed=failed or any(earlier) or findings.failed)
+    exit_with_status(failed=failed or bool(refused) or any(earlier) or findings.failed)
 
 
 def _show_all(judged: Judgement, needs: Mapping[str, str], *, plan: bool) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from lidarops.cli.app import say, wrapped
@@ -18,6 +19,8 @@ _REQUEST: Final = "request"
 """Rule by which products are left out that the campaign does not request."""
 _READ: Final = "read"
 """Step that is left out for channels of which nothing is made."""
+_REASONS: Final = 3
+"""Reasons of refused files that fit on the screen."""
 
 
 def scene_title(judged: Judgement) -> str:
@@ -88,6 +91,19 @@ def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
     )
     for _, channels, reason in grouped((left.name, left.reason, left.channel) for left in unread):
         yield channels, reason
+
+
+def show_refused(reasons: Sequence[str]) -> None:
+    """Print the number of refused files, and of each reason."""
+    if not reasons:
+        return
+    _say(f"{counted(len(reasons), 'file')} refused (lidarops catalog names them):", "")
+    frequent = Counter(reasons).most_common(_REASONS)
+    for reason, count in frequent:
+        _say(f"{counted(count, 'file')}: {reason}", "  ")
+    rest = len(reasons) - sum(count for _, count in frequent)
+    if rest:
+        _say(f"{counted(rest, 'file')}: other reasons", "  ")
 
 
 def show_times(runs: Mapping[str, RunTime]) -> None:

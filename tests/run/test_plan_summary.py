@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,34 @@ def test_a_channel_without_a_plausible_wavelength_is_shown_with_the_reason(tmp_p
     text = " ".join(planned(file, width=300))
     assert "without product: analog_1o: the wavelength" in text
     assert "steps: read" in text
+
+
+def test_refused_files_are_counted_by_reason_and_fail(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    folder = tmp_path / "raw" / "coast"
+    whole = (folder / "h00").read_bytes()
+    for number in range(5):
+        (folder / f"h{number + 1:02}").write_bytes(whole[: -100 - number // 2])
+    shown = CliRunner().invoke(app, ["plan", str(file)], env=terminal(300))
+    text = _STYLE.sub("", shown.output)
+    assert shown.exit_code == 1
+    assert "5 files refused (lidarops catalog names them):" in text
+    assert len(re.findall(r"^  2 files: .*truncated", text, re.MULTILINE)) == 2
+    document = json.loads(CliRunner().invoke(app, ["plan", str(file), "--json"]).output)
+    assert len(document["refused_files"]) == 5
+
+
+def test_a_campaign_whose_only_file_is_refused_says_why_nothing_is_planned(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    raw = tmp_path / "raw" / "coast" / "h00"
+    raw.write_bytes(raw.read_bytes()[:-100])
+    codes, texts = set(), []
+    for command in ("plan", "catalog", "reprocess"):
+        shown = CliRunner().invoke(app, [command, str(file)], env=terminal(300))
+        codes.add(shown.exit_code)
+        texts.append(shown.output)
+    assert codes == {1}
+    assert "1 file refused" in texts[0]
 
 
 def test_rows_become_paragraphs_where_columns_are_too_narrow(
