@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import Any, get_args
 
 import campaign_keys
 import command_line
@@ -25,7 +25,7 @@ import lidarops
 from lidarops.campaign.model import load_campaign
 from lidarops.cli import app
 from lidarops.flags import Severity
-from lidarops.kinds import flags_of
+from lidarops.kinds import flags_of, kind_of
 
 # Made of the settings of all kinds of product, and listed among the keys of a campaign file.
 ASSEMBLED = {"Products", "Network"}
@@ -158,6 +158,23 @@ def test_every_flag_that_rejects_values_points_to_facts_or_is_named_as_of_none(r
     assert rejecting <= set(named)
     assert set(named) <= {bit.word for bit in bits}
     assert len(named) == len(set(named))
+
+
+def test_the_table_of_backgrounds_names_the_products_that_take_each(repository) -> None:
+    page = (repository / "docs/algorithms/background.md").read_text(encoding="utf-8")
+    table = page.partition("## Model")[2].partition("\n## ")[0]
+    cells = re.findall(r"^\| (.*`.*) \| .* \| .* \| (.*) \|$", table, re.MULTILINE)
+    rows = [[re.findall(r"`(\w+)`", cell) for cell in row] for row in cells]
+    named = {(method, kind) for methods, kinds in rows for method in methods for kind in kinds}
+    taken = {
+        (method, kind)
+        for kind in OWN_KINDS
+        if (field := kind_of(kind).settings.model_fields.get("background"))
+        for method in get_args(field.annotation)
+        if isinstance(method, str)
+    }
+    assert len(taken) > 6
+    assert taken <= named
 
 
 def test_stiff_cases_of_every_retrieval_are_listed_with_what_they_expect() -> None:
