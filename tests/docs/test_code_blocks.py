@@ -4,9 +4,9 @@ Benchmarks take minutes: their arguments are parsed here, and tests/bench runs t
 
 The blocks of a page run one after another in a folder of its own, with the campaign of
 `docs/howto/campaign.md`, its raw files and its products. Commands of lidarops run in this process.
-Tools that install, or need a server, a cluster or a container engine, are stand-ins here: what they
-are given must exist.
-`tests/deploy` runs most of them in earnest, and `.ci/run` the installation.
+Tools that install, or need a server, a cluster or a container engine, are stand-ins here that do
+nothing: only the files of the repository, modules, targets and options that they are given must
+exist. `tests/deploy` runs most of them in earnest, and `.ci/run` the installation.
 """
 
 from __future__ import annotations
