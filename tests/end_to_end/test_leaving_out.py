@@ -251,6 +251,27 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
     ).sides
 
 
+def test_cycles_of_one_beam_are_warned_of_with_their_first_file():
+    def step_of(granules):
+        (step,) = (step for step in planned(*granules, **MULTI).steps if step.name == "multiangle")
+        return step
+
+    beams = [10.0 * k for k in range(8)]
+    cycle = scans(*((angle, 90.0) for angle in beams))
+    assert step_of(cycle).warning == ""
+    assert "cycles" not in step_of(cycle).reason
+    lone = [
+        factories.granule(60 * k, path=f"coast/lone{k}", zenith_angle=0.0, azimuth=90.0)
+        for k in (1, 2)
+    ]
+    # A level beam is of no cycle.
+    level = factories.granule(180, path="coast/level", zenith_angle=90.0, azimuth=90.0)
+    step = step_of([*cycle, *lone, level])
+    assert step.reason.count("8 directions, in 3 cycles of at most 8") == 1
+    assert step.warning.startswith("cycles of one beam only: 2 of 3. All their values are rejected")
+    assert "leave their files out of `files` (first: coast/lone1)" in step.warning
+
+
 def test_invalid_angles_are_left_to_the_retrieval():
     plan = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
     assert decided(plan, "robust") == (

@@ -7,7 +7,7 @@ A step that the retrieval decides from the data is planned where the beams permi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -22,6 +22,7 @@ from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.multiangle.baseline import BASELINE, Baseline, with_baseline
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
+from lidarops.records import Granule
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
@@ -47,6 +48,8 @@ from lidarops.steps.workload import Workload
 
 Array = npt.NDArray[np.float64]
 Case = ProductCase[MultiAngleSettings]
+Numbers = tuple[tuple[float, ...], ...]
+"""Angles, or bounds of time, of each granule."""
 PartOfRetrieval = Choice[Case, NoSettings]
 """A step that the retrieval carries out within itself."""
 
@@ -87,6 +90,11 @@ class Beams:
     """Largest minus smallest slant path over the vertical one."""
     pattern: str = ""
     """Such as a volume of 6 vertical planes."""
+    cycles: int = 0
+    largest: int = 0
+    """Number of directions of the cycle that has most."""
+    lone: tuple[int, ...] = ()
+    """The first granule of each cycle of one direction, which has no value."""
 
 
 def beams(case: Case) -> Beams:
@@ -97,7 +105,15 @@ def beams(case: Case) -> Beams:
         (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
         for granule in case.scene.granules
     )
-    return _beams(pointings, settings.step, settings.highest)
+    return _beams(pointings, _bounds(case.scene.granules), settings.step, settings.highest)
+
+
+def _bounds(granules: Iterable[Granule]) -> Numbers:
+    """Return start and end of each granule, s."""
+    return tuple(
+        tuple(moment.timestamp() for moment in (granule.start, granule.stop) if moment)
+        for granule in granules
+    )
 
 
 def _number(angle: float | None) -> float:
@@ -106,11 +122,12 @@ def _number(angle: float | None) -> float:
 
 # All rules of a scene need the same beams.
 @lru_cache(maxsize=1)
-def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: float) -> Beams:
+def _beams(pointings: Numbers, bounds: Numbers, step: float, highest: float) -> Beams:
     zenith_angle, azimuth = np.array(pointings).T
     sides_known = bool(np.isfinite(azimuth).any())
     try:
         directions = scan_cycles.directions(zenith_angle, azimuth)
+        cycle = scan_cycles.cycles(zenith_angle, azimuth, bounds)
     except RetrievalInputError:
         # The retrieval raises the same error with its message.
         return Beams(0, 0, sides_known, 2 * _HALF_TURN, surround=False)
@@ -123,6 +140,10 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
     tilted = scan.tilted_azimuths
     free = math.degrees(slant_paths.widest_azimuth_gap(tilted))
     angles = directions.zenith_angle[up]
+    profiles = np.flatnonzero(np.isin(directions.index, up))
+    seen = np.unique(np.stack([cycle[profiles], directions.index[profiles]]), axis=1)[0]
+    numbers, counts = np.unique(seen, return_counts=True)
+    lone = numbers[counts < _FEWEST_DIRECTIONS]
     return Beams(
         up.size,
         low,
@@ -131,6 +152,9 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
         slant_paths.surrounds_zenith(tilted),
         float(np.ptp(scan.path[:, 0])),
         _pattern(angles, directions.azimuth[up]) if sides_known else f"{up.size} zenith angles",
+        counts.size,
+        int(counts.max()),
+        tuple(int(row) for row in np.searchsorted(cycle, lone)),
     )
 
 
@@ -141,6 +165,17 @@ def _pattern(zenith_angle: Array, azimuth: Array) -> str:
         return f"a volume of {len(planes)} vertical planes, {azimuth.size} directions"
     lowest = azimuth[np.argmax(zenith_angle)]
     return f"a range-height scan (RHI) at azimuth {lowest:.0f} degree, {azimuth.size} directions"
+
+
+def _lone_beams(case: Case, directions: Beams) -> str:
+    """Return the warning of cycles of one beam; empty where there are none."""
+    if not directions.lone:
+        return ""
+    first = case.scene.granules[directions.lone[0]].path
+    return (
+        f"cycles of one beam only: {len(directions.lone)} of {directions.cycles}. All their values"
+        f" are rejected: leave their files out of `files` (first: {first})"
+    )
 
 
 class Gradient(PartOfRetrieval):
@@ -304,6 +339,8 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         words = f"{REQUESTED}, and the beam scans"
         if directions.pattern:
             words += f": {directions.pattern}"
+        if directions.cycles > 1:
+            words += f", in {directions.cycles} cycles of at most {directions.largest}"
         yield Run(
             f"{words}; {low} and are left out" if directions.low else words,
             ScanSettings(
@@ -315,6 +352,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
                 layers=tuple(settings.layers),
                 least_signal_to_noise=settings.least_signal_to_noise,
             ),
+            warning=_lone_beams(case, directions),
         )
 
     def stream(self, settings: ScanSettings, data: Data) -> WholeProduct:
@@ -332,8 +370,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
             [_number(getattr(granule, name)) for granule in granules]
             for name in ("zenith_angle", "azimuth")
         )
-        bounds = [[moment.timestamp() for moment in (g.start, g.stop) if moment] for g in granules]
-        numbers = scan_cycles.cycles(zenith_angle, azimuth, bounds)
+        numbers = scan_cycles.cycles(zenith_angle, azimuth, _bounds(granules))
         return max(BATCH, int(np.bincount(numbers[numbers >= 0]).max(initial=1)))
 
     def held(self, settings: ScanSettings, work: Workload) -> float:
