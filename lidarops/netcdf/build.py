@@ -150,8 +150,10 @@ class ProductEncoder:
             if row.summary:
                 encoded[row.name] = rows.summarize_flags(flags, self._layout.flags)
                 continue
-            # Bits refer to retrieved values; an optional derived value may be missing without one.
-            judging = row.dims == judged.dims and not row.optional
+            # Bits refer to retrieved values; an optional derived or an auxiliary value may be
+            # missing without one.
+            spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
+            judging = row.dims == judged.dims and not spared
             encoded[row.name] = _stored(source, row, flags if judging else None)
             self._refuse_other_sizes(row, encoded[row.name])
         return encoded

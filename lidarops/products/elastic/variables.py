@@ -267,10 +267,11 @@ LAYOUT: Final = Layout(
             standard_name="status_flag",
             long_name="clouds and dense layers in the mean profile",
             coverage=Coverage.AUXILIARY,
-            states=("clear", "partly_cloudy", "cloudy"),
+            states=("clear", "partly_cloudy", "cloudy", "unknown"),
             comment="partly_cloudy: some of the averaged profiles show a cloud, not all. cloudy:"
-            " all of them do, or their mean does. From base to apparent top: beyond a cloud that"
-            " attenuates strongly there may be more. Profiles that are left out do not count.",
+            " all of them do, or their mean does. unknown: no usable data, or the overlap may be"
+            " incomplete. From base to apparent top: beyond a cloud that attenuates strongly there"
+            " may be more. Profiles that are left out, or have no data there, do not count.",
         ),
         Row(
             name="cloud_fraction",
@@ -283,8 +284,9 @@ LAYOUT: Final = Layout(
             valid_max=1.0,
             comment="The profiles of a mean are divided into up to"
             f" {SIGNAL_THRESHOLDS.most_parts} parts, and clouds are sought in each, in cells of"
-            f" about {SIGNAL_THRESHOLDS.cell_length:g} m. Where only the mean shows a cloud, the"
-            f" share is missing, and cloud_mask is cloudy. {NO_STANDARD_NAME}",
+            f" about {SIGNAL_THRESHOLDS.cell_length:g} m; only those with data there count. Missing"
+            " where no part has any, or where only the mean shows a cloud, so that cloud_mask is"
+            f" cloudy. {NO_STANDARD_NAME}",
         ),
         Row(
             name="cloud_base_range",

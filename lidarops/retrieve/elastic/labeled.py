@@ -96,7 +96,14 @@ class _Clouds:
     mask: Mask
     """Clouds of the mean, or of all profiles in it."""
     fraction: Array
-    """Share of the profiles with a cloud; NaN where only the mean shows it."""
+    """Share of the profiles with a cloud; NaN where only the mean shows it, or is examined."""
+    unknown: Mask
+    """Bins in which neither the mean nor a part of it can show a cloud."""
+
+    @property
+    def state(self) -> npt.NDArray[np.int8]:
+        """0 clear, 1 partly cloudy, 2 cloudy, 3 unknown."""
+        return np.where(self.unknown, np.int8(3), self.mask + self.any.astype(np.int8))
 
     @property
     def partly(self) -> Mask:
@@ -255,7 +262,7 @@ def invert_elastic(
                 "time",
                 np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32),
             ),
-            "cloud_mask": (("time", "range"), clouds.mask + clouds.any.astype(np.int8)),
+            "cloud_mask": (("time", "range"), clouds.state),
             "cloud_fraction": (("time", "range"), clouds.fraction),
             "cloud_base_range": ("time", heights[0]),
             "cloud_base_altitude": ("time", station_altitude + climb * heights[0]),
@@ -359,20 +366,22 @@ def _signal_and_clouds(
     signal, layers, doubtful = _signal_beyond_overlap(
         means, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
     )
-    fraction = np.where(doubtful, 0.0, _cloud_fraction(averages, means))
+    fraction = np.where(doubtful, np.nan, _cloud_fraction(averages, means))
     means.partly = (fraction > 0.0) & ~layers.mask
     if means.partly.any():
         signal, layers = _signal_beyond_clouds(means, known_shape=known_shape)
     mask = (layers.mask | (fraction == 1.0)) & ~doubtful
-    return signal, _Clouds(mask, np.where(mask & (fraction == 0.0), np.nan, fraction))
+    unknown = (doubtful | ~np.isfinite(signal.power)) & ~mask & np.isnan(fraction)
+    return signal, _Clouds(mask, np.where(mask & (fraction == 0.0), np.nan, fraction), unknown)
 
 
 def _cloud_fraction(averages: xr.Dataset, means: _Means) -> Array:
     """Return the share of the profiles of each mean that lie in parts with a cloud, (time, range).
 
-    The false-alarm rate is that of a mean.
+    Only profiles in parts with data count; NaN where there are none, and beyond the last whole
+    cell. The false-alarm rate is that of a mean.
     """
-    fraction = np.zeros(means.raw.shape)
+    fraction = np.full(means.raw.shape, np.nan)
     if "part_power" not in averages:
         return fraction
     bins = int(averages["part_power"].attrs["bins"])
@@ -397,9 +406,14 @@ def _cloud_fraction(averages: xr.Dataset, means: _Means) -> Array:
         false_alarm=THRESHOLDS.cloud_false_alarm / profiles.shape[1],
         quantum=averages["part_quantum"].to_numpy()[there],
     )
-    masks = np.zeros((*profiles.shape, cells))
-    masks[there] = found.mask
-    share = (masks * profiles[..., np.newaxis]).sum(axis=1) / profiles.sum(axis=1)[:, np.newaxis]
+    cloudy = np.zeros((*profiles.shape, cells), dtype=np.bool_)
+    cloudy[there] = found.mask
+    # A cloud may span cells without data.
+    examined = np.isfinite(power) | cloudy
+    with_cloud, of_all = (
+        (parts * profiles[..., np.newaxis]).sum(axis=1) for parts in (cloudy, examined)
+    )
+    share = np.where(of_all > 0, with_cloud / np.maximum(of_all, 1), np.nan)
     fraction[:, : cells * bins] = np.repeat(share, bins, axis=-1)
     return fraction
 

@@ -478,6 +478,8 @@ def test_an_overlap_that_is_not_full_where_stated_is_found_by_negative_backscatt
     assert not (runs & ~negative[:, 3:]).any()
 
 
+UNKNOWN = 3
+"""State of the cloud mask."""
 FULL = 1000.0
 OVERLAPS = {
     "sine": np.sin(0.5 * np.pi * np.clip(distance / FULL, 0.0, 1.0)) ** 2,
@@ -582,7 +584,9 @@ def test_a_rise_without_clean_air_beyond_is_no_cloud_unless_the_overlap_is_state
     signal = light(distance, backscatter=cloud(2500.0, 2e-3, 100.0))
     retrieved = solved(counted(signal, 10), overlap_is_stated=False)
     assert has(retrieved, ElasticQuality.NO_REFERENCE).all()
-    assert has(retrieved, ElasticQuality.UNKNOWN_OVERLAP).any(axis=1).all()
+    doubtful = has(retrieved, ElasticQuality.UNKNOWN_OVERLAP)
+    assert doubtful.any(axis=1).all()
+    assert (retrieved["cloud_mask"].to_numpy()[doubtful] == UNKNOWN).all()
     assert not has(retrieved, ElasticQuality.CLOUD).any()
     assert np.isnan(retrieved["cloud_base_range"]).all()
 

@@ -146,6 +146,43 @@ def test_a_cloud_in_all_profiles_is_no_partial_one():
     assert not raised(product, ElasticQuality.PARTLY_CLOUDY)[0, inside].any()
 
 
+# Where nothing can show a cloud ------------------------------------------------------------------
+
+CLEAR, UNKNOWN = 0, 3
+
+
+def test_profiles_without_data_in_a_cell_do_not_count():
+    """Six of 14 profiles with a cirrus, and four of the others without data there."""
+    conditioned = profiles(cirrus_of(6))
+    gap = between(7950.0, 8650.0)
+    conditioned["quality"][10:, gap] = np.int32(Quality.INPUT_MISSING)
+    conditioned["power"][10:, gap] = np.nan
+    product = retrieved(averages(conditioned))
+    fraction = product["cloud_fraction"].to_numpy()[0]
+    np.testing.assert_allclose(fraction[between(8060.0, 8540.0)], 6 / 10)
+
+
+def test_bins_without_usable_data_are_not_clear():
+    conditioned = profiles([light(HAZE)] * PROFILES)
+    near = between(300.0, 900.0)
+    conditioned["quality"][:, near] = np.int32(Quality.SATURATED)
+    product = retrieved(averages(conditioned))
+    state, fraction = (product[name].to_numpy()[0] for name in ("cloud_mask", "cloud_fraction"))
+    assert (state[near] == UNKNOWN).all()
+    assert np.isnan(fraction[near]).all()
+    beside = between(0.0, 270.0) | between(930.0, 15_000.0)
+    assert (state[beside] == CLEAR).all()
+    assert (fraction[beside] == 0.0).all()
+
+
+def test_the_mean_alone_shows_bins_beyond_the_last_whole_cell():
+    means = averages(profiles([light(HAZE)] * PROFILES)).isel(range=slice(0, 1998))
+    assert means["part_power"].attrs["bins"] == 4
+    product = retrieved(means)
+    assert (product["cloud_mask"] == CLEAR).all()
+    assert np.isnan(product["cloud_fraction"]).to_numpy()[0].nonzero()[0].tolist() == [1996, 1997]
+
+
 # A profile unlike the others ---------------------------------------------------------------------
 
 
