@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import Final, Literal, Protocol
 
-from lidarops.netcdf.variables import MOLECULAR_SOURCE
+import xarray as xr
+
+from lidarops.netcdf.variables import BACKGROUND_METHOD, MOLECULAR_SOURCE
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.thresholds import THRESHOLDS
@@ -24,9 +26,15 @@ FEWEST_BINS: Final = THRESHOLDS.fewest_bins
 """Fewest bins of a section, and of the range of a background."""
 
 
-def molecular_source(molecules: MolecularProfile) -> int:
-    """Return the value of the variable ``molecular_source``."""
-    return MOLECULAR_SOURCE.code("standard_atmosphere" if molecules.standard else "sounding")
+def with_methods(
+    product: xr.Dataset, molecules: MolecularProfile, *, known_shape: bool
+) -> xr.Dataset:
+    """Return the product with the source of its air and the method of its backgrounds."""
+    source = "standard_atmosphere" if molecules.standard else "sounding"
+    return product.assign(
+        molecular_source=MOLECULAR_SOURCE.code(source),
+        background_method=BACKGROUND_METHOD.code("known_shape" if known_shape else "tail_mean"),
+    )
 
 
 def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, float]:

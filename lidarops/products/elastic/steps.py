@@ -12,7 +12,6 @@ from pydantic import model_validator
 
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
-from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.records import Role
@@ -25,7 +24,7 @@ from lidarops.steps.channels import range_channel, range_offset
 from lidarops.steps.conditioning import FULL_OVERLAP_RANGE, OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct, Source
 from lidarops.steps.pointing import fixed_zenith
-from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, molecular_source
+from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, with_methods
 from lidarops.steps.profiles import gluing
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
@@ -270,16 +269,9 @@ class _Inversion(RowProduct):
         if known_shape:
             inverted = inverted.assign_attrs(references=KNOWN_SHAPE_PAPERS)
         least = settings.least_signal_to_noise
-        return (
-            with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
-            .assign(gluing(averages))
-            .assign(
-                molecular_source=molecular_source(data[MOLECULES]),
-                background_method=BACKGROUND_METHOD.code(
-                    "known_shape" if known_shape else "tail_mean"
-                ),
-            )
-        )
+        flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
+        glued = flagged.assign(gluing(averages))
+        return with_methods(glued, data[MOLECULES], known_shape=known_shape)
 
 
 def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:

@@ -11,7 +11,6 @@ import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
-from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.raman.settings import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import LeftOut, PlannedStep
@@ -34,7 +33,7 @@ from lidarops.steps.data import (
     in_one_batch,
 )
 from lidarops.steps.pointing import fixed_zenith
-from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, molecular_source
+from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, with_methods
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import REQUESTED, Decisions, Leave, Look, ProductStep, Run
@@ -297,7 +296,7 @@ class _Retrieval(RowProduct):
         flagged = with_low_signal_to_noise(
             retrieved, LAYOUT.weighed, settings.least_signal_to_noise
         )
-        return _with_methods(flagged, settings, data)
+        return with_methods(flagged, data[MOLECULES], known_shape=settings.known_shape)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
         settings = self._settings
@@ -311,15 +310,6 @@ class _Retrieval(RowProduct):
 def _of(data: Data, channel: str) -> Data:
     """Return what the steps of a channel gave."""
     return data if channel == data.channel else data.channels[channel]
-
-
-def _with_methods(product: xr.Dataset, settings: RetrievalSettings, data: Data) -> xr.Dataset:
-    """Return the product with the source of its air and the method of its backgrounds."""
-    method = "known_shape" if settings.known_shape else "tail_mean"
-    return product.assign(
-        molecular_source=molecular_source(data[MOLECULES]),
-        background_method=BACKGROUND_METHOD.code(method),
-    )
 
 
 def _pointing(data: Data) -> Mapping[str, float]:
@@ -358,7 +348,8 @@ class _Dark(WholeProduct):
             station_altitude=source.station_altitude,
             assumptions=_assumptions(settings, data[WAVELENGTH], raman),
         )
-        return in_one_batch(_with_methods(empty, settings, data))
+        product = with_methods(empty, data[MOLECULES], known_shape=settings.known_shape)
+        return in_one_batch(product)
 
 
 STEP: Final = Raman()
