@@ -677,32 +677,39 @@ REFERENCE_WINDOW: Final = (
 )
 """Where a profile was compared with clean air, and how clean the air is taken to be."""
 
-MOLECULAR_SOURCE: Final = Row(
-    name="molecular_source",
-    dims=(),
-    dtype="i1",
-    units="1",
-    long_name="source of pressure and temperature of the molecular atmosphere",
-    coverage=Coverage.AUXILIARY,
-    states=("standard_atmosphere", "sounding"),
-    comment="standard_atmosphere: US Standard Atmosphere 1976. sounding: the file of a sounding or"
-    f" model that the campaign gives; provenance names it. {NO_STANDARD_NAME}",
+
+def _coded(name: str, long_name: str, states: tuple[str, ...], comment: str) -> Row:
+    """Return the row of a number that stands for one of several states of the whole product."""
+    return Row(
+        name=name,
+        dims=(),
+        dtype="i1",
+        units="1",
+        long_name=long_name,
+        coverage=Coverage.AUXILIARY,
+        states=states,
+        comment=f"{comment} {NO_STANDARD_NAME}",
+    )
+
+
+MOLECULAR_SOURCE: Final = _coded(
+    "molecular_source",
+    "source of pressure and temperature of the molecular atmosphere",
+    ("standard_atmosphere", "sounding"),
+    "standard_atmosphere: US Standard Atmosphere 1976. sounding: the file of a sounding or model"
+    " that the campaign gives; provenance names it.",
 )
 
-BACKGROUND_METHOD: Final = Row(
-    name="background_method",
-    dims=(),
-    dtype="i1",
-    units="1",
-    long_name="method by which the background is estimated",
-    coverage=Coverage.AUXILIARY,
-    states=("tail_mean", "cubic", "known_shape"),
-    comment="tail_mean: mean of the far range. cubic: from the cubic of a homogeneous section."
+BACKGROUND_METHOD: Final = _coded(
+    "background_method",
+    "method by which the background is estimated",
+    ("tail_mean", "cubic", "known_shape"),
+    "tail_mean: mean of the far range. cubic: from the cubic of a homogeneous section."
     " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
     " the far range where the fit fails. Haze that falls with height nearly as air does leaves no"
     " trace in that fit: with simulated haze of 0.6 to 3 times the backscatter of air at the ground"
     " and a scale height of 3 km, 12 percent of the backgrounds deviated by more than 4 standard"
-    f" errors. {NO_STANDARD_NAME}",
+    " errors.",
 )
 
 AVERAGED_PROFILES: Final = Row(
@@ -720,16 +727,7 @@ AVERAGED_PROFILES: Final = Row(
 
 def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
     """Return the row of the method by which a product was retrieved."""
-    return Row(
-        name="retrieval_method",
-        dims=(),
-        dtype="i1",
-        units="1",
-        long_name="method of the retrieval",
-        coverage=Coverage.AUXILIARY,
-        states=states,
-        comment=f"{comment} {NO_STANDARD_NAME}",
-    )
+    return _coded("retrieval_method", "method of the retrieval", states, comment)
 
 
 def reference_rejections(comment: str) -> Row:
