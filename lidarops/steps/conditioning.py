@@ -17,7 +17,7 @@ from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
-from lidarops.retrieve.signal.lag import enough_bins, profile_groups
+from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
@@ -266,6 +266,20 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
         elif settings.dead_time is not None and settings.dead_time_uncertainty is not None:
             data[DEAD_TIME] = settings.dead_time
             data[DEAD_TIME_ERROR] = settings.dead_time_uncertainty
+
+    def cpu_time(self, settings: DeadTimeSettings, work: Workload) -> float:
+        """Return the CPU time of an estimate, s."""
+        profiles = min(labeled_gluing.LAG_PROFILES, work.profiles)
+        return 0.0 if settings.analog is None else 4e-7 * profiles * work.bins
+
+    def held(self, settings: DeadTimeSettings, work: Workload) -> float:
+        """Return the bytes of the profiles from which a dead time is estimated."""
+        profiles = min(PROFILES_AT_ONCE, work.profiles)
+        return 0.0 if settings.analog is None else _BYTES_OF_AN_ESTIMATE * profiles * work.bins
+
+
+_BYTES_OF_AN_ESTIMATE: Final = 105.0
+"""Bytes per bin of a profile of the estimate of a dead time, at the peak."""
 
 
 def _estimated_dead_time(photon: Data, analog: Data) -> DeadTimeEstimate | None:

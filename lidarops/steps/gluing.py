@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lidarops.campaign.model import channel_facts
 from lidarops.retrieve.signal import labeled_gluing
-from lidarops.retrieve.signal.lag import enough_bins, profile_groups
+from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_groups
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import LAG_STEP, glued_parts
@@ -25,8 +25,6 @@ _Power = npt.NDArray[np.float64]
 
 LAG: Final = Datum[bool]("lag")
 """Whether the lag is to be estimated."""
-_MOST_AT_ONCE: Final = 32
-"""Profiles that are conditioned together for an estimate of the lag (`profile_groups`)."""
 
 
 class LagSettings(SettingsModel):
@@ -71,7 +69,7 @@ class Lag(Step[ChannelCase, LagSettings]):
         """Return the bytes of the profiles from which a lag is estimated."""
         if settings.method == "given":
             return 0.0
-        profiles = min(_MOST_AT_ONCE, len(work.scene.granules))
+        profiles = min(PROFILES_AT_ONCE, len(work.scene.granules))
         return _BYTES_OF_A_LAG_BIN * profiles * work.bins
 
 

@@ -16,6 +16,7 @@ from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import ChannelLayout, Plan, Role, Scene
 from lidarops.reports import gallery
+from lidarops.steps.memory import scene_memory
 
 LEVEL = {"homogeneous": {"channels": ["photon_532o"], "sections": [[750, 4500]]}}
 SIGNAL = {"signal": {"channels": ["photon_532o"]}}
@@ -23,13 +24,20 @@ ANALOG = {"signal": {"channels": ["analog_532o"]}}
 
 
 def planned(
-    count: int = 10, *, products: dict[str, Any] | None = None, dark: int = 0, **changes: Any
+    count: int = 10,
+    *,
+    products: dict[str, Any] | None = None,
+    dark: int = 0,
+    dead_time: float | str = 4e-9,
+    **changes: Any,
 ) -> tuple[Scene, Plan]:
     granules = [factories.granule(5.0 * k, **changes) for k in range(count)]
     granules += [
         factories.granule(-30.0 - k, path=f"dark/{k}", role=Role.DARK) for k in range(dark)
     ]
-    campaign = factories.campaign(products=LEVEL if products is None else products)
+    facts = [{"full_overlap_range": 300.0, "channels": {"photon_532o": {"dead_time": dead_time}}}]
+    requests = LEVEL if products is None else products
+    campaign = factories.campaign(products=requests, facts=facts)
     scene = cut_scenes(campaign, granules).scenes[0]
     return scene, plan_scene(scene, campaign)
 
@@ -56,6 +64,33 @@ def test_dark_files_cost_more_where_they_are_subtracted():
         for products in (ANALOG, SIGNAL)
     )
     assert analog > photon + 0.01
+
+
+def test_an_estimate_of_the_dead_time_costs_time_and_memory():
+    given, estimated = (
+        planned(count=20, products=SIGNAL, dead_time=dead_time) for dead_time in (4e-9, "estimate")
+    )
+    assert scene_cpu_time(*estimated) > scene_cpu_time(*given)
+    held = scene_memory(*estimated).held - scene_memory(*given).held
+    # Power, variance, quality and counts of the profiles of a group.
+    assert held > 20 * factories.PHOTON.bins * (8 + 8 + 4 + 8)
+
+
+@pytest.mark.parametrize(("lowest", "dearer"), [(30.0, False), (10.0, True)])
+def test_beams_that_may_be_blocked_cost_time_and_memory(lowest: float, dearer: bool):
+    def planned_scan(channel: str) -> tuple[Scene, Plan]:
+        granules = [
+            factories.granule(float(k), zenith_angle=angle)
+            for k, angle in enumerate([90.0 - lowest, 50.0, 30.0] * 10)
+        ]
+        scan = {"channels": [channel], "background": "tail_mean"}
+        campaign = factories.campaign(products={"multiangle": scan})
+        scene = cut_scenes(campaign, granules).scenes[0]
+        return scene, plan_scene(scene, campaign)
+
+    analog, photon = (planned_scan(channel) for channel in ("analog_532o", "photon_532o"))
+    assert (scene_cpu_time(*analog) > scene_cpu_time(*photon)) is dearer
+    assert (scene_memory(*analog).held > scene_memory(*photon).held) is dearer
 
 
 def test_a_glued_channel_reads_both_parts():

@@ -19,6 +19,7 @@ from lidarops.steps.data import BackgroundSettings, Data
 from lidarops.steps.preparation import BACKGROUND
 from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, NoSettings, Run, Step
+from lidarops.steps.workload import Workload
 
 BASELINE: Final = Datum[AnalogBaseline]("baseline")
 _UNKNOWN: Final = np.int32(Quality.INPUT_MISSING | Quality.SATURATED)
@@ -57,6 +58,24 @@ class Baseline(Step[ProductCase[MultiAngleSettings], NoSettings]):
         baseline = _baseline(data, data[BACKGROUND])
         if baseline is not None:
             data[BASELINE] = baseline
+
+    def cpu_time(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the CPU time by the number of bins of low beams, s."""
+        return 4e-7 * _low_profiles(work) * work.bins
+
+    def held(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the bytes of the profiles that are read together."""
+        return _BYTES_OF_A_BIN * min(_TOGETHER, _low_profiles(work)) * work.bins
+
+
+_BYTES_OF_A_BIN: Final = 90.0
+"""Bytes per bin of a profile that is read for the baseline, at the peak."""
+
+
+def _low_profiles(work: Workload) -> int:
+    """Return the number of profiles so low that they may be blocked."""
+    limit = 90.0 - THRESHOLDS.lowest_free
+    return sum((granule.zenith_angle or 0.0) > limit for granule in work.scene.granules)
 
 
 def _baseline(data: Data, background: BackgroundSettings) -> AnalogBaseline | None:

@@ -27,7 +27,7 @@ _MARGIN: Final = 2
 """Additional lags on either side, for the neighbours of a peak."""
 _REACH: Final = THRESHOLDS.largest_lag + _MARGIN
 _LAGS: Final = np.arange(-_REACH, _REACH + 1)
-_PROFILES_AT_ONCE: Final = 32
+PROFILES_AT_ONCE: Final = 32
 """Profiles of a group with a mean of its own, from which noise is taken. In a group of n, a
 profile keeps 1 - 1/n of its noise."""
 
@@ -93,7 +93,7 @@ def estimate_lag(
 
 def profile_groups(profiles: int) -> list[slice]:
     """Return groups of about equal size, of at most 32 profiles, from which noise is taken."""
-    groups = max(-(-profiles // _PROFILES_AT_ONCE), 1)
+    groups = max(-(-profiles // PROFILES_AT_ONCE), 1)
     edges = np.linspace(0, profiles, groups + 1).astype(int)
     return [slice(int(first), int(last)) for first, last in itertools.pairwise(edges)]
 
