@@ -20,8 +20,10 @@ from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.system.files import within
 
+_ROWS: Final = 256
+"""Rows of a chunk, whatever the products: an update copies the rows of its last chunk again."""
 _LEAST_CHUNK: Final = 2**14
-"""Bytes: a small variable has one chunk for many products, so that it opens fast."""
+"""Bytes: times of a year of minutes, which opening reads, are 257 chunks; of `_ROWS`, 2054."""
 _LARGEST_CHUNK: Final = 2**20
 """Bytes: as in products."""
 
@@ -82,7 +84,7 @@ def write_group(
     if not lacking and not gone:
         return
     if 0 in lacking:
-        # The first product gives the attributes of variables and the length of chunks.
+        # The first product gives the attributes of variables.
         lacking = list(range(len(ids)))
     # What all have in common is known of those that stay, unless others go.
     read = range(len(ids)) if gone else lacking
@@ -185,7 +187,7 @@ def _chunk(variable: xr.Variable) -> tuple[int, ...]:
     if not _is_long(variable):
         return variable.shape
     row = variable.dtype.itemsize * int(np.prod(variable.shape[1:]))
-    rows = min(max(variable.shape[0], _LEAST_CHUNK // row), max(1, _LARGEST_CHUNK // row))
+    rows = min(max(_ROWS, _LEAST_CHUNK // row), max(1, _LARGEST_CHUNK // row))
     return (rows, *variable.shape[1:])
 
 

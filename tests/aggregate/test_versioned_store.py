@@ -85,15 +85,17 @@ def test_products_of_unequal_length_may_come_in_any_order(tmp_path: Path):
         assert_like_products(tmp_path)
 
 
-def test_no_chunk_is_larger_than_a_mebibyte_and_small_variables_have_one(tmp_path: Path):
-    for day in range(2):
-        add_day(tmp_path, day, KIND, profiles=60, bins=10000)
+@pytest.mark.parametrize(("bins", "rows"), [(1000, 256), (10000, 26)])
+def test_chunks_are_long_whatever_the_first_product_but_within_a_mebibyte(
+    bins: int, rows: int, tmp_path: Path
+):
+    for day, profiles in enumerate((1, 270)):
+        add_day(tmp_path, day, KIND, profiles=profiles, bins=bins)
     update(tmp_path)
     assert_like_products(tmp_path)
     data = open_products(store_path(tmp_path, KIND), usable=2)
-    # 26 rows of 10000 numbers of 4 bytes.
-    assert data.signal.chunks[0] == (26, 26, 26, 26, 16)
-    assert data.shots.chunks == ((120,),)
+    assert data.signal.chunks[0][0] == rows
+    assert data.shots.chunks == ((271,),)
 
 
 def test_a_product_made_again_replaces_its_times_and_the_snapshot_before_stays(tmp_path: Path):
