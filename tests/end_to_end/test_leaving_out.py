@@ -272,6 +272,18 @@ def test_cycles_of_one_beam_are_warned_of_with_their_first_file():
     assert "leave their files out of `files` (first: coast/lone1)" in step.warning
 
 
+@pytest.mark.parametrize(
+    ("method", "retrieved"),
+    [("auto", True), ("joint", True), ("two_angle", False), ("mld", False), ("mld_prior", False)],
+)
+def test_a_gradient_is_said_to_be_retrieved_by_methods_that_fit_it(method, retrieved):
+    plan = planned(*BOTH_SIDES, **multi(method=method))
+    (gradient,) = (step for step in plan.steps if step.name == "gradient")
+    assert "part of the error" in gradient.reason
+    assert ("retrieved" in gradient.reason) == retrieved
+    assert ("gradient_regressor" in {step.name for step in plan.steps}) == retrieved
+
+
 def test_invalid_angles_are_left_to_the_retrieval():
     plan = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
     assert decided(plan, "robust") == (

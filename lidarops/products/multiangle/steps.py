@@ -187,7 +187,9 @@ class Gradient(PartOfRetrieval):
         """Run unless the campaign excludes gradients."""
         largest = case.request.largest_gradient
         if largest > 0:
-            reason = "backscatter may vary horizontally: retrieved, or part of the error"
+            blind = case.request.method in _BLIND
+            use = "part of the error" if blind else "retrieved, or part of the error"
+            reason = f"backscatter may vary horizontally: {use}"
             directions = beams(case)
             if directions.surround and directions.pattern.startswith("a volume"):
                 reason += (
