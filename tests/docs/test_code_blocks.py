@@ -113,7 +113,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "lidar/bin").mkdir()
     (folder / "lidar/bin/activate").touch()
     (folder / "dist").mkdir()
-    (folder / "dist/lidarops-0-py3-none-any.whl").touch()
+    for version in (0, 1):
+        (folder / f"dist/lidarops-{version}-py3-none-any.whl").touch()
     campaign = folder / "harbour.yaml"
     campaign.write_text(harbour() + SIMULATION)
     lidarops("simulate", str(campaign))
@@ -200,6 +201,10 @@ def check_arguments(tool: str, arguments: list[str]) -> None:
             assert in_cluster or (REPOSITORY / argument).exists(), argument
     if tool == "python" and arguments[0] == "-m" and arguments[1].startswith("flows"):
         assert find_spec(arguments[1])
+    if tool == "pip":
+        # One wheel, or a checkout: a name alone is that of any package of the index.
+        assert arguments[0] == "install", arguments
+        assert sum(".whl" in argument for argument in arguments) <= 1, arguments
     if tool == "make":
         makefile = (REPOSITORY / "Makefile").read_text()
         assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in arguments)
@@ -233,6 +238,13 @@ def test_every_block_is_of_a_kind_that_runs() -> None:
         directive = block.language.startswith("{") and not block.language.startswith(SHOWN_ONLY)
         runs = block.language in ELSEWHERE.get(block.page, {"python", "sh", "yaml"})
         assert directive or runs or block.language == "text", block
+
+
+def test_no_page_installs_lidarops_by_its_name() -> None:
+    """It is on no index, where the name may be that of another package."""
+    for page in pages():
+        by_name = re.findall(r"pip install [\"']?lidarops\b", page.read_text("utf-8"))
+        assert not by_name, name_of(page)
 
 
 def test_no_block_is_indented_only() -> None:
