@@ -21,8 +21,9 @@ from lidarops.errors import NO_FILE, ProductError
 from lidarops.netcdf.sizes import check_contents
 from lidarops.records import InputRecord, LeftOut, Provenance
 
-RELEASE_DATE: Final = date(2026, 11, 21)
-"""Release date of this version of lidarops, set with the version; a product is dated no earlier."""
+VERSION_DATE: Final = date(2026, 11, 21)
+"""Date of this version of lidarops: of its release, and until then that of its first code. Means of
+products are dated no earlier."""
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
@@ -263,7 +264,7 @@ def product_date(end: datetime) -> tuple[datetime, str]:
     -------
     datetime
         The environment variable ``SOURCE_DATE_EPOCH`` if set, else the later of `end` and the
-        release date of the code.
+        date of the version of lidarops, which is that of its release once it has one.
     str
         Which of these it is, in words.
 
@@ -275,5 +276,6 @@ def product_date(end: datetime) -> tuple[datetime, str]:
     epoch = _epoch()
     if epoch is not None:
         return epoch, f"that of {EPOCH_VARIABLE}"
-    release = datetime.combine(RELEASE_DATE, time(tzinfo=UTC))
-    return max(end, release), "the later of the end of the data and the release of lidarops"
+    of_version = datetime.combine(VERSION_DATE, time(tzinfo=UTC))
+    words = "the later of the end of the data and the date of the version of lidarops"
+    return max(end, of_version), words
