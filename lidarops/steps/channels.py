@@ -75,6 +75,17 @@ def estimated_against(
     return next((other.name for other in same if other.bin_width == channel.bin_width), "")
 
 
+def lag_is_unknown(facts: InstrumentFacts, analog: str, photon: str) -> bool:
+    """Return whether the lag of an analog channel is to be estimated.
+
+    The campaign states it as a lag, or by range offsets that differ between both channels.
+    """
+    of_analog, of_photon = (channel_facts(facts, name) for name in (analog, photon))
+    if of_analog.lag is not None:
+        return of_analog.lag == "estimate"
+    return (of_analog.range_offset or 0.0) == (of_photon.range_offset or 0.0)
+
+
 def joined_layout(
     layout: Iterable[ChannelLayout], names: Iterable[str]
 ) -> tuple[ChannelLayout, ...]:

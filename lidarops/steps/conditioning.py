@@ -21,7 +21,7 @@ from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import estimated_against, range_offset
+from lidarops.steps.channels import estimated_against, lag_is_unknown, range_offset
 from lidarops.steps.data import Data, Profiles
 from lidarops.steps.profiles import FileProfiles
 from lidarops.steps.reading import ARCHIVE
@@ -209,6 +209,8 @@ class DeadTimeSettings(SettingsModel):
     """Relative standard error; None if it is estimated."""
     analog: str | None = None
     """Channel against which it is estimated."""
+    lag: Literal["estimate", "given"] | None = None
+    """Whether the lag of that channel is estimated too, or given by the ranges of the campaign."""
 
 
 class DeadTime(Step[ChannelCase, DeadTimeSettings]):
@@ -236,7 +238,9 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
                 yield Leave("the files hold no analog channel of the same detector and bins")
             else:
                 words = f"the campaign requests an estimate, against {analog}"
-                yield Run(words, DeadTimeSettings(analog=analog))
+                unknown = lag_is_unknown(case.facts, analog, case.channel.name)
+                lag: Literal["estimate", "given"] = "estimate" if unknown else "given"
+                yield Run(words, DeadTimeSettings(analog=analog, lag=lag))
         else:
             reason, error = "given by the campaign", case.facts_of_channel.dead_time_uncertainty
             if error is None:
@@ -252,7 +256,7 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
     def carry_out(self, settings: DeadTimeSettings, data: Data) -> None:
         """Give the dead time, and its relative standard error."""
         if settings.analog is not None:
-            estimate = _estimated_dead_time(data, data.channels[settings.analog])
+            estimate = _estimated_dead_time(data, data.channels[settings.analog], settings)
             words = f"dead_time: no estimate of {data.channel} against {settings.analog}"
             if estimate is not None:
                 data[DEAD_TIME] = estimate.dead_time
@@ -282,14 +286,16 @@ _BYTES_OF_AN_ESTIMATE: Final = 105.0
 """Bytes per bin of a profile of the estimate of a dead time, at the peak."""
 
 
-def _estimated_dead_time(photon: Data, analog: Data) -> DeadTimeEstimate | None:
+def _estimated_dead_time(
+    photon: Data, analog: Data, settings: DeadTimeSettings
+) -> DeadTimeEstimate | None:
     """Return the dead time from the first profiles of a scene."""
     archive, profiles = photon[ARCHIVE], analog[PROFILES]
     channel = photon.channel
     width = archive[channel].attrs["bin_width"]
     groups: list[tuple[Array, ...]] = []
 
-    def noise() -> Iterator[tuple[Array, Array]]:
+    def records() -> Iterator[tuple[Array, Array]]:
         """Yield the records for an estimate of the lag, and keep their sums."""
         for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
             raw = archive.isel(time=rows)
@@ -308,8 +314,12 @@ def _estimated_dead_time(photon: Data, analog: Data) -> DeadTimeEstimate | None:
             yield power, counts / np.maximum(exposure, 1e-300)[:, np.newaxis]
 
     distance = _ranges(archive, channel, photon.get(RANGE_OFFSET) or 0.0)
-    known = labeled_gluing.range_lag(profiles.range, distance)
-    lag = labeled_gluing.estimate_lag(noise(), known=known).bins
+    lag = labeled_gluing.range_lag(profiles.range, distance)
+    if settings.lag == "estimate":
+        lag = labeled_gluing.estimate_lag(records(), known=lag).bins
+    else:
+        for _ in records():
+            pass
     kept = [group for group in groups if group[1] > 0.0]
     if not kept:
         return None

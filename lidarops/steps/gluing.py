@@ -13,7 +13,7 @@ from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_groups
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import LAG_STEP, glued_parts
+from lidarops.steps.channels import LAG_STEP, glued_parts, lag_is_unknown
 from lidarops.steps.conditioning import PROFILES
 from lidarops.steps.data import Data
 from lidarops.steps.profiles import FileProfiles, GluedProfiles
@@ -43,22 +43,18 @@ class Lag(Step[ChannelCase, LagSettings]):
 
     def decide(self, case: ChannelCase) -> Decisions:
         """Run but where the ranges of the campaign state the lag; estimate one that it omits."""
-        analog, photon = (
-            channel_facts(case.facts, part) for part in glued_parts(case.channel.name)
-        )
-        offsets = [part.range_offset or 0.0 for part in (analog, photon)]
-        if isinstance(analog.lag, float):
-            settings = LagSettings(method="given", lag=analog.lag)
-            yield Run("given by the campaign", settings, number=analog.lag)
+        analog, photon = glued_parts(case.channel.name)
+        lag = channel_facts(case.facts, analog).lag
+        if isinstance(lag, float):
+            settings = LagSettings(method="given", lag=lag)
+            yield Run("given by the campaign", settings, number=lag)
         elif not enough_bins(case.channel.bins):
             yield Leave(f"the {case.channel.bins} bins are too few for an estimate")
-        elif analog.lag == "estimate":
-            reason = "the campaign requests an estimate, from noise common to both records"
-            yield Run(reason, LagSettings(method="estimate"))
-        elif offsets[0] != offsets[1]:
+        elif not lag_is_unknown(case.facts, analog, photon):
             yield Leave("the range offsets that the campaign gives for both channels state the lag")
         else:
-            reason = "the campaign gives none: estimated from noise common to both records"
+            estimate = "requests an estimate," if lag else "gives none: estimated"
+            reason = f"the campaign {estimate} from noise common to both records"
             yield Run(reason, LagSettings(method="estimate"))
 
     def carry_out(self, settings: LagSettings, data: Data) -> None:

@@ -510,6 +510,23 @@ class TestGlued:
         result = self._plan(analog={"range_offset": -45.0})
         assert "range offsets" in _left_out(result, "glued_532o")["lag"]
 
+    @pytest.mark.parametrize(
+        ("facts", "lag"),
+        [
+            ({}, "estimate"),
+            ({"lag": "estimate", "range_offset": -45.0}, "estimate"),
+            ({"lag": 5.5}, "given"),
+            ({"range_offset": -45.0}, "given"),
+        ],
+    )
+    def test_an_estimate_of_the_dead_time_takes_the_lag_that_the_campaign_gives(
+        self, facts: dict[str, object], lag: str
+    ) -> None:
+        channels = {"analog_532o": facts, "photon_532o": {"dead_time": "estimate"}}
+        result = self._plan(facts={"channels": channels})
+        expected = {"analog": "analog_532o", "lag": lag}
+        assert _steps(result, "photon_532o")["dead_time"] == expected
+
     def test_a_lag_of_another_channel_is_not_overlooked(self) -> None:
         known_facts = {"channels": {"photon_532o": {"lag": 5}, "analog_532o": {}}}
         result = self._plan(facts=known_facts)

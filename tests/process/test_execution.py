@@ -23,7 +23,7 @@ from lidarops.plan.scenes import cut_scenes
 from lidarops.process import execution
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
-from lidarops.steps import dependence
+from lidarops.steps import conditioning, dependence
 from lidarops.steps.channels import counted_channels
 from lidarops.steps.data import Chunk, Data, RowProduct, Source, WholeProduct
 from lidarops.steps.registry import FILE_STEPS, GLUE_STEPS, product_step
@@ -520,6 +520,27 @@ def test_a_given_lag_is_corrected(lag: int, settings: dict[str, object]) -> None
     relative_error = product["signal"].to_numpy()[:, near] / true[near] - 1.0
     assert np.abs(np.nanmean(relative_error, axis=0)).max() < 0.03
     np.testing.assert_array_equal(product["range"], distance)
+
+
+def test_a_lag_that_the_campaign_gives_is_not_estimated_for_the_dead_time() -> None:
+    """Both records hold the same noise, 4 bins apart: an estimate of the lag finds it."""
+    raw = archive()
+    measured = raw["photon_532o"].to_numpy() / (SHOTS * 7.5 / 150.0)
+    light = np.roll(measured / (1.0 - measured * DEAD_TIME * 1e6), 4, axis=1)
+    voltage = np.rint((1.0 + light / RATIO) * SHOTS * 4096 / (1000 * INPUT_RANGE))
+    raw["analog_532o"] = raw["analog_532o"].copy(data=da.from_array(voltage.astype(np.int32)))
+
+    def estimate(**analog: object) -> float | None:
+        channels = {"photon_532o": {"dead_time": "estimate"}, "analog_532o": analog}
+        steps = planned(
+            campaign({"signal": {"channels": ["photon_532o"]}}, channels=channels)
+        ).steps
+        data = execution.channel_data(Source(raw, None, NONE, STATION), steps, "photon_532o")
+        return data[""].get(conditioning.DEAD_TIME)
+
+    assert estimate(lag="estimate") == pytest.approx(DEAD_TIME, rel=0.1)
+    assert estimate(lag=4) == pytest.approx(DEAD_TIME, rel=0.1)
+    assert estimate(lag=0) != pytest.approx(DEAD_TIME, rel=0.1)
 
 
 def test_an_uncorrected_lag_shows_near_the_lidar() -> None:
