@@ -74,8 +74,7 @@ def _climbs(case: Case, near: float, far: float) -> list[float]:
 
     Infinite where the zenith angle is unknown, so that the beam does not count as level.
     """
-    fixed = case.facts.zenith_angle
-    angles = [granule.zenith_angle if fixed is None else fixed for granule in case.scene.granules]
+    angles = [granule.zenith_angle for granule in case.scene.granules]
     return [math.inf if angle is None else climb(angle, near, far) for angle in angles]
 
 
