@@ -51,8 +51,9 @@ class Thresholds:
     stability benchmark counts them as false: half of its target. Assumed; with few bins, intervals
     hold more than they state."""
     false_curved: float = 7e-4
-    """Share of the backgrounds that may be more than 4 standard errors off because noise bent the
-    signal. Simulations: with less, 95 % intervals hold more than 97 %."""
+    """Probability beyond the deviation of a curvature that `curved_widening` allows for; 3 to 4 in
+    a thousand backgrounds near the limit of determination are more than 4 errors off. Simulations:
+    with less, 95 % intervals hold more than 97 %."""
     independent: float = 1e-9
     """Squared share of a shape outside the span of others, above which it is tested. Rounding."""
     model_error: float = 0.05
