@@ -13,6 +13,9 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
+_BLOCK: Final = THRESHOLDS.dead_time_block
+_TAIL: Final = 10
+"""Part of the bins, the last ones, that hold the background."""
 _PASSES: Final = 12
 """Gauss-Newton steps of a solution."""
 _ROUNDS: Final = 6
@@ -62,8 +65,8 @@ def estimate_dead_time(
     Returns
     -------
     DeadTimeEstimate or None
-        None where no bin has a load of 0.1, fewer than 50 bins have signal, or the dead time is
-        less than 5 standard errors of noise.
+        None where no bin has a load of 0.1, all bins have the same signal, or the dead time is less
+        than 5 standard errors of noise.
 
     References
     ----------
@@ -97,10 +100,6 @@ def estimate_dead_time(
     return DeadTimeEstimate(1e-6 * dead_time, 1e-6 * error, load)
 
 
-_BLOCK: Final = THRESHOLDS.dead_time_block
-_TAIL: Final = 10
-
-
 class _Cells(NamedTuple):
     """Means over a few bins, (group, cell)."""
 
@@ -118,26 +117,29 @@ def _blocks(values: Array) -> Array:
 
 
 def _fit(cells: _Cells, highest: float) -> tuple[float, float, float] | None:
-    """Return dead time and its error by noise, microseconds, and the load of cells below one."""
+    """Return dead time and its error by noise, microseconds, and the load of cells below one.
+
+    None where the cells do not determine them.
+    """
     known = np.isfinite(cells.analog) & np.isfinite(cells.variance)
     known &= cells.analog > THRESHOLDS.least_analog * np.sqrt(np.where(known, cells.variance, 1.0))
     known &= cells.rate > THRESHOLDS.least_rate
     fastest = math.inf
-    found: tuple[float, float, float] | None = None
+    solution: tuple[float, float, float] | None = None
     for _ in range(_ROUNDS):
         used = known & (cells.rate < fastest)
-        if used.sum() < THRESHOLDS.fewest_cells:
+        solution = _solve(*(part[used] for part in cells)) if used.any() else None
+        if solution is None:
             return None
-        found = _solve(*(part[used] for part in cells))
         # Only ever less, so that the rounds converge.
-        fastest = min(fastest, highest / found[0])
-    return found
+        fastest = min(fastest, highest / solution[0])
+    return solution
 
 
 def _solve(
     rate: Array, analog: Array, variance: Array, sky: Array, exposure: Array
-) -> tuple[float, float, float]:
-    """Return dead time and its error by noise, microseconds, and the highest load."""
+) -> tuple[float, float, float] | None:
+    """Return dead time and its error by noise, microseconds, and the highest load; see `_fit`."""
     dead_time = THRESHOLDS.first_dead_time
     slope = float((rate - sky).sum() / analog.sum())
     error = math.inf
@@ -149,8 +151,14 @@ def _solve(
         jacobian = np.stack([-(true**2) * of_true, analog * of_true])
         weighted = jacobian / noise
         normal = weighted @ jacobian.T
-        change = np.linalg.solve(normal, weighted @ (rate - model))
+        try:
+            change = np.linalg.solve(normal, weighted @ (rate - model))
+            square = float(np.linalg.inv(normal)[0, 0])
+        except np.linalg.LinAlgError:
+            return None
+        if square < 0.0:  # By rounding: all cells are alike.
+            return None
+        error = math.sqrt(square)
         dead_time = float(np.clip(dead_time + change[0], *THRESHOLDS.dead_times))
         slope += float(change[1])
-        error = float(np.sqrt(np.linalg.inv(normal)[0, 0]))
     return dead_time, error, float((rate * dead_time).max())

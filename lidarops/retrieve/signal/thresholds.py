@@ -129,18 +129,17 @@ class Thresholds:
     changes the dead time by 1 / load - 1 percent: of a real scan, loads up to 0.5 give 4.4 and
     5.2 ns, all 5.9 and 6.3; with 6.2 and 6.8 ns, its optical depth is that of other azimuths."""
     least_load: float = 0.1
-    """Share that the largest must reach: below, an error of the analog baseline has more effect;
-    assumed."""
+    """Share that the largest must reach: at 0.08, an analog baseline of 1 uV makes a dead time 10
+    stated errors too small (`test_a_baseline_shows_no_dead_time`)."""
     least_dead_time: float = 5.0
-    """Standard errors of noise below which there is no dead time; assumed."""
+    """Standard errors of noise below which there is no dead time: else weak light gives up to 100
+    ns (`test_noise_shows_no_dead_time`)."""
     least_rate: float = 1.0
-    """MHz, rate from which bins count; assumed."""
+    """MHz, rate from which bins count: below, noise gives 100 ns (the same test)."""
     least_analog: float = 3.0
     """Analog signal over its noise from which bins count; assumed."""
     dead_time_block: int = 2
     """Bins that are averaged; few, because the rate is no linear function of the light; assumed."""
-    fewest_cells: int = 50
-    """Averages from which a dead time is estimated; assumed."""
     first_dead_time: float = 4e-3
     """Microseconds, first guess; the result does not depend on it."""
     dead_times: tuple[float, float] = (1e-4, 0.1)
