@@ -76,7 +76,7 @@ def test_an_estimate_of_the_dead_time_costs_time_and_memory():
     assert held > 20 * factories.PHOTON.bins * (8 + 8 + 4 + 8)
 
 
-@pytest.mark.parametrize(("lowest", "dearer"), [(30.0, False), (10.0, True)])
+@pytest.mark.parametrize(("lowest", "dearer"), [(20.0, False), (19.5, True)])
 def test_beams_that_may_be_blocked_cost_time_and_memory(lowest: float, dearer: bool):
     def planned_scan(channel: str) -> tuple[Scene, Plan]:
         granules = [

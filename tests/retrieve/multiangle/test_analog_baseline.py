@@ -98,3 +98,21 @@ def test_an_echo_before_the_overlap_is_no_obstruction():
     power[0, (DISTANCE > 130.0) & (DISTANCE < 500.0)] = 4.8
     power[0, DISTANCE < 130.0] += 3000.0
     assert baseline(power, variance) is None
+
+
+def test_the_echo_of_a_target_leaves_the_baseline_as_it_is():
+    """25 uV behind the target, which fall by half in 30 m, as in a real scan."""
+    target = 299.0
+    power, variance = scan(np.random.default_rng(5), [target, np.inf, np.inf])
+    echo = 25e-3 * 0.5 ** ((DISTANCE - target - 40.0) / 30.0)
+    with_echo = power.copy()
+    with_echo[0] += np.where(target + 40.0 < DISTANCE, echo, 0.0)
+    before, found = (baseline(values, variance) for values in (power, with_echo))
+    assert np.array_equal(found.range, before.range)
+    assert (np.abs(found.power - before.power) < 0.1 * found.standard_error).all()
+
+
+def test_far_blocks_are_longer_and_have_less_noise():
+    found = baseline(*scan(np.random.default_rng(7), [200.0, np.inf, np.inf]))
+    of_300_m = NOISE / np.sqrt(300.0 / 3.75)
+    assert (found.standard_error[found.range > 6000.0] < 0.6 * of_300_m).all()
