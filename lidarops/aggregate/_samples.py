@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened, refuse_changed
-from lidarops.aggregate.means_variables import averaged, budget_of, systematic_terms
+from lidarops.aggregate.means_variables import averaged, budget_of, systematic
 from lidarops.kinds import flags_of
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
@@ -78,28 +78,23 @@ def _sample(product: xr.Dataset, kind: str, row: Row, usable: NDArray[np.bool_])
         errors,
         random,
         shared,
-        _systematic_error(product, kind, row, values, errors),
+        _systematic_errors(product, kind, row, values, errors),
         usable if has_flags else np.ones(values.shape, np.bool_),
     )
 
 
-def _systematic_error(
+def _systematic_errors(
     product: xr.Dataset, kind: str, row: Row, values: Array, errors: Array
-) -> Array | None:
-    """Return the systematic error that is not part of the standard error; None without one."""
+) -> dict[str, Array]:
+    """Return the systematic errors that are not part of the standard error, by variable."""
+    names = systematic(kind, row.name)
     if row.lower_end:
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = values / numbers(product, row.lower_end) - 1.0
             # With hardly any systematic error, rounding may give a negative difference.
-            error: Array = values * np.sqrt(np.maximum(relative**2 - (errors / values) ** 2, 0.0))
-        return error
-    terms = [numbers(product, name) for name in systematic_terms(kind, row.name) if name in product]
-    if not terms:
-        return None
-    # A term that does not apply, as that of the dead time to analog signals, is missing.
-    known = np.any([np.isfinite(term) for term in terms], axis=0)
-    whole: Array = np.sqrt(np.nansum(np.square(terms), axis=0))
-    return np.where(known, whole, np.nan)
+            error = values * np.sqrt(np.maximum(relative**2 - (errors / values) ** 2, 0.0))
+        return dict.fromkeys(names, error)
+    return {name: numbers(product, name) for name in names if name in product}
 
 
 def _divide(

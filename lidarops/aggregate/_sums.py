@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,9 @@ class Sample:
     """The part of `errors` that is independent between profiles."""
     shared: tuple[Array, ...]
     """Signed errors that all profiles share, one array per cause."""
-    systematic: Array | None
-    """Systematic error that is not part of `errors`, shared by all profiles."""
+    systematic: Mapping[str, Array]
+    """Variable -> systematic error that is not part of `errors`, shared by all profiles; NaN where
+    it is missing."""
     usable: NDArray[np.bool_]
     """Whether no quality bit rejects the value."""
 
@@ -35,7 +37,7 @@ class Sample:
             self.errors[chosen],
             self.random[chosen],
             tuple(part[chosen] for part in self.shared),
-            None if self.systematic is None else self.systematic[chosen],
+            {name: error[chosen] for name, error in self.systematic.items()},
             self.usable[chosen],
         )
 
@@ -47,7 +49,7 @@ class Mean:
     mean: Array
     standard_error: Array
     standard_deviation: Array
-    systematic: Array | None
+    systematic: Mapping[str, Array]
     observations: Counts
 
 
@@ -70,7 +72,7 @@ class Sums:
     value: Array
     random: Array
     shared: tuple[Array, ...]
-    systematic: Array | None
+    systematic: Mapping[str, Array]
     count: Counts
     centre: Array
     """Unweighted mean so far, for `spread`."""
@@ -86,7 +88,7 @@ class Sums:
             value=zeros.copy(),
             random=zeros.copy(),
             shared=tuple(zeros.copy() for _ in sample.shared),
-            systematic=None if sample.systematic is None else zeros.copy(),
+            systematic={name: zeros.copy() for name in sample.systematic},
             count=zeros.astype(np.int64),
             centre=zeros.copy(),
             spread=zeros.copy(),
@@ -109,8 +111,9 @@ class Sums:
         self.random += _sum(weights**2, sample.random**2, used)
         for total, part in zip(self.shared, sample.shared, strict=True):
             np.add(total, _sum(weights, part, used), out=total)
-        if self.systematic is not None and sample.systematic is not None:
-            self.systematic += _sum(weights, sample.systematic, used)
+        for name, total in self.systematic.items():
+            # The error of a mean is unknown where that of one profile is.
+            np.add(total, np.where(used, weights * sample.systematic[name], 0.0).sum(0), out=total)
         self._spread(np.where(used, sample.values, 0.0), used)
 
     def _spread(self, values: Array, used: NDArray[np.bool_]) -> None:
@@ -135,17 +138,19 @@ class Sums:
             self.value / weight,
             np.sqrt(variance),
             np.sqrt(self.spread / degrees),
-            None if self.systematic is None else self.systematic / weight,
+            {name: total / weight for name, total in self.systematic.items()},
             self.count,
         )
 
 
 def _used(sample: Sample) -> NDArray[np.bool_]:
     parts = [sample.values, sample.errors, sample.random, *sample.shared]
-    parts += [] if sample.systematic is None else [sample.systematic]
     used = sample.usable.copy()
     for part in parts:
         used &= np.isfinite(part)
+    if sample.systematic:
+        # One that does not apply, as that of the dead time to analog signals, is missing.
+        used &= np.any([np.isfinite(error) for error in sample.systematic.values()], axis=0)
     return used
 
 

@@ -24,7 +24,7 @@ from lidarops.aggregate.means_file import (
     means_version,
     read_frame,
 )
-from lidarops.aggregate.means_variables import MeansDescription, Period, Weights, systematic
+from lidarops.aggregate.means_variables import MeansDescription, Period, Weights
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
@@ -158,8 +158,7 @@ class _PeriodSums:
             variables[f"{name}_standard_error"] = mean.standard_error
             variables[f"{name}_standard_deviation"] = mean.standard_deviation
             variables[f"{name}_observations"] = mean.observations
-            if mean.systematic is not None:
-                variables[f"{systematic(self.kind, name)}"] = mean.systematic
+            variables |= mean.systematic
             if name in weighed:
                 error = mean.standard_error
                 flags = flags | np.where(np.abs(mean.mean) < error, _WEIGHED, np.int32(0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -137,18 +137,20 @@ def _times(
 
 def _data(table: Layout, periods: Periods, frame: Frame) -> Iterator[tuple[str, xr.Variable]]:
     flags = np.stack([record[rows.QUALITY_FLAG] for record in periods.records]).astype(np.int32)
-    for row in table.variables:
+    # An optional variable may be in no product.
+    present = [row for row in table.variables if row.summary or row.name in periods.records[0]]
+    names = {row.name for row in present}
+    for row in present:
         values: NDArray[Any]
         if row.summary:
             values = rows.summarize_flags(flags, table.flags)
         elif row.name == rows.QUALITY_FLAG:
             values = flags
-        elif row.name in periods.records[0]:
-            values = _stored(row, np.stack([record[row.name] for record in periods.records]))
         else:
-            # An optional variable that no product has.
-            continue
-        yield row.name, xr.Variable(row.dims, values, _attributes(row, frame))
+            values = _stored(row, np.stack([record[row.name] for record in periods.records]))
+        ancillaries = tuple(name for name in row.ancillaries if name in names)
+        attrs = _attributes(replace(row, ancillaries=ancillaries), frame)
+        yield row.name, xr.Variable(row.dims, values, attrs)
 
 
 def _attributes(row: Row, frame: Frame) -> dict[str, Any]:

@@ -76,8 +76,8 @@ class Weights(StrEnum):
         }[self.value]
 
 
-def systematic(kind: str, name: str) -> str | None:
-    """Return the variable of the systematic error that is not part of the standard error.
+def systematic(kind: str, name: str) -> tuple[str, ...]:
+    """Return the variables of the systematic errors that are not part of the standard error.
 
     Parameters
     ----------
@@ -87,22 +87,14 @@ def systematic(kind: str, name: str) -> str | None:
 
     Returns
     -------
-    str or None
-        Such as ``total_extinction_model_error``; a variable of products or, for a quantity with an
+    tuple of str
+        Such as ``total_extinction_model_error``; variables of products or, for a quantity with an
         interval (`Row.lower_end`), of means only.
     """
     table = layout_of(kind)
     if table.row(name).lower_end:
-        return f"{name}_systematic_error"
-    return next(iter(systematic_terms(kind, name)), None)
-
-
-def systematic_terms(kind: str, name: str) -> tuple[str, ...]:
-    """Return the variables of all systematic errors that are not part of the standard error.
-
-    In means they are one error, under the name of the first.
-    """
-    names = (row.name for row in layout_of(kind).data)
+        return (f"{name}_systematic_error",)
+    names = (row.name for row in table.data)
     return tuple(
         error for error in names if error.startswith(f"{name}_") and error.endswith("_error")
     )
@@ -179,11 +171,11 @@ _ADJECTIVE: Final = {Period.DAY: "Daily", Period.MONTH: "Monthly"}
 def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     flags = source.row("quality_flag")
     for row in averaged(kind):
-        error = systematic(kind, row.name)
-        yield from _mean_rows(row, weights, error)
-        if error:
-            systematic_row = _interval_error(row, error) if row.lower_end else source.row(error)
-            yield _averaged_error(systematic_row, row, systematic_terms(kind, row.name)[1:])
+        names = systematic(kind, row.name)
+        yield from _mean_rows(row, weights, names)
+        for name in names:
+            error = _interval_error(row, name) if row.lower_end else source.row(name)
+            yield _averaged_error(error, row)
     yield Row(
         name="usable_share",
         dims=flags.dims,
@@ -204,13 +196,11 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 
-def _mean_rows(row: Row, weights: Weights, error: str | None) -> Iterator[Row]:
+def _mean_rows(row: Row, weights: Weights, systematic_errors: Sequence[str]) -> Iterator[Row]:
     """Yield the rows of the mean of a quantity."""
     weighting, errors = f"Weights: {weights.description}.", _error_comment(row)
     count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
-    ancillaries: tuple[str, ...] = (spread, count)
-    if error:
-        ancillaries = (error, *ancillaries)
+    ancillaries = (*systematic_errors, spread, count)
     if len(row.dims) > 1:
         ancillaries = (*ancillaries, "usable_share", "quality_flag")
     yield replace(
@@ -269,14 +259,13 @@ def _interval_error(row: Row, name: str) -> Row:
     )
 
 
-def _averaged_error(row: Row, quantity: Row, others: Sequence[str]) -> Row:
-    within = f" Together with {', '.join(others)}." if others else ""
+def _averaged_error(row: Row, quantity: Row) -> Row:
     return replace(
         row,
         long_name=f"mean over time of {row.long_name}",
         cell_methods=_cell_methods(quantity, "mean"),
         comment=f"{row.comment} Averaged with the weights of {quantity.name}: it does not decrease"
-        f" with the number of profiles.{within}",
+        " with the number of profiles.",
     )
 
 

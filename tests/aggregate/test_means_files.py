@@ -21,7 +21,7 @@ from lidarops.aggregate.means_variables import (
     Weights,
     averaged,
     layout,
-    systematic_terms,
+    systematic,
 )
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
@@ -212,6 +212,34 @@ def test_fully_shared_errors_are_averaged(kind: str, names: list[str], tmp_path:
         assert data[f"{name}_standard_error"].attrs["error_kind"] == ErrorKind.BOTH
 
 
+def test_each_systematic_error_is_averaged_under_its_own_name(tmp_path: Path):
+    quantity = "vertical_optical_depth"
+    names = [f"{quantity}_gradient_error", f"{quantity}_dead_time_error"]
+
+    def odd(data: xr.Dataset) -> xr.Dataset:
+        data[names[1]][2, 5] = np.nan
+        return data
+
+    add_day(tmp_path, 0, "multiangle", change=odd)
+    means = only(tmp_path, means_of(tmp_path)).isel(time=0)
+    data = open_products(tmp_path, usable=1).astype(np.float64).load()
+    level = np.arange(data.sizes["altitude"])
+    for name in names:
+        expected = data[name].mean("time").where((level != 5) | (name != names[1]))
+        np.testing.assert_allclose(means[name], expected, rtol=0.005)
+        assert name in means[quantity].attrs["ancillary_variables"].split()
+    # The error of the dead time is unknown in one profile, and so in the mean.
+    assert np.isnan(means[names[1]][5])
+    assert float(means[f"{quantity}_observations"][5]) == float(data[quantity][:, 5].count())
+
+
+def test_an_error_that_no_product_has_is_no_ancillary_variable(tmp_path: Path):
+    name = "signal_dead_time_error"
+    add_day(tmp_path, 0, "signal", change=lambda data: data.drop_vars(name, errors="ignore"))
+    means = only(tmp_path, means_of(tmp_path))
+    assert set(means.signal.attrs["ancillary_variables"].split()) <= set(means.variables)
+
+
 def test_means_of_visibility_state_the_systematic_error_of_extinction(tmp_path: Path):
     add_day(tmp_path, 0, "visibility")
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
@@ -382,7 +410,7 @@ def test_means_are_no_products(tmp_path: Path):
 @pytest.mark.parametrize("kind", list(kinds()))
 def test_every_systematic_error_is_averaged(kind: str):
     source = layout_of(kind)
-    covered = {name for row in averaged(kind) for name in systematic_terms(kind, row.name)}
+    covered = {name for row in averaged(kind) for name in systematic(kind, row.name)}
     covered |= {name for row in averaged(kind) if row.budget for name in row.budget.shared}
     for row in source.data:
         if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:

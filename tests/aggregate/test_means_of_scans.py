@@ -38,7 +38,7 @@ def test_means_stay_within_their_errors(name: str):
         budget = budget_of(layout_of("multiangle").row(name))
         random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = np.isfinite(smooth.optical_depth)
-        day = Sample(getattr(smooth, short), errors, random, shared, None, usable)
+        day = Sample(getattr(smooth, short), errors, random, shared, {}, usable)
         sums = sums or Sums.like(day)
         sums.add(day, np.ones(day.values.shape))
         if days in (1, 5):

@@ -18,7 +18,7 @@ def sample(values, errors, *, random=None, shared=(), systematic=None, usable=No
         errors,
         errors if random is None else np.asarray(random, np.float64),
         tuple(np.asarray(part, np.float64) for part in shared),
-        None if systematic is None else np.asarray(systematic, np.float64),
+        {name: np.asarray(part, np.float64) for name, part in (systematic or {}).items()},
         np.ones(values.shape, np.bool_) if usable is None else np.asarray(usable),
     )
 
@@ -58,9 +58,11 @@ def test_shared_errors_keep_their_signs():
 
 
 def test_systematic_errors_are_averaged_with_the_weights():
-    given_ = sample([1.0, 1.0], [0.1, 0.2], systematic=[0.3, 0.8])
-    assert mean(given_).systematic == pytest.approx(0.55)
-    assert mean(given_, inverse_variance=True).systematic == pytest.approx((30 + 20) / 125)
+    given_ = sample([1.0, 1.0], [0.1, 0.2], systematic={"a": [0.3, 0.8], "b": [0.1, np.nan]})
+    plain, weighted = mean(given_).systematic, mean(given_, inverse_variance=True).systematic
+    assert plain["a"] == pytest.approx(0.55)
+    assert weighted["a"] == pytest.approx((30 + 20) / 125)
+    assert np.isnan([plain["b"], weighted["b"]]).all()
 
 
 @pytest.mark.parametrize("inverse_variance", [False, True])
