@@ -35,6 +35,8 @@ class Job:
     """The channel whose products are made; all channels where None."""
     places: Mapping[ProductKey, Place] = field(default_factory=dict)
     """Of products that were made before."""
+    requested: tuple[ProductKey, ...] = ()
+    """Products of the scene, also those that are not made now. Channels are compared among them."""
 
     def place(self, kind: str, channel: str) -> Place:
         """Return what stands at the place of a product."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -17,52 +17,68 @@ from scipy.special import ndtri
 from lidarops.errors import ProductError
 from lidarops.flags import Severity
 from lidarops.kinds import kinds
+from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import open_product
-from lidarops.records import Disagreement, ProductRecord
+from lidarops.records import Disagreement, ProductRecord, Scene
+from lidarops.steps.dependence import ProductKey
 
 _FALSE_ALARM: Final = 1e-3
-"""Probability that noise makes a pair of channels disagree, at all places of a profile together."""
+"""Probability that noise makes a pair of channels disagree, at all places of a profile together.
+
+Chosen: three channels, which are 3 pairs, give one false alarm in 333 scenes, about a year of days.
+"""
 
 
-def find_disagreements(products: Sequence[ProductRecord], root: Path) -> tuple[Disagreement, ...]:
+def find_disagreements(
+    products: Sequence[ProductRecord], scene: Scene, requested: Sequence[ProductKey], root: Path
+) -> tuple[Disagreement, ...]:
     """Return the channels of a scene whose products disagree about what they measure alike.
 
     New products are compared with each other and with those of other channels of the scene, which
     may be older. Differences are averaged over the times at which both values are usable. So are
-    their errors, because those of inhomogeneous air are common to all times. Files that cannot be
-    read are left out.
+    their errors, because those of inhomogeneous air are common to all times. Older files that
+    cannot be read are left out.
 
     Parameters
     ----------
     products : sequence of ProductRecord
-        New products of one scene.
+        New products of the scene.
+    scene : Scene
+    requested : sequence of (str, str)
+        Kind and channel of its new and older products; some may not be made.
     root : Path
         Of all products.
+
+    Raises
+    ------
+    ProductError
+        If a new product cannot be read.
     """
     disagreements: list[Disagreement] = []
     for kind in kinds().values():
-        new = [product for product in products if product.kind == kind.name]
+        new = {product.channel for product in products if product.kind == kind.name}
         if kind.common and new:
-            paths = _of_all_channels(new[0], root)
-            disagreements += _name_outliers(list(_compare(kind.name, kind.common, paths)))
+            names = [channel for name, channel in requested if name == kind.name]
+            paths = {name: root / _path(scene, kind.name, name) for name in names}
+            pairs = _name_outliers(list(_compare(kind.name, kind.common, paths, new)))
+            # Pairs of two older products were reported when these were made.
+            disagreements += [pair for pair in pairs if new & set(pair.channels)]
     return tuple(disagreements)
 
 
-def _of_all_channels(product: ProductRecord, root: Path) -> dict[str, Path]:
-    """Return channel -> file of the products of the scene and kind of a product."""
-    path = root / product.path
-    begin, end = path.name.split(f"{product.kind}_{product.channel}", 1)
-    begin += f"{product.kind}_"
-    files = sorted(path.parent.glob(f"{begin}*{end}"))
-    return {file.name.removeprefix(begin).removesuffix(end): file for file in files}
+def _path(scene: Scene, kind: str, channel: str) -> str:
+    names = (scene.station, scene.instrument, kind, channel)
+    return path_of_product(names, scene.id, scene.start)
 
 
-def _compare(kind: str, common: tuple[str, str], paths: dict[str, Path]) -> Iterator[Disagreement]:
+def _compare(
+    kind: str, common: tuple[str, str], paths: Mapping[str, Path], new: Set[str]
+) -> Iterator[Disagreement]:
     """Yield the pairs of channels of a wavelength that disagree."""
     variable, along = common
     profiles = {}
     for channel, path in paths.items():
-        with suppress(ProductError):
+        with nullcontext() if channel in new else suppress(ProductError):
             profiles[channel] = _usable_values(path, variable, along)
     for pair in combinations(profiles, 2):
         first, second = xr.align(*(profiles[channel] for channel in pair), join="inner")

@@ -39,6 +39,7 @@ from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
+from lidarops.steps.dependence import planned_products
 from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
 
@@ -451,6 +452,7 @@ class _Pass:
                     scene.needed(),
                     self.options.profiles_per_chunk,
                     places=scene.places,
+                    requested=planned_products(scene.plan),
                 )
                 for scene in due
                 if scene.stale

@@ -260,10 +260,11 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
 
     outcome, final = scene.attempt(job)
     products, root = outcome.products, job.campaign.products_root
-    compared = guarded(lambda: find_disagreements(products, root))
+    compared = guarded(lambda: find_disagreements(products, job.scene, job.requested, root))
     if isinstance(compared, Failure):
         # The products are written and stay recorded.
-        return replace(outcome, error=compared.error, internal=compared.internal), compared.final
+        failed = replace(outcome, error=compared.error, internal=compared.internal)
+        return failed, final and compared.final
     return replace(outcome, disagreements=compared), final
 
 
