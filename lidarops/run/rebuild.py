@@ -20,14 +20,16 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.store import Store
 from lidarops.errors import ProductError
+from lidarops.figures.series_data import blocks
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.context import path_of_product
-from lidarops.netcdf.stored_flags import with_current_flags
+from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.plan.scenes import parse_scene_id
 from lidarops.process.context import recorded_settings
 from lidarops.process.job import Job
 from lidarops.records import Plan, ProductRecord, Role, SceneOutcome
+from lidarops.reports.reading import UNREADABLE
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, Judgement
@@ -35,10 +37,8 @@ from lidarops.steps import dependence
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
 
-_UNREADABLE: Final = (
-    ProductError, OSError, RuntimeError, ValueError, KeyError, IndexError, TypeError,
-)  # fmt: skip
-"""Exceptions of damaged and foreign files; that of HDF5 depends on the place of the damage."""
+_UNREADABLE: Final = (*UNREADABLE, TypeError)
+"""Also what foreign settings raise."""
 _BLOCK: Final = 1 << 24
 """Quality flags that are read at a time."""
 
@@ -213,15 +213,13 @@ def _counts(file: Path, kind: str) -> tuple[int, int, int]:
     rejecting = np.int32(flags_of(kind).rejecting)
     unflagged = usable = 0
     with xr.open_dataset(file, decode_cf=False, cache=False) as product:
-        flags = product[[QUALITY_FLAG]]
-        first, size = flags[QUALITY_FLAG].dims[0], flags[QUALITY_FLAG].size
-        rows = max(1, _BLOCK * flags.sizes[first] // max(size, 1))
-        for start in range(0, flags.sizes[first], rows):
-            part = with_current_flags(flags.isel({first: slice(start, start + rows)}))
-            values = part[QUALITY_FLAG].to_numpy()
+        flags = product[QUALITY_FLAG]
+        recode = recoding(flags.attrs, kind)
+        for block in blocks(flags, _BLOCK):
+            values = recode(block.to_numpy()) if recode else block.to_numpy()
             unflagged += int(np.count_nonzero(values == 0))
             usable += int(np.count_nonzero(values & rejecting == 0))
-    return size, unflagged, usable
+    return flags.size, unflagged, usable
 
 
 def _expected_path(recipe: Recipe) -> str:
