@@ -15,9 +15,9 @@ from lidarops.errors import CatalogError
 
 FOLDER: Final = "superseded"
 """Folder of kept versions, below the output folder."""
-BUILDING: Final = 3600.0
-"""s for which a temporary file of a report is left alone: reports are built outside the lock, and
-one of their files is written within seconds; assumed."""
+LONGEST_WRITE: Final = 3600.0
+"""s for which a temporary file of a report is left alone, because reports are built outside the
+lock. What it holds is in memory before it is made: its writer only writes and syncs it."""
 
 _NO_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.EXDEV, errno.EMLINK, errno.ENOSYS})
 
@@ -113,6 +113,6 @@ def temporary_files(output: Path) -> Iterator[Path]:
 
 def _is_old(path: Path) -> bool:
     try:
-        return time.time() - path.stat().st_mtime > BUILDING
+        return time.time() - path.stat().st_mtime > LONGEST_WRITE
     except OSError:
         return False

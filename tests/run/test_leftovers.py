@@ -659,7 +659,7 @@ def test_a_report_that_somebody_builds_keeps_its_temporary_files(archive: Archiv
     half, old = (folder / f".index.html.{name}.tmp" for name in ("half", "old"))
     for file in (half, old):
         file.write_bytes(b"half of a page")
-    long_ago = time.time() - 2 * versions.BUILDING
+    long_ago = time.time() - 2 * versions.LONGEST_WRITE
     os.utime(old, (long_ago, long_ago))
     assert reprocess(archive.write()) is not None
     assert (half.exists(), old.exists()) == (True, False)
