@@ -30,7 +30,7 @@ ROWS: Final = 20_000
 _SIGNAL_ROWS: Final = 4_000
 """Most rows of a CSV file of signals, which few read as text."""
 _TIMES: Final = 300
-"""Most times of a table of few columns."""
+"""Most times of a table of few columns, or of few values."""
 _CELLS: Final = 320
 """Most values of a table; beyond, times and columns are chosen."""
 _COLUMNS: Final = 12
@@ -40,6 +40,8 @@ _STEPS: Final = (1, 2, 5, 10, 15, 20, 30, 60, 120, 180, 360, 720, 1440)
 _READ_BYTES: Final = 16_000_000
 """Most bytes of a variable that are read for the choice of places. A variable of fewer is read as
 a whole, which is faster than single rows."""
+_FEW_COLUMNS: Final = 2
+"""Columns of a table that may have `_TIMES` times, because it is narrow."""
 _ACROSS: Final = 2
 """Dimensions of a variable over time and another dimension."""
 
@@ -180,7 +182,7 @@ def read_values(product: xr.Dataset, kind: str) -> Values:
     source = _Source(product, kind, quantities, grid)
     reach = _reach(source)
     places = _chosen_places(grid, reach)
-    few = places.size * grid.start.size <= _CELLS or grid.place.size <= _ACROSS
+    few = places.size * grid.start.size <= _CELLS or grid.place.size <= _FEW_COLUMNS
     rows = _near_round_times(grid, _TIMES if few else max(1, _CELLS // places.size))
     shown = source.part(rows, places)
     most = ROWS if is_retrieved(kind) else _SIGNAL_ROWS

@@ -130,6 +130,12 @@ def test_long_products_are_thinned_to_round_times_and_said() -> None:
     assert made.csv.count(b"\n") <= 4_001
 
 
+def test_a_narrow_table_may_be_long() -> None:
+    lengths = [len(read_values(fields(250, places), "signal").tables[0].rows) for places in (2, 3)]
+    assert lengths[0] == 250
+    assert lengths[1] <= 320 / 3
+
+
 @pytest.mark.parametrize("limit", [1, 10**9], ids=["single rows are read", "all is read"])
 def test_values_along_a_falling_altitude_rise(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
     monkeypatch.setattr(values, "_READ_BYTES", limit)
