@@ -123,7 +123,7 @@ class Entry:
     @property
     def verdicts(self) -> Verdicts:
         """Numbers of good values, of those to be used with care, and of rejected ones."""
-        return Verdicts(self.unflagged, self.usable - self.unflagged, self.values - self.usable)
+        return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
 
     @property
     def grade(self) -> ShareGrade:
