@@ -27,7 +27,7 @@ _MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all produc
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
 _SECRET: Final = re.compile("passw|secret")
 """Names of passwords in the query of a URL: password, passwd, sslpassword, oauth_client_secret."""
-WITHOUT_PASSWORD: Final = rf"^(?!.*://[^/:]*:.*@)(?!.*[?&][^=&]*(?:{_SECRET.pattern})[^=&]*=)"
+WITHOUT_PASSWORD: Final = rf"^(?![^:]*://[^/:]*:[^@]+@)(?!.*[?&][^=&]*(?:{_SECRET.pattern})[^=&]*=)"
 """Regular expression of URLs without password, for JSON schemas."""
 _BROKEN: Final = ("malformed", "not a database", "decode")
 """Words in the messages of SQLite about a damaged file."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import yaml
 from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
+from lidarops.catalog.database import WITHOUT_PASSWORD, holds_password
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
@@ -44,6 +46,25 @@ def test_a_store_with_a_key_is_refused_by_publish(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["publish", str(archive.file), f"s3://key:{SECRET}@bucket"])
     assert result.exit_code == 2
     assert SECRET not in result.output
+
+
+@pytest.mark.parametrize(
+    ("rest", "holds"),
+    [
+        ("user@host:5432/name", False),
+        ("user:@host/name", False),
+        ("host:5432/na:me?application_name=password", False),
+        ("/name?service=file://name:port@host", False),
+        (f"user:{SECRET}@host/name", True),
+        (f":{SECRET}@host/name", True),
+        (f"user:{SECRET}/?@host/name", True),
+        (f"host/name?sslmode=require&sslpassword={SECRET}", True),
+    ],
+)
+def test_schemas_and_settings_agree_which_urls_hold_a_password(rest: str, holds: bool) -> None:
+    url = f"postgresql+psycopg://{rest}"
+    assert holds_password(url) is holds
+    assert (re.search(WITHOUT_PASSWORD, url) is None) is holds
 
 
 @pytest.mark.parametrize(
