@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import erfcx
 
 from lidarops.retrieve.raman.depth_fit import SignalNoise
 
@@ -37,6 +38,28 @@ def inverse_mean(signal: Array, relative_variance: Array) -> Array:
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(1.0 / (signal * (1.0 + relative_variance)))
+
+
+def inverse_of_weak(value: Array, error: Array) -> Array:
+    r"""Return an unbiased estimate of the reciprocal of a positive mean, from a value of it.
+
+    For normal noise of standard error :math:`\sigma`, the ratio of Mills
+
+    .. math:: \frac{1}{\sigma} \int_0^\infty e^{-t x / \sigma - t^2 / 2}\, \mathrm{d}t
+
+    of a value :math:`x` has the expectation :math:`1 / \mu`, however weak the mean is; it includes
+    values below zero. Of a mean of 2 errors, :math:`x / (x^2 + \sigma^2)` is too small by a fifth.
+
+    Parameters
+    ----------
+    value, error : (...) float
+        Value and its standard error.
+
+    References
+    ----------
+    `voinov1985`.
+    """
+    return np.asarray(np.sqrt(0.5 * np.pi) / error * erfcx(value / (np.sqrt(2.0) * error)))
 
 
 def ratio_of_counts(counts: Array, denominator: Array) -> tuple[Array, Array]:

@@ -552,7 +552,7 @@ def _lidar_ratio(
     error = np.sqrt((of_smooth**2).sum(axis=1) + own + level**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         uncertainty = (error / smooth) ** 2
-        inverse = _backscatter.inverse_mean(smooth, uncertainty)
+        inverse = _backscatter.inverse_of_weak(smooth, error)
         ratio = extinction.value * inverse
         by_noise = extinction.noise - ratio[:, np.newaxis] * of_smooth
         random = (by_noise**2).sum(axis=1) + (own + level**2) * ratio**2
@@ -569,7 +569,7 @@ def _lidar_ratio(
         likely = _likely(extinction, smooth, error)
         # The error is in proportion to total backscatter: this is that of the likely one.
         least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
-    certain = complete & (smooth > error) & (likely > least)
+    certain = complete & (smooth > 0.0) & (likely > least)
     return (
         np.where(certain, ratio, np.nan),
         np.where(certain, np.sqrt(random), np.nan),

@@ -8,7 +8,13 @@ from support.raman_signals import make_sky, mean_over
 
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.raman import retrieve_raman
-from lidarops.retrieve.raman.backscatter import Ratio, calibrated, inverse_mean, ratio_of_counts
+from lidarops.retrieve.raman.backscatter import (
+    Ratio,
+    calibrated,
+    inverse_mean,
+    inverse_of_weak,
+    ratio_of_counts,
+)
 from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
 
@@ -118,6 +124,17 @@ def test_backscatter_from_a_reference_of_few_counts_has_no_bias():
     assert abs(np.mean(total) / 2.0 - 1.0) < 3.0 * np.std(total) / 2.0 / np.sqrt(len(total))
 
 
+@pytest.mark.parametrize("errors", [1.5, 2.0, 3.0, 10.0])
+def test_reciprocals_of_weak_values_have_no_bias(errors):
+    # The mean over normal noise to 9 errors, by quadrature.
+    error = 0.3
+    values = errors * error + error * np.linspace(-9.0, 9.0, 20_001)
+    density = np.exp(-0.5 * (values / error - errors) ** 2)
+    inverse = inverse_of_weak(values, np.full(values.size, error))
+    mean = (density * inverse).sum() / density.sum()
+    assert mean == pytest.approx(1.0 / (errors * error), rel=1e-5)
+
+
 def of_lidar_ratio(light, lidar_ratio, rows, seed):
     """Return the mean relative deviation of lidar ratios, and the share that 95 % intervals hold.
 
@@ -143,8 +160,8 @@ def test_lidar_ratios_of_few_counts_have_little_bias(lidar_ratio):
 @pytest.mark.parametrize(
     ("light", "lidar_ratio", "away", "held"),
     [
-        (1000.0, 25.0, 0.01, 0.96), (1000.0, 50.0, -0.05, 0.91), (1000.0, 90.0, -0.22, 0.86),
-        (5000.0, 25.0, 0.02, 0.97), (5000.0, 50.0, -0.01, 0.94), (5000.0, 90.0, -0.06, 0.92),
+        (1000.0, 25.0, 0.01, 0.96), (1000.0, 50.0, -0.02, 0.91), (1000.0, 90.0, -0.13, 0.87),
+        (5000.0, 25.0, 0.03, 0.97), (5000.0, 50.0, 0.00, 0.94), (5000.0, 90.0, -0.02, 0.93),
     ],
 )  # fmt: skip
 def test_high_lidar_ratios_of_few_counts_are_too_small_as_the_page_tells(
