@@ -29,6 +29,7 @@ from lidarops.records import (
     Grade,
     Granule,
     InputRecord,
+    Plan,
     PlannedStep,
     ProductRecord,
     Scene,
@@ -43,7 +44,7 @@ from lidarops.steps.channels import (
 )
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.data import Chunk, Data, ProductStream, Source, WholeProduct, in_one_batch
-from lidarops.steps.dependence import ancillary_files, is_product, scene_facts
+from lidarops.steps.dependence import ancillary_files, is_product, plan_closure, scene_facts
 from lidarops.steps.network import Member
 from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
 from lidarops.steps.registry import gives, network_step
@@ -252,7 +253,7 @@ class _Instrument(_Work):
             )
             for kind in streams
         }
-        words = _words(data[""], channel)
+        words = {kind: _words(self.job.plan, kind, data[""]) for kind in streams}
         with ExitStack() as until_written:
             writers: dict[str, ProductWriter] = {}
             channels = counted_channels(steps, channel)
@@ -264,20 +265,21 @@ class _Instrument(_Work):
                         writers[kind].add(rows)
                         self._clock.lap("write")
                     else:
-                        writer = self._writer(_with_words(rows, words), contexts[kind])
+                        writer = self._writer(_with_words(rows, words[kind]), contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
         yield from (self._record(contexts[kind], writer) for kind, writer in writers.items())
         for kind, stream in streams.items():
             if isinstance(stream, WholeProduct):
                 results = stream.results()
-                frame = _with_words(next(results), words)
+                frame = _with_words(next(results), words[kind])
                 yield self._written(contexts[kind], itertools.chain([frame], results))
 
 
-def _words(data: Data, channel: str) -> list[str]:
-    """Return what steps decided from the data, of a channel or of both parts of a glued one."""
-    parts = (data.channels.get(part, data) for part in file_channels(channel))
-    return [words for part in parts for words in part.statements]
+def _words(plan: Plan, product: str, data: Data) -> list[str]:
+    """Return what steps decided from the data of all channels from which a product is made."""
+    steps = plan_closure(plan, [(product, data.channel)]).steps
+    parts = counted_channels(steps, data.channel)
+    return [words for part in parts for words in data.channels[part].statements]
 
 
 def _with_words(frame: xr.Dataset, words: Sequence[str]) -> xr.Dataset:

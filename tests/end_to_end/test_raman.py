@@ -139,6 +139,30 @@ def test_products_cite_the_papers_of_the_known_shape_where_it_runs(
         assert "Appl. Opt." in cited
 
 
+def test_a_product_states_the_estimated_dead_time_of_its_nitrogen_channel(repository, tmp_path):
+    tree = yaml.safe_load((repository / "catalogs/raman.yaml").read_text())
+    lidar = tree["instruments"]["valley-raman"]
+    del lidar["products"]["signal"]
+    tree["simulation"]["duration"] = 1800
+    detectors = tree["simulation"]["instruments"]["valley-raman"]["detectors"]
+    detectors[1]["analog"] = {"gain": 0.5, "noise": 0.05, "dark_offset": 1.0}
+    path = tmp_path / "estimate.yaml"
+
+    def campaign() -> Campaign:
+        path.write_text(yaml.safe_dump(tree))
+        return load_campaign(path, archive=tmp_path / "raw", output=tmp_path / "out")
+
+    simulate_campaign(campaign())
+    lidar["facts"][0]["channels"]["photon_387o"] = {"dead_time": "estimate"}
+    record = reprocess(campaign())
+    stated = {
+        kind: product_of(campaign(), record, kind).attrs.get("lidarops_steps", "")
+        for kind in ("elastic", "raman")
+    }
+    assert "of photon_387o" in stated["raman"]
+    assert "dead_time" not in stated["elastic"]
+
+
 def test_water_vapour_needs_no_overlap(night):
     campaign, _, record = night
     product = product_of(campaign, record)
