@@ -393,15 +393,17 @@ def _cloud_fraction(averages: xr.Dataset, means: _Means) -> Array:
         return np.asarray(in_cells.mean(axis=-1))
 
     withheld = mean_of_bins(((means.quality & _WITHHELD) != 0).astype(float)) > 0.5
-    overlap = mean_of_bins(means.overlap)
+    # The overlap is in the air instead of the signal, of which a count is one quantum everywhere.
+    seen_air = mean_of_bins(means.overlap * means.air.shape)
     power, variance = (averages[name].to_numpy()[..., :cells] for name in _PARTS)
-    power = np.where(withheld[:, np.newaxis], np.nan, power / overlap)
+    withheld |= np.isnan(seen_air)
+    power = np.where(withheld[:, np.newaxis], np.nan, power)
     there = profiles > 0
     found = _layers.find_layers(
         power[there],
         mean_of_bins(means.distance),
-        (variance / overlap**2)[there],
-        molecular_attenuated=mean_of_bins(means.air.shape),
+        variance[there],
+        molecular_attenuated=np.nan_to_num(seen_air),
         contrast=means.contrast,
         false_alarm=THRESHOLDS.cloud_false_alarm / profiles.shape[1],
         quantum=averages["part_quantum"].to_numpy()[there],

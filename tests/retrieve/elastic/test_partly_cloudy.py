@@ -93,7 +93,7 @@ def averages(conditioned, edges=(), contrast=None):
     return xr.concat([batch for (batch,) in average.completed()], dim="time", data_vars="minimal")
 
 
-def retrieved(means):
+def retrieved(means, overlap=None):
     return invert_elastic(
         means.assign_coords(zenith_angle=0.0),
         molecules=AIR,
@@ -102,6 +102,7 @@ def retrieved(means):
         lidar_ratio=constant_ratio(LIDAR_RATIO, 0.0),
         molecular_relative_error=0.0,
         reference=Reference(3000.0, 12_000.0, 1000.0, 1.0, 0.02),
+        overlap=overlap,
     )
 
 
@@ -144,6 +145,18 @@ def test_a_cloud_in_all_profiles_is_no_partial_one():
     assert (product["cloud_mask"].to_numpy()[0, inside] == 2).all()
     assert raised(product, ElasticQuality.CLOUD)[0, inside].all()
     assert not raised(product, ElasticQuality.PARTLY_CLOUDY)[0, inside].any()
+
+
+def test_few_counts_need_the_same_margin_whatever_the_overlap():
+    """Cirrus of a few counts in a cell: a factor on the signal decides nothing."""
+    signals = [0.3 * light(HAZE, CIRRUS if k % 2 else 0.0) for k in range(10 * PROFILES)]
+    means = averages(profiles(signals))
+    fractions = [
+        retrieved(means, overlap)["cloud_fraction"].to_numpy()
+        for overlap in (None, np.full(DISTANCE.size, 0.02))
+    ]
+    assert 0.1 < fractions[0][:, between(8060.0, 8540.0)].mean() < 0.4
+    np.testing.assert_array_equal(*fractions)
 
 
 # Where nothing can show a cloud ------------------------------------------------------------------
