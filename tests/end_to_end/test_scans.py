@@ -305,4 +305,8 @@ def test_gradient_errors_of_planes_pool_over_the_scene_whatever_the_chunks(tmp_p
     assert "scatter between them, pooled over all cycles of the scene and 15" in step.reason
     product = xr.load_dataset(other.products_root / outcome.products[0].path)
     assert product.sizes["plane"] == 3
-    assert product["plane_vertical_optical_depth_gradient_error"].notnull().any()
+    # The air is level: planes differ by noise alone, a tenth of what the declared gradient allows.
+    error = product["plane_vertical_optical_depth_gradient_error"]
+    noise = product["plane_vertical_optical_depth_standard_error"].where(error.notnull())
+    assert error.notnull().sum() > 400
+    assert error.mean() < 0.1 * noise.mean()
