@@ -10,14 +10,13 @@ import os
 import signal
 from typing import Final
 
-_PARENT: Final = "__LIDAROPS_PARENT_PID"
-"""Variable with the id of the parent; see `lidarops.system.processes`."""
+from lidarops.system.processes import PARENT
 
 _PR_SET_PDEATHSIG: Final = 1
 """Of prctl on Linux: the signal that a process gets when its parent dies."""
 
 # Who imports this module has no parent to end with.
-_parent = os.environ.pop(_PARENT, None)
+_parent = os.environ.pop(PARENT, None)
 if _parent is not None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(_parent):

@@ -36,10 +36,10 @@ _ONE_THREAD: Final = dict.fromkeys(
 )
 """Variables that libraries read when they are loaded; dask sets the same for its workers."""
 _ENDS_WITH_PARENT: Final = "lidarops.system.ends_with_parent"
-_PARENT: Final = "__LIDAROPS_PARENT_PID"
-"""Variable with the id of this process, for that module."""
+PARENT: Final = "__LIDAROPS_PARENT_PID"
+"""Variable with the id of this process, for that module, which removes it."""
 _LIBRARY_VARIABLES: Final = frozenset(
-    {*_ONE_THREAD, _PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
+    {*_ONE_THREAD, PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
 )
 """Variables that dask, when it starts workers, netCDF4 and `preload_modules` set here, too."""
 
@@ -63,7 +63,8 @@ def preload_modules(modules: Collection[str]) -> None:
     in_main = threading.current_thread() is threading.main_thread()
     multiprocessing.set_forkserver_preload([*([_ENDS_WITH_PARENT] if in_main else []), *modules])
     unset = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
-    unset[_PARENT] = str(os.getpid())
+    if in_main:
+        unset[PARENT] = str(os.getpid())
     os.environ.update(unset)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:

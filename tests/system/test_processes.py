@@ -202,6 +202,22 @@ if __name__ == "__main__":
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
+IN_A_THREAD = """
+import os, threading
+from lidarops.system import processes
+
+def kept_variables(kept, item):
+    return [name for name in os.environ if "LIDAROPS" in name]
+
+if __name__ == "__main__":
+    thread = threading.Thread(target=processes.preload_modules, args=(["colorsys"],))
+    thread.start()
+    thread.join()
+    assert processes.start_method() == "forkserver"
+    with processes.Processes(2, 2) as pool:
+        assert pool.later(kept_variables, 0)() == []
+"""
+
 WORKERS = """
 import os
 from lidarops.run.executor import local_client
@@ -273,6 +289,16 @@ class TestPreloadModules:
         )  # fmt: skip
         assert done.returncode == -signal.SIGKILL
         assert _ends(int(done.stdout))
+
+    def test_processes_of_a_thread_know_no_parent_to_end_with(self, tmp_path: Path) -> None:
+        script = tmp_path / "in_a_thread.py"
+        script.write_text(IN_A_THREAD)
+        environment = {key: os.environ[key] for key in os.environ if "LIDAROPS" not in key}
+        done = subprocess.run(
+            [sys.executable, str(script)],
+            capture_output=True, text=True, env=environment, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
 
     def test_serves_workers_and_later_processes(self, tmp_path: Path) -> None:
         script = tmp_path / "workers.py"
