@@ -106,8 +106,7 @@ def make_aggregates(
         if options.period is not None:
             _try(made, partial(_means, made, group_products, options.period, options.weights))
     if options.store:
-        for kind in sorted({product.kind for product in products} | set(stored_kinds(root))):
-            _try(made, partial(_store, made, kind, products, options))
+        _try(made, partial(_stores, made, products, options))
     if options.stac:
         _try(made, partial(_stac, made, products, options.selection))
     return made
@@ -174,14 +173,19 @@ def _means(
     made.notes += [done.note] if done.note else []
 
 
+def _stores(made: AggregateResult, products: Sequence[Facts], options: AggregateOptions) -> None:
+    selection = options.selection
+    if selection.since is not None or selection.until is not None:
+        raise ProductError("a store holds all times", remedy="run without --since and --until")
+    for kind in sorted({product.kind for product in products} | set(stored_kinds(made.root))):
+        if selection.kind in (None, kind):
+            _try(made, partial(_store, made, kind, products, options))
+
+
 def _store(
     made: AggregateResult, kind: str, products: Sequence[Facts], options: AggregateOptions
 ) -> None:
     selection = options.selection
-    if selection.kind not in (None, kind):
-        return
-    if selection.since is not None or selection.until is not None:
-        raise ProductError("a store holds all times", remedy="run without --since and --until")
     alike = [product for product in products if product.kind == kind]
     done = update_store(made.root, kind, alike, selection, options.runs)
     made.stores.append(done)

@@ -81,7 +81,7 @@ def test_stores_are_made_and_their_snapshots_shown(tmp_path: Path):
     assert (signals["path"], signals["groups"], signals["dropped"]) == ("stores/signal", 0, 1)
     code, output = run(tmp_path, "--store", "--since", "2026-01-01")
     assert code == 1
-    assert "a store holds all times" in output
+    assert output.count("a store holds all times") == 1
 
 
 def test_signals_of_a_scan_have_no_mean_and_the_others_are_made(tmp_path: Path):
