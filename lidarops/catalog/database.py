@@ -157,6 +157,13 @@ class Database:
         file = Path(self._url.database or "")
         if not self._sqlite or not self._url.database or os.access(file.parent, os.W_OK):
             return self._url
+        try:
+            return self._read_only(file)
+        except FileNotFoundError:
+            # Another user has closed it meanwhile, which removes the journal.
+            return self._as_uri(file, immutable="1")
+
+    def _read_only(self, file: Path) -> sa.URL:
         journal, index = Path(f"{file}-wal"), Path(f"{file}-shm")
         has_journal = journal.exists()
         if has_journal and index.exists():

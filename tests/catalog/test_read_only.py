@@ -110,6 +110,26 @@ def _read_beside_a_writer(own: Archive, readable: Archive) -> None:
         assert (code, json.loads(output)[0]["version"]) == (0, "checkpointed")
 
 
+def test_a_journal_that_goes_while_it_is_copied_is_needed_no_more(
+    made: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(made.folder, tmp_path / "archive")
+    archive = Archive(tmp_path / "archive")
+    journal = archive.folder / "out/catalog.sqlite-wal"
+    journal.write_bytes(b"rows")
+    copy = shutil.copy
+
+    def close_first(source: Path, target: str) -> object:
+        journal.unlink(missing_ok=True)
+        return copy(source, target)
+
+    monkeypatch.setattr("os.access", lambda *_: False)
+    monkeypatch.setattr("shutil.copy", close_first)
+    campaign = load_campaign(archive.file)
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        assert len(store.runs()) == 1
+
+
 def test_a_bug_within_a_transaction_is_not_blamed_on_the_catalog(made: Archive) -> None:
     campaign = load_campaign(made.file)
     with (
