@@ -156,7 +156,7 @@ def _clear_errors(target: Path) -> Iterator[None]:
     # Zarr finds no group where it cannot read one.
     except (icechunk.IcechunkError, FileNotFoundError) as error:
         # Icechunk draws a tree of causes, whose first line begins with a cross.
-        reason = str(error).strip().splitlines()[0].removeprefix("x ")
+        reason = str(error).strip().partition("\n")[0].removeprefix("x ")
         raise ProductError(f"the store cannot be read or written: {reason}", file=target) from error
 
 

@@ -210,7 +210,7 @@ make_aggregates(Path({str(tmp_path)!r}), AggregateOptions(store=True))
     assert open_products(store_path(tmp_path, KIND), version=before.snapshot).sizes["time"] == 5
 
 
-def test_a_second_writer_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_second_writer_is_refused(tmp_path: Path):
     add_day(tmp_path, 0, KIND)
     before = update(tmp_path)
     add_day(tmp_path, 1, KIND)
@@ -275,6 +275,15 @@ def test_a_product_that_changes_while_it_is_copied_is_left_out(
     assert open_products(store_path(tmp_path, KIND)).sizes["product"] == 2
     assert update(tmp_path).added == 1
     assert_like_products(tmp_path)
+
+
+def test_an_error_without_words_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(_target: Path) -> None:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(versioned_store, "_storage", fail)
+    with pytest.raises(ProductError, match="the store cannot be read or written"):
+        update(tmp_path)
 
 
 def test_a_time_twice_fails_its_group_only(tmp_path: Path):
