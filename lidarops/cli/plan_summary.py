@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Final
 from lidarops.cli.app import say, wrapped
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
+from lidarops.steps.channels import READ_STEP
+from lidarops.steps.step import REQUEST
 
 if TYPE_CHECKING:
     from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import Plan
     from lidarops.run.staleness import Judgement
 
-_REQUEST: Final = "request"
-"""Rule by which products are left out that the campaign does not request."""
-_READ: Final = "read"
-"""Step that is left out for channels of which nothing is made."""
 _REASONS: Final = 3
 """Reasons of refused files that fit on the screen."""
 
@@ -61,7 +59,7 @@ def _say_steps(plan: Plan) -> None:
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
         _say(f"steps: {', '.join(names)}", "  ")
-    missed = [left for left in plan.left_out if left.name in kinds() and left.rule != _REQUEST]
+    missed = [left for left in plan.left_out if left.name in kinds() and left.rule != REQUEST]
     for name, channels, reason in grouped(
         (left.name, left.reason, left.channel) for left in missed
     ):
@@ -73,7 +71,7 @@ def _say_steps(plan: Plan) -> None:
         (step.name, step.warning, step.channel) for step in warned
     ):
         _say(f"warning: {name} {channels}: {warning}", "  ")
-    shown = {*kinds(), _READ}
+    shown = {*kinds(), READ_STEP}
     others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:
         _say(f"left out, of some channels: {', '.join(others)}", "  ")
@@ -87,7 +85,7 @@ def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
     unread = (
         left
         for left in plan.left_out
-        if left.name == _READ and left.rule != _REQUEST and left.channel not in told
+        if left.name == READ_STEP and left.rule != REQUEST and left.channel not in told
     )
     for _, channels, reason in grouped((left.name, left.reason, left.channel) for left in unread):
         yield channels, reason

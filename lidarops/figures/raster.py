@@ -273,15 +273,16 @@ def _sums(
     signal = product[quantity].values.astype(np.float64)
     error = product[f"{quantity}_standard_error"].values.astype(np.float64)
     flag = quality_bits(product["quality_flag"])
-    refused = (flag & flags.rejecting) != 0
+    missing = (flag & int(Quality.INPUT_MISSING)) != 0
     rejected = (flag & flags.rejecting & ~int(Quality.INPUT_MISSING)) != 0
-    good = np.isfinite(signal) & ~rejected & ((flag & int(Quality.INPUT_MISSING)) == 0)
+    usable = (flag & flags.rejecting) == 0
+    good = np.isfinite(signal) & ~rejected & ~missing
     return _Block(
         total=total(np.where(good, signal, 0.0)),
         variance=total(np.where(good, error, 0.0) ** 2),
         used=total(good),
         rejected=total(rejected),
-        with_care=int(np.count_nonzero((flag & flags.caring).astype(bool) & ~refused)),
+        with_care=int(np.count_nonzero((flag & flags.caring).astype(bool) & usable)),
         bits=int(np.bitwise_or.reduce(flag, axis=None)),
     )
 
