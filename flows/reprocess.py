@@ -277,18 +277,18 @@ def reprocess(
     # Even if nothing was stale: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
+    local = chosen.workers if isinstance(chosen, clusters.Local) else 1
     built = None
     if result.record is None:
         no_scene = selects_no_scene(settings, selection)
         reason = "the selection contains no scene of the archive" if no_scene else "nothing to do"
         get_run_logger().info("campaign %s: %s", settings.name, reason)
     else:
-        local = chosen.workers if isinstance(chosen, clusters.Local) else 1
         built = report_task(_opaque(settings), _opaque(result.record), local)
         scenes = len(result.record.scenes)
         get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
     made = "" if result.record is None else result.record.id
-    for page in report_earlier_runs(settings, without=made):
+    for page in report_earlier_runs(settings, without=made, workers=local):
         get_run_logger().info("campaign %s: report of an earlier run, %s", settings.name, page)
     if report_note := missing_report(settings):
         get_run_logger().warning("campaign %s: %s", settings.name, report_note)
