@@ -55,7 +55,7 @@ def root_of(store: Any) -> Any:
 def write_group(
     store: Any, name: str, root: Path, products: Sequence[Facts], changes: Changes
 ) -> None:
-    """Write what a group lacks: a product stays if it is where it would be written.
+    """Write the products that a group lacks; one whose rows are at their place stays.
 
     Parameters
     ----------

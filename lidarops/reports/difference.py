@@ -27,7 +27,7 @@ class _Fate(Enum):
     """What a run made of a product."""
 
     NEW = auto()
-    """Made for the first time, or a first version whose file was missing."""
+    """Made for the first time, or again where the file of a first version was missing."""
     SAME = auto()
     CHANGED = auto()
     UNCOMPARED = auto()

@@ -212,7 +212,7 @@ class Session:
         return record
 
     def _save(self, record: RunRecord) -> None:
-        """Save the record before the run has ended: another process may then report it."""
+        """Save the record before the run has ended: from here on, another process may report it."""
         try:
             save_run_record(record, self._campaign.report_root / self.id)
         except CatalogError as error:

@@ -1,4 +1,4 @@
-"""Files in the output folder of a campaign, as packages know them that do not import each other."""
+"""Names of files in the output folder of a campaign that several packages share."""
 
 from __future__ import annotations
 
