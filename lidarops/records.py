@@ -107,6 +107,9 @@ class Granule:
     header_digest: str | None = None
     """Equal for files whose headers differ only in the fields above and in the lasers; None where
     unknown, or where the file may have changed."""
+    setup: str = ""
+    """Equal for files of one site whose channels were recorded in the same way, whatever their
+    shots; empty where the file is refused."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,6 +182,7 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
         layout=header.layout,
         format=header.format,
         header_digest=header.digest,
+        setup=header.setup,
     )
 
 

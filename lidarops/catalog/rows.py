@@ -21,7 +21,7 @@ NO_NOTES: Final = "[]"
 
 _AS_THEY_ARE: Final = (
     "path", "size", "mtime_ns", "instrument", "reason", "zenith_angle", "azimuth", "latitude",
-    "longitude", "altitude", "sha256", "format", "header_digest",
+    "longitude", "altitude", "sha256", "format", "header_digest", "setup",
 )  # fmt: skip
 """Fields of a granule that are columns."""
 _HALF: Final = (1 << 31) - 1

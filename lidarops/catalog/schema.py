@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 9
+SCHEMA_VERSION: Final = 10
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -52,6 +52,7 @@ GRANULE = sa.Table(
     # Name of the raw format; empty where the file is refused.
     sa.Column("format", _NAME, nullable=False),
     sa.Column("header_digest", sa.String(16)),
+    sa.Column("setup", sa.String(16), nullable=False),
     # Day of the start, in days since 1970-01-01; null if the start is unknown.
     sa.Column("day", sa.Integer),
     # Two halves of a digest of the row; their sums over a day change if any row of it changes.

@@ -12,14 +12,12 @@ from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Final, NamedTuple
 
-from lidarops.catalog.rows import day_of
+from lidarops.plan.outlying_intervals import lone_intervals
+from lidarops.plan.outlying_pointings import lone_pointings
+from lidarops.plan.surroundings import FEWEST_ALIKE, Outlying, ReadHeader, granules_around
 from lidarops.raw.header import RawChannel, RawHeader
-from lidarops.records import Granule, Status
+from lidarops.records import Granule, Role, Status
 
-NEAR_DAYS: Final = 1
-"""Days before and after that of a file whose files are compared with it."""
-_FEWEST_ALIKE: Final = 3
-"""Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 _OF_VALUES: Final = frozenset({"wavelength_label", "bins", "bin_width", "adc_bits", "input_range"})
 """Properties of a channel by which its values or their ranges would be wrong."""
 _FREE: Final = frozenset({"name", "shots", "scale", "places", "mode", "wavelength", "polarisation"})
@@ -31,17 +29,6 @@ _REMEDY: Final = (
     "a damaged digit, or a change for this file only (leave it out, correct its header, or give"
     " such files an instrument of their own)"
 )
-
-ReadHeader = Callable[[Granule], RawHeader | None]
-"""Header of a file; None where it cannot be read."""
-
-
-class Outlying(NamedTuple):
-    """What the header of a file states otherwise than the files around it, in words."""
-
-    refused: str
-    """Why the file cannot be used; empty where values are right whatever is true."""
-    note: str
 
 
 def without_outlying(
@@ -84,20 +71,32 @@ def outlying_headers(
     dict
         By path.
     """
-    outlying = {}
+    outlying: dict[str, Outlying] = {}
     ordered = sorted(granules, key=lambda g: (g.instrument, g.role.value, g.start, g.path))
-    for _, alike in itertools.groupby(ordered, key=lambda g: (g.instrument, g.role)):
+    for (_, role), alike in itertools.groupby(ordered, key=lambda g: (g.instrument, g.role)):
         own = list(alike)
-        lone = {index: near for key in (_digest, _layout) for index, near in _lone(own, days, key)}
-        for index, near in lone.items():
-            stated = _compared(own[index], [own[other] for other in near], read)
-            if stated is not None:
-                outlying[own[index].path] = stated
+        statements = [_lone_setups(own, days, read), lone_intervals(own, days, read)]
+        if role is Role.SIGNAL:
+            statements.append(lone_pointings(own, days))
+        for granule, stated in itertools.chain(*statements):
+            before = outlying.get(granule.path)
+            outlying[granule.path] = stated if before is None else before.joined(stated)
     return outlying
 
 
-def _digest(granule: Granule) -> Hashable:
-    return granule.header_digest
+def _lone_setups(
+    granules: Sequence[Granule], days: Collection[int], read: ReadHeader
+) -> Iterator[tuple[Granule, Outlying]]:
+    """Yield granules whose site or channels are recorded otherwise than those around them."""
+    lone = {index: near for key in (_setup, _layout) for index, near in _lone(granules, days, key)}
+    for index, near in lone.items():
+        stated = _compared(granules[index], [granules[other] for other in near], read)
+        if stated is not None:
+            yield granules[index], stated
+
+
+def _setup(granule: Granule) -> Hashable:
+    return granule.setup
 
 
 def _layout(granule: Granule) -> Hashable:
@@ -111,31 +110,18 @@ def _lone(
 
     These are like each other and like others.
     """
-    of_day: dict[int, list[int]] = {}
-    for index, granule in enumerate(granules):
-        of_day.setdefault(_day(granule), []).append(index)
-    for day in sorted(of_day.keys() & set(days)):
-        around = [
-            index
-            for near in range(day - NEAR_DAYS, day + NEAR_DAYS + 1)
-            for index in of_day.get(near, ())
-        ]
+    for own, around in granules_around(granules, days):
         counts = Counter(key(granules[index]) for index in around)
         if len(counts) == 1:
             continue
         for place, index in enumerate(around):
-            if counts[key(granules[index])] > 1 or _day(granules[index]) != day:
+            if counts[key(granules[index])] > 1 or index not in own:
                 continue
             first = min(max(place - 1, 0), len(around) - 3)
             near = tuple(other for other in around[first : first + 3] if other != index)
             stated = {key(granules[other]) for other in near}
-            if len(near) == 2 and len(stated) == 1 and counts[stated.pop()] >= _FEWEST_ALIKE:
+            if len(near) == 2 and len(stated) == 1 and counts[stated.pop()] >= FEWEST_ALIKE:
                 yield index, (near[0], near[1])
-
-
-def _day(granule: Granule) -> int:
-    assert granule.start is not None  # noqa: S101 - good granules have one
-    return day_of(granule.start)
 
 
 def _compared(granule: Granule, near: Sequence[Granule], read: ReadHeader) -> Outlying | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, Protocol, TypeVar
@@ -140,6 +141,11 @@ class RawHeader(NamedTuple):
         """Channels and their range grids, in file order."""
         return _layout(self.channels)
 
+    @property
+    def setup(self) -> str:
+        """Digest of site and channels whatever their shots, and wherever the file holds them."""
+        return _setup(self.site, self.channels)
+
 
 def place_on_earth(
     longitude: float, latitude: float, order: HeaderOrder, file: str
@@ -177,6 +183,12 @@ def _layout(channels: tuple[RawChannel, ...]) -> tuple[ChannelLayout, ...]:
         )
         for channel in channels
     )
+
+
+@lru_cache(maxsize=128)
+def _setup(site: str, channels: tuple[RawChannel, ...]) -> str:
+    recorded = [replace(channel, shots=0, scale=0.0, places=()) for channel in channels]
+    return hashlib.sha256(f"{site} {recorded}".encode()).hexdigest()[:16]
 
 
 def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:

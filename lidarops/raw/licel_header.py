@@ -58,6 +58,8 @@ _SCAN = re.compile(rf" *{_DECIMAL}(?: +{_DECIMAL}){{6}} *", re.ASCII)
 
 _CLOCK_STEP = timedelta(seconds=1)
 """Resolution of start and stop, by which the stop may lie before the start."""
+_LONGEST = timedelta(days=1)
+"""Interval of a file; a scene, of which it is one profile, is at most a day."""
 _ANGLE_STEP = 0.1
 """degree; resolution of pointings and of the grid of a scan."""
 
@@ -380,6 +382,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         _refuse_export(buffer[data_start:])
         raise
     _refuse_outlying_shots(datasets, lasers)
+    notes += _note_on_shots(datasets, lasers)
     if written_stop < start:
         notes += ("stop lies 1 s before start: the interval follows from the shots",)
     if len(memories(datasets)) < sum(dataset.is_signal for dataset in datasets):
@@ -460,6 +463,13 @@ def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
     start, stop = _moment(numbers[:6], "start"), _moment(numbers[6:], "stop")
     if stop < start - _CLOCK_STEP:
         raise RawFormatError(f"{stop:%Y-%m-%d %H:%M:%S} lies before the start", field="stop")
+    if stop - start > _LONGEST:
+        raise RawFormatError(
+            f"{stop:%Y-%m-%d %H:%M:%S} lies {(stop - start) / _LONGEST:.1f} days after the start"
+            f" {start:%Y-%m-%d %H:%M:%S}",
+            field="stop",
+            remedy="leave the file out, or correct the damaged date in its header",
+        )
     return start, stop
 
 
@@ -500,8 +510,9 @@ def memories(datasets: tuple[Dataset, ...]) -> tuple[tuple[Dataset, ...], ...]:
 
 @lru_cache(maxsize=128)
 def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, ...]) -> None:
-    """Refuse a file if two or more channels contradict the shots of a single one.
+    """Refuse a file if two or more witnesses contradict the shots of a single channel.
 
+    Witnesses are other channels; of a channel with one other of the same recorder, also line 3.
     A recorder that misses triggers misses them for all its datasets; a damaged digit is one. All
     channels of each of 272 measured files state the same shots, those of recorders with two
     memories as the sum over both, and in 180 files they are those of line 3. A dataset without
@@ -509,17 +520,20 @@ def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, .
     """
     fired = {laser.shots for laser in lasers}
     groups = memories(datasets)
-    if len(groups) <= _WITNESSES:
+    if len(groups) < _WITNESSES:
         return
     # A channel that alone is recorded twice cannot be compared with the others.
     usual = Counter(len(group) for group in groups).most_common(1)[0][0]
     shots = {g[0].name: sum(d.shots for d in g) for g in groups if len(g) == usual}
     counted = {name: number for name, number in shots.items() if number}
-    if len(counted) <= _WITNESSES:
+    if len(counted) > _WITNESSES:
+        alike, channels = Counter(counted.values()).most_common(1)[0]
+        # A recorder of two memories states line 3 for each of them, or less.
+        others = {alike} if channels == len(counted) - 1 else fired
+    elif len(counted) == len(groups) and _of_one_recorder(groups):
+        others = fired & set(counted.values())
+    else:
         return
-    alike, channels = Counter(counted.values()).most_common(1)[0]
-    # A recorder of two memories states line 3 for each of them, or less.
-    others = {alike} if channels == len(counted) - 1 else fired
     outlying = {name: n for name, n in counted.items() if n not in others | fired}
     if len(outlying) == 1:
         ((name, number),) = outlying.items()
@@ -529,6 +543,25 @@ def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, .
             field=f"shots of {name}",
             remedy="leave the file out, or correct the shots in its header",
         )
+
+
+@lru_cache(maxsize=128)
+def _note_on_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, ...]) -> tuple[str, ...]:
+    """Return a note if line 3 contradicts the only channel: either may be damaged."""
+    groups = memories(datasets)
+    if len(groups) != 1 or len(groups[0]) > 1:
+        return ()
+    channel = groups[0][0]
+    fired = {laser.shots for laser in lasers if laser.shots}
+    if not fired or channel.shots in fired | {0}:
+        return ()
+    stated = ", ".join(map(str, sorted(fired)))
+    return (f"{channel.name} states {channel.shots} shots, line 3 {stated}",)
+
+
+def _of_one_recorder(groups: Iterable[tuple[Dataset, ...]]) -> bool:
+    """Return whether datasets are the analog and photon ones of a recorder, as BT0 and BC0."""
+    return len({group[0].device[2:] for group in groups}) == 1
 
 
 @lru_cache(maxsize=1024)

@@ -25,9 +25,10 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import AncillaryError, RawFormatError
 from lidarops.netcdf.provenance import package_versions
-from lidarops.plan.outlying_headers import NEAR_DAYS, without_outlying
+from lidarops.plan.outlying_headers import without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
+from lidarops.plan.surroundings import NEAR_DAYS
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.job import Place
 from lidarops.raw.formats import parse_raw_header

@@ -8,7 +8,16 @@ import pytest
 import xarray as xr
 from support.archives.small_archive import DAY, Archive
 
-from lidarops.records import RunRecord
+from lidarops.campaign.model import load_campaign
+from lidarops.catalog.rows import day_of
+from lidarops.catalog.scan import scan_archive
+from lidarops.catalog.store import Store
+from lidarops.plan.outlying_headers import outlying_headers
+from lidarops.plan.surroundings import Outlying
+from lidarops.raw.file import RawFile
+from lidarops.raw.formats import read_raw_header
+from lidarops.raw.header import RawHeader
+from lidarops.records import Granule, RunRecord, Status
 from lidarops.run import staleness
 from lidarops.run.archive import Result, bring_up_to_date
 from lidarops.run.reproduction import reproduce_product
@@ -148,3 +157,118 @@ def test_a_new_state_is_accepted_when_more_files_have_it(tmp_path: Path) -> None
     result, _ = _run(archive)
     assert not result.set_aside
     assert not result.has_failures
+
+
+@pytest.mark.parametrize("changed", ["shots", "length of the header"])
+def test_files_that_differ_in_shots_or_length_only_are_alike(tmp_path: Path, changed: str) -> None:
+    """Recorders of real lidars miss shots, and azimuths of scans have two or three digits."""
+    archive = _archive(tmp_path, [600.0 + k for k in range(FILES)])
+    for number in range(FILES):
+        path = archive.folder / f"raw/poor/h{number}"
+        content = path.read_bytes()
+        if changed == "shots":
+            content = content.replace(b"000600", b"%06d" % (590 + number))
+        elif number % 2:
+            content = content.replace(b" Coast ", b" Coast  ", 1)
+        path.write_bytes(content)
+    shots = b"000592" if changed == "shots" else b"000600"
+    line = ANALOG.replace(b"000600", shots)
+    _damage(archive, 2, line, line.replace(b"0.500", b"0.100", 1))
+    result, _ = _run(archive)
+    assert "analog_532o input_range 0.1, the files around" in result.set_aside["poor/h2"]
+
+
+def test_a_pointing_that_no_other_file_has_is_refused(tmp_path: Path) -> None:
+    """It would make a scan of a fixed beam."""
+    archive = _archive(tmp_path, [600.0 + k for k in range(FILES)])
+    _damage(archive, 2, b" 0046.4 00", b" 0046.4 70")
+    result, _ = _run(archive)
+    assert list(result.set_aside) == ["poor/h2"]
+    assert "states the pointing zenith angle 70" in result.set_aside["poor/h2"]
+
+
+def test_a_pointing_that_occurs_once_in_a_scan_is_noted(tmp_path: Path) -> None:
+    archive = _archive(tmp_path, [600.0 + k for k in range(9)])
+    angles = [b"00", b"30"] * 4 + [b"37"]
+    for number, angle in enumerate(angles):
+        _damage(archive, number, b" 0046.4 00", b" 0046.4 " + angle)
+    result, products = _run(archive)
+    assert not result.has_failures
+    with xr.open_dataset(archive.folder / "out/products" / min(products)) as opened:
+        assert "the pointing zenith angle 37 alone" in opened.attrs["lidarops_input_notes"]
+
+
+@pytest.mark.parametrize("angles", [[b"00", b"30", b"37"] * 2, [b"00"] * 3 + [b"30"] * 2])
+def test_scans_and_repeated_pointings_are_no_damage(tmp_path: Path, angles: list[bytes]) -> None:
+    archive = _archive(tmp_path, [600.0 + k for k in range(len(angles))])
+    for number, angle in enumerate(angles):
+        _damage(archive, number, b" 0046.4 00", b" 0046.4 " + angle)
+    result, products = _run(archive)
+    assert not result.has_failures
+    with xr.open_dataset(archive.folder / "out/products" / min(products)) as opened:
+        assert "pointing" not in opened.attrs.get("lidarops_input_notes", "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "refused", "text"),
+    [
+        (
+            b"10:03:00 0020",
+            b"10:23:00 0020",
+            True,
+            "1260 s for 600 shots, the files around it 60 s",
+        ),
+        (b"2026 10:02:00 01", b"2026 09:02:00 01", True, "3660 s for 600 shots"),
+        (b"10:03:00 0020", b"10:02:30 0020", False, "30 s for 600 shots"),
+    ],
+)
+def test_an_interval_that_the_shots_contradict_is_refused_or_noted(
+    tmp_path: Path, old: bytes, new: bytes, refused: bool, text: str
+) -> None:
+    """It is refused where it would mean that two files were recorded at the same time."""
+    archive = _archive(tmp_path, [600.0 + k for k in range(FILES)])
+    _damage(archive, 2, old, new)
+    result, products = _run(archive)
+    assert list(result.set_aside) == (["poor/h2"] if refused else [])
+    if refused:
+        assert text in result.set_aside["poor/h2"]
+        return
+    with xr.open_dataset(archive.folder / "out/products" / min(products)) as opened:
+        assert text in opened.attrs["lidarops_input_notes"]
+
+
+def test_a_file_that_is_shorter_by_its_shots_is_no_damage(tmp_path: Path) -> None:
+    archive = _archive(tmp_path, [600.0 + k for k in range(FILES)])
+    _damage(archive, 4, b"10:05:00 0020", b"10:04:30 0020")
+    for line in (ANALOG, PHOTON):
+        _damage(archive, 4, line, line.replace(b"000600", b"000300"))
+    _damage(archive, 4, b" 0000600 0010", b" 0000300 0010")
+    result, products = _run(archive)
+    assert not result.has_failures
+    with xr.open_dataset(archive.folder / "out/products" / min(products)) as opened:
+        assert "interval" not in opened.attrs.get("lidarops_input_notes", "")
+
+
+@pytest.mark.parametrize("name", ["pilar", "saopaulo", "manaus", "savant"])
+def test_no_measured_file_lies_off_those_around_it(
+    name: str, data_root: Path, tmp_path: Path
+) -> None:
+    """The times of five lidars jitter by a second, and the scans are of many pointings."""
+    path = Path(__file__).parents[1] / f"end_to_end/campaigns/{name}.yaml"
+    archive = data_root if name == "manaus" else data_root / name
+    campaign = load_campaign(path, archive=archive, output=tmp_path)
+    store = Store(campaign.catalog_url, campaign.name)
+    scan_archive(campaign, store)
+    granules = store.granules(status=Status.GOOD)
+    store.close()
+
+    def header(granule: Granule) -> RawHeader:
+        with RawFile(archive / granule.path) as file:
+            return read_raw_header(file)
+
+    days = {day_of(granule.start) for granule in granules if granule.start}
+    assert len(granules) > 25
+    outlying = set(outlying_headers(granules, days, header).values())
+    # One file of the test archive stems from elsewhere.
+    foreign = Outlying("", "site CHICAGO, the files around it U-C_VOL_")
+    assert outlying == ({foreign} if name == "savant" else set())

@@ -83,9 +83,9 @@ def test_order_of_input_does_not_matter(pilar):
 
 
 def test_sorted_by_start_then_path(tmp_path):
-    make(tmp_path, "c", 10, datasets=(ANALOG.replace("000101", "000001"), PHOTON))
-    make(tmp_path, "a", 50, datasets=(ANALOG.replace("000101", "000002"), PHOTON))
-    make(tmp_path, "b", 10, datasets=(ANALOG.replace("000101", "000003"), PHOTON))
+    for name, minute, shots in (("c", 10, 1), ("a", 50, 2), ("b", 10, 3)):
+        datasets = [line.replace("000101", f"{shots:06d}") for line in (ANALOG, PHOTON)]
+        make(tmp_path, name, minute, datasets=datasets)
     archive = open_archive(tmp_path)
     assert archive.analog_532p_shots.values.tolist() == [3, 1, 2]
     signal = archive.analog_532p.compute(**SYNCHRONOUS).values[:, 1]
@@ -243,7 +243,7 @@ def headers_read(monkeypatch) -> list[str]:
 
 
 def test_one_header_is_read_of_files_with_equal_digests(tmp_path, headers_read):
-    other_shots = (ANALOG.replace("000101", "000102"), PHOTON)
+    other_shots = [line.replace("000101", "000102") for line in (ANALOG, PHOTON)]
     paths = [make(tmp_path, f"a{k}", k, line_2=f"{LINE_2[:-2]}{k:02d}") for k in (5, 1, 3)]
     paths += [make(tmp_path, f"b{k}", k, datasets=other_shots) for k in (4, 2)]
     paths.append(make(tmp_path, "c", 6, line_2=LINE_2.replace("LidarPi", "Elsewhere")))

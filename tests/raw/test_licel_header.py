@@ -199,7 +199,8 @@ def test_mistyped_wavelength():
         (("101", "181", "101"), True),
         # The lasers fired 101 times; a recorder of two datasets may have missed triggers.
         (("100", "100", "101"), False),
-        (("101", "100"), False),
+        # Line 3 states 101, as the other channel of the same recorder.
+        (("101", "181"), True),
         (("000", "101", "101"), False),
     ],
 )
@@ -216,6 +217,33 @@ def test_shots_that_all_other_channels_contradict_are_refused(shots, refused):
         assert error.value.field == "shots of photon_532p"
     else:
         assert parse(line_3=LINE_3.format(len(data)), datasets=data).datasets
+
+
+@pytest.mark.parametrize(
+    ("analog", "photon", "recorder"), [("101", "100", "BC3"), ("100", "181", "BC0")]
+)
+def test_a_channel_of_another_recorder_or_line_3_alone_contradict_no_shots(
+    analog, photon, recorder
+):
+    first = ANALOG.replace("000101", analog.zfill(6))
+    second = PHOTON.replace("000101", photon.zfill(6)).replace("BC0", recorder)
+    assert parse(line_3=LINE_3.format(2), datasets=(first, second)).datasets
+
+
+def test_shots_of_a_single_channel_that_line_3_contradicts_are_noted():
+    note = "photon_532p states 601 shots, line 3 101"
+    assert note in parse(datasets=(PHOTON.replace("000101", "000601"),)).notes
+    for line_3, shots in ((LINE_3, "000101"), (LINE_3.replace("0000101", "0000000"), "000601")):
+        header = parse(line_3=line_3.format(1), datasets=(PHOTON.replace("000101", shots),))
+        assert header.notes == ()
+
+
+def test_an_interval_of_more_than_a_day_is_refused():
+    """A damaged date; a file from midnight to midnight is none."""
+    parse(line_2=" LidarPi  02/10/2024 00:00:00 03/10/2024 00:00:00 0411 -064.1 -031.2 00")
+    with pytest.raises(RawFormatError, match=r"lies 1\.0 days after the start") as error:
+        parse(line_2=f" LidarPi  {DATES.replace(' 02/', ' 03/')} 0411 -064.1 -031.2 00")
+    assert error.value.field == "stop"
 
 
 def test_values_without_shots_are_nan(tmp_path):
@@ -430,7 +458,7 @@ def test_layouts_must_agree(tmp_path):
     variants = {
         "a": (ANALOG, PHOTON),
         "b": (ANALOG, PHOTON.replace("7.50", "15.0")),
-        "c": (ANALOG.replace("000101", "000099"), PHOTON),
+        "c": tuple(line.replace("000101", "000099") for line in (ANALOG, PHOTON)),
     }
     for name, lines in variants.items():
         (tmp_path / name).write_bytes(raw_file(lines))
