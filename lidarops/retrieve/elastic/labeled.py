@@ -147,9 +147,9 @@ def invert_elastic(
     lidar_ratio: RatioAt,
     molecular_relative_error: float,
     reference: Reference,
+    overlap_is_stated: bool,
     known_shape: bool = True,
     overlap: Array | None = None,
-    overlap_is_stated: bool = True,
 ) -> xr.Dataset:
     """Return aerosol backscatter and extinction of mean profiles.
 
@@ -173,15 +173,15 @@ def invert_elastic(
     molecular_relative_error : float
         Relative standard error of the air density.
     reference : Reference
+    overlap_is_stated : bool
+        If false, a layer that begins before the search range of the reference window is a cloud
+        only where clean air beyond shows that the overlap is full below it.
     known_shape : bool
         If true, fit the background together with the shape of clean air to the far range
         (`lidarops.retrieve.background.known_shape`); else use the mean of the last tenth of the
         bins.
     overlap : (range,) float, optional
         Overlap function, by which the signal is divided; NaN where it is not known.
-    overlap_is_stated : bool
-        If false, a layer that begins before the search range of the reference window is a cloud
-        only where clean air beyond shows that the overlap is full below it.
 
     Returns
     -------

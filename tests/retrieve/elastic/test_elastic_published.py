@@ -210,6 +210,7 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
         ),
         molecular_relative_error=0.01,
         reference=labeled.Reference(**dict(reference)),
+        overlap_is_stated=True,
     )
     score = (result["aerosol_backscatter"].values - true) / result[
         "aerosol_backscatter_standard_error"

@@ -88,6 +88,7 @@ def solved(data, **changes):
         "lidar_ratio": constant_ratio(LIDAR_RATIO, 0.0),
         "molecular_relative_error": 0.0,
         "reference": Reference(5000.0, 11_000.0, 1000.0, 1.0, 0.0),
+        "overlap_is_stated": True,
     }
     return invert_elastic(data, **(settings | changes))
 

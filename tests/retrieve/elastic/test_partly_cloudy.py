@@ -103,6 +103,7 @@ def retrieved(means, overlap=None):
         molecular_relative_error=0.0,
         reference=Reference(3000.0, 12_000.0, 1000.0, 1.0, 0.02),
         overlap=overlap,
+        overlap_is_stated=True,
     )
 
 
