@@ -132,8 +132,9 @@ def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
         uncertain=True,
         error_kind=ErrorKind.BOTH,
         optional=True,
-        comment=f"As {quantity}, with an inhomogeneity of the plane. Missing where a test rejects"
-        f" the value. {NO_STANDARD_NAME}",
+        comment=f"As {quantity}, with an inhomogeneity of the plane. Its error by the dead time is"
+        f" not stated: see {quantity}_dead_time_error. Missing where a test rejects the value."
+        f" {NO_STANDARD_NAME}",
     )
     error = _gradient_error(f"plane_{quantity}", f"{words} of a plane", units)
     comment = (
@@ -367,8 +368,9 @@ LAYOUT: Final = Layout(
             # Noise, and smoothing error that profiles share, are not stated separately.
             error_kind=ErrorKind.BOTH,
             optional=True,
-            comment="Along the vertical, at the wavelength of the channel. Missing where"
-            f" quality_flag rejects the value at a bound of the layer. {NO_STANDARD_NAME}",
+            comment="Along the vertical, at the wavelength of the channel. Its error by the dead"
+            " time is not stated: see vertical_optical_depth_dead_time_error at its bounds. Missing"
+            f" where quality_flag rejects the value at a bound of the layer. {NO_STANDARD_NAME}",
         ),
         replace(
             _gradient_error("layer_vertical_optical_depth", "the optical depth of the layer", "1"),
@@ -411,10 +413,12 @@ LAYOUT: Final = Layout(
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
             optional=True,
-            comment="From profiles that a tree or building blocks, at least 300 m behind it;"
-            " subtracted from all profiles, interpolated between ranges. Its standard error is that"
-            " of noise and of the scatter between profiles, and part of the error of the"
-            f" backgrounds. {NO_STANDARD_NAME}",
+            comment="From profiles that a tree or building blocks, at least"
+            f" {THRESHOLDS.baseline_guard:g} m behind it; subtracted from all profiles,"
+            " interpolated between ranges. Its standard error is that of noise and of the scatter"
+            " between profiles, and part of the error of the backgrounds; it grows before the first"
+            " range."
+            f" {NO_STANDARD_NAME}",
         ),
         Row(
             name="blocked_range",
