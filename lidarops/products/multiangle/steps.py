@@ -390,11 +390,11 @@ class _Scans(WholeProduct):
 
     def __init__(self, settings: ScanSettings, data: Data) -> None:
         self._settings, self._station = settings, data.source.station_altitude
-        self._background_method = data[BACKGROUND].method
         self._profiles = profiles = data[PROFILES]
         self._geometry = geometry = data.source.geometry
         self._baseline, overlap = data.get(BASELINE), data.get(OVERLAP)
-        self._known_shape = data[BACKGROUND].method == "known_shape"
+        self._background_method = data[BACKGROUND].method
+        self._known_shape = self._background_method == "known_shape"
         self._cycles = AltitudeCycles(
             profiles.range,
             zenith_angle=geometry["zenith_angle"].to_numpy(),
