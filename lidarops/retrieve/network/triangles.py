@@ -288,7 +288,7 @@ class _Sums(NamedTuple):
 
 
 def _sum_rows(start: Array, end: Array, integral: Array, multiplier: Array) -> _Sums:
-    r"""Return the reciprocal extinction at the first crossing of a cycle of beams.
+    r"""Return the reciprocal extinction at the first crossing of a cycle, and its derivatives.
 
     .. math::
         \frac{1}{\hat\sigma_1} = \frac{\sum_j \mu_j Q_{j-1} J_j / \alpha_j}{1 - \mu_K Q_K},
