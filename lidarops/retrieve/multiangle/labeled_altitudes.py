@@ -114,6 +114,7 @@ class AltitudeCycles:
                 "holds one altitude", field="altitude_grid", remedy="give at least two, in m"
             )
         self._order = order = _order(directions, numbers, height)
+        slant_edges = _slant_edges(order.zenith_angle, height)
         self._settings = _Settings(
             distance=distance,
             overlap=overlap,
@@ -122,8 +123,9 @@ class AltitudeCycles:
             if molecules is None
             else _shapes(molecules, wavelength, order.zenith_angle, distance, station_altitude),
             altitude=levels,
-            slant_edges=_slant_edges(order.zenith_angle, height),
+            slant_edges=slant_edges,
             baseline=baseline,
+            baseline_error=_baseline_error(baseline, distance, slant_edges),
         )
         self._weights = np.asarray(shots, dtype=np.float64)
         self._bounds = np.asarray(time_bnds)
@@ -244,6 +246,8 @@ class _Settings:
     slant_edges: Array
     """(beam, altitude + 1) m: the range at which a beam crosses the edges of the cells."""
     baseline: AnalogBaseline | None
+    baseline_error: Array
+    """(beam,) mV: standard error of the baseline within the cells of a beam."""
 
     @property
     def in_front(self) -> slice:
@@ -267,18 +271,6 @@ class _Settings:
         overlap = self.overlap[self.covered]
         return distance**2 / np.where(overlap > 0.0, overlap, np.nan)
 
-    def baseline_error(self, beam: Integers) -> Array:
-        """Return the standard error of the baseline within the cells of beams, mV."""
-        if self.baseline is None:
-            return np.zeros(beam.size)
-        errors = [
-            self.baseline.error_within(
-                self.distance[(self.distance >= edges[0]) & (self.distance <= edges[-1])]
-            )
-            for edges in self.slant_edges
-        ]
-        return np.array(errors)[beam]
-
     def response(self) -> Array:
         """Return the change of signals per change of the background, (beam, altitude) m2."""
         distance = self.distance[self.covered]
@@ -290,6 +282,14 @@ class _Settings:
                 for edges in self.slant_edges
             ]
         )
+
+
+def _baseline_error(baseline: AnalogBaseline | None, distance: Array, slant_edges: Array) -> Array:
+    """Return the standard error of the baseline within the cells of each beam, mV."""
+    if baseline is None:
+        return np.zeros(len(slant_edges))
+    inside = (distance[(distance >= edges[0]) & (distance <= edges[-1])] for edges in slant_edges)
+    return np.array([baseline.error_within(part) for part in inside])
 
 
 def _slant_edges(zenith_angle: Array, height: Array) -> Array:
@@ -463,7 +463,7 @@ def _net_bins(
     unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
     left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
-    left = np.hypot(left, settings.baseline_error(beam))
+    left = np.hypot(left, settings.baseline_error[beam])
     distance = settings.distance[near]
     blocked = obstruction_range(net, of_means[:, near], distance)
     net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)
