@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.archives.aggregate_archive import add_day, facts_of
+from support.products.damaged_products import damage_values
 
 from lidarops.aggregate import open_products as opening
 from lidarops.aggregate.facts import Facts, Group
@@ -116,10 +117,7 @@ def test_a_damaged_product_is_named(tmp_path: Path):
 
 def test_a_damaged_chunk_raises_an_error(tmp_path: Path):
     path = tmp_path / add_day(tmp_path, 0, "signal", profiles=30, bins=1000)
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 2000] = bytes(2000)
-    path.write_bytes(content)
+    damage_values(path, "signal")
     with pytest.raises((ProductError, RuntimeError)):
         open_products(path, usable=2).load()
 
