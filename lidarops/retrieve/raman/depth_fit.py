@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -65,31 +65,38 @@ class DepthFit:
     walk: float
     """Weight of smoothness that is likely: reciprocal variance of the second differences of the
     depth."""
+    noise: Array
+    """Response of the depth to independent unit noise, (cell, noise of a cell)."""
+    standard_error: Array
+    """Standard error of the depth by noise, (cell,)."""
+    expected_error: Array
+    """Standard error of the depth for clean air beyond the most certain cell, (cell,).
 
-    @property
-    def noise(self) -> Array:
-        """Response of the depth to independent unit noise, (cell, noise of a cell)."""
-        return np.asarray(self.inverse * np.sqrt(self.information))
+    What is decided by it is not decided by the noise of the cell: by its own standard error, cells
+    that noise makes bright would be kept, and the depth there biased."""
 
-    @property
-    def standard_error(self) -> Array:
-        """Standard error of the depth by noise, (cell,)."""
-        return np.asarray(np.sqrt((self.noise**2).sum(axis=1)))
-
-    @property
-    def expected_error(self) -> Array:
-        """Standard error of the depth for clean air beyond the most certain cell, (cell,).
-
-        What is decided by it is not decided by the noise of the cell: by its own standard error,
-        cells that noise makes bright would be kept, and the depth there biased.
-        """
-        error = self.standard_error
-        nearer = self.depth[int(np.argmin(error))]
-        return np.asarray(error * np.exp(-0.5 * (self.depth - nearer)))
+    @classmethod
+    def of(cls, depth: Array, information: Array, inverse: Array, walk: float) -> Self:
+        """Return a fit with its errors."""
+        noise = inverse * np.sqrt(information)
+        error = root_of_squares(noise)
+        nearer = depth[int(np.argmin(error))]
+        expected = error * np.exp(-0.5 * (depth - nearer))
+        return cls(depth, information, inverse, walk, noise, error, expected)
 
     def respond(self, relative: Array) -> Array:
-        """Return the change of the depth when the signal changes by a share of it, (cell,)."""
-        return np.asarray(-self.inverse @ (self.information * relative))
+        """Return the change of the depth when the signal changes by shares of it.
+
+        Parameters
+        ----------
+        relative : (cell, change) float
+        """
+        return np.asarray(-self.inverse @ (self.information[:, np.newaxis] * relative))
+
+
+def root_of_squares(rows: Array) -> Array:
+    """Return the root of the sum of squares of each row."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
 
 
 def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
@@ -131,7 +138,7 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
     mean = float(information.mean())
     # LAPACK copies right-hand sides in another order.
     inverse = _solved(information, weight * mean, np.eye(signal.size, order="F"))
-    return DepthFit(used, information, inverse, walk * mean)
+    return DepthFit.of(used, information, inverse, walk * mean)
 
 
 def _level(signal: Array, noise: SignalNoise, known: npt.NDArray[np.bool_]) -> float:
@@ -176,10 +183,11 @@ def _solved(information: Array, weight: float, right: Array) -> Array:
     factor = _factor(information, weight)
     solved = dpbtrs(factor, right)[0]
     bend = np.diff(solved, 2, axis=0)
+    bend *= weight
     left = (information * solved.T).T
-    left[2:] += weight * bend
-    left[1:-1] -= 2.0 * weight * bend
-    left[:-2] += weight * bend
+    left[2:] += bend
+    left[1:-1] -= 2.0 * bend
+    left[:-2] += bend
     return np.asarray(solved + dpbtrs(factor, right - left)[0])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.raman.depth_fit import DepthFit
+from lidarops.retrieve.raman.depth_fit import DepthFit, root_of_squares
 
 Array = npt.NDArray[np.float64]
 
@@ -33,12 +33,17 @@ class Extinction:
     @property
     def noise_error(self) -> Array:
         """Standard error by noise, m-1."""
-        return np.asarray(np.sqrt((self.noise**2).sum(axis=1)))
+        return root_of_squares(self.noise)
 
 
 def slope(depth: Array, step: float) -> Array:
     """Return the derivative along the first axis: central differences, one-sided at the ends."""
-    return np.asarray(np.gradient(depth, step, axis=0))
+    change = np.empty(depth.shape)
+    change[1:-1] = depth[2:] - depth[:-2]
+    change[1:-1] *= 0.5 / step
+    change[0] = (depth[1] - depth[0]) / step
+    change[-1] = (depth[-1] - depth[-2]) / step
+    return change
 
 
 def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
@@ -66,7 +71,7 @@ def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
     weights = response * fit.information
     beyond = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
     kernel = step * (beyond - 0.5 * weights)
-    resolution = step / (kernel**2).sum(axis=1)
+    resolution = step / root_of_squares(kernel) ** 2
     walk = np.sqrt(1.0 / fit.walk) / (step * both)
     away = kernel - mean_weights(resolution, step)
     return Extinction(
@@ -81,8 +86,7 @@ def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
 
 def _summed(weights: Array) -> Array:
     """Return the response of weighted sums to a random walk with unit steps."""
-    beyond = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
-    return np.asarray(np.sqrt((beyond[:, 1:] ** 2).sum(axis=1)))
+    return root_of_squares(np.cumsum(weights[:, :0:-1], axis=1))
 
 
 def mean_weights(length: Array, step: float) -> Array:
@@ -103,8 +107,9 @@ def mean_weights(length: Array, step: float) -> Array:
     edges = np.arange(length.size + 1) * step
     middle = 0.5 * (edges[1:] + edges[:-1])
     low, high = middle - 0.5 * length, middle + 0.5 * length
-    inside = np.minimum(high[:, np.newaxis], edges[1:]) - np.maximum(low[:, np.newaxis], edges[:-1])
-    inside = np.maximum(inside, 0.0)
+    inside = np.minimum(high[:, np.newaxis], edges[1:])
+    inside -= np.maximum(low[:, np.newaxis], edges[:-1])
+    np.maximum(inside, 0.0, out=inside)
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))
 
 

@@ -25,7 +25,7 @@ from lidarops.retrieve.raman.retrieval import (
     ChannelSignal,
     RamanResult,
     RamanSettings,
-    cell_signal,
+    cell_signals,
     retrieve_raman,
 )
 from lidarops.retrieve.raman.scattering import nitrogen_line_share, particle_ratio
@@ -377,8 +377,8 @@ def _overlap(
     """Return the overlap of each profile, from a signal that is not corrected for overlap."""
     unity = replace(air, overlap=np.ones(air.overlap.size))
     value, error = np.full((2, *result.quality.shape), np.nan)
-    for row, bits in enumerate(result.quality):
-        signal = cell_signal(raman, row, unity.raman_shape, cells)
+    signals = cell_signals(raman, unity.raman_shape, cells)
+    for row, (signal, bits) in enumerate(zip(signals, result.quality, strict=True)):
         found = overlap_of(
             signal.value,
             signal.variance,
@@ -405,10 +405,8 @@ def _water(
     laser = settings.wavelength
     of_water = particle_ratio(settings.angstrom_exponent, laser, water.wavelength)
     value, random, systematic = np.full((3, *result.quality.shape), np.nan)
-    for row in range(len(value)):
-        nitrogen, vapour = (
-            cell_signal(signal, row, air.raman_shape, cells) for signal, air in pair
-        )
+    signals = (cell_signals(signal, air.raman_shape, cells) for signal, air in pair)
+    for row, (nitrogen, vapour) in enumerate(zip(*signals, strict=True)):
         found = mixing_ratio(
             vapour,
             nitrogen,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.raman import backscatter as _backscatter
 from lidarops.retrieve.raman.backscatter import Backscatter
 from lidarops.retrieve.raman.cells import Cells
-from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth
+from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth, root_of_squares
 from lidarops.retrieve.raman.extinction import Extinction, extinction_of, slope
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.scattering import particle_ratio
@@ -76,17 +76,17 @@ class AirColumn:
     @property
     def elastic_shape(self) -> Array:
         """Elastic signal of air for a backscatter of 1."""
-        return np.asarray(self._seen * np.exp(-2.0 * self.depth) / self.range**2)
+        return np.asarray(self.known_overlap * np.exp(-2.0 * self.depth) / self.range**2)
 
     @property
     def raman_shape(self) -> Array:
         """Raman signal of clean air."""
         density = self.density / self.density.max()
         both = np.exp(-self.depth - self.raman_depth)
-        return np.asarray(self._seen * density * both / self.range**2)
+        return np.asarray(self.known_overlap * density * both / self.range**2)
 
     @property
-    def _seen(self) -> Array:
+    def known_overlap(self) -> Array:
         """Overlap, 1 where it is not known."""
         return np.where(np.isnan(self.overlap), 1.0, self.overlap)
 
@@ -202,34 +202,57 @@ class CellSignal:
             return np.nan_to_num(change / level, posinf=0.0, neginf=0.0)
 
 
-def cell_signal(signal: ChannelSignal, profile: int, shape: Array, cells: Cells) -> CellSignal:
-    """Return a signal over that of clean air in cells, with its noise as a function of its mean."""
-    power, stated = signal.power[profile], signal.variance[profile]
-    known = np.isfinite(power) & np.isfinite(stated)
-    power = np.where(known, power, np.nan)
+def cell_signals(signal: ChannelSignal, shape: Array, cells: Cells) -> list[CellSignal]:
+    """Return the signals of all profiles over that of clean air in cells.
+
+    Their noise is a function of their mean.
+    """
+    known = np.isfinite(signal.power) & np.isfinite(signal.variance)
+    power = np.where(known, signal.power, np.nan)
     bins = np.maximum(cells.known(power), 1.0)
-    variance = cells.mean(np.where(known, stated / shape**2, np.nan)) / bins
+    variance = cells.mean(np.where(known, signal.variance / shape**2, np.nan)) / bins
     inverse = np.where(known, 1.0 / shape, np.nan)
+    level = cells.mean(inverse)
     value = cells.mean(power / shape)
-    change = signal.dead_time_error[min(profile, len(signal.dead_time_error) - 1)]
+    missing = np.isnan(value)
     if signal.counts_per_power is None:
-        noise = SignalNoise(np.zeros(value.size), np.where(np.isnan(variance), np.inf, variance))
+        per_signal, fixed = np.zeros(value.shape), np.where(np.isnan(variance), np.inf, variance)
     else:
-        counts = signal.counts_per_power[profile]
-        per_signal = cells.mean(inverse) / (bins * counts)
-        sky = max(float(signal.background[profile]), 0.0)
+        counts = signal.counts_per_power[:, np.newaxis]
+        sky = np.maximum(signal.background, 0.0)[:, np.newaxis]
+        per_signal = level / (bins * counts)
         fixed = sky * cells.mean(inverse**2) / (bins * counts)
-        missing = np.isnan(value)
         many = np.nan_to_num(value / per_signal) > THRESHOLDS.many_counts
         expected = np.where(many, per_signal * value + fixed, 1.0)
         excess = np.where(many, np.maximum(variance / expected, 1.0), 1.0)
-        noise = SignalNoise(
-            np.where(missing, 0.0, per_signal * excess), np.where(missing, np.inf, fixed * excess)
+        per_signal = np.where(missing, 0.0, per_signal * excess)
+        fixed = np.where(missing, np.inf, fixed * excess)
+    background = level * np.nan_to_num(signal.background_standard_error)[:, np.newaxis]
+    dead_time = cells.mean(signal.dead_time_error * inverse)
+    return [
+        CellSignal(v, s, SignalNoise(p, f), b, d)
+        for v, s, p, f, b, d in zip(
+            value, variance, per_signal, fixed, background, dead_time, strict=True
         )
-    error = float(np.nan_to_num(signal.background_standard_error[profile]))
-    return CellSignal(
-        value, variance, noise, cells.mean(inverse) * error, cells.mean(change * inverse)
-    )
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _AirCells:
+    """Clean air in cells, (cell,)."""
+
+    backscatter: Array
+    """m-1 sr-1."""
+    depth: Array
+    raman_depth: Array
+    overlap: Array
+    """1 where it is not known."""
+
+    @classmethod
+    def of(cls, air: AirColumn, cells: Cells) -> Self:
+        """Return the means of cells."""
+        profiles = (air.backscatter, air.depth, air.raman_depth, air.known_overlap)
+        return cls(*(cells.mean(profile) for profile in profiles))
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,14 +310,20 @@ def retrieve_raman(
     `ansmann1990`, `ansmann1992`, `pappalardo2004`, `russo2006`.
     """
     partial = (quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
+    pairs = zip(
+        cell_signals(raman, air.raman_shape, cells),
+        cell_signals(elastic, air.elastic_shape, cells),
+        strict=True,
+    )
     rows = [
-        _profile(raman, elastic, air, cells, settings, number, partial[number])
-        for number in range(len(raman.power))
+        _profile(of_raman, of_elastic, cells, settings, near)
+        for (of_raman, of_elastic), near in zip(pairs, partial, strict=True)
     ]
     window = _reference(elastic, air, cells, settings, rows)
     edges = np.stack(window.edges, axis=-1)
+    in_cells = _AirCells.of(air, cells)
     solved = [
-        _Solution.of(row, air, cells, settings, partial[number], edges[number], number)
+        _Solution.of(row, in_cells, cells, settings, partial[number], edges[number], number)
         for number, row in enumerate(rows)
         if row is not None
     ]
@@ -303,26 +332,14 @@ def retrieve_raman(
 
 
 def _profile(
-    raman: ChannelSignal,
-    elastic: ChannelSignal,
-    air: AirColumn,
-    cells: Cells,
-    settings: RamanSettings,
-    number: int,
-    partial: Mask,
+    raman: CellSignal, elastic: CellSignal, cells: Cells, settings: RamanSettings, partial: Mask
 ) -> _Profile | None:
     """Return the fitted profile; None where there is no Raman signal."""
-    of_raman = cell_signal(raman, number, air.raman_shape, cells)
-    noise = SignalNoise(of_raman.noise.per_signal, np.where(partial, np.inf, of_raman.noise.fixed))
-    fit = fit_depth(of_raman.value, noise)
+    noise = SignalNoise(raman.noise.per_signal, np.where(partial, np.inf, raman.noise.fixed))
+    fit = fit_depth(raman.value, noise)
     if fit is None:
         return None
-    return _Profile(
-        of_raman,
-        cell_signal(elastic, number, air.elastic_shape, cells),
-        fit,
-        extinction_of(fit, cells.step, settings.ratio),
-    )
+    return _Profile(raman, elastic, fit, extinction_of(fit, cells.step, settings.ratio))
 
 
 def _reference(
@@ -377,15 +394,15 @@ class _Solution:
     def of(
         cls,
         profile: _Profile,
-        air: AirColumn,
+        air: _AirCells,
         cells: Cells,
         settings: RamanSettings,
         partial: Mask,
         window: Array,
         number: int,
-    ) -> _Solution:
+    ) -> Self:
         """Calibrate a profile and state its errors."""
-        molecular = cells.mean(air.backscatter)
+        molecular = air.backscatter
         bottom, top = window
         inside = (cells.range >= bottom) & (cells.range <= top)
         ratio = _ratio(profile, partial, settings.ratio)
@@ -393,8 +410,8 @@ class _Solution:
         calibrated = _backscatter.calibrated(
             ratio, profile.elastic.noise, profile.fit.noise, assumed, inside
         )
-        effects = _Effects(profile, calibrated, air, cells, settings, partial)
-        causes = list(effects.causes(molecular))
+        effects = _Effects(profile, calibrated, air, cells.step, settings, partial)
+        causes = list(effects.causes())
         extinction = profile.extinction
         budget = _summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
         budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
@@ -407,7 +424,7 @@ class _Solution:
         of_backscatter = _summed(BACKSCATTER_CAUSES, [(c.name, c.backscatter) for c in causes])
         of_backscatter["noise"] = np.sqrt(
             calibrated.own**2
-            + (noise**2).sum(axis=1)
+            + root_of_squares(noise) ** 2
             + (calibrated.total * calibrated.reference) ** 2
         )
         value = calibrated.total - molecular
@@ -422,17 +439,18 @@ def _negative(fit: DepthFit, effects: Sequence[Array], partial: Mask) -> Mask:
     is not complete there, or the background is wrong.
     """
     usable = np.flatnonzero(~partial & (fit.expected_error <= THRESHOLDS.most_uncertain))
-    covariance = fit.inverse[np.ix_(usable, usable)]
-    own, depth = np.diag(covariance), fit.depth[usable]
-    lost = np.maximum(np.subtract.outer(depth, depth), 0.0)
-    least = THRESHOLDS.negative**2
-    noise = own[:, np.newaxis] + own - 2.0 * covariance
-    rows, columns = np.nonzero(np.triu(lost**2 > least * noise, 1))
-    variance = noise[rows, columns]
-    for effect in effects:
-        variance += (effect[usable[rows]] - effect[usable[columns]]) ** 2
     negative = np.zeros(partial.size, dtype=np.bool_)
-    negative[usable[rows[lost[rows, columns] ** 2 > least * variance]]] = True
+    depth = fit.depth[usable]
+    near, far = np.nonzero(np.triu(depth[:, np.newaxis] > depth, 1))
+    squares, own = (depth[near] - depth[far]) ** 2, np.diag(fit.inverse)
+    near, far = usable[near], usable[far]
+    noise = own[near] + own[far] - 2.0 * fit.inverse[near, far]
+    least = THRESHOLDS.negative**2
+    beyond_noise = squares > least * noise
+    near, far, variance = near[beyond_noise], far[beyond_noise], noise[beyond_noise]
+    for effect in effects:
+        variance += (effect[near] - effect[far]) ** 2
+    negative[near[squares[beyond_noise] > least * variance]] = True
     return negative
 
 
@@ -459,63 +477,57 @@ class _Effects:
 
     profile: _Profile
     calibrated: Backscatter | None
-    air: AirColumn
-    cells: Cells
+    air: _AirCells
+    step: float
+    """m, length of a cell."""
     settings: RamanSettings
     partial: Mask
 
-    def causes(self, molecular: Array) -> Iterator[_Cause]:
+    def causes(self) -> Iterator[_Cause]:
         """Yield the effect of one standard error of each cause but noise."""
-        raman, elastic = self.profile.raman, self.profile.elastic
-        level = np.exp(-self.profile.fit.depth)
-        none = np.zeros(molecular.size)
-        for name in ("background", "dead_time"):
-            of_raman = raman.relative(-getattr(raman, name), level)
-            of_elastic = elastic.relative(-getattr(elastic, name), elastic.value)
-            yield self._signals(name, of_raman, none)
-            yield self._signals(name, none, of_elastic)
+        none, total = np.zeros(self.partial.size), self._total()
+        of_density = self.settings.molecular_relative_error * (total - self.air.backscatter)
+        for cause in self._of_signals(list(self._changes())):
+            shift = of_density if cause.name == "molecular" else none
+            yield replace(cause, backscatter=cause.backscatter + shift)
         error = self.settings.reference_relative_error
-        yield _Cause("reference", none, error * self._total(molecular), none)
-        yield self._angstrom(none)
-        yield self._molecular(molecular)
-        seen = self.cells.mean(np.where(np.isnan(self.air.overlap), 1.0, self.air.overlap))
-        of_overlap = self.settings.overlap_relative_error * (1.0 - seen)
-        yield self._signals("overlap", of_overlap, of_overlap)
-
-    def _signals(self, name: str, raman: Array, elastic: Array) -> _Cause:
-        """Return the effect of relative changes of the signals."""
-        depth = self.profile.fit.respond(np.where(self.partial, 0.0, raman))
-        relative = elastic - np.where(self.partial, raman, 0.0)
-        alpha = slope(depth, self.cells.step) / (1.0 + self.settings.ratio)
-        return _Cause(name, alpha, self._respond(relative, depth), depth)
-
-    def _angstrom(self, none: Array) -> _Cause:
+        yield _Cause("reference", none, error * total, none)
         change = self.settings.ratio_error / (1.0 + self.settings.ratio)
         relative = -2.0 * self.profile.fit.depth * change / (1.0 + self.settings.ratio)
-        return _Cause(
-            "angstrom",
-            -change * self.profile.extinction.value,
-            self._respond(relative, none),
-            none,
-        )
+        alpha = -change * self.profile.extinction.value
+        yield _Cause("angstrom", alpha, self._respond(relative, none), none)
 
-    def _molecular(self, molecular: Array) -> _Cause:
-        error = self.settings.molecular_relative_error
-        depth = self.cells.mean(self.air.depth)
-        raman = error * (depth + self.cells.mean(self.air.raman_depth))
-        effect = self._signals("molecular", raman, 2.0 * error * depth)
-        shifted = effect.backscatter + error * (self._total(molecular) - molecular)
-        return _Cause("molecular", effect.extinction, shifted, effect.depth)
+    def _changes(self) -> Iterator[tuple[str, Array, Array]]:
+        """Yield names, and relative changes of the Raman and the elastic signal."""
+        raman, elastic = self.profile.raman, self.profile.elastic
+        level, none = np.exp(-self.profile.fit.depth), np.zeros(self.partial.size)
+        for name in ("background", "dead_time"):
+            yield name, raman.relative(-getattr(raman, name), level), none
+            yield name, none, elastic.relative(-getattr(elastic, name), elastic.value)
+        error, depth = self.settings.molecular_relative_error, self.air.depth
+        yield "molecular", error * (depth + self.air.raman_depth), 2.0 * error * depth
+        of_overlap = self.settings.overlap_relative_error * (1.0 - self.air.overlap)
+        yield "overlap", of_overlap, of_overlap
 
-    def _total(self, molecular: Array) -> Array:
+    def _of_signals(self, changes: Sequence[tuple[str, Array, Array]]) -> Iterator[_Cause]:
+        """Yield the effects of relative changes of the signals."""
+        raman, elastic = (np.stack([c[k] for c in changes], axis=-1) for k in (1, 2))
+        partial = self.partial[:, np.newaxis]
+        depth = self.profile.fit.respond(np.where(partial, 0.0, raman))
+        alpha = slope(depth, self.step) / (1.0 + self.settings.ratio)
+        beta = self._respond(elastic - np.where(partial, raman, 0.0), depth)
+        for change, *effects in zip(changes, alpha.T, beta.T, depth.T, strict=True):
+            yield _Cause(change[0], *effects)
+
+    def _total(self) -> Array:
         """Return total backscatter; NaN without calibration."""
         if self.calibrated is None:
-            return np.full(molecular.size, np.nan)
+            return np.full(self.partial.size, np.nan)
         return self.calibrated.total
 
     def _respond(self, relative: Array, depth: Array) -> Array:
         if self.calibrated is None:
-            return np.full(depth.size, np.nan)
+            return np.full(depth.shape, np.nan)
         return self.calibrated.respond(relative, depth)
 
 
@@ -539,26 +551,21 @@ def _lidar_ratio(
     kernel = extinction.kernel
     known = np.isfinite(value)
     complete = np.abs(kernel[:, ~known]).sum(axis=1) < _MOST_UNKNOWN
-    kernel = np.where(known, kernel, 0.0)
-
-    def smoothed(values: Array) -> Array:
-        mask = known.reshape(-1, *(1,) * (values.ndim - 1))
-        return np.asarray(kernel @ np.where(mask, values, 0.0))
-
-    smooth, total = smoothed(value), smoothed(calibrated.total)
-    of_smooth = smoothed(noise)
-    own = kernel**2 @ np.where(known, calibrated.own, 0.0) ** 2
+    columns = np.column_stack([value, calibrated.total, *(c.backscatter for c in causes), noise])
+    smoothed = (kernel[:, known] @ columns[known]).T
+    (smooth, total), of_smooth = smoothed[:2], smoothed[2 + len(causes) :].T
+    own = kernel[:, known] ** 2 @ calibrated.own[known] ** 2
     level = calibrated.reference * total
-    error = np.sqrt((of_smooth**2).sum(axis=1) + own + level**2)
+    error = np.sqrt(root_of_squares(of_smooth) ** 2 + own + level**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         uncertainty = (error / smooth) ** 2
         inverse = _backscatter.inverse_of_weak(smooth, error)
         ratio = extinction.value * inverse
         by_noise = extinction.noise - ratio[:, np.newaxis] * of_smooth
-        random = (by_noise**2).sum(axis=1) + (own + level**2) * ratio**2
+        random = root_of_squares(by_noise) ** 2 + (own + level**2) * ratio**2
         systematic = np.zeros(value.size)
-        for cause in causes:
-            square = (cause.extinction - ratio * smoothed(cause.backscatter)) ** 2
+        for cause, of_cause in zip(causes, smoothed[2:], strict=False):
+            square = (cause.extinction - ratio * of_cause) ** 2
             if cause.name in RANDOM:
                 random += square
             else:

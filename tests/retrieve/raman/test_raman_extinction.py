@@ -9,7 +9,7 @@ from support.raman_signals import make_sky
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.raman.depth_fit import SignalNoise, fit_depth
 from lidarops.retrieve.raman.extinction import extinction_of, mean_weights, sliding_line
-from lidarops.retrieve.raman.retrieval import cell_signal
+from lidarops.retrieve.raman.retrieval import cell_signals
 
 STEP = 30.0
 R = STEP * (np.arange(400) + 0.5)
@@ -20,7 +20,7 @@ def solved(extinction, light, counts=None):
     """Return the extinction of one profile of cells of one bin, and the bins of full overlap."""
     sky = make_sky(extinction, STEP, light, cell=STEP)
     signal = sky.signal((sky.raman if counts is None else counts)[np.newaxis])
-    cells = cell_signal(signal, 0, sky.air.raman_shape, sky.cells)
+    (cells,) = cell_signals(signal, sky.air.raman_shape, sky.cells)
     full = sky.quality[0] == 0
     noise = SignalNoise(cells.noise.per_signal, np.where(full, cells.noise.fixed, np.inf))
     fit = fit_depth(cells.value, noise)
@@ -63,7 +63,7 @@ def test_noise_error_is_the_scatter_of_profiles():
 
 def test_lines_agree_with_the_smooth_solution_where_there_is_much_light():
     sky = make_sky(HAZE, STEP, 1e8, cell=STEP)
-    cells = cell_signal(sky.signal(sky.raman[np.newaxis]), 0, sky.air.raman_shape, sky.cells)
+    (cells,) = cell_signals(sky.signal(sky.raman[np.newaxis]), sky.air.raman_shape, sky.cells)
     value, error = sliding_line(cells.value, cells.variance, STEP, sky.settings.ratio, 5)
     inside = slice(12, 250)
     np.testing.assert_allclose(value[inside], HAZE[inside], rtol=0.02)

@@ -25,7 +25,7 @@ from lidarops.retrieve.raman.retrieval import (
     AirColumn,
     ChannelSignal,
     RamanSettings,
-    cell_signal,
+    cell_signals,
 )
 
 STEP = 15.0
@@ -208,10 +208,7 @@ def lines(case):
     return np.array(
         [
             sliding_line(signal.value, signal.variance, case.cells.step, case.settings.ratio, 11)[0]
-            for signal in (
-                cell_signal(channel(case.raman), row, case.air.raman_shape, case.cells)
-                for row in range(REALISATIONS)
-            )
+            for signal in cell_signals(channel(case.raman), case.air.raman_shape, case.cells)
         ]
     )
 
