@@ -64,7 +64,6 @@ _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
 """Methods that cannot fit a horizontal gradient."""
 _DIFFERENTIATING: Final = frozenset({"mld", "mld_prior"})
 """Methods of Gobrusenko and Ivanenko."""
-_JOINT: Final = frozenset({"auto", "joint"})
 
 
 def altitude_steps(step: float, highest: float) -> Array:
@@ -273,7 +272,7 @@ class Correlation(PartOfRetrieval):
     def decide(self, case: Case) -> Decisions:
         """Run where redundant beams can show a correlation."""
         spare, method = float(beams(case).count - 2), case.request.method
-        if method not in _JOINT:
+        if method in _DIFFERENTIATING:
             yield Leave(f"method {method} assumes independent errors at different altitudes")
         elif spare <= 0:
             reason = "no beam direction is redundant: residuals show no correlation along altitude"

@@ -16,7 +16,11 @@ from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 from lidarops.retrieve.multiangle._result import MultiAngleResult, StepRecord
 from lidarops.retrieve.multiangle.slant_paths import Scan
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical.correlation import residual_moments
+from lidarops.retrieve.multiangle.vertical.correlation import (
+    ResidualMoments,
+    fit_correlation,
+    residual_moments,
+)
 from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
 
 Array = npt.NDArray[np.float64]
@@ -133,24 +137,53 @@ def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]
 
 def _kano_hamilton(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Return the estimates of single altitudes."""
+    return _single_altitudes(beams, fit, settings, _moments(beams, fit))
+
+
+def _single_altitudes(
+    beams: BeamBlock, fit: Regression, settings: BlockSettings, moments: ResidualMoments
+) -> MultiAngleResult:
+    """Return the estimates of single altitudes, with the correlation that residuals show."""
     profiles = _start(beams, fit, settings)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
+    correlation, amplitude = fit_correlation(moments.lag_products, moments.lag_norms)
+    share = np.clip(_correlated_share(beams, fit) * amplitude, 0.0, 1.0)
     single = _Single(
         profiles.optical_depth, error, np.ones_like(error), np.ones_like(error),
         _gradient_slopes(profiles, beams, fit, settings),
+        correlation * np.sqrt(share * _below(share)),
     )  # fmt: skip
     _fill_single(profiles, single, settings)
     return profiles
 
 
+def _correlated_share(beams: BeamBlock, fit: Regression) -> Array:
+    """Return the share of the air between the beams in the variances, (profile, altitude)."""
+    return fit.column(kh.SHARE) * fit.inhomogeneity * _block.kept_information(beams, fit)
+
+
+def _moments(beams: BeamBlock, fit: Regression) -> ResidualMoments:
+    """Return what the residuals show of the correlation along altitude."""
+    within = (beams.alive >= beams.needed) & np.isfinite(fit.column(kh.TAU))
+    return residual_moments(
+        fit.residual * _block.residual_scale(beams, fit)[:, np.newaxis],
+        np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
+        fit.leverage,
+        fit.inhomogeneity,
+        np.where(within, _correlated_share(beams, fit), 0.0),
+        beams.gaps,
+    )
+
+
 def _two_angle(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Solve with the shortest and the longest path of each altitude.
 
-    The inhomogeneity comes from all beams of the scan.
+    The inhomogeneity and its correlation along altitude come from all beams of the scan.
     """
     ends = _block.end_beams(beams)
-    return _kano_hamilton(ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), settings)
+    of_ends = _block.refit(ends, fit.inhomogeneity, fit.freedom)
+    return _single_altitudes(ends, of_ends, settings, _moments(beams, fit))
 
 
 def _mld(
@@ -164,6 +197,7 @@ def _mld(
     single = _Single(
         estimates.optical_depth, np.sqrt(estimates.variance), estimates.data_share,
         estimates.freedom, settings.largest_gradient * settings.height * estimates.slopes,
+        np.zeros_like(estimates.variance),
     )  # fmt: skip
     _fill_single(profiles, single, settings)
     within = np.isfinite(profiles.data_share)
@@ -185,10 +219,12 @@ class _Single(NamedTuple):
     freedom: Array
     slopes: Array
     """(2, profile, altitude): error by the largest gradient to the east and north."""
+    correlation: Array
+    """Of the error with that at the altitude below."""
 
 
 def _fill_single(profiles: MultiAngleResult, single: _Single, settings: BlockSettings) -> None:
-    """Fill optical depth within the reach, and what follows from it with independent errors."""
+    """Fill optical depth within the reach, and what follows from it."""
     within = np.isfinite(profiles.optical_depth) & np.isfinite(single.optical_depth)
     for values, estimates in (
         (profiles.optical_depth, single.optical_depth),
@@ -199,7 +235,8 @@ def _fill_single(profiles: MultiAngleResult, single: _Single, settings: BlockSet
     profiles.extinction[:] = _layer_means(profiles.optical_depth, settings.height)
     both = profiles.optical_depth_standard_error**2
     step = np.diff(settings.height, prepend=0.0)
-    profiles.extinction_standard_error[:] = np.sqrt(both + _below(both)) / step
+    common = 2.0 * single.correlation * np.sqrt(both * _below(both))
+    profiles.extinction_standard_error[:] = np.sqrt(both + _below(both) - common) / step
     _fill_gradient_errors(profiles, np.where(within, single.slopes, np.nan), settings)
     freedom = np.where(within, single.freedom, 0.0).sum(axis=1)
     profiles.effective_degrees_of_freedom[:] = np.where(within.any(axis=1), freedom, np.nan)
@@ -219,20 +256,11 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     rows = np.flatnonzero(within.any(axis=1))
     if rows.size == 0:
         return profiles
-    share = fit.column(kh.SHARE) * fit.inhomogeneity * _block.kept_information(beams, fit)
-    moments = residual_moments(
-        fit.residual * _block.residual_scale(beams, fit)[:, np.newaxis],
-        np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
-        fit.leverage,
-        fit.inhomogeneity,
-        np.where(within, share, 0.0),
-        beams.gaps,
-    )
     smooth = smooth_optical_depth(
         profiles.optical_depth[rows],
         np.where(within, fit.column(kh.INFORMATION), 0.0)[rows],
         settings.height,
-        residuals=moments.of(rows),
+        residuals=_moments(beams, fit).of(rows),
     )
     profiles.optical_depth[rows] = smooth.optical_depth
     profiles.optical_depth_standard_error[rows] = smooth.optical_depth_standard_error

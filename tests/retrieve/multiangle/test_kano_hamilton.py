@@ -204,6 +204,28 @@ def test_weak_signals_are_not_biased(ratio):
     assert np.nanmean(naive) < -0.1 * np.nanstd(naive)
 
 
+# Standard errors ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["kano_hamilton", "two_angle"])
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.9])
+def test_extinction_allows_for_errors_that_neighbouring_altitudes_share(method, correlation):
+    """As differences of independent errors, 95 percent intervals covered 99.6 and 100 percent."""
+    atmosphere, rng = clear(100), np.random.default_rng(23)
+    options = {"ratio": 1e4, "inhomogeneity": 0.05, "correlation": correlation}
+    error, stated = [], []
+    for _ in range(8):
+        signal, variance, _ = signals(rng, 8, ANGLES, atmosphere, **options)
+        result = retrieve_optical_depth(
+            signal, ANGLES, atmosphere[0], variance=variance, method=method
+        )
+        error.append(result.extinction - atmosphere[1])
+        stated.append(result.extinction_standard_error)
+    one, two = coverage(np.array(error), np.array(stated))
+    assert 66 < one < 72
+    assert 94 < two < 97
+
+
 # Outliers -----------------------------------------------------------------------------------
 
 
