@@ -9,7 +9,6 @@ from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
 from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
 from lidarops.records import DetectionMode, Granule, Role
@@ -23,7 +22,7 @@ from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import estimated_against, lag_is_unknown, range_offset
 from lidarops.steps.data import Data, Profiles
-from lidarops.steps.profiles import FileProfiles
+from lidarops.steps.profiles import FileProfiles, bin_ranges
 from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, Run, Step
 from lidarops.steps.workload import Workload
@@ -313,7 +312,7 @@ def _estimated_dead_time(
             )
             yield power, counts / np.maximum(exposure, 1e-300)[:, np.newaxis]
 
-    distance = _ranges(archive, channel, photon.get(RANGE_OFFSET) or 0.0)
+    distance = bin_ranges(archive, channel, photon.get(RANGE_OFFSET) or 0.0)
     lag = labeled_gluing.range_lag(profiles.range, distance)
     if settings.lag == "estimate":
         lag = labeled_gluing.estimate_lag(records(), known=lag).bins
@@ -325,12 +324,6 @@ def _estimated_dead_time(
         return None
     counts, exposure, power, variance = (np.stack(parts) for parts in zip(*kept, strict=True))
     return estimate_dead_time(counts, exposure, power, variance, lag)
-
-
-def _ranges(archive: xr.Dataset, channel: str, offset: float) -> Array:
-    """Return the ranges of a channel in m, shifted by an offset."""
-    grid = str(archive[channel].dims[-1])
-    return np.asarray(archive[grid].to_numpy() + offset, dtype=np.float64)
 
 
 class NoiseSettings(SettingsModel):

@@ -30,6 +30,13 @@ class Conditioning(TypedDict):
     full_overlap_range: float
 
 
+def bin_ranges(archive: xr.Dataset, channel: str, offset: float) -> npt.NDArray[np.float64]:
+    """Return the ranges of the bin centres of a channel of the files, m, shifted by an offset."""
+    # As `condition` adds it, in the type of the coordinate.
+    distance = archive[str(archive[channel].dims[-1])].to_numpy() + offset
+    return np.asarray(distance, dtype=np.float64)
+
+
 class FileProfiles(Profiles):
     """Profiles of a channel that the files hold.
 
@@ -43,11 +50,7 @@ class FileProfiles(Profiles):
 
     def __init__(self, archive: xr.Dataset, channel: str, settings: Conditioning) -> None:
         self._channel, self._settings = channel, settings
-        grid = str(archive[channel].dims[-1])
-        # As `condition` adds it, in the type of the coordinate.
-        distance = archive[grid].to_numpy()
-        offset = settings["range_offset"]
-        self._range = (distance + offset if offset else distance).astype(np.float64)
+        self._range = bin_ranges(archive, channel, settings["range_offset"])
 
     @property
     def range(self) -> npt.NDArray[np.float64]:
