@@ -38,7 +38,7 @@ from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection, requested_kinds
 from lidarops.steps import dependence
-from lidarops.steps.dependence import ProductKey, ancillary_files
+from lidarops.steps.dependence import OPERATION, ProductKey, ancillary_files
 from lidarops.system.code_version import code_version, joint_code_version, source_version
 from lidarops.system.files import sha256_of
 
@@ -47,10 +47,6 @@ MOST_GRANULES: Final = 50_000
 """Granules that are judged at a time, unless one day has more. Memory holds the current group and,
 if workers process the scenes, the next group."""
 
-# Settings that change neither the scenes nor the content of a product.
-_OPERATION: Final = frozenset(
-    {"archive", "output", "catalog", "superseded", "simulation", "periods"}
-)
 _PLANNING: Final = (
     "lidarops.plan.outlying_headers",
     "lidarops.plan.scene_plan",
@@ -238,7 +234,7 @@ class Judge:
         settings = as_settings(self.campaign)
         return dependence.digest(
             [
-                {key: value for key, value in settings.items() if key not in _OPERATION},
+                {key: value for key, value in settings.items() if key not in OPERATION},
                 joint_code_version(requested_kinds(self.campaign), *_PLANNING),
             ]
         )

@@ -29,10 +29,11 @@ UNUSABLE_FILE: Final = "ancillary"
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
-_OF_CAMPAIGN: Final = frozenset(
-    {"all_steps", "archive", "output", "catalog", "superseded", "scenes", "simulation", "stations",
-     "instruments", "networks"}
-)  # fmt: skip
+OPERATION: Final = frozenset(
+    {"archive", "output", "catalog", "superseded", "simulation", "periods"}
+)
+"""Settings of a campaign that change neither the scenes nor the content of a product."""
+_OF_CAMPAIGN: Final = OPERATION | {"all_steps", "scenes", "stations", "instruments", "networks"}
 _OF_INSTRUMENT: Final = frozenset(
     {"files", "dark_files", "header_position", "position_tolerance", "altitude_tolerance", "facts",
      "products"}
