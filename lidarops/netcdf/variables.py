@@ -724,6 +724,22 @@ AVERAGED_PROFILES: Final = Row(
     valid_min=0.0,
 )
 
+LEFT_OUT_PROFILES: Final = Row(
+    name="profiles_left_out",
+    dims=("time",),
+    dtype="i4",
+    units="1",
+    standard_name="number_of_observations",
+    long_name="number of raw profiles that are left out of the mean as outlying",
+    coverage=Coverage.AUXILIARY,
+    cell_methods="time: sum",
+    valid_min=0.0,
+    comment="Profiles are left out where their signal, in any channel, exceeds that of all others"
+    " of the interval at some range by more than the contrast of a cloud and noise allow, or lies"
+    " below zero unlike that of all others, if they are at most a fifth of the interval: a"
+    " short cloud, a bird, an aircraft, interference.",
+)
+
 
 def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
     """Return the row of the method by which a product was retrieved."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
-from lidarops.retrieve.signal.labeled_screening import Screening
+from lidarops.retrieve.signal.labeled_screening import Record
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.step import Datum
 
@@ -92,15 +92,33 @@ class Profiles(ABC):
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""
 
+    @property
     @abstractmethod
-    def screened(
-        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, screening: Screening
-    ) -> Averages:
-        """Return an empty average of profiles over clock intervals, without outlying parts.
+    def recorded(self) -> tuple[LaggedProfiles, ...]:
+        """The channels of the files of which the profiles are made."""
 
-        Its means have the variables of
-        `lidarops.retrieve.signal.labeled_screening.ScreenedAverage.completed`.
-        """
+    @abstractmethod
+    def joined(self, *means: xr.Dataset) -> xr.Dataset:
+        """Return the means of the profiles from those of `recorded`, which are screened."""
+
+
+class RecordedProfiles(Profiles):
+    """Profiles of a channel that the files hold."""
+
+    @abstractmethod
+    def record(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, lag: int = 0
+    ) -> Record:
+        """Return the record of an empty screened average."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaggedProfiles:
+    """A channel of the files of which profiles are made."""
+
+    profiles: RecordedProfiles
+    lag: int
+    """Bins by which it lags behind the profiles."""
 
 
 class Averages(ABC):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Final, TypedDict
 
 import numpy as np
@@ -14,7 +15,7 @@ from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.steps.data import Averages, Chunk, Indices, Profiles
+from lidarops.steps.data import Averages, Chunk, Indices, LaggedProfiles, Profiles, RecordedProfiles
 
 _PARTS: Final = ("power", "variance", "quality")
 
@@ -37,7 +38,7 @@ def bin_ranges(archive: xr.Dataset, channel: str, offset: float) -> npt.NDArray[
     return np.asarray(distance, dtype=np.float64)
 
 
-class FileProfiles(Profiles):
+class FileProfiles(RecordedProfiles):
     """Profiles of a channel that the files hold.
 
     Parameters
@@ -89,12 +90,15 @@ class FileProfiles(Profiles):
         parts = THRESHOLDS.most_parts
         return Record(self._means(geometry, shots, seconds, parts), self._range, lag)
 
-    def screened(
-        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, screening: Screening
-    ) -> Averages:
-        """Return an empty average of profiles over clock intervals, without outlying parts."""
-        records = [self.record(geometry, shots, seconds)]
-        return _ScreenedAverages((self,), ScreenedAverage(records, screening), _alone)
+    @property
+    def recorded(self) -> tuple[LaggedProfiles, ...]:
+        """The channel itself."""
+        return (LaggedProfiles(self, 0),)
+
+    def joined(self, *means: xr.Dataset) -> xr.Dataset:
+        """Return the means of the channel."""
+        (own,) = means
+        return own
 
 
 class _FileAverages(Averages):
@@ -154,41 +158,65 @@ class GluedProfiles(Profiles):
             self._lag,
         )
 
-    def screened(
-        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, screening: Screening
-    ) -> Averages:
-        """Return an empty average of profiles over clock intervals, without outlying parts."""
-        records = [
-            self._analog.record(geometry, shots, seconds, round(self._lag.bins)),
-            self._photon.record(geometry, shots, seconds),
-        ]
-        average = ScreenedAverage(records, screening)
-        return _ScreenedAverages((self._analog, self._photon), average, self._glued)
+    @property
+    def recorded(self) -> tuple[LaggedProfiles, ...]:
+        """Both parts; the photon-counting one comes last, whose bins are those of the channel."""
+        return LaggedProfiles(self._analog, round(self._lag.bins)), LaggedProfiles(self._photon, 0)
 
-    def _glued(self, analog: xr.Dataset, photon: xr.Dataset) -> xr.Dataset:
+    def joined(self, *means: xr.Dataset) -> xr.Dataset:
+        """Return the glued means."""
+        analog, photon = means
         glued = labeled_gluing.glue(analog, photon, self._lag)
         kept = photon.isel(range=slice(glued.sizes["range"])).drop_vars(_PARTS)
         return kept.assign(glued.variables).assign(labeled_gluing.glue_cells(analog, photon, glued))
 
 
-def _alone(record: xr.Dataset) -> xr.Dataset:
-    return record
+class ScreenedAverages:
+    """Means of the profiles of channels over clock intervals, without outlying parts.
 
+    A part that is outlying in any channel is left out of all. The means of a channel have the
+    variables of `lidarops.retrieve.signal.labeled_screening.ScreenedAverage.completed`.
 
-class _ScreenedAverages(Averages):
-    """Means of the records of a channel without outlying parts."""
+    Parameters
+    ----------
+    channels : sequence of Profiles
+        With bins of equal width.
+    geometry : xr.Dataset
+        ``time`` and ``time_bnds`` of all profiles.
+    shots : xr.DataArray, (time,)
+        Of all profiles.
+    seconds : float
+        Length of an interval.
+    screening : Screening
+    """
 
     def __init__(
         self,
-        records: tuple[FileProfiles, ...],
-        means: ScreenedAverage,
-        joined: Callable[..., xr.Dataset],
+        channels: Sequence[Profiles],
+        geometry: xr.Dataset,
+        shots: xr.DataArray,
+        seconds: float,
+        screening: Screening,
     ) -> None:
-        self._records, self._means, self._joined = records, means, joined
+        self._channels = channels
+        self._recorded = [lagged.profiles for channel in channels for lagged in channel.recorded]
+        first = channels[-1].range
+        width = float(np.median(np.diff(first))) if first.size > 1 else 1.0
+        records = [
+            lagged.profiles.record(
+                geometry,
+                shots,
+                seconds,
+                lagged.lag + round((first[0] - channel.range[0]) / width),
+            )
+            for channel in channels
+            for lagged in channel.recorded
+        ]
+        self._means = ScreenedAverage(records, screening)
 
     def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
         """Add the next profiles: all of a chunk, or some of its rows."""
-        conditioned = [chunk.profiles(record) for record in self._records]
+        conditioned = [chunk.profiles(profiles) for profiles in self._recorded]
         self._means.add(conditioned if rows is None else [c.isel(time=rows) for c in conditioned])
 
     @property
@@ -196,10 +224,14 @@ class _ScreenedAverages(Averages):
         """``time`` and ``time_bnds`` of all means."""
         return self._means.times
 
-    def completed(self) -> Iterator[xr.Dataset]:
-        """Yield the means that are complete."""
+    def completed(self) -> Iterator[tuple[xr.Dataset, ...]]:
+        """Yield the means that are complete, in batches, of each channel."""
         for records in self._means.completed():
-            yield self._joined(*records)
+            means = iter(records)
+            yield tuple(
+                channel.joined(*itertools.islice(means, len(channel.recorded)))
+                for channel in self._channels
+            )
 
 
 class _GluedAverages(Averages):

@@ -84,6 +84,7 @@ def deviations(product: xr.Dataset, name: str, true: Any) -> Any:
 def test_a_simulated_night_agrees_with_the_truth(night):
     campaign, truth, record = night
     product, true = product_of(campaign, record), particles(truth)
+    assert (product["profiles_left_out"].values == 0).all()
     r = product["range"].values
     length = np.nan_to_num(product["vertical_resolution"].values, nan=60.0)
     extinction = mean_over(true["aerosol_extinction"], STEP, r, length)
@@ -337,6 +338,7 @@ def manaus(data_root, tmp_path_factory):
 
 def test_the_night_of_manaus_agrees_with_clean_air_and_the_elastic_inversion(manaus):
     elastic, raman = (product.isel(time=0) for product in manaus)
+    assert raman["profiles_left_out"] == 0
     r = raman["range"].values
     usable = (raman["quality_flag"].values & rejecting((*RamanQuality, *Quality))) == 0
     # Up to 7.4 km the signal falls less than air explains, as where overlap is not complete: no

@@ -18,6 +18,7 @@ from lidarops.records import Role
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.retrieve.signal.labeled_screening import Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import range_channel, range_offset
@@ -25,7 +26,7 @@ from lidarops.steps.conditioning import FULL_OVERLAP_RANGE, OVERLAP, PROFILES
 from lidarops.steps.data import Chunk, Data, RowProduct, Source
 from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, with_methods
-from lidarops.steps.profiles import gluing
+from lidarops.steps.profiles import ScreenedAverages, gluing
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import (
@@ -226,11 +227,12 @@ class _Inversion(RowProduct):
     def __init__(self, settings: InversionSettings, data: Data) -> None:
         self._settings, self._data = settings, data
         source, profiles = data.source, data[PROFILES]
-        self._averages = profiles.screened(
+        self._averages = ScreenedAverages(
+            [profiles],
             source.geometry,
             profiles.shots(source.archive),
             data[AVERAGE],
-            Screening(labeled.cloud_contrast(data[WAVELENGTH]), data[REFERENCE].highest),
+            Screening(cloud_contrast(data[WAVELENGTH]), data[REFERENCE].highest),
         )
         self._begun = False
         self._lidar_ratio = _ratio_at(settings, source)
@@ -238,7 +240,7 @@ class _Inversion(RowProduct):
     def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Add the next profiles to their averages, and yield those that are complete, inverted."""
         self._averages.add(chunk)
-        for averages in self._averages.completed():
+        for (averages,) in self._averages.completed():
             rows = self._inverted(averages)
             if not self._begun:
                 self._begun = True

@@ -13,6 +13,7 @@ from lidarops.netcdf.variables import (
     AVERAGED_PROFILES,
     BACKGROUND_METHOD,
     GLUING,
+    LEFT_OUT_PROFILES,
     MOLECULAR_BACKSCATTER,
     MOLECULAR_SOURCE,
     NO_STANDARD_NAME,
@@ -327,21 +328,7 @@ LAYOUT: Final = Layout(
         *GLUING,
         quality(_BINS, FLAGS),
         AVERAGED_PROFILES,
-        Row(
-            name="profiles_left_out",
-            dims=("time",),
-            dtype="i4",
-            units="1",
-            standard_name="number_of_observations",
-            long_name="number of raw profiles that are left out of the mean as outlying",
-            coverage=Coverage.AUXILIARY,
-            cell_methods="time: sum",
-            valid_min=0.0,
-            comment="Profiles are left out where their signal exceeds that of all others of the"
-            " interval at some range by more than the contrast of a cloud and noise allow, or lies"
-            " below zero unlike that of all others, if they are at most a fifth of the interval: a"
-            " short cloud, a bird, an aircraft, interference.",
-        ),
+        LEFT_OUT_PROFILES,
         shots(of="all profiles in the mean"),
     ),
 )

@@ -19,12 +19,13 @@ from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.retrieval import RamanSettings
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
+from lidarops.retrieve.signal.labeled_screening import Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import member_channel, range_channel, wavelength
 from lidarops.steps.conditioning import OVERLAP, PROFILES
 from lidarops.steps.data import (
-    Averages,
     Chunk,
     Data,
     ProductStream,
@@ -34,6 +35,7 @@ from lidarops.steps.data import (
 )
 from lidarops.steps.pointing import fixed_zenith
 from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, with_methods
+from lidarops.steps.profiles import ScreenedAverages
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
 from lidarops.steps.step import REQUESTED, Decisions, Leave, Look, ProductStep, Run
@@ -218,9 +220,12 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
 
     def held(self, settings: RetrievalSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the averages that are completed together, and of their solution."""
-        return _BYTES_OF_A_BIN * work.bins * min(_averages(work), MEANS_TOGETHER)
+        together = min(_averages(work), MEANS_TOGETHER)
+        return (_BYTES_OF_A_BIN * together + _BYTES_OF_PARTS) * work.bins
 
 
+_BYTES_OF_PARTS: Final = 4500.0
+"""Bytes per bin of the parts of the open average: of three channels, each of two records."""
 _BYTES_OF_A_BIN: Final = 500.0
 """Bytes per bin of an average that is open or being solved, of three channels."""
 
@@ -260,20 +265,22 @@ class _Retrieval(RowProduct):
         self._begun = False
         names = [data.channel, *STEP.companions(settings)]
         source, shots = data.source, data[PROFILES].shots(data.source.archive)
-        self._averages: list[Averages] = [
-            _of(data, name)[PROFILES].averages(source.geometry, shots, data[AVERAGE])
-            for name in names
-        ]
+        self._averages = ScreenedAverages(
+            [_of(data, name)[PROFILES] for name in names],
+            source.geometry,
+            shots,
+            data[AVERAGE],
+            Screening(cloud_contrast(data[WAVELENGTH]), settings.highest),
+        )
 
     def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Add the next profiles to their averages, and yield those that are complete."""
-        for averages in self._averages:
-            averages.add(chunk)
-        for means in zip(*(averages.completed() for averages in self._averages), strict=True):
+        self._averages.add(chunk)
+        for means in self._averages.completed():
             rows = self._retrieved(*means)
             if not self._begun:
                 self._begun = True
-                yield rows.drop_dims("time").assign_coords(self._averages[0].times.coords)
+                yield rows.drop_dims("time").assign_coords(self._averages.times.coords)
             yield rows
 
     def _retrieved(

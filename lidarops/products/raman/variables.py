@@ -11,6 +11,7 @@ from lidarops.netcdf.variables import (
     AEROSOL_LIDAR_RATIO,
     AVERAGED_PROFILES,
     BACKGROUND_METHOD,
+    LEFT_OUT_PROFILES,
     MOLECULAR_BACKSCATTER,
     MOLECULAR_SOURCE,
     NO_STANDARD_NAME,
@@ -272,6 +273,7 @@ LAYOUT: Final = Layout(
         SUBTRACTED_BACKGROUND,
         quality(_BINS, FLAGS),
         AVERAGED_PROFILES,
+        LEFT_OUT_PROFILES,
         shots(of="all profiles in the mean"),
     ),
 )

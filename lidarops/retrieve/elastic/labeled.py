@@ -26,15 +26,13 @@ from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import actual_noise, counts_per_power, dead_time_error
+from lidarops.retrieve.signal.screening import cloud_contrast
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 RatioAt = Callable[[Array], tuple[Array, Array]]
 """Altitudes in m -> lidar ratio and its standard error, sr."""
-
-_CONTRAST_WAVELENGTH: Final = 532e-9
-"""m; wavelength of `Thresholds.cloud_contrast`."""
 
 _CARRIED: Final = int(
     Quality.INPUT_MISSING
@@ -114,19 +112,6 @@ class _Clouds:
     def any(self) -> Mask:
         """Bins that are cloudy in some profiles or the mean."""
         return np.asarray(self.mask | self.partly)
-
-
-def cloud_contrast(wavelength: float) -> float:
-    """Return the least contrast of a cloud; aerosol over air scales with lambda^3.
-
-    Parameters
-    ----------
-    wavelength : float
-        m.
-    """
-    scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
-    contrast = 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
-    return max(contrast, THRESHOLDS.least_cloud_contrast)
 
 
 def constant_ratio(ratio: float, standard_error: float) -> RatioAt:

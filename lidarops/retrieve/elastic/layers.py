@@ -18,6 +18,7 @@ from lidarops.retrieve.elastic._fernald import HUGE, usable
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.screening import skewness_margin
+from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -57,7 +58,7 @@ def find_layers(
     variance: npt.ArrayLike,
     *,
     molecular_attenuated: npt.ArrayLike,
-    contrast: float = THRESHOLDS.cloud_contrast,
+    contrast: float = SIGNAL_THRESHOLDS.cloud_contrast,
     false_alarm: float = THRESHOLDS.cloud_false_alarm,
     quantum: npt.ArrayLike = 0.0,
 ) -> Layers:

@@ -31,11 +31,6 @@ class Thresholds:
     # Clouds
     window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0)
     """m; in which signals are averaged below and above a base. Assumed."""
-    cloud_contrast: float = 3.0
-    """Factor of the rise at 532 nm. The scattering ratio of aerosol rarely rises by this factor
-    within 500 m, that of thin cirrus does. Assumed."""
-    least_cloud_contrast: float = 2.0
-    """The same at short wavelengths, where air scatters more. Assumed."""
     cloud_false_alarm: float = 0.001
     """Probability of a false cloud in a profile. Required of the product."""
     top: float = 2.0

@@ -198,6 +198,7 @@ def retrieve(
             "background": ("time", of_elastic.background),
             "background_standard_error": ("time", of_elastic.background_standard_error),
             "profiles": elastic["profiles"],
+            "profiles_left_out": elastic.get("profiles_left_out", 0 * elastic["profiles"]),
             "shots": elastic["shots"],
         },
         coords={**coords, "range": ("range", cells.range)},

@@ -40,7 +40,7 @@ class Record:
     range: Array
     """m."""
     lag: int = 0
-    """Bins by which the record lags behind the light."""
+    """Bins by which the record lags behind the last of its channels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class ScreenedAverage:
     Parameters
     ----------
     records : sequence of Record
-        One, or those that are glued, with the same bins from the first range above zero on.
+        Of one channel or several, two of each that is glued, with bins of equal width.
     screening : Screening
     """
 

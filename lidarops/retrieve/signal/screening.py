@@ -21,6 +21,8 @@ Mask = npt.NDArray[np.bool_]
 _SIGNS: Final = (1.0, -1.0)
 
 FEWEST_PARTS: Final = THRESHOLDS.fewest_parts
+_CONTRAST_WAVELENGTH: Final = 532e-9
+"""m; wavelength of `Thresholds.cloud_contrast`."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -34,6 +36,19 @@ class PartCells:
     variance: Array
     quantum: Array
     """(...): the power of a cell with a single count; 0 where nothing is counted."""
+
+
+def cloud_contrast(wavelength: float) -> float:
+    """Return the least contrast of a cloud; aerosol over air scales with lambda^3.
+
+    Parameters
+    ----------
+    wavelength : float
+        m.
+    """
+    scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
+    contrast = 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
+    return max(contrast, THRESHOLDS.least_cloud_contrast)
 
 
 def skewness_margin(quantile: Array | float) -> Array:

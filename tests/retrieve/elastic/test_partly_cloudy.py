@@ -13,12 +13,12 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import (
     Reference,
-    cloud_contrast,
     constant_ratio,
     invert_elastic,
 )
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 GREEN = 532e-9

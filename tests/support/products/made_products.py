@@ -307,6 +307,7 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
             "quality_flag": (dims, flags),
             "profiles": ("time", np.full(profiles, 10, np.int32)),
+            "profiles_left_out": ("time", np.arange(profiles, dtype=np.int32)),
             "shots": ("time", np.full(profiles, 6000, np.int32)),
         },
         coords={**clock(profiles, **beam), "range": ("range", 60.0 * (np.arange(bins) + 0.5))},
