@@ -77,40 +77,46 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     """
     begin = time.thread_time()
 
-    def process() -> SceneOutcome:
+    def process() -> tuple[SceneOutcome, bool]:
         with local_files(job.campaign.archive, job.scene) as root:
             return _process(job, root)
 
-    outcome = guarded(process)
-    if isinstance(outcome, Failure):
-        return outcome.outcome(job.scene, job.plan), outcome.final
+    result = guarded(process)
+    if isinstance(result, Failure):
+        return result.outcome(job.scene, job.plan), result.final
+    outcome, final = result
     # The next scan reads refused files again.
-    return replace(outcome, cpu_seconds=time.thread_time() - begin), not outcome.refused
+    final &= not outcome.refused
+    return replace(outcome, cpu_seconds=time.thread_time() - begin), final
 
 
-def _process(job: Job, root: Path) -> SceneOutcome:
+def _process(job: Job, root: Path) -> tuple[SceneOutcome, bool]:
     clock = _Clock()
     if not any(is_product(step) for step in job.plan.steps):
-        return Failure(nothing_to_do(job.plan)).outcome(job.scene, job.plan)
+        return Failure(nothing_to_do(job.plan)).outcome(job.scene, job.plan), True
     read_all = job.campaign.all_steps
     usable, inputs, refused, read = check_files(job.scene, root, read_all=read_all)
     clock.lap("digest")
     failure = Failure("").outcome(job.scene, job.plan)
     failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
     if not usable.granules:
-        return replace(failure, error="no granule of the scene can be read")
+        return replace(failure, error="no granule of the scene can be read"), True
     with dask.config.set(scheduler="synchronous"), count_bytes_read() as tally:
         process = _Network if usable.members else _Instrument
         work = process(job, usable, inputs, root, clock)
-        products = tuple(work.products())
-    return replace(
+        products = guarded(lambda: tuple(work.products()))
+    outcome = replace(
         failure,
         plan=work.job.plan,
-        products=products,
         inputs=work.inputs,
         seconds=clock.laps,
         bytes_read=read + tally.bytes,
     )
+    if isinstance(products, Failure):
+        # Those before the failure are on the disk, so that the ledger must know them.
+        failed = replace(outcome, error=products.error, internal=products.internal)
+        return replace(failed, products=tuple(work.made)), products.final
+    return replace(outcome, products=products), True
 
 
 class _Clock:
@@ -139,6 +145,8 @@ class _Work:
     ) -> None:
         self.job, self.inputs = job, inputs
         self._scene, self._root, self._clock = scene, root, clock
+        self.made: list[ProductRecord] = []
+        """Products that are written, in the order in which they were complete."""
 
     def _source(
         self,
@@ -192,6 +200,7 @@ class _Work:
         former = self.job.place(context.kind, context.channel).sha256
         with create_product(frame, context, target, former) as writer:
             yield writer
+        self.made.append(self._record(context, writer))
         self._clock.lap("write")
 
     def _written(self, context: Context, results: Iterator[xr.Dataset]) -> ProductRecord:

@@ -12,7 +12,10 @@ import xarray as xr
 from support.archives.small_archive import Archive, made
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog.store import Store
+from lidarops.catalog.verify import verify_archive
 from lidarops.netcdf.comparison import compare_products
+from lidarops.process import scene
 from lidarops.records import Grade
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.session import Session
@@ -88,6 +91,36 @@ def test_a_scene_whose_counts_could_not_be_read_is_tried_again(
     later = bring_up_to_date(campaign)
     assert not later.has_failures
     assert made(later.record)
+
+
+def test_products_before_a_failure_are_those_of_the_ledger(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A forced run read a file less, and then failed after it had replaced the first product."""
+    assert len(made(reprocess(campaign))) == 2
+    read, created = Path.read_bytes, scene.create_product
+
+    def failing(path: Path) -> bytes:
+        if path.name == "h01":
+            raise OSError(errno.EIO, "Input/output error")
+        return read(path)
+
+    def create(frame: xr.Dataset, context: Any, *arguments: Any) -> Any:
+        if context.channel == "photon_532o":
+            raise OSError(errno.EIO, "Input/output error")
+        return created(frame, context, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", failing)
+        patch.setattr(scene, "create_product", create)
+        result = bring_up_to_date(campaign, options=Options(force=True))
+    assert "Input/output error" in str(result.failures)
+    assert made(result.record) == {"poor 1 signal analog"}
+    store = Store(campaign.catalog_url, campaign.name)
+    assert [checked for checked in verify_archive(campaign, store) if checked.problem] == []
+    store.close()
+    assert not bring_up_to_date(campaign).has_failures
+    assert _is_undisturbed(campaign, tmp_path)
 
 
 def test_a_forced_run_that_could_not_read_does_not_fail_the_runs_after_it(

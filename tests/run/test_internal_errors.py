@@ -15,6 +15,7 @@ from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
 from lidarops.catalog.store import Store
+from lidarops.catalog.verify import verify_archive
 from lidarops.cli import app
 from lidarops.process.scene import process_scene
 from lidarops.records import RunRecord
@@ -63,7 +64,9 @@ def test_a_bug_ends_its_scene_only_and_its_traceback_is_kept(
     assert found["traceback"].strip() in log.read_text()
     with Store(archive.write().catalog_url, "small") as store:
         assert store.internal_errors() == {SCENE: found["traceback"]}
-        assert {row["scene"] for row in store.products()} == OTHERS
+        # Products of other channels were complete before the bug.
+        assert {row["scene"] for row in store.products()} == {*OTHERS, SCENE}
+        assert not [file for file in verify_archive(archive.write(), store) if file.problem]
     page = Path(summary["report"]).read_text()
     assert "1 scene ended with an internal error" in page
     assert "in fit_with_a_bug" in page
