@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
-import miepython
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
+
+try:
+    import miepython
+except ModuleNotFoundError as error:
+    raise ImportError("scattering by spheres needs miepython: pip install lidarops[mie]") from error
 
 Array = NDArray[np.float64]
 
