@@ -59,11 +59,14 @@ class RawFormat:
     ) -> None:
         """Fill a row with the counts of a channel, the sum of those at its places."""
         self.read_counts(file, places[0], stretches, row)
+        if len(places) == 1:
+            return
+        total, further = row.astype(np.int64), np.empty_like(row)
         for place in places[1:]:
-            further = np.empty_like(row)
             self.read_counts(file, place, stretches, further)
-            # A sum beyond 32 bits stays above full scale.
-            row[:] = np.clip(row.astype(np.int64) + further, _INT32.min, _INT32.max)
+            total += further
+        # A sum beyond 32 bits stays above full scale.
+        row[:] = np.clip(total, _INT32.min, _INT32.max)
 
 
 @cache

@@ -79,6 +79,17 @@ def test_files_are_read_back_in_every_way(tmp_path, file):
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
+def test_memories_are_added_before_their_sum_is_limited(tmp_path):
+    header = new(datasets=[dataset()] * 3)
+    path = tmp_path / "file"
+    values = (2**31 - 1, 2, -3)
+    rows = [np.full(4, value, dtype=np.int32) for value in values]
+    counts = {one.name: row for one, row in zip(header.datasets, rows, strict=True)}
+    licel.write(path, header, counts)
+    with xr.open_dataset(path, engine="licel", mask_and_scale=False) as raw:
+        assert np.all(raw[memories(header.datasets)[0][0].name].values == sum(values))
+
+
 def new(**changes) -> licel.Header:
     start = datetime(2024, 10, 2, 17, 30, tzinfo=UTC)
     arguments = {
