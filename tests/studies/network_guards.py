@@ -90,7 +90,7 @@ VARIANTS: dict[str, list[Patch]] = {
         (_empirical_prior, "_can_test_prior", lambda *_: True),
     ],
     "noise bias": [(_block_errors, "noise_bias_variance", lambda *_: 0.0)],
-    "excluded fields": [(_block_errors, "excluded_field_variance", lambda *_: 0.0)],
+    "curved fields": [(_block_errors, "bent_fields", lambda at: np.zeros((1, len(at))))],
     "at least typical": [(_block_errors, "at_least_typical", lambda _, variance, *__: variance)],
     "curvature errors": [(_block_errors, "curvature_variance", lambda *_: 0.0)],
     "outlying bins": [(outlying_bins, "search", lambda *_: None)],

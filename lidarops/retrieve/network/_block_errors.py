@@ -1,10 +1,10 @@
 """Errors of extinction that the profiles of a block show together.
 
 In thin air a single profile shows little of its own error: amplified noise raises its logarithm of
-extinction, and the error computed there is too small. A field that the prior excludes shifts all
-profiles alike, and no profile can separate it from attenuation. The curvature of a signal within
-the bins of a fit is hidden by noise. The block shows all three: by the difference of profiles and
-their mean and by the median error, by what the mean leaves open without a prior, and by the median
+extinction, and the error computed there is too small. A field that deviates from the prior shifts
+all profiles alike, and no profile can separate it from attenuation. The curvature of a signal
+within the bins of a fit is hidden by noise. The block shows all three: by the difference of
+profiles and their mean and by the median error, by the mean without a prior, and by the median
 curvature. Values do not change here, only their errors.
 """
 
@@ -54,16 +54,30 @@ def bent_fields(position: Array) -> Array:
     return np.asarray(fields * (THRESHOLDS.bend / total if total > 0.0 else 0.0))
 
 
-def excluded_field_variance(block: BlockSolution, position: Array) -> Array:
-    """Return (profile, crossing) variances by curved fields that the prior excludes.
+def field_variance(block: BlockSolution, position: Array) -> Array:
+    """Return (profile, crossing) variances by the field, which the prior does not describe.
 
-    All profiles share such an error, so it is at most what the mean of the beams leaves
-    undetermined without a prior.
+    One field is no sample of many: errors are stated for one that deviates `doubt` times as much
+    as the prior states, and where nothing can contradict a prior, as much as the weakest one; and
+    that is curved by `bend`. All profiles share the field, so their median shift is at most what
+    their solutions differ from the mean of the beams without a prior, and the error of that mean.
+    A profile with fewer beams or more noise is shifted farther, as its prior has more weight.
+
+    Parameters
+    ----------
+    block : BlockSolution
+    position : (crossing, 3) float64
+        m.
     """
-    shifts = block.profiles.prior_response @ bent_fields(position).T
-    gap = block.free_mean.logarithm[0] - block.mean.logarithm[0]
-    allowed = block.free_mean.variance[0] + gap**2
-    return np.asarray(np.fmin((shifts**2).sum(axis=2), allowed))
+    solution, free = block.profiles, block.free_mean
+    weakest = max(THRESHOLDS.strengths[-1] / solution.prior.strength, THRESHOLDS.doubt)
+    factor = np.where(np.isfinite(free.variance[0]), THRESHOLDS.doubt, weakest)
+    bends = solution.prior_response @ bent_fields(position).T
+    expected = factor**2 * solution.prior_share + (bends**2).sum(axis=2)
+    gap = median(solution.logarithm) - free.logarithm[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        allowed = (free.variance[0] + gap**2) / median(expected)
+        return np.asarray(expected * np.fmin(allowed, 1.0))
 
 
 def at_least_typical(extinction: Array, variance: Array, usable: Booleans) -> Array:
@@ -87,18 +101,6 @@ def at_least_typical(extinction: Array, variance: Array, usable: Booleans) -> Ar
         large = typical > (THRESHOLDS.nonlinear_error * level) ** 2
         raised[alike] = np.maximum(variance[alike], np.where(large, typical, 0.0))
     return raised
-
-
-def prior_variance(block: BlockSolution) -> Array:
-    """Return (profile, crossing) variances by fields that deviate from the prior.
-
-    One field is no sample of many: errors are stated for one that deviates `doubt` times as much
-    as the prior states, and where nothing can contradict a prior, as much as the weakest one.
-    """
-    solution, free = block.profiles, block.free_mean
-    weakest = max(THRESHOLDS.strengths[-1] / solution.prior.strength, THRESHOLDS.doubt)
-    factor = np.where(np.isfinite(free.variance[0]), THRESHOLDS.doubt, weakest)
-    return np.asarray((factor**2 - 1.0) * solution.prior_share)
 
 
 def noise_bias_variance(block: BlockSolution) -> Array:

@@ -107,8 +107,8 @@ class NetworkResult:
     extinction_standard_error: Array
     """m-1. From noise, from the error of a straight-line fit where the signal is curved, from a
     field that deviates by twice the prior's standard deviation, or by four times the strongest
-    prior where the beams leave a crossing open, and from the bias that noise gives all profiles
-    of a block."""
+    prior where the beams leave a crossing open, as far as the mean of a block allows, and from the
+    bias that noise gives all profiles of a block."""
     flags: CrossingFlags
     near_crossing: Booleans
     """(crossing,) True where extinction is reported."""
@@ -261,9 +261,9 @@ def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> _E
         else:
             solved = solve_block(problem)
             solution = solved.profiles
-            variance = solution.variance + _block_errors.prior_variance(solved)
+            variance = solution.variance - solution.prior_share
+            variance = variance + _block_errors.field_variance(solved, problem.position)
             variance = variance + _block_errors.noise_bias_variance(solved)
-            variance = variance + _block_errors.excluded_field_variance(solved, problem.position)
             out.prior_contradicted[rows] = solved.contradicted
         curvature = _block_errors.curvature_variance(data, solution.carried)
         here = np.ix_(rows, np.flatnonzero(layout.measured))

@@ -414,7 +414,8 @@ def test_a_noisy_profile_does_not_change_the_others(factor):
     np.testing.assert_array_equal(result.flags.flagged[others], clean.flags.flagged[others])
     assert np.all(apart(result, clean)[others][kept[others]] < 0.05)
     ratio = result.extinction_standard_error / clean.extinction_standard_error
-    np.testing.assert_allclose(ratio[others][kept[others]], 1.0, rtol=0.02)
+    # The mean that limits the error by the prior has one profile fewer.
+    np.testing.assert_allclose(ratio[others][kept[others]], 1.0, rtol=0.05)
     selected = np.isfinite(result.extinction[3]) & ~result.flags.flagged[3]
     if factor > 50.0 or np.isnan(factor):
         assert not selected.any()

@@ -203,9 +203,12 @@ def layer(x, y, z):
 
 
 @pytest.mark.parametrize("step", [5.0, 2.0])
-@pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 4.0), (layer, 6.0)])
+@pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 4.2), (layer, 6.0)])
 def test_single_outlying_bins_in_curved_air_change_little(field, most, step):
-    """Lines from one to the next would remove the plume and raise the errors."""
+    """Lines from one to the next would remove the plume and raise the errors.
+
+    The ratio rose from below 4 when the errors of the clean signals became smaller.
+    """
     net = three_by_two()
     r = grid(net, step)
     power, variance = noisy(net, r, signals(net, r, field), 0.01, 60, 3, 0.003)
