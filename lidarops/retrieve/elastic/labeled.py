@@ -292,6 +292,7 @@ class _Means:
         self.noise, self.correlation_length = noise.variance, length
         counts = counts_per_power(averages, averages["shots"].to_numpy())
         self.exposure = None if counts is None else counts / (noise.excess * length)
+        self.quantum = _quantum(averages)
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
         self.partly = np.zeros(self.raw.shape, dtype=np.bool_)
@@ -336,7 +337,14 @@ class _Means:
             self.variance,
             molecular_attenuated=self.air.shape,
             contrast=self.contrast,
+            quantum=self.quantum,
         )
+
+
+def _quantum(averages: xr.Dataset) -> npt.ArrayLike:
+    """Return the power of a single count in a bin of each mean, (time,); 0 of analog records."""
+    counts = counts_per_power(averages, averages["shots"].to_numpy(), glued=True)
+    return 0.0 if counts is None else 1.0 / counts
 
 
 def _signal_and_clouds(

@@ -67,15 +67,17 @@ def find_layers(
     Let :math:`\rho = \sum P / \sum \phi` be the ratio of the power to the molecular shape in two
     adjoining windows, below and above a bin. The bin is a base where
 
-    .. math:: \frac{\rho_+ - c \rho_-}{\sqrt{\sigma_+^2 + c^2 \sigma_-^2}} > t
+    .. math:: \frac{\rho_+ - \rho_-}{\sqrt{\sigma_+^2 + \sigma_-^2}} > t, \qquad
+       \frac{\rho_+ - c \rho_-}{\sqrt{\sigma_+^2 + c^2 \sigma_-^2}} > u
 
-    for at least one length of the windows. This tests the hypothesis that the ratio rises by no
-    more than the factor :math:`c`. If that holds everywhere, whatever the aerosol, a profile is
-    flagged with a probability below the false-alarm rate, because :math:`t` is the
-    quantile of the normal distribution for that rate over the number of bins and lengths
-    (Bonferroni bound), times the factor by which the noise of means over :math:`L` bins exceeds
-    the stated one in the far half of the profile, with two standard errors
-    (`lidarops.retrieve.signal.noise_correlation`).
+    for at least one length of the windows. Noise may rise in any bin: :math:`t` is the quantile of
+    the normal distribution for the false-alarm rate over the number of bins and lengths
+    (Bonferroni bound). An edge of aerosol is in one place, where noise may decide beside it as
+    well: :math:`u` is the quantile for half the rate over the number of lengths. So a profile of
+    air, and one with an edge of aerosol that rises by :math:`c`, are flagged with a probability
+    of the false-alarm rate at most. Both are multiplied by the factor by which the noise of means
+    over :math:`L` bins exceeds the stated one in the far half of the profile, with four standard
+    errors (`lidarops.retrieve.signal.noise_correlation`).
     The base is where the statistic peaks. The top is where the mean of the next window is again
     within 2 standard errors of the level below the base.
 
@@ -130,10 +132,10 @@ def find_layers(
     step = float(np.median(np.diff(grid.values))) if grid.size > 1 else 1.0
     # A window has at least two bins.
     lengths = np.unique(np.maximum(np.rint(np.array(THRESHOLDS.window_lengths) / step), 2.0))
-    rate = false_alarm / (grid.size * lengths.size)
+    anywhere, at_an_edge = -ndtri(false_alarm / lengths.size / np.array([grid.size, 2.0]))
     mask = np.zeros(rows.shape, dtype=np.bool_)
     values = rows.astype(np.float64, copy=False)
-    limits = -float(ndtri(rate)) * _excess_noise(values, noise, lengths)
+    limits = anywhere * _excess_noise(values, noise, lengths)
     margins = skewness_margin(limits) * np.reshape(quantum, (-1, 1))
     _mark_layers(
         frozen(values),
@@ -141,6 +143,7 @@ def find_layers(
         frozen(shape),
         lengths.astype(np.int64),
         float(contrast),
+        at_an_edge / anywhere,
         frozen(limits),
         frozen(margins),
         mask,
@@ -153,8 +156,8 @@ def _excess_noise(power: Array, variance: Array, lengths: Array) -> Array:
     """Return the noise of means over each length relative to the stated one, (profile, length)."""
     noise = estimate_noise_correlation(power, variance)
     of_means = noise.excess[:, np.newaxis] * noise.variance_of_means(lengths)
-    # A second standard error: noise that is estimated too small by chance makes layers.
-    return np.asarray(np.sqrt(of_means * (1.0 + noise.relative_error[:, np.newaxis])))
+    # Three standard errors more: noise that is estimated too small by chance makes layers.
+    return np.asarray(np.sqrt(of_means * (1.0 + 3.0 * noise.relative_error[:, np.newaxis])))
 
 
 @_compiled
@@ -191,10 +194,13 @@ def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
 
 
 @_compiled
-def _rise(sums: Array, i: int, length: int, contrast: float, margin: float) -> float:
+def _rise(
+    sums: Array, i: int, length: int, contrast: float, certainty: float, limit: float, margin: float
+) -> float:
     """Return by how many standard errors the rise of the ratio to air exceeds `contrast`.
 
-    The sum above is taken to be less by `margin`.
+    0 where no layer begins: the rise is within `limit` standard errors, or exceeds `contrast` by
+    less than the share `certainty` of them. The sum above is taken to be less by `margin`.
     """
     first, stop = i - length, i + length
     if first < 0 or stop >= sums.shape[1]:
@@ -206,11 +212,16 @@ def _rise(sums: Array, i: int, length: int, contrast: float, margin: float) -> f
         return 0.0
     low, low_variance = _mean(sums, first, i)
     high, high_variance = _mean(sums, i, stop)
-    excess = high - contrast * low - margin / (sums[SHAPE, i] - sums[SHAPE, stop])
-    variance = high_variance + contrast * contrast * low_variance
+    high -= margin / (sums[SHAPE, i] - sums[SHAPE, stop])
+    if not high - low >= limit * math.sqrt(high_variance + low_variance):
+        return 0.0
+    excess = high - contrast * low
     if not excess > _ROUNDING * high:
         return 0.0
-    return excess / math.sqrt(variance) if variance > 0.0 else HUGE
+    error = math.sqrt(high_variance + contrast * contrast * low_variance)
+    if excess < certainty * limit * error:
+        return 0.0
+    return excess / error if error > 0.0 else HUGE
 
 
 @_compiled
@@ -220,7 +231,8 @@ def _steepest(
     reach: int,
     lengths: npt.NDArray[np.int64],
     contrast: float,
-    thresholds: Array,
+    certainty: float,
+    limits: Array,
     margins: Array,
 ) -> tuple[int, int]:
     """Return the bin of the steepest rise for the shortest window that shows it, and its length."""
@@ -228,10 +240,10 @@ def _steepest(
     for k, length in enumerate(lengths):
         best, highest = start, 0.0
         for i in range(start, stop):
-            rise = _rise(sums, i, length, contrast, margins[k])
+            rise = _rise(sums, i, length, contrast, certainty, limits[k], margins[k])
             if rise > highest:
                 best, highest = i, rise
-        if highest >= thresholds[k]:
+        if highest > 0.0:
             break
     return best, length
 
@@ -242,14 +254,15 @@ def _next_base(
     start: int,
     lengths: npt.NDArray[np.int64],
     contrast: float,
-    thresholds: Array,
+    certainty: float,
+    limits: Array,
     margins: Array,
 ) -> tuple[int, int]:
     """Return the bin where the next layer begins and the window length that shows it; or -1."""
     for i in range(start, sums.shape[1] - 1):
         for k, length in enumerate(lengths):
-            if _rise(sums, i, length, contrast, margins[k]) >= thresholds[k]:
-                return _steepest(sums, i, length, lengths, contrast, thresholds, margins)
+            if _rise(sums, i, length, contrast, certainty, limits[k], margins[k]) > 0.0:
+                return _steepest(sums, i, length, lengths, contrast, certainty, limits, margins)
     return -1, 0
 
 
@@ -272,7 +285,8 @@ def _mark_layers(
     shape: Array,
     lengths: npt.NDArray[np.int64],
     contrast: float,
-    thresholds: Array,
+    certainty: float,
+    limits: Array,
     margins: Array,
     layers: Mask,
 ) -> None:
@@ -286,10 +300,12 @@ def _mark_layers(
         Bins that are averaged below and above a base, ascending.
     contrast : float
         Least factor by which the ratio to air rises.
-    thresholds : (profile, scale) float64
-        Standard errors by which the rise exceeds that factor.
+    certainty : float
+        Share of `limits` by which the rise exceeds that factor.
+    limits : (profile, scale) float64
+        Standard errors of the rise.
     margins : (profile, scale) float64
-        Sums of power above a base by which it exceeds it further.
+        Sums of power above a base that are subtracted there.
     layers : (profile, bin) bool
         Output, False before.
     """
@@ -299,7 +315,9 @@ def _mark_layers(
         _accumulate(power[k], noise, air, sums)
         end = 0
         while True:
-            base, length = _next_base(sums, end, lengths, contrast, thresholds[k], margins[k])
+            base, length = _next_base(
+                sums, end, lengths, contrast, certainty, limits[k], margins[k]
+            )
             if base < 0:
                 break
             end = _end(sums, base, length)

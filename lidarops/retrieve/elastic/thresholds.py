@@ -29,7 +29,7 @@ class Thresholds:
     which the signal may change across a bin. Assumed."""
 
     # Clouds
-    window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0)
+    window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0, 960.0)
     """m; in which signals are averaged below and above a base. Assumed."""
     cloud_false_alarm: float = 0.001
     """Probability of a false cloud in a profile. Required of the product."""

@@ -39,7 +39,9 @@ class PartCells:
 
 
 def cloud_contrast(wavelength: float) -> float:
-    """Return the least contrast of a cloud; aerosol over air scales with lambda^3.
+    """Return the least contrast of a cloud, that of the same aerosol at each wavelength.
+
+    Over air, aerosol of an Angstrom exponent of 1 scales with lambda^3.
 
     Parameters
     ----------
@@ -47,8 +49,7 @@ def cloud_contrast(wavelength: float) -> float:
         m.
     """
     scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
-    contrast = 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
-    return max(contrast, THRESHOLDS.least_cloud_contrast)
+    return 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
 
 
 def skewness_margin(quantile: Array | float) -> Array:

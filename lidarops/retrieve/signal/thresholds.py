@@ -36,9 +36,7 @@ class Thresholds:
     found."""
     cloud_contrast: float = 3.0
     """Factor of the rise at a cloud, at 532 nm. The scattering ratio of aerosol rarely rises by
-    this factor within 500 m, that of thin cirrus does. Assumed."""
-    least_cloud_contrast: float = 2.0
-    """The same at short wavelengths, where air scatters more. Assumed."""
+    this factor within 1 km, that of thin cirrus does. Assumed."""
     screening_false_alarm: float = 0.001
     """Probability that noise makes a part of a mean outlying. Required of the product."""
 

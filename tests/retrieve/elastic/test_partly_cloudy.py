@@ -150,7 +150,7 @@ def test_a_cloud_in_all_profiles_is_no_partial_one():
 
 def test_few_counts_need_the_same_margin_whatever_the_overlap():
     """Cirrus of a few counts in a cell: a factor on the signal decides nothing."""
-    signals = [0.3 * light(HAZE, CIRRUS if k % 2 else 0.0) for k in range(10 * PROFILES)]
+    signals = [0.2 * light(HAZE, CIRRUS if k % 2 else 0.0) for k in range(10 * PROFILES)]
     means = averages(profiles(signals))
     fractions = [
         retrieved(means, overlap)["cloud_fraction"].to_numpy()
