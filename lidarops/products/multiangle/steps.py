@@ -23,6 +23,7 @@ from lidarops.products.multiangle.baseline import BASELINE, Baseline, with_basel
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
 from lidarops.records import Granule
+from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
@@ -137,7 +138,7 @@ def _beams(pointings: Numbers, bounds: Numbers, step: float, highest: float) -> 
         return Beams(0, low, sides_known, 2 * _HALF_TURN, surround=False)
     scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
     tilted = scan.tilted_azimuths
-    free = math.degrees(slant_paths.widest_azimuth_gap(tilted))
+    free = math.degrees(widest_azimuth_gap(tilted))
     angles = directions.zenith_angle[up]
     profiles = np.flatnonzero(np.isin(directions.index, up))
     seen = np.unique(np.stack([cycle[profiles], directions.index[profiles]]), axis=1)[0]

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -130,20 +131,6 @@ def surrounds_zenith(azimuth: Array) -> bool:
         radian; only of beams that are not vertical.
     """
     return widest_azimuth_gap(azimuth) <= np.pi + _OPPOSITE
-
-
-def widest_azimuth_gap(azimuth: Array) -> float:
-    """Return the widest range of azimuths without a beam, radian.
-
-    Parameters
-    ----------
-    azimuth : (angle,) float
-        radian; only of beams that are not vertical.
-    """
-    if azimuth.size == 0:
-        return 2.0 * np.pi
-    ordered = np.sort(np.mod(azimuth, 2.0 * np.pi))
-    return float(np.max(np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))))
 
 
 def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:
