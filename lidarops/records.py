@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -282,8 +281,19 @@ class Grade(StrEnum):
     NONE = "none"
     """The same values and texts; the old file stays."""
     MINOR = "minor"
-    """Texts, or values within a tenth of their stated errors."""
+    """Texts, flags, or values within a tenth of their stated errors."""
     MAJOR = "major"
+
+
+class Measure(StrEnum):
+    """What a difference is divided by."""
+
+    ERROR = "standard error"
+    """Of values that state one."""
+    OF_ERROR = "share of the standard error"
+    """Of an error itself, and of its parts: the standard error of the quantity."""
+    SIZE = "share of the value"
+    """Of values without a stated error: their size, or the usual one of the variable if larger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,38 +302,31 @@ class Change:
 
     grade: Grade
     largest: float
-    """Largest difference: of values over their standard error, or relative where none is stated.
-    Infinite where values or variables came or went."""
+    """Largest difference of values that are in both, in units of `measure`."""
     variable: str
-    """Of the largest difference; empty without one."""
+    """Of the largest difference; without one, in which values came or went."""
     share: float
     """Share of the values that differ."""
     causes: tuple[str, ...]
     """Inputs, settings, steps and software that differ."""
+    measure: Measure = Measure.ERROR
+    lost: int = 0
+    """Number of values that are missing or rejected in only one of both."""
+    flags: int = 0
+    """Number of flags and states that differ."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain JSON types; None for an infinite difference."""
+        """Return plain JSON types."""
         return {
             "grade": self.grade.value,
-            "largest": self.largest if math.isfinite(self.largest) else None,
+            "largest": self.largest,
+            "measure": self.measure.value,
             "variable": self.variable,
             "share": self.share,
+            "came_or_went": self.lost,
+            "other_flags": self.flags,
             "causes": list(self.causes),
         }
-
-    @property
-    def words(self) -> str:
-        """The difference as a phrase."""
-        if self.grade is Grade.NONE:
-            return "the same"
-        if not self.variable:
-            return "the same values, other texts"
-        size = (
-            f"up to {self.largest:.2g} standard errors"
-            if math.isfinite(self.largest)
-            else ("values that came, went or have other bits")
-        )
-        return f"{size} in {self.variable}; {100.0 * self.share:.2g} % of the values"
 
 
 @dataclass(frozen=True, slots=True)

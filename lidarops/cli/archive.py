@@ -434,9 +434,11 @@ def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
 
 def _show_changes(result: Result) -> None:
     """Print how products differ from those that they replace, and frozen ones that would."""
+    from lidarops.figures.wording import change_in_words
+
     scenes = () if result.record is None else result.record.scenes
     rows = (
-        (product.path, change.grade.value, change.words, "; ".join(change.causes))
+        (product.path, change.grade.value, change_in_words(change), "; ".join(change.causes))
         for scene in scenes
         for product in scene.products
         for change in [product.change]

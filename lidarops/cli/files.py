@@ -122,11 +122,12 @@ def compare(
 ) -> None:
     """Show how a product differs from another version of it, and why. Exit code 0 if it does not.
 
-    none: the same values and texts; minor: other texts, or values within a tenth of their stated
-    errors; major: all else.
+    none: the same values and texts. minor: other texts or flags, or values within a tenth of their
+    stated errors. major: all else.
 
     Example: lidarops compare OLD.nc NEW.nc
     """
+    from lidarops.figures.wording import change_in_words
     from lidarops.netcdf.comparison import compare_products
     from lidarops.records import Grade
 
@@ -134,7 +135,7 @@ def compare(
     if as_json:
         typer.echo(json.dumps(change.as_dict(), indent=2))
     else:
-        typer.echo(f"{change.grade.value}: {change.words}")
+        typer.echo(f"{change.grade.value}: {change_in_words(change)}")
         for cause in change.causes:
             typer.echo(f"  {cause}")
     exit_with_status(failed=change.grade is not Grade.NONE)

@@ -6,10 +6,12 @@ import math
 import unicodedata
 from typing import TYPE_CHECKING, Final
 
+from lidarops.records import Grade, Measure
+
 if TYPE_CHECKING:
     import numpy as np
 
-    from lidarops.records import Verdicts
+    from lidarops.records import Change, Verdicts
 
 _REORDERING: Final = frozenset(
     "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
@@ -37,6 +39,28 @@ def verdicts_in_words(verdicts: Verdicts) -> str:
         return "no value"
     named = zip(verdicts._fields, verdicts, strict=True)
     return ", ".join(f"{percent(count / verdicts.values)} {word}" for word, count in named)
+
+
+def change_in_words(change: Change) -> str:
+    """Return how a product differs from the one that it replaces, as a phrase."""
+    if change.grade is Grade.NONE:
+        return "the same"
+    if not change.share:
+        return "the same values, other texts"
+    words = [f"{counted(change.lost, 'value')} came or went"] if change.lost else []
+    if change.largest:
+        words.append(f"up to {_measured(change)} in {change.variable}")
+    if change.flags:
+        words.append(f"{counted(change.flags, 'flag')} differ{'s' if change.flags == 1 else ''}")
+    return "; ".join([*words, f"{percent(change.share)} of the values differ"])
+
+
+def _measured(change: Change) -> str:
+    """Return the largest difference with what it is measured in."""
+    if change.measure is Measure.ERROR:
+        return f"{change.largest:.2g} standard errors"
+    of = "standard error" if change.measure is Measure.OF_ERROR else "value"
+    return f"{100.0 * change.largest:.2g} % of the {of}"
 
 
 def size(count: float) -> str:

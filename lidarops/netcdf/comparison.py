@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,9 +14,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
+from lidarops.flags import Severity
 from lidarops.netcdf.provenance import read_provenance
-from lidarops.netcdf.variables import PROVENANCE
-from lidarops.records import Change, Grade
+from lidarops.netcdf.variables import PROVENANCE, USABLE
+from lidarops.records import Change, Grade, Measure
 
 MINOR: Final = 0.1
 """Largest difference of a minor change, in standard errors: an interval of 95 % that is off by it
@@ -32,8 +34,22 @@ _BLOCK: Final = 1 << 26
 """Bytes of a variable that are compared at a time."""
 _MOST_CAUSES: Final = 20
 _ERROR: Final = "_standard_error"
+_SAME: Final = ("kind", "station", "instrument", "channel", "scene")
+"""Attributes ``lidarops_...`` that versions of a product share."""
 
-Values = NDArray[Any]
+
+@dataclass(frozen=True, slots=True)
+class _Difference:
+    """How a variable differs."""
+
+    variable: str
+    count: int
+    """Number of values that differ."""
+    lost: int = 0
+    """Number of those that are missing or rejected in only one of both."""
+    flags: int = 0
+    largest: float = 0.0
+    measure: Measure = Measure.SIZE
 
 
 def compare_products(old: Path, new: Path) -> Change:
@@ -50,12 +66,13 @@ def compare_products(old: Path, new: Path) -> Change:
         None where values and texts are the same, apart from those that state how and when a
         product was made; minor where all values are within `MINOR` standard errors of `old`, or
         within that share of their size where no error is stated, and the same values are missing
-        and rejected.
+        and rejected. Values that are rejected in both are not measured, and other flags of a
+        value are counted only.
 
     Raises
     ------
     ProductError
-        If a file cannot be read, or is no product.
+        If a file cannot be read, is no product, or is another product.
     """
     causes = tuple(_causes(_making(old), _making(new)))
     try:
@@ -63,62 +80,126 @@ def compare_products(old: Path, new: Path) -> Change:
             xr.open_dataset(old, engine="netcdf4", decode_cf=False, cache=False) as before,
             xr.open_dataset(new, engine="netcdf4", decode_cf=False, cache=False) as after,
         ):
-            differences = dict(_differences(before, after))
+            _refuse_another(before, after, new)
+            differences = [d for d in _differences(before, after) if d.count or d.lost]
             same_texts = _texts(before) == _texts(after)
-            values = sum(before[name].size for name in _measured(before))
+            sizes = {name: part[name].size for part in (before, after) for name in _measured(part)}
     # The type of HDF5's error depends on the place of the damage.
     except (OSError, RuntimeError, ValueError) as error:
         raise ProductError(f"cannot be compared with {old}: {error}", file=new) from error
-    largest = max((size for size, _ in differences.values()), default=0.0)
-    variable = next((name for name, (size, _) in differences.items() if size == largest), "")
-    changed = sum(count for _, count in differences.values())
-    grade = Grade.MAJOR if largest > MINOR else Grade.MINOR
+    most = max(differences, key=lambda d: d.largest, default=_Difference("", 0))
+    lost = sum(d.lost for d in differences)
+    first_lost = next((d.variable for d in differences if d.lost), "")
+    grade = Grade.MAJOR if lost or most.largest > MINOR else Grade.MINOR
     if not differences and same_texts:
         grade = Grade.NONE
-    return Change(grade, largest, variable, changed / values if values else 0.0, causes)
+    return Change(
+        grade,
+        most.largest,
+        most.variable if most.largest else first_lost,
+        sum(d.count for d in differences) / max(sum(sizes.values()), 1),
+        causes,
+        measure=most.measure,
+        lost=lost,
+        flags=sum(d.flags for d in differences),
+    )
+
+
+def _refuse_another(before: xr.Dataset, after: xr.Dataset, new: Path) -> None:
+    for name in (f"lidarops_{word}" for word in _SAME):
+        states = [str(product.attrs.get(name, "")) for product in (before, after)]
+        if states[0] != states[1]:
+            raise ProductError(
+                f"is {states[1]!r}, not {states[0]!r} as in the older file",
+                file=new,
+                field=name,
+                remedy="compare two versions of one product",
+            )
 
 
 def _measured(product: xr.Dataset) -> list[str]:
     """Return the variables whose values are compared."""
-    return [str(name) for name in product.variables if name != PROVENANCE.name]
+    return [str(name) for name, array in product.variables.items() if array.dtype.kind in "if"]
 
 
 def _texts(product: xr.Dataset) -> Mapping[str, Any]:
-    """Return the attributes that state what a product holds."""
+    """Return the texts and attributes that state what a product holds."""
     own = {key: value for key, value in product.attrs.items() if key not in _MAKING}
-    owners = {"": own, **{name: product[name].attrs for name in _measured(product)}}
-    return {
+    names = [str(name) for name in product.variables if name != PROVENANCE.name]
+    owners = {"": own, **{name: product[name].attrs for name in names}}
+    attributes = {
         f"{owner}:{key}": np.asarray(value).tolist()
         for owner, attributes in owners.items()
         for key, value in attributes.items()
     }
+    texts = {name: product[name].values.tolist() for name in set(names) - {*_measured(product)}}
+    return {**attributes, **texts}
 
 
-def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[tuple[str, tuple[float, int]]]:
-    """Yield the variables that differ, with the largest difference and the number of values."""
+def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
+    """Yield the differences of all variables."""
     names = _measured(old)
     for name in sorted(set(names) ^ set(_measured(new))):
-        yield name, (math.inf, old[name].size if name in old.variables else 0)
+        size = (old if name in old.variables else new)[name].size
+        yield _Difference(name, size, lost=size)
+    quantities = dict(_quantities(old))
     for name in names:
         if name not in new.variables:
             continue
         before, after = old[name].variable, new[name].variable
         if (before.shape, before.dtype) != (after.shape, after.dtype):
-            yield name, (math.inf, before.size)
+            size = max(before.size, after.size)
+            yield _Difference(name, size, lost=size)
             continue
-        error = old[name + _ERROR].variable if name + _ERROR in old.variables else None
-        pieces = [
-            _difference(
-                before[part].values,
-                after[part].values,
-                None if error is None or error.shape != before.shape else error[part].values,
-                before.attrs.get("_FillValue"),
-            )
-            for part in _parts(before)
-        ]
-        count = sum(number for _, number in pieces)
-        if count:
-            yield name, (max(size for size, _ in pieces), count)
+        count = sum(int(_differs(before, after, part).sum()) for part in _parts(before))
+        if name in before.dims:
+            # Values of another place or time.
+            yield _Difference(name, count, lost=count)
+        elif name == USABLE:
+            # What it changes is counted as lost values, or as flags of quality_flag.
+            yield _Difference(name, count)
+        elif "flag_meanings" in before.attrs:
+            yield _Difference(name, count, flags=count)
+        else:
+            yield _difference(old, new, name, quantities.get(name, name), count)
+
+
+def _quantities(product: xr.Dataset) -> Iterator[tuple[str, str]]:
+    """Yield the variables that hold an error, with the quantity that it is of."""
+    names = _measured(product)
+    # The longest name comes last, and counts.
+    for quantity in sorted((name for name in names if name + _ERROR in names), key=len):
+        for name in names:
+            is_error = name.startswith(f"{quantity}_") and "error_kind" in product[name].attrs
+            if is_error and product[name].shape == product[quantity].shape:
+                yield name, quantity
+
+
+def _difference(
+    old: xr.Dataset, new: xr.Dataset, name: str, quantity: str, count: int
+) -> _Difference:
+    """Return how a variable differs that holds a quantity, or one of the errors of a quantity."""
+    before, after = old[name].variable, new[name].variable
+    error = old.variables.get(f"{quantity}{_ERROR}")
+    measure = Measure.SIZE
+    if error is not None:
+        measure = Measure.ERROR if name == quantity else Measure.OF_ERROR
+    usual = _usual(before) if count else 0.0
+    lost, largest = 0, 0.0
+    for part in _parts(before):
+        stated, now_stated = (_stated(product, quantity, part) for product in (old, new))
+        if name == quantity:
+            lost += int(np.count_nonzero(stated != now_stated))
+        both = stated & now_stated
+        then, now = (_numbers(variable, part)[both] for variable in (before, after))
+        scale = np.maximum(np.abs(then), usual)
+        if error is not None:
+            errors = _numbers(error, part)[both]
+            scale = np.where(errors > 0.0, errors, scale)
+        scale = np.where(scale > 0.0, scale, np.abs(now))
+        moved = np.abs(now - then)
+        largest = max(largest, float(np.max(moved[moved > 0.0] / scale[moved > 0.0], initial=0.0)))
+    return _Difference(name, count, lost=lost, largest=largest, measure=measure)
 
 
 def _parts(variable: xr.Variable) -> Iterator[Any]:
@@ -131,33 +212,41 @@ def _parts(variable: xr.Variable) -> Iterator[Any]:
         yield slice(first, first + rows)
 
 
-def _difference(old: Values, new: Values, error: Values | None, fill: object) -> tuple[float, int]:
-    """Return the largest difference of some values, and the number of values that differ."""
-    if old.dtype.kind not in "if":
-        count = int(np.count_nonzero(old != new))
-        return (math.inf if count else 0.0), count
-    missing, now_missing = ((_missing(values, fill)) for values in (old, new))
-    differs = (old != new) & ~(missing & now_missing)
-    count = int(np.count_nonzero(differs))
-    if not count:
-        return 0.0, 0
-    if old.dtype.kind == "i" or (missing != now_missing)[differs].any():
-        # Bits and counts have no size; values came or went.
-        return math.inf, count
-    before, after = (np.float64(values[differs]) for values in (old, new))
-    if not (np.isfinite(before) & np.isfinite(after)).all():
-        # The distance from an infinite bound has no size: inf / inf is NaN.
-        return math.inf, count
-    scale = np.abs(before)
-    if error is not None:
-        scale = np.where(_missing(error, fill)[differs], scale, np.float64(error[differs]))
-    with np.errstate(divide="ignore"):
-        return float(np.max(np.abs(after - before) / scale)), count
+def _differs(before: xr.Variable, after: xr.Variable, part: Any) -> NDArray[np.bool_]:
+    """Return which values of a part differ."""
+    missing, now_missing = (_missing(variable, part) for variable in (before, after))
+    differs: NDArray[np.bool_] = before[part].values != after[part].values
+    return differs & ~(missing & now_missing)
 
 
-def _missing(values: Values, fill: object) -> NDArray[np.bool_]:
-    unknown = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, np.bool_)
+def _missing(variable: xr.Variable, part: Any) -> NDArray[np.bool_]:
+    values = variable[part].values
+    unknown: NDArray[np.bool_] = np.isnan(values)
+    fill = variable.attrs.get("_FillValue")
     return unknown if fill is None else unknown | (values == fill)
+
+
+def _stated(product: xr.Dataset, name: str, part: Any) -> NDArray[np.bool_]:
+    """Return which values of a part are finite, not missing and not rejected."""
+    variable = product[name].variable
+    stated: NDArray[np.bool_] = ~_missing(variable, part) & np.isfinite(variable[part].values)
+    usable = product.variables.get(USABLE)
+    if usable is None or usable.dims != variable.dims:
+        return stated
+    kept: NDArray[np.bool_] = usable[part].values != int(Severity.REJECT)
+    return stated & kept
+
+
+def _numbers(variable: xr.Variable, part: Any) -> NDArray[np.float64]:
+    """Return the values of a part, 0 where they are missing."""
+    values = np.asarray(variable[part].values, np.float64)
+    return np.where(_missing(variable, part) | ~np.isfinite(values), 0.0, values)
+
+
+def _usual(variable: xr.Variable) -> float:
+    """Return the root mean square of a variable."""
+    total = sum(float(np.sum(_numbers(variable, part) ** 2)) for part in _parts(variable))
+    return math.sqrt(total / max(variable.size, 1))
 
 
 def _making(file: Path) -> dict[str, dict[str, str]]:

@@ -8,7 +8,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
-from lidarops.figures.wording import counted, decided_on, duration, percent, verdicts_in_words
+from lidarops.figures.wording import (
+    change_in_words,
+    counted,
+    decided_on,
+    duration,
+    percent,
+    verdicts_in_words,
+)
 from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
@@ -124,7 +131,7 @@ def changes(record: RunRecord) -> list[ChangeRow]:
                 f"{product.kind} {product.channel}",
                 product.stamp.version,
                 change.grade.value,
-                change.words,
+                change_in_words(change),
                 "; ".join(change.causes),
             ),
         )

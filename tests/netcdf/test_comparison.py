@@ -14,13 +14,15 @@ import pytest
 import xarray as xr
 from support.products.damaged_products import damage_values
 from support.products.encoded_products import build_product
-from support.products.made_products import context, homogeneous, provenance, visibility
+from support.products.made_products import context, elastic, homogeneous, provenance, visibility
 
 from lidarops.errors import ProductError
+from lidarops.figures.wording import change_in_words
+from lidarops.flags import Quality
 from lidarops.netcdf import sizes
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.write import write_product
-from lidarops.records import Change, Grade, InputRecord, Role, Stamp
+from lidarops.records import Change, Grade, InputRecord, Measure, Role, Stamp
 
 NAME = "total_extinction"
 
@@ -64,7 +66,7 @@ def test_the_grade_goes_by_the_stated_error(errors: float, grade: Grade, tmp_pat
     assert change.variable == NAME
     assert change.largest == pytest.approx(abs(errors), rel=1e-3)
     with xr.open_dataset(tmp_path / "old.nc", decode_cf=False) as old:
-        sizes = [array.size for name, array in old.variables.items() if name != "provenance"]
+        sizes = [array.size for array in old.variables.values() if array.dtype.kind in "if"]
     assert change.share == pytest.approx(1 / sum(sizes))
 
 
@@ -74,9 +76,99 @@ def test_a_value_that_goes_is_major(tmp_path: Path):
         data["quality_flag"][2, 1] = 1
 
     change = compared(tmp_path, lose)
-    assert change.grade is Grade.MAJOR
-    assert math.isinf(change.largest)
-    assert change.as_dict()["largest"] is None
+    assert (change.grade, change.variable, change.largest) == (Grade.MAJOR, NAME, 0.0)
+    assert change.lost
+    assert change_in_words(change).startswith(f"{change.lost} values came or went; ")
+
+
+def changed_elastic(folder: Path, name: str, value: float) -> Change:
+    """Return how a product differs in which one good bin has another value of a variable."""
+    files = [written(folder / file, elastic(), kind="elastic") for file in ("old.nc", "new.nc")]
+    with netCDF4.Dataset(files[0], "a") as product:
+        # No error term is zero in the made product.
+        product["aerosol_backscatter_error_lidar_ratio"][2, 10] = 0.0
+    with netCDF4.Dataset(files[1], "a") as product:
+        product["aerosol_backscatter_error_lidar_ratio"][2, 10] = 0.0
+        product[name][2, 10] = value
+    return compare_products(*files)
+
+
+@pytest.mark.parametrize(("share", "grade"), [(1e-3, Grade.MINOR), (0.3, Grade.MAJOR)])
+def test_a_term_of_the_error_that_was_zero_is_judged_by_the_error(
+    share: float, grade: Grade, tmp_path: Path
+):
+    """Its relative change is infinite, and means nothing."""
+    with xr.open_dataset(
+        written(tmp_path / "whole.nc", elastic(), kind="elastic"), decode_cf=False
+    ) as whole:
+        error = float(whole["aerosol_backscatter_standard_error"][2, 10])
+    name = "aerosol_backscatter_error_lidar_ratio"
+    change = changed_elastic(tmp_path, name, share * error)
+    assert (change.grade, change.variable, change.lost) == (grade, name, 0)
+    assert change.measure is Measure.OF_ERROR
+    assert change.largest == pytest.approx(share, rel=1e-3)
+    assert f"up to {100 * share:.2g} % of the standard error in {name}" in change_in_words(change)
+
+
+def test_another_caring_bit_is_counted_and_the_values_are_measured(tmp_path: Path):
+    def change(data: xr.Dataset) -> None:
+        data["quality_flag"][2, 1] = Quality.OUTLIER
+        shift(0.05, (3, 1))(data)
+
+    found = compared(tmp_path, change)
+    assert (found.grade, found.variable, found.flags, found.lost) == (Grade.MINOR, NAME, 1, 0)
+    assert found.largest == pytest.approx(0.05, rel=1e-3)
+    assert "; 1 flag differs; " in change_in_words(found)
+
+
+def test_a_rejecting_bit_leaves_the_other_values_measured(tmp_path: Path):
+    def change(data: xr.Dataset) -> None:
+        data["quality_flag"][2, 1] = Quality.INCOMPLETE_OVERLAP
+        shift(0.05, (3, 1))(data)
+
+    found = compared(tmp_path, change)
+    assert found.grade is Grade.MAJOR
+    assert found.lost
+    assert found.largest == pytest.approx(0.05, rel=1e-3)
+
+
+def test_values_that_are_rejected_in_both_are_not_measured(tmp_path: Path):
+    old, new = homogeneous(), homogeneous()
+    for data in (old, new):
+        data["quality_flag"][2, 1] = Quality.INCOMPLETE_OVERLAP
+    shift(9.0)(new)
+    change = compare_products(written(tmp_path / "old.nc", old), written(tmp_path / "new.nc", new))
+    assert (change.grade, change.largest) == (Grade.MINOR, 0.0)
+    assert change.share > 0.0
+
+
+def test_without_a_stated_error_the_difference_is_a_share_of_the_value(tmp_path: Path):
+    def change(data: xr.Dataset) -> None:
+        data["reduced_chi2"] *= 1.5
+
+    found = compared(tmp_path, change)
+    assert (found.grade, found.measure) == (Grade.MAJOR, Measure.SIZE)
+    assert "up to 50 % of the value in reduced_chi2" in change_in_words(found)
+
+
+def test_values_of_another_time_are_major(tmp_path: Path):
+    """An hour is a small share of the seconds since 1970."""
+    files = [written(tmp_path / name, homogeneous()) for name in ("old.nc", "new.nc")]
+    with netCDF4.Dataset(files[1], "a") as product:
+        product["time"][:] += 3600.0
+    assert compare_products(*files).grade is Grade.MAJOR
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"station_key": "other"}, "lidarops_station"),
+        ({"instrument_key": "other"}, "lidarops_instr"),
+    ],
+)
+def test_another_product_is_refused(changes: dict[str, Any], field: str, tmp_path: Path):
+    with pytest.raises(ProductError, match=field):
+        compared(tmp_path, **changes)
 
 
 @pytest.mark.parametrize("bound", [math.inf, -math.inf])
@@ -92,8 +184,7 @@ def test_a_bound_that_becomes_infinite_or_finite_is_major(
     with netCDF4.Dataset(files[changed], "a") as product:
         product[name][2, 1] = bound
     change = compare_products(*files)
-    assert (change.grade, change.variable) == (Grade.MAJOR, name)
-    assert math.isinf(change.largest)
+    assert (change.grade, change.variable, change.lost) == (Grade.MAJOR, name, 1)
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", '{"entity": []}', '{"entity": {"a": "b"}}'])

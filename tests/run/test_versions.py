@@ -143,6 +143,8 @@ def test_products_of_a_frozen_period_are_not_replaced(source: Archive) -> None:
 
 
 def test_compare_prints_grade_and_cause(source: Archive, tmp_path: Path) -> None:
+    set_dead_time(source, 3.6e-9)
+    brought(source)
     root = source.write().products_root
     path = next(path for path in _paths(root) if "photon" in path)
     old = tmp_path / "old.nc"
@@ -150,13 +152,29 @@ def test_compare_prints_grade_and_cause(source: Archive, tmp_path: Path) -> None
     same = CliRunner().invoke(app, ["compare", str(old), str(root / path)])
     assert same.exit_code == 0
     assert same.output.startswith("none")
-    set_dead_time(source, 20e-9)
+    set_dead_time(source, 4.5e-9)
     brought(source)
     found = CliRunner().invoke(app, ["compare", "--json", str(old), str(root / path)])
     assert found.exit_code == 1
     document = json.loads(found.output)
     assert document["grade"] == "major"
+    assert document["largest"] > 0.1
     assert any("dead_time" in cause for cause in document["causes"])
+
+
+def test_a_slightly_longer_dead_time_is_minor(source: Archive) -> None:
+    set_dead_time(source, 3.6e-9)
+    brought(source)
+    set_dead_time(source, 3.601e-9)
+    changes = [product.change for product in products(brought(source)).values()]
+    assert changes
+    for change in changes:
+        assert change is not None
+        assert change.grade is Grade.MINOR
+        assert 0.0 < change.largest < 0.1
+        assert change.variable
+        assert 0.0 < change.share < 1.0
+        assert change.lost == 0
 
 
 def test_a_store_keeps_the_version_before_and_names_the_run(source: Archive) -> None:
