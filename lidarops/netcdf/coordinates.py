@@ -21,6 +21,8 @@ NEAR_VERTICAL: Final = 10.0
 
 _SAME_STEP: Final = 1e-6
 """Relative difference up to which vertical steps are equal."""
+_LEVEL: Final = 1e-6
+"""m; vertical step of a level beam: cos(90 degrees) is 6e-17, and 1e-3 degree more gives 1e-4 m."""
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 
 
@@ -323,7 +325,10 @@ def _altitude(
 
 
 def _common_step(profiles: Iterable[Values]) -> float | None:
-    """Return the distance of neighbouring altitudes of all profiles, m; None where it varies."""
+    """Return the distance of neighbouring altitudes of all profiles, m.
+
+    0 where the altitude does not change; None where the distance varies.
+    """
     first, smallest, largest = None, np.inf, 0.0
     for altitudes in profiles:
         steps = np.abs(np.diff(altitudes))
@@ -331,9 +336,9 @@ def _common_step(profiles: Iterable[Values]) -> float | None:
             return None
         first = float(steps[0]) if first is None else first
         smallest, largest = min(smallest, steps.min()), max(largest, steps.max())
-        if largest - smallest > _SAME_STEP * largest:
+        if largest > _LEVEL and largest - smallest > _SAME_STEP * largest:
             return None
-    return first
+    return first if largest > _LEVEL else 0.0
 
 
 def _extents(source: CheckedInput, vertical: _Vertical, horizontal: list[Values]) -> Extents:

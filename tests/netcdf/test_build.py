@@ -487,6 +487,15 @@ def test_layers_of_a_scan_reach_from_the_station_upwards():
     assert "featureType" not in product.attrs
 
 
+def test_a_level_beam_has_no_vertical_resolution():
+    """The cosine of 90 degrees is not exactly 0."""
+    name = "geospatial_vertical_resolution"
+    assert name not in build_product(homogeneous(zenith=90.0), context()).attrs
+    slanting = build_product(homogeneous(zenith=89.9), context())
+    sections = slanting["altitude"].values
+    assert float(slanting.attrs[name].split()[0]) == pytest.approx(np.diff(sections)[0], abs=1e-4)
+
+
 def test_a_product_states_the_steps_of_its_retrieval():
     product = build_product(multiangle(), context("multiangle"))
     assert product.attrs["lidarops_steps"] == "joint: extinction is requested"
