@@ -110,7 +110,7 @@ def show_times(runs: Mapping[str, RunTime]) -> None:
         f"{name}: about {run.parts['all']:.2g} s for {counted(run.count, 'scene')}"
         for name, run in runs.items()
     )
-    _say(f"CPU time, {'; '.join(times)}", "")
+    _say(f"CPU time of a run with its start and report, {'; '.join(times)}", "")
     _say("--all shows settings and reasons of every step; --json shows everything.", "")
 
 

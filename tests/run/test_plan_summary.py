@@ -55,6 +55,9 @@ def test_one_scene_fills_at_most_a_screen(campaign: Path) -> None:
     text = " ".join(lines)
     assert "to be made:" in text
     assert "steps: read" in text
+    # Of the scene alone, and of all that a process does.
+    assert re.search(r"about [0-9.]+ s of CPU time and", text)
+    assert "CPU time of a run with its start and report, to be made: about" in text
     assert "--all" in text
 
 
