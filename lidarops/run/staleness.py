@@ -411,7 +411,10 @@ class Judge:
             reason, restored = self._reason(judged, (kind, channel), known, touched)
             if reason:
                 one = Stale(kind, channel, reason, known, restored)
-                (frozen if self._stays_frozen(scene, one) else stale).append(one)
+                if self._stays_frozen(scene, one):
+                    frozen.append(self._with_remedy(one))
+                else:
+                    stale.append(one)
         return replace(
             judged,
             requested=requested,
@@ -424,6 +427,13 @@ class Judge:
         """Return whether a product would be replaced, and its period forbids it."""
         replaced = stale.before is not None and not stale.restored
         return replaced and not self._thaw and self.campaign.is_frozen(scene.start)
+
+    def _with_remedy(self, frozen: Stale) -> Stale:
+        """Return a frozen product whose reason says, if its file is missing, what restores it."""
+        if frozen.before is None or (self.campaign.products_root / frozen.before.path).exists():
+            return frozen
+        remedy = "only a copy restores this version, --thaw makes a new one"
+        return replace(frozen, reason=f"{frozen.reason}; {remedy}")
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement by which every product of a scene is stale."""
@@ -535,7 +545,8 @@ class Judge:
         if known is None:
             return "forced" if self._force else "not made yet", False
         difference = self._dependence_reason(judged, product, known)
-        reason = difference or self._file_reason(known, touched)
+        lost = self._file_reason(known, touched)
+        reason = "; ".join(filter(None, (lost, difference)))
         return "forced" if self._force else reason, not difference
 
     def _dependence_reason(

@@ -142,6 +142,18 @@ def test_products_of_a_frozen_period_are_not_replaced(source: Archive) -> None:
     assert not brought(source).frozen
 
 
+def test_a_lost_file_of_a_frozen_product_is_missing(source: Archive) -> None:
+    root = source.write().products_root
+    source.tree["periods"] = [{"since": "2000-01-01", "until": "2100-01-01", "frozen": True}]
+    set_dead_time(source, 7e-9)
+    lost, kept = (path for path in _paths(root) if "photon" in path)
+    (root / lost).unlink()
+    frozen = brought(source).frozen
+    assert set(frozen) == {lost, kept}
+    assert frozen[lost].startswith("its file is missing; its plan changed; only a copy restores")
+    assert frozen[kept] == "its plan changed"
+
+
 def test_compare_prints_grade_and_cause(source: Archive, tmp_path: Path) -> None:
     set_dead_time(source, 3.6e-9)
     brought(source)
