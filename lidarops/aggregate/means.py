@@ -188,6 +188,8 @@ class _Year:
     inputs: dict[str, Facts] = field(default_factory=dict)
     shared: dict[str, Any] | None = None
     """Attributes that are equal in all products so far."""
+    modified: str = ""
+    """``date_modified`` of the newest product so far; such times in UTC sort as texts."""
 
     def note(self, profiles: Profiles) -> None:
         path = profiles.facts.path
@@ -195,6 +197,7 @@ class _Year:
             self.inputs[path] = profiles.facts
             so_far = profiles.attributes if self.shared is None else self.shared
             self.shared = shared_attributes([so_far, profiles.attributes])
+            self.modified = max(self.modified, str(profiles.attributes.get("date_modified", "")))
 
     def close(self, key: np.datetime64, sums: _PeriodSums) -> None:
         self.keys.append(key)
@@ -269,6 +272,7 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
             first,
             last,
             len(year.inputs),
+            year.modified,
             means_version(group.kind),
         )
         periods = Periods(bounds.astype(np.float64), year.records)

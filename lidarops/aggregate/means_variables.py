@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops import __version__
-from lidarops.netcdf.provenance import product_date
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     TIME,
@@ -290,8 +289,6 @@ def global_attributes(
     source = layout_of(kind)
     # The comment of a product ends with a sentence on its dates, which is replaced.
     comment = shared.get("comment", "").partition(" Dates of creation")[0]
-    made, why = product_date(about.stop)
-    stamp = _iso(made)
     program = f"lidarops {__version__} ({about.code_version})"
     texts = {
         "title": _replaced(shared.get("title", ""), source.title, table.title),
@@ -304,16 +301,16 @@ def global_attributes(
         "id": about.id,
         "processing_level": table.processing_level,
         "product_version": f"{__version__}+{about.code_version}",
-        "history": f"{stamp} averaged {about.inputs} products over UTC {about.period.value}s,"
-        f" weights {about.weights.value} [{program}]",
+        "history": f"{about.modified} averaged {about.inputs} products over UTC"
+        f" {about.period.value}s, weights {about.weights.value} [{program}]",
         "comment": f"{_replaced(comment, source.comment, table.comment)} Dates of creation and"
-        f" change are {why}, so that equal inputs give equal files.",
+        " change are those of the newest product, so that equal inputs give equal files.",
         # As ACDD has it: the times of the first and last value, which are middles of periods.
         "time_coverage_start": _iso(about.first),
         "time_coverage_end": _iso(about.last),
         "time_coverage_duration": f"P{(about.stop - about.start).days}D",
         "time_coverage_resolution": about.period.duration,
-        **dict.fromkeys(dates, stamp),
+        **dict.fromkeys(dates, about.modified),
         PERIOD: about.period.value,
         "lidarops_weights": about.weights.value,
         "lidarops_code_version": about.code_version,
@@ -341,6 +338,8 @@ class MeansDescription:
     """Middle of the last period."""
     inputs: int
     """Number of products."""
+    modified: str
+    """``date_modified`` of the newest product."""
     code_version: str
 
 

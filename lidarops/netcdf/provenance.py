@@ -6,7 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping
-from datetime import UTC, date, datetime, time
+from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from itertools import groupby
@@ -21,9 +21,6 @@ from lidarops.errors import NO_FILE, ProductError
 from lidarops.netcdf.sizes import check_contents
 from lidarops.records import InputRecord, LeftOut, Provenance
 
-VERSION_DATE: Final = date(2026, 11, 21)
-"""Date of this version of lidarops: of its release, and until then that of its first code. Means of
-products are dated no earlier."""
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
@@ -250,32 +247,3 @@ def _epoch() -> datetime | None:
             field=EPOCH_VARIABLE,
             remedy="set it to whole seconds since 1970-01-01, or unset it",
         ) from error
-
-
-def product_date(end: datetime) -> tuple[datetime, str]:
-    """Return the date of a product, which does not depend on when or where it is made.
-
-    Parameters
-    ----------
-    end : datetime
-        End of the data, with time zone.
-
-    Returns
-    -------
-    datetime
-        The environment variable ``SOURCE_DATE_EPOCH`` if set, else the later of `end` and the
-        date of the version of lidarops, which is that of its release once it has one.
-    str
-        Which of these it is, in words.
-
-    Raises
-    ------
-    ProductError
-        If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
-    """
-    epoch = _epoch()
-    if epoch is not None:
-        return epoch, f"that of {EPOCH_VARIABLE}"
-    of_version = datetime.combine(VERSION_DATE, time(tzinfo=UTC))
-    words = "the later of the end of the data and the date of the version of lidarops"
-    return max(end, of_version), words

@@ -64,6 +64,16 @@ def only(root: Path, done: MeansResult) -> xr.Dataset:
         return means.load()
 
 
+def test_means_have_the_date_of_their_newest_product(tmp_path: Path):
+    dates = []
+    for day in range(3):
+        with xr.open_dataset(tmp_path / add_day(tmp_path, day)) as product:
+            dates.append(product.attrs["date_modified"])
+    means = only(tmp_path, means_of(tmp_path)).attrs
+    assert means["date_modified"] == means["date_created"] == max(dates)
+    assert means["history"].startswith(max(dates))
+
+
 def test_daily_means_of_the_usable_values(tmp_path: Path):
     for day in range(3):
         add_day(tmp_path, day, profiles=6, sections=2)

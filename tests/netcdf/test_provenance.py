@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from support.products.made_products import context, homogeneous, provenance
 from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import (
     package_versions,
-    product_date,
     product_id,
     prov_json,
     read_provenance,
@@ -167,13 +165,3 @@ def test_packages_of_this_installation():
     versions = package_versions()
     assert versions["numpy"] == np.__version__
     assert {"lidarops", "netCDF4", "numba", "python", "scipy", "xarray"} <= set(versions)
-
-
-def test_dates_have_a_time_zone(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
-    late = datetime(2100, 1, 1, tzinfo=UTC)
-    assert product_date(late)[0] == late
-    early, words = product_date(datetime(1990, 1, 1, tzinfo=UTC))
-    assert early > datetime(2026, 1, 1, tzinfo=UTC)
-    # A version that is not released yet has a date, too.
-    assert "release" not in words
