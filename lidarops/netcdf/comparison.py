@@ -306,7 +306,7 @@ def _settings(document: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _flat(key: str, value: Any) -> Iterator[tuple[str, str]]:
-    if isinstance(value, dict) and value:
+    if isinstance(value, dict) and (value or not key):
         for name, item in value.items():
             yield from _flat(f"{key}.{name}" if key else name, item)
     else:
@@ -314,14 +314,14 @@ def _flat(key: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def _steps(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return step and channel -> its settings, of the plan."""
+    """Return step, channel and setting -> value, of the plan."""
     plan = json.loads(document["entity"]["lidarops:plan"]["lidarops:json"])
-    return {
-        " ".join(part for part in (step["name"], step.get("channel", "")) if part): json.dumps(
-            step.get("settings", {}), sort_keys=True
-        )
-        for step in plan["steps"]
-    }
+    stated = {}
+    for step in plan["steps"]:
+        name = " ".join(part for part in (step["name"], step.get("channel", "")) if part)
+        stated[name] = "runs"
+        stated |= {f"{name} {key}": value for key, value in _flat("", step.get("settings") or {})}
+    return stated
 
 
 def _software(document: Mapping[str, Any]) -> dict[str, str]:
