@@ -24,7 +24,7 @@ from lidarops.site.links import Links
 from lidarops.site.neighbours import Neighbours
 from lidarops.site.paths import day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import Origin, QualityCounts, citation, variables
-from lidarops.site.product_entry import UNKNOWN, Entry, Problem, ShareGrade, mean_share
+from lidarops.site.product_entry import UNKNOWN, Entry, Problem, ShareGrade, Shares, mean_shares
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import Values
 
@@ -172,7 +172,7 @@ def _trail(entry: Entry, page: str) -> list[tuple[str, str]]:
 
 
 def _quality(entry: Entry) -> str:
-    if entry.share is None:
+    if entry.shares is None:
         return "no quality flags"
     return f"{verdicts_in_words(entry.verdicts)} of {entry.values:,} values"
 
@@ -180,7 +180,6 @@ def _quality(entry: Entry) -> str:
 def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
     spans = f"{_clock(entry.start)[11:]} to {_clock(entry.stop)[11:]} UTC"
     where = f"{entry.place}, {entry.day}, {spans}" if place else spans
-    share = entry.share
     return {
         "thumbnail": href(entry.thumbnail, page),
         "alt": entry.alt,
@@ -189,7 +188,7 @@ def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
         "light": entry.light or entry.channel,
         "where": where,
         "grade": entry.grade,
-        "quality": "" if share is None else verdicts_in_words(entry.verdicts),
+        "quality": "" if entry.shares is None else verdicts_in_words(entry.verdicts),
         "problem": entry.problem,
     }
 
@@ -199,10 +198,25 @@ def _order(entry: Entry) -> tuple[Any, ...]:
     return entry.instrument, rank, entry.kind, entry.channel, entry.start, entry.path
 
 
-def _short(share: float | None) -> str:
+def _cell(shares: Shares | None) -> dict[str, Any]:
+    """Return what a day or month shows: its share of good values, and a bar of all shares."""
+    if shares is None:
+        return {"share": "", "of": "", "bar": [], "grade": ShareGrade.UNKNOWN}
+    return {
+        "share": _short(shares.good),
+        "of": f" good, {_short(shares.care)} care, {_short(shares.reject)} reject",
+        "bar": [
+            (word, f"{100 * before:.4g}", f"{100 * share:.4g}")
+            for word, before, share in zip(
+                Shares._fields, (0.0, shares.good, shares.good + shares.care), shares, strict=True
+            )
+        ],
+        "grade": ShareGrade.of(shares.good),
+    }
+
+
+def _short(share: float) -> str:
     """Return a share in whole percent; only exact 0 and 1 become 0 % and 100 %."""
-    if share is None:
-        return ""
     whole = round(100 * share)
     if whole in (0, 100) and share not in (0.0, 1.0):
         return "<1 %" if whole == 0 else ">99 %"
@@ -322,15 +336,13 @@ def _position(entry: Entry) -> str:
 def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
     cells: list[dict[str, Any] | None] = [None] * 12
     for month, group in _by(entries, lambda entry: entry.day[5:7]).items():
-        share = mean_share(group)
         number = int(month)
         cells[number - 1] = {
             "number": number,
             "name": calendar.month_abbr[number],
             "label": f"{calendar.month_name[number]} {group[0].day[:4]}",
             "days": len({entry.day for entry in group}),
-            "share": _short(share),
-            "grade": ShareGrade.of(share),
+            **_cell(mean_shares(group)),
         }
     return cells
 
@@ -398,13 +410,11 @@ def _day(key: str, date_: date, month: int, by_day: ByDay, page: str) -> dict[st
     entries = by_day.get(date_.isoformat(), ())
     if not entries:
         return {"href": "", "number": date_.day}
-    share = mean_share(entries)
     return {
         "href": href(day_page(key, date_.isoformat()), page),
         "number": date_.day,
-        "share": _short(share),
-        "grade": ShareGrade.of(share),
-        "words": f" usable, {counted(len(entries), 'product')}",
+        "words": f", {counted(len(entries), 'product')}",
+        **_cell(mean_shares(entries)),
     }
 
 
@@ -414,8 +424,11 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
     entries = by_day[day_]
     shown_kinds = tabs(entries)[1:]
     ordered = sorted(entries, key=_order)
-    share = mean_share(entries)
-    mean = "" if share is None else f", on average {percent(share)} of values usable"
+    shares = mean_shares(entries)
+    words = [
+        f"{percent(share)} {word}" for word, share in (shares._asdict() if shares else {}).items()
+    ]
+    mean = f"; on average {', '.join(words)}" if words else ""
 
     def beside(other: str | None) -> tuple[str, str] | None:
         return None if other is None else (other, href(day_page(key, other), page))

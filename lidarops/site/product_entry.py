@@ -1,4 +1,4 @@
-"""The entry of a product in the calendar, and grades for the share of usable values."""
+"""The entry of a product in the calendar, and grades for the share of good values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from statistics import fmean
-from typing import Final
+from typing import Final, NamedTuple
 
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import Verdicts
@@ -15,7 +15,7 @@ UNKNOWN: Final = "unknown"
 
 
 class ShareGrade(StrEnum):
-    """Grade of a share of usable values."""
+    """Grade of a share of good values."""
 
     MOST = "most"
     SOME = "some"
@@ -35,7 +35,7 @@ class ShareGrade(StrEnum):
 
     @classmethod
     def of(cls, share: float | None) -> ShareGrade:
-        """Return the grade of a share of usable values (0 to 1; None without quality flags)."""
+        """Return the grade of a share of good values (0 to 1; None without quality flags)."""
         if share is None:
             return cls.UNKNOWN
         if share <= 0.0:
@@ -48,12 +48,20 @@ class ShareGrade(StrEnum):
 _SOME: Final = 0.25
 _MOST: Final = 0.75
 _MEANING: Final = {
-    ShareGrade.MOST: "75 % or more of the values usable",
-    ShareGrade.SOME: "25 to 75 % usable",
-    ShareGrade.FEW: "less than 25 % usable",
-    ShareGrade.NONE: "no value usable",
+    ShareGrade.MOST: "75 % or more of the values good",
+    ShareGrade.SOME: "25 to 75 % good",
+    ShareGrade.FEW: "less than 25 % good",
+    ShareGrade.NONE: "no value good",
     ShareGrade.UNKNOWN: "no quality flags",
 }
+
+
+class Shares(NamedTuple):
+    """Shares of values by the worst severity of their quality bits, 0 to 1."""
+
+    good: float
+    care: float
+    reject: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,9 +124,11 @@ class Entry:
         return self.start[:10]
 
     @property
-    def share(self) -> float | None:
-        """Share of usable values; None without quality flags."""
-        return self.usable / self.values if self.values else None
+    def shares(self) -> Shares | None:
+        """Shares of good, care and rejected values; None without quality flags."""
+        if not self.values:
+            return None
+        return Shares(*(count / self.values for count in self.verdicts))
 
     @property
     def verdicts(self) -> Verdicts:
@@ -127,8 +137,8 @@ class Entry:
 
     @property
     def grade(self) -> ShareGrade:
-        """Grade of the share of usable values."""
-        return ShareGrade.of(self.share)
+        """Grade of the share of good values."""
+        return ShareGrade.of(self.shares and self.shares.good)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,14 +149,14 @@ class Problem:
     reason: str
 
 
-def mean_share(entries: Iterable[Entry]) -> float | None:
-    """Return the mean over products of the share of usable values.
+def mean_shares(entries: Iterable[Entry]) -> Shares | None:
+    """Return the means over products of the shares of good, care and rejected values.
 
     Only retrievals count if there are any, because signals are always flagged at far range. The
     mean is over products, not values, so that a product of many bins does not dominate one of few
     sections. None without quality flags.
     """
-    known = [(entry.kind, entry.share) for entry in entries if entry.share is not None]
-    retrieved = [share for kind, share in known if is_retrieved(kind)]
-    shares = retrieved or [share for _, share in known]
-    return fmean(shares) if shares else None
+    known = [(entry.kind, entry.shares) for entry in entries if entry.shares is not None]
+    retrieved = [shares for kind, shares in known if is_retrieved(kind)]
+    shares = retrieved or [shares for _, shares in known]
+    return Shares(*map(fmean, zip(*shares, strict=True))) if shares else None
