@@ -48,14 +48,18 @@ _LINE: Final = 18
 """Height of a line of text."""
 _BAR: Final = 110
 """Space for a colour bar."""
-_RIGHT: Final = 62
-"""Space for an axis at the right."""
+_RIGHT: Final = 72
+"""Space for an axis at the right, with labels of four characters."""
+_EDGE: Final = 18
+"""Least space at the right of a panel."""
 _BETWEEN: Final = 72
 """Space between panels side by side, for the labels of an axis."""
 _LOWER: Final = 0.6
 """Height of panels that are below each other in a narrow figure, but side by side in a wide one."""
 _TICK: Final = 16
 """Least space between the labels of ticks along the horizontal axis of a narrow figure."""
+_FEWEST_TICKS: Final = 2
+"""Without a second tick an axis has no scale."""
 _NARROW_PIXELS: Final = 390
 """Most columns of an image in a narrow figure."""
 _FEW: Final = 150
@@ -212,7 +216,7 @@ def _margins(panels: Sequence[Panel]) -> tuple[float, float]:
     """Return the space left and right of panels."""
     left = max(_LEFT, *(_label_width(panel) + (31 if panel.y.label else 24) for panel in panels))
     right = _RIGHT * any(panel.right for panel in panels) + _BAR * any(p.bar for p in panels)
-    return left, right or 18
+    return left, right or _EDGE
 
 
 def _label_width(panel: Panel) -> float:
@@ -283,11 +287,12 @@ def _panel(box: _Box) -> str:
         grid += f"M{box.left:.1f} {y:.1f}h{box.width:.1f}"
         edge += f"M{box.left:.1f} {y:.1f}h-4"
         words.append(text(box.left - 9, y + 4, label, "e"))
-    for x, label in _spaced(box.x.ticks(max(2, round(box.width / 110)))):
+    end = box.left + box.width + _EDGE
+    for x, label in _spaced(box.x.ticks(max(2, round(box.width / 110))), end):
         grid += f"M{x:.1f} {box.top:.1f}v{height:.1f}"
         edge += f"M{x:.1f} {box.foot:.1f}v4"
         for row, line in enumerate(label.split("\n") if box.labelled else ()):
-            words.append(text(x, box.foot + 19 + 16 * row, line, "m"))
+            words.append(text(_centre(x, label, end), box.foot + 19 + 16 * row, line, "m"))
     for x in box.x(np.array(panel.x.breaks)).tolist():
         edge += f"M{x - 5:.1f} {box.foot + 5:.1f}l4-10m2 10l4-10"
     middle = box.top + height / 2
@@ -312,12 +317,19 @@ def _panel(box: _Box) -> str:
     )
 
 
-def _spaced(ticks: Sequence[tuple[float, str]]) -> Sequence[tuple[float, str]]:
+def _centre(x: float, label: str, end: float) -> float:
+    """Return the middle of the label of a tick at a place, with which it does not pass an end."""
+    # Letters of some fonts are wider by a fifth.
+    return min(x, end - 1.2 * _half_width(label))
+
+
+def _spaced(ticks: Sequence[tuple[float, str]], end: float) -> Sequence[tuple[float, str]]:
     """Return every tick, or every second, third, ... so that their labels do not touch."""
     for every in range(1, len(ticks)):
         kept = ticks[::every]
         if all(
-            after[0] - before[0] >= _half_width(before[1]) + _half_width(after[1]) + _TICK / 2
+            _centre(*after, end) - before[0]
+            >= _half_width(before[1]) + _half_width(after[1]) + _TICK / 2
             for before, after in pairwise(kept)
         ):
             return kept
@@ -392,7 +404,11 @@ def _round_ticks(axis: Axis, at_most: int) -> list[tuple[float, str]]:
     """Return round values and their labels, with equal decimals on a linear axis."""
     if axis.log:
         return [(tick, number(tick)) for tick in _decades(axis.low, axis.high)]
-    ticks = round_steps(min(axis.low, axis.high), max(axis.low, axis.high), at_most)
+    low, high = min(axis.low, axis.high), max(axis.low, axis.high)
+    ticks = round_steps(low, high, at_most)
+    while len(ticks) < _FEWEST_TICKS:
+        at_most += 1
+        ticks = round_steps(low, high, at_most)
     words = [number(tick) for tick in ticks]
     if not any("\N{MULTIPLICATION SIGN}" in text for text in words):
         decimals = max((len(text.partition(".")[2]) for text in words), default=0)

@@ -247,3 +247,36 @@ def test_a_map_keeps_its_shape():
 def test_a_page_gets_both_widths():
     markup = str(svg.inline(figure(panel(Curve(ONE, ONE)))))
     assert re.findall(r'class="fig (\w+)"', markup) == ["wide", "narrow"]
+
+
+def labels(document):
+    """Return the words of a figure with their horizontal positions."""
+    elements = [element for element in ET.fromstring(document).iter() if "text" in element.tag]
+    return {element.text: float(element.get("x")) for element in elements}
+
+
+@pytest.mark.parametrize("width", [svg.WIDTH, svg.NARROW])
+def test_a_date_at_the_end_of_an_axis_is_within_the_figure(width):
+    ticks = (Tick(0.0, "22:30\n2024-09-21"), Tick(1.0, "00:00\n2024-09-22"))
+    shown = Panel(Axis("time", 0.0, 1.0, ticks=ticks), Axis("up", 0.0, 1.0), (Curve(ONE, ONE),))
+    document = svg.file(figure(shown), width).decode()
+    # A digit of 13 px is at most 8.3 px wide.
+    assert labels(document)["2024-09-22"] + 5 * 8.2 <= width
+
+
+def test_the_title_of_an_axis_at_the_right_is_beside_its_labels():
+    document = drawn(panel(Curve(ONE, ONE), right=Axis("altitude (km)", 2.5, 15.0), height=240))
+    shown = labels(document)
+    # Letters of 13 px: 8.3 px wide, and 10 px high above the line of the title.
+    assert shown["altitude (km)"] - 10.0 > shown["10.0"] + 3 * 8.3 + 4.2
+
+
+def test_each_axis_has_a_scale():
+    """As of aerosol extinction of a Raman product: the only multiple of 200 in it is 0."""
+    shown = [
+        Panel(Axis("across", -160.0, 190.0), Axis("up", 0.0, 1.0), (Curve(ONE, ONE),))
+        for _ in range(3)
+    ]
+    words = texts(drawn(*shown, beside=True))
+    assert words.count("0") >= 3
+    assert words.count("100") == 3
