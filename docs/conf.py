@@ -46,8 +46,8 @@ nb_execution_mode = "cache"
 nb_execution_in_temp = True
 # Notebooks call the commands of this environment.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-# Their output is text: no progress bars, and tables as wide as a page.
-os.environ |= {"TERM": "dumb", "COLUMNS": "110"}
+# Their output is text: no progress bars or colours, and tables as wide as a page.
+os.environ |= {"TTY_COMPATIBLE": "0", "COLUMNS": "110"}
 # No notebook shows results of other code.
 nb_execution_cache_path = str(HERE / "_build" / "notebooks" / source_version())
 nb_execution_raise_on_error = True

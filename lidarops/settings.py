@@ -100,7 +100,10 @@ def _as_list(value: Any) -> Any:
 
 def _clean_pattern(value: str) -> str:
     if value.startswith(("/", "~")) or ".." in value.split("/"):
-        raise ValueError(f"{value!r} must be a relative path without '..'")
+        raise ValueError(
+            f"{value!r} must be a relative path without '..': put the file into the folder of the"
+            " campaign file, or below it"
+        )
     return value
 
 

@@ -221,6 +221,7 @@ def test_files_of_real_archives_are_those_of_their_headers(
         assert sum(granule.role is Role.DARK for granule in known) == 12
     if name == "manaus_raman":
         assert "nitrogen: {photon_355o: photon_387o}" in text
+        assert "molecular_profile; copy them below the folder of this file first" in text
 
 
 def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path: Path) -> None:
