@@ -271,16 +271,14 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
     scratch = [p for group in contents.groups if group.stem == _SCRATCH for p in group.files]
     tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
     rest = [path for path in contents.other if path not in tables]
-    # A campaign reads no file outside of its folder.
-    outside = archive.startswith(("/", ".."))
+    named = "? soundings, lidar ratios or overlap? Name them in the facts, as molecular_profile"
+    if archive.startswith(("/", "..")):
+        # A campaign reads no file outside of its folder.
+        named += "; copy them below the folder of this file first"
     for title, paths in (
         ("the last record of the acquisition, left out", scratch),
-        (
-            "? soundings, lidar ratios or overlap? Name them in the facts, as molecular_profile"
-            f"{'; copy them below the folder of this file first' * outside}",
-            # As seen from the campaign file.
-            [f"{archive}/{path}" for path in tables],
-        ),
+        # As seen from the campaign file.
+        (named, [f"{archive}/{path}" for path in tables]),
         ("of no raw format", rest),
         ("damaged", [f"{path}: {reason}" for path, reason in contents.refused]),
     ):
