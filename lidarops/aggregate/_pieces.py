@@ -11,7 +11,6 @@ from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, refuse_c
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
-from lidarops.records import DetectionMode
 
 
 def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
@@ -53,7 +52,7 @@ def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
         whole = "time" not in variable.dims and name not in static
         variables[name] = variable.expand_dims("product") if whole else variable
     index = np.zeros(facts.profiles, np.int32)
-    mode = DetectionMode(facts.mode)
+    mode = facts.counting
     about = {row.name: attributes(row, mode=mode) for row in (PRODUCT, PRODUCT_INDEX)}
     about[PRODUCT.name].pop("_Encoding")
     own = {

@@ -20,7 +20,7 @@ from lidarops.kinds import kinds
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
-from lidarops.records import Verdicts
+from lidarops.records import DetectionMode, Verdicts, is_glued
 from lidarops.system.files import sha256_of, within
 from lidarops.system.output_files import product_paths
 
@@ -46,6 +46,7 @@ class Facts:
     instrument: str
     channel: str
     mode: str
+    """analog, photon, or glued of both."""
     wavelength: float
     """m; NaN if unknown."""
     start: datetime
@@ -75,6 +76,11 @@ class Facts:
     def verdicts(self) -> Verdicts:
         """Numbers of good values, of those to be used with care, and of rejected ones."""
         return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
+
+    @property
+    def counting(self) -> DetectionMode:
+        """How the signal is stated: glued ones as counted."""
+        return DetectionMode.PHOTON if is_glued(self.channel) else DetectionMode(self.mode)
 
     @property
     def group(self) -> Group:

@@ -65,7 +65,7 @@ def read_frame(root: Path, facts: Facts) -> Frame:
         ]
         return Frame(
             facts.kind,
-            DetectionMode(facts.mode),
+            facts.counting,
             {name: product.variables[name].load() for name in kept},
             {
                 tuple(str(dim) for dim in variable.dims): tuple(

@@ -80,7 +80,7 @@ def write_view(root: Path, products: Sequence[Facts]) -> View:
     _refuse_duplicates(sources)
     all_parts = group_parts(sources, alike)
     target = root / FOLDER / "views" / f"{group.name}.json"
-    content = _document(all_parts, alike, DetectionMode(products[0].mode))
+    content = _document(all_parts, alike, products[0].counting)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
     profiles = sum(source.facts.profiles for source in sources)

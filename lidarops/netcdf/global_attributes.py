@@ -13,7 +13,7 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import DetectionMode, is_glued
+from lidarops.records import GLUED, DetectionMode, is_glued
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,12 +234,16 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_station": context.station_key,
         "lidarops_instrument": context.instrument_key,
         "lidarops_channel": context.channel,
-        "lidarops_detection_mode": context.mode.value,
+        "lidarops_detection_mode": _mode(context),
         "lidarops_plan_sha256": provenance.plan.hash,
         "lidarops_code_version": provenance.code_version,
         "lidarops_input_count": np.int32(len(provenance.inputs)),
         **({"lidarops_input_notes": "\n".join(context.notes)} if context.notes else {}),
     }
+
+
+def _mode(context: Context) -> str:
+    return GLUED.rstrip("_") if is_glued(context.channel) else context.mode.value
 
 
 def _iso(moment: datetime) -> str:

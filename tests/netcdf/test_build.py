@@ -310,6 +310,13 @@ def test_identifiers_and_the_principal_investigator_are_stated_as_networks_do():
         Station(name="Odesa", latitude=46.0, longitude=30.0, wigos_station_id="33837")
 
 
+@pytest.mark.parametrize(("channel", "mode"), [("glued_532o", "glued"), ("photon_532o", "photon")])
+def test_the_detection_mode_of_glued_channels_is_stated(channel: str, mode: str):
+    of = provenance("homogeneous", channel=channel)
+    product = build_product(homogeneous(), context(channel=channel, provenance=of))
+    assert product.attrs["lidarops_detection_mode"] == mode
+
+
 def test_no_attribute_is_empty():
     for kind in KINDS:
         product = build_product(MAKERS[kind](), context(kind, summary=""))
