@@ -47,6 +47,7 @@ def site(
 
     Example: lidarops site demo --products-at https://example.org/lidar/products
     """
+    from lidarops.figures.wording import counted
     from lidarops.site.build import build_site
 
     with progress_bar("site", None) as bar:
@@ -58,5 +59,8 @@ def site(
     else:
         rows = ((problem.path, problem.reason) for problem in made.problems)
         show_rows("Cannot be shown completely", ("file", "reason"), rows)
-        say(f"{made.products} products, {made.made} pages made\nsite: {made.index}")
+        say(
+            f"{counted(made.products, 'product')}, {counted(made.made, 'page')} made\n"
+            f"site: {made.index}"
+        )
     exit_with_status(failed=bool(made.problems))

@@ -30,7 +30,9 @@ def percent(share: float) -> str:
         return "<0.1 %"
     if 99.9 < number < 100.0:
         return ">99.9 %"
-    return f"{number:.1f} %" if number % 100.0 else f"{number:.0f} %"
+    # Halves are rounded up, whatever the rounding errors of the share.
+    tenths = math.floor(10.0 * round(number, 6) + 0.5) / 10.0
+    return f"{tenths:.1f} %" if number % 100.0 else f"{number:.0f} %"
 
 
 def verdicts_in_words(verdicts: Verdicts) -> str:

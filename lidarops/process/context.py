@@ -162,5 +162,9 @@ def _station(campaign: Campaign, scene: Scene) -> Station:
 
 def _instrument_name(campaign: Campaign, scene: Scene) -> str:
     if scene.members:
-        return "network of " + ", ".join(_instrument_name(campaign, m) for m in scene.members)
+        members = (
+            campaign.instruments[member.instrument].name or campaign.stations[member.station].name
+            for member in scene.members
+        )
+        return "network of " + ", ".join(members)
     return campaign.instruments[scene.instrument].name or scene.instrument

@@ -45,12 +45,15 @@ def difference(record: RunRecord, folder: Path) -> RunDifference:
     """
     fates = Counter(_fate(product) for scene in record.scenes for product in scene.products)
     uncompared = fates[_Fate.UNCOMPARED]
-    products = (
-        f"{counted(fates[_Fate.NEW], 'product')} new,"
-        f" {fates[_Fate.CHANGED]:,} with other content,"
-        f" {fates[_Fate.SAME]:,} made again with the same content"
-        + (f", {uncompared:,} made again without a file to compare with." if uncompared else ".")
+    counts = (
+        (fates[_Fate.NEW], "new"),
+        (fates[_Fate.CHANGED], "with other content"),
+        (fates[_Fate.SAME], "made again with the same content"),
+        (uncompared, "made again without a file to compare with"),
     )
+    made = [(count, words) for count, words in counts if count] or [(0, "made")]
+    products = f"{counted(made[0][0], 'product')} {made[0][1]}"
+    products += "".join(f", {count:,} {words}" for count, words in made[1:]) + "."
     try:
         before = _before(record, folder)
     except CatalogError:

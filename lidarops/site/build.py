@@ -242,7 +242,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             page=page,
             thumbnail=page.removesuffix(".html") + ".svg",
             digests=(),
-            campaign=product_contents.attribute(opened, "lidarops_campaign"),
+            campaign=product_contents.campaign(opened),
             station=station,
             place=product_contents.attribute(opened, "platform", station),
             instrument=instrument,

@@ -265,7 +265,7 @@ def index(
     """Return the first page."""
     by_station = stations(entries)
     rows = sum(len(years(group)) for group in by_station.values())
-    title = f"Lidar archive: {', '.join(campaigns[:3])}" if campaigns else "Lidar archive"
+    title = f"Lidar archive: {'; '.join(campaigns[:3])}" if campaigns else "Lidar archive"
     newest = sorted(entries, key=lambda entry: (entry.start, entry.path), reverse=True)
     retrieved = [entry for entry in newest if is_retrieved(entry.kind)] or newest
     return _render(

@@ -185,6 +185,12 @@ def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
     return str(product.attrs.get(name, "")).strip() or default
 
 
+def campaign(product: xr.Dataset) -> str:
+    """Return the title of the campaign, with which that of a product begins; its key without."""
+    title, _, _ = attribute(product, "title", "").rpartition(": ")
+    return title or attribute(product, "lidarops_campaign")
+
+
 def light(product: xr.Dataset) -> str:
     """Return wavelength and detection of the channel in words; empty if unknown."""
     wavelength = scalar(product, "wavelength")

@@ -79,6 +79,7 @@ class Entry:
     digests: tuple[str, ...]
     """sha256 of the files of the page, in the order of `files`."""
     campaign: str
+    """Title of the campaign."""
     station: str
     place: str
     """Name of the station."""

@@ -619,6 +619,10 @@ def test_percent_never_rounds_to_all_or_nothing(share, words):
     assert percent(share) == words
 
 
+def test_percent_of_equal_shares_has_the_same_words():
+    assert percent(85 / 400) == percent(0.2125 + 1e-15) == "21.3 %"
+
+
 def test_words():
     assert [duration(s) for s in (0.0123, 1.26, 61, 3725, 90_000)] == [
         "12 ms", "1.3 s", "1 min 01 s", "1 h 02 min", "25 h 00 min",

@@ -297,7 +297,7 @@ def test_find_a_setting_that_was_used(visitor: Visitor) -> None:
 
 def test_find_what_is_different_since_the_last_run(visitor: Visitor) -> None:
     visitor.click("Report of the last run")
-    assert visitor.reads("1 with other content")
+    assert visitor.reads("1 product with other content")
     assert visitor.reads("0 files newly refused")
 
 

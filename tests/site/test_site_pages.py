@@ -15,6 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 import xarray as xr
+from netCDF4 import Dataset
 from support.archives.site_archive import add, add_unknown, contents, small_archive
 from support.products.drawn import figures
 from support.products.fabricated import START as FIRST
@@ -26,6 +27,7 @@ from lidarops.errors import CatalogError
 from lidarops.flags import Quality
 from lidarops.site import build, values
 from lidarops.site.build import build_site
+from lidarops.site.product_contents import campaign
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import read_values
 
@@ -420,3 +422,21 @@ def test_the_map_crosses_the_date_line() -> None:
 def pins(markup: str) -> list[tuple[float, ...]]:
     found = re.findall(r'cx="([-\d.]+)" cy="([-\d.]+)"', markup)
     return [tuple(map(float, point)) for point in found]
+
+
+def test_the_first_page_is_titled_by_the_campaign() -> None:
+    key = {"lidarops_campaign": "demo"}
+    title = {"title": "Demonstration: a day: Aerosol backscatter, channel glued_532o, hill"}
+    assert campaign(xr.Dataset(attrs=key | title)) == "Demonstration: a day"
+    assert campaign(xr.Dataset(attrs=key)) == "demo"
+
+
+def test_a_product_without_bits_says_so(tmp_path: Path) -> None:
+    output = small_archive(tmp_path / "out")
+    product = next((output / "products").rglob("*elastic*.nc"))
+    with Dataset(product, "a") as opened:
+        opened["quality_flag"][:] = 0
+    build_site(output)
+    page = output / "site/product" / product.relative_to(output / "products").with_suffix(".html")
+    section = page.read_text(encoding="utf-8").partition('<h2 id="quality">')[2]
+    assert section.partition("</section>")[0].endswith("<p>No value has a quality bit.</p>\n")

@@ -247,11 +247,12 @@ LAYOUT: Final = Layout(
             dims=("time",),
             dtype="f4",
             units="1",
-            long_name="least ratio of backscatter of particles to that of molecules in the"
-            " reference window that other windows show with a probability of 0.95",
+            long_name="least ratio of backscatter of particles to that of molecules that is"
+            " detected in the reference window with a probability of 0.95",
             coverage=Coverage.AUXILIARY,
-            comment="Fewer particles may remain undetected: aerosol_backscatter_error_reference"
-            " states 1.5 standard errors of the comparison for them. Missing where no window passed"
+            comment="By comparison with other windows. Fewer particles may remain undetected:"
+            " aerosol_backscatter_error_reference states 1.5 standard errors of the comparison for"
+            " them. Missing where no window passed"
             f" the tests, or none beside it is comparable. {NO_STANDARD_NAME}",
         ),
         reference_rejections(

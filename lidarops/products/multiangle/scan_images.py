@@ -122,7 +122,8 @@ def draw_scan_images(images: Sequence[ScanImage]) -> list[Figure]:
     shown = planes[:: -(-len(planes) // _MOST_PLANES)]
     panels = tuple(_range_height(image, beams, ends) for beams in shown)
     words = (
-        f"{counted(len(shown), 'vertical plane')} of {len(planes)}, up to the reach of each beam"
+        f"{counted(len(shown), 'vertical plane')} of {len(planes)}; each beam is shown as far as"
+        " its signal is used"
     )
     figures = [Figure("Range-height scans (RHI)", words, panels)]
     beams = _of_one_elevation(image)
