@@ -36,6 +36,16 @@ def site(
         bool,
         typer.Option("--copies", help="Copy the products into the site, to serve it alone."),
     ] = False,
+    stac_at: Annotated[
+        str,
+        typer.Option(
+            help="Where links to the STAC catalog lead, for a site that is published or holds"
+            " copies: an address, or a place relative to the site. Default: no link there."
+        ),
+    ] = "",
+    reports_at: Annotated[
+        str, typer.Option(help="The same for the folder of the reports of runs.")
+    ] = "",
     as_json: JsonOption = False,
 ) -> None:
     """Make a static site of all products: calendar, figures, flags, provenance, downloads.
@@ -52,7 +62,13 @@ def site(
 
     with progress_bar("site", None) as bar:
         made = build_site(
-            out, workers=workers, products_at=products_at, copies=copies, progress=bar.advance
+            out,
+            workers=workers,
+            products_at=products_at,
+            copies=copies,
+            stac_at=stac_at,
+            reports_at=reports_at,
+            progress=bar.advance,
         )
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))

@@ -87,6 +87,8 @@ def build_site(
     workers: int = 1,
     products_at: str = BESIDE,
     copies: bool = False,
+    stac_at: str = "",
+    reports_at: str = "",
     progress: Callable[[int], None] | None = None,
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
@@ -106,6 +108,9 @@ def build_site(
         Where the downloads lead: an address, or a place relative to the site.
     copies : bool, optional
         Whether the site holds copies of the products, so that it can be served alone.
+    stac_at, reports_at : str, optional
+        Where the links to the STAC catalog and to the report of the last run lead, where the site
+        is not used in the output: an address, or a place relative to the site.
     progress : callable, optional
         Called with the number of products done since the last call.
 
@@ -122,7 +127,7 @@ def build_site(
         If the site cannot be written, or the folder ``site`` has other content.
     """
     output = Path(output).resolve()
-    links = Links(output, COPIES if copies else products_at)
+    links = Links(output, COPIES if copies else products_at, stac_at, reports_at)
     products, site = product_folder(output), output / SITE
     before = _manifest(site, links)
     tasks = [_Task(path, products, site, before.get(path)) for path in product_paths(products)]

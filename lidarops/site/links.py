@@ -14,6 +14,8 @@ from lidarops.site.product_entry import Entry
 
 BESIDE: Final = "../products"
 """Where products are in the output of a campaign, relative to the site."""
+STAC_BESIDE: Final = "../aggregates/stac"
+REPORTS_BESIDE: Final = "../report"
 _ADDRESS: Final = re.compile(r"https?://[^\s\"<>]+")
 _RELATIVE: Final = re.compile(r"(?:[A-Za-z0-9._-]+/?)+")
 
@@ -26,15 +28,24 @@ class Links:
     """Output of the campaign."""
     products: str = BESIDE
     """Address of the products, or their place relative to the site."""
+    stac_at: str = ""
+    """The same of the STAC catalog; empty: beside the products in the output, else nowhere."""
+    reports_at: str = ""
+    """The same of the reports of runs."""
 
     def __post_init__(self) -> None:
-        if not (_ADDRESS.fullmatch(self.products) or _RELATIVE.fullmatch(self.products)):
-            raise CatalogError(
-                f"is neither an address nor a relative place: {self.products!r}",
-                field="products",
-                remedy="give https://..., or a place relative to the site such as ../products",
-                wrong_use=True,
-            )
+        for field, place in (
+            ("products", self.products),
+            ("stac", self.stac_at or STAC_BESIDE),
+            ("reports", self.reports_at or REPORTS_BESIDE),
+        ):
+            if not (_ADDRESS.fullmatch(place) or _RELATIVE.fullmatch(place)):
+                raise CatalogError(
+                    f"is neither an address nor a relative place: {place!r}",
+                    field=field,
+                    remedy="give https://..., or a place relative to the site such as ../products",
+                    wrong_use=True,
+                )
 
     @property
     def beside(self) -> bool:
@@ -43,26 +54,33 @@ class Links:
 
     def product(self, entry: Entry, page: str) -> str:
         """Return the link from a page to the file of a product."""
-        base = self.products.rstrip("/")
-        if _ADDRESS.fullmatch(self.products):
-            return f"{base}/{quote(entry.path)}"
-        return href(f"{base}/{entry.path}", page)
+        return _link(self.products, entry.path, page)
 
     def stac(self, entry: Entry, page: str) -> str:
-        """Return the link to the STAC item of a product; empty if there is none beside the site."""
+        """Return the link to the STAC item of a product; empty if there is none."""
         name = PurePosixPath(entry.path).stem
-        return self._beside(f"aggregates/stac/{entry.kind}/{name}/{name}.json", page)
+        return self._stac(f"{entry.kind}/{name}/{name}.json", page)
 
     def catalog(self, page: str) -> str:
-        """Return the link to the STAC catalog; empty if there is none beside the site."""
-        return self._beside("aggregates/stac/catalog.json", page)
+        """Return the link to the STAC catalog; empty if there is none."""
+        return self._stac("catalog.json", page)
 
     def report(self, page: str) -> str:
         """Return the link to the report of the last run; empty if there is none."""
         # The names of runs begin with their time.
         reports = sorted(self.output.glob("report/*/index.html"))
-        return self._beside(f"report/{reports[-1].parent.name}/index.html", page) if reports else ""
+        place = self.reports_at or (REPORTS_BESIDE if self.beside else "")
+        if not (reports and place):
+            return ""
+        return _link(place, f"{reports[-1].parent.name}/index.html", page)
 
-    def _beside(self, name: str, page: str) -> str:
-        exists = self.beside and (self.output / name).is_file()
-        return href(f"../{name}", page) if exists else ""
+    def _stac(self, name: str, page: str) -> str:
+        place = self.stac_at or (STAC_BESIDE if self.beside else "")
+        exists = (self.output / "aggregates/stac" / name).is_file()
+        return _link(place, name, page) if place and exists else ""
+
+
+def _link(place: str, name: str, page: str) -> str:
+    """Return the link from a page to a file at a place."""
+    base = place.rstrip("/")
+    return f"{base}/{quote(name)}" if _ADDRESS.fullmatch(place) else href(f"{base}/{name}", page)

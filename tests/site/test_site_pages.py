@@ -317,6 +317,8 @@ def test_other_places_are_refused(tmp_path: Path, place: str) -> None:
     add(tmp_path, "signal")
     with pytest.raises(CatalogError, match="neither an address nor a relative place"):
         build_site(tmp_path, products_at=place)
+    with pytest.raises(CatalogError, match="neither an address nor a relative place"):
+        build_site(tmp_path, reports_at=place)
 
 
 def test_a_month_can_be_downloaded_from_its_list(output: Path) -> None:
@@ -368,6 +370,28 @@ def test_the_stac_item_is_linked_where_it_exists(tmp_path: Path) -> None:
     index = output / "site/index.html"
     (catalog,) = (href for href, words in links(index).items() if words == "STAC catalog")
     assert (index.parent / catalog).is_file()
+
+
+@pytest.mark.parametrize("serving", [["--products-at", ".."], ["--copies"]])
+def test_a_published_site_links_catalog_and_report_where_they_are(
+    tmp_path: Path, serving: list[str]
+) -> None:
+    output = tmp_path / "out"
+    add(output, "signal")
+    catalog, report = output / "aggregates/stac/catalog.json", output / "report/run-1/index.html"
+    for file in (catalog, report):
+        file.parent.mkdir(parents=True)
+        file.write_text("{}")
+
+    def shown(*options: str) -> dict[str, str]:
+        result = CliRunner().invoke(app, ["site", str(output), *serving, *options])
+        assert result.exit_code == 0, result.output
+        return {words: href for href, words in links(output / "site/index.html").items()}
+
+    assert not {"STAC catalog", "Report of the last run"} & shown().keys()
+    places = shown("--stac-at", "https://example.org/stac", "--reports-at", "../../reports")
+    assert places["STAC catalog"] == "https://example.org/stac/catalog.json"
+    assert places["Report of the last run"] == "../../reports/run-1/index.html"
 
 
 def test_stations_are_on_a_map(output: Path) -> None:
