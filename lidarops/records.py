@@ -427,6 +427,9 @@ class SceneOutcome:
 
     disagreements: tuple[Disagreement, ...] = ()
 
+    notes: tuple[str, ...] = ()
+    """What the data did not give though the campaign requests it, with the remedy."""
+
     internal: str = ""
     """Traceback of the internal error (a bug of lidarops) that `error` names; else empty."""
 

@@ -348,6 +348,7 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             for scene in scenes
             for pair in scene.disagreements
         ],
+        "scene_notes": {scene.scene: list(scene.notes) for scene in scenes if scene.notes},
         "orphans": {
             orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
         },
@@ -394,6 +395,7 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     _show_unused(result, {granule.path for granule in refused})
     show_findings(result.findings)
     _show_disagreements(scenes)
+    _show_scene_notes(scenes)
     if not removing:
         _show_orphans(result, None)
     kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
@@ -421,6 +423,13 @@ def _show_disagreements(scenes: Iterable[SceneOutcome]) -> None:
 
     rows = ((row.instrument, row.subject, row.problem) for row in disagreement_rows(scenes))
     show_rows("Channels that disagree", ("instrument", "channels", "finding"), rows)
+
+
+def _show_scene_notes(scenes: Iterable[SceneOutcome]) -> None:
+    from lidarops.reports.findings import scene_note_rows
+
+    rows = ((row.instrument, row.subject, row.problem) for row in scene_note_rows(scenes))
+    show_rows("Not found in the data", ("instrument", "in", "finding"), rows)
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:

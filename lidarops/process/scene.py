@@ -110,6 +110,7 @@ def _process(job: Job, root: Path) -> tuple[SceneOutcome, bool]:
         plan=work.job.plan,
         inputs=work.inputs,
         seconds=clock.laps,
+        notes=tuple(work.notes),
         bytes_read=read + tally.bytes,
     )
     if isinstance(products, Failure):
@@ -147,6 +148,8 @@ class _Work:
         self._scene, self._root, self._clock = scene, root, clock
         self.made: list[ProductRecord] = []
         """Products that are written, in the order in which they were complete."""
+        self.notes: dict[str, None] = {}
+        """What the data did not give, each once."""
 
     def _source(
         self,
@@ -254,6 +257,8 @@ class _Instrument(_Work):
     def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
         steps = self.job.plan.steps
         data = execution.channel_data(source, steps, channel)
+        for part in data[""].channels.values():
+            self.notes.update(dict.fromkeys(part.notes))
         streams = execution.streams_of(steps, data, channel)
         layout = member_channel(self._scene.layout, channel)
         contexts = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -37,6 +38,15 @@ def disagreement_rows(scenes: Iterable[SceneOutcome]) -> Iterator[FindingRow]:
             )
             subject = f"{pair.kind}: {pair.channels[0]}, {pair.channels[1]}"
             yield FindingRow(scene.instrument, subject, problem, fails=False)
+
+
+def scene_note_rows(scenes: Iterable[SceneOutcome]) -> list[FindingRow]:
+    """Return a row for each note on the data of an instrument, the most frequent first."""
+    notes = Counter((scene.instrument, note) for scene in scenes for note in scene.notes)
+    return [
+        FindingRow(instrument, counted(count, "scene"), note, fails=False)
+        for (instrument, note), count in sorted(notes.items(), key=lambda row: (-row[1], row[0]))
+    ]
 
 
 def unmade_words(findings: Findings) -> list[str]:

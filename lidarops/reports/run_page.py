@@ -22,7 +22,7 @@ from lidarops.figures.wording import duration, percent, size
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
-from lidarops.reports.findings import disagreement_rows, finding_rows, lacking
+from lidarops.reports.findings import disagreement_rows, finding_rows, lacking, scene_note_rows
 from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME, INDEX
 from lidarops.reports.sources import Compared
@@ -154,7 +154,11 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         narrow=gallery.NARROW,
         page_style=Markup(page_style()),  # noqa: S704 - it is a file of the package
         overview=_overview(pictures),
-        findings=[*finding_rows(record.findings), *disagreement_rows(record.scenes)],
+        findings=[
+            *finding_rows(record.findings),
+            *disagreement_rows(record.scenes),
+            *scene_note_rows(record.scenes),
+        ],
         instruments=run_tables.instruments(record),
         stages=stages,
         scenes=[

@@ -20,7 +20,7 @@ from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import Grade, LeftOut, PlannedStep, RunRecord, SceneOutcome, Verdicts
-from lidarops.reports.findings import disagreement_rows, finding_rows, unmade_words
+from lidarops.reports.findings import disagreement_rows, finding_rows, scene_note_rows, unmade_words
 from lidarops.steps.reading import idle_window
 
 _MOST_NAMES: Final = 8
@@ -251,6 +251,7 @@ def _cautions(record: RunRecord) -> Iterator[str]:
     disagreeing = sorted({row.subject for row in disagreement_rows(record.scenes)})
     if disagreeing:
         yield f"Channels that measure the same disagree: {listed(disagreeing)}"
+    yield from (f"{row.instrument}: {row.problem}" for row in scene_note_rows(record.scenes))
     unmade = unmade_words(record.findings)
     if unmade:
         yield f"Requested, but made in no scene: {listed(unmade)}"

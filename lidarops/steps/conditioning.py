@@ -257,7 +257,13 @@ class DeadTime(Step[ChannelCase, DeadTimeSettings]):
         if settings.analog is not None:
             estimate = _estimated_dead_time(data, data.channels[settings.analog], settings)
             words = f"dead_time: no estimate of {data.channel} against {settings.analog}"
-            if estimate is not None:
+            if estimate is None:
+                data.notes.append(
+                    f"dead_time: estimate of {data.channel}: the data give none against"
+                    f" {settings.analog}, so that pile-up is not corrected, and flagged for an"
+                    " assumed 4 ns; give dead_time in s, as the data sheet of the counter states it"
+                )
+            else:
                 data[DEAD_TIME] = estimate.dead_time
                 data[DEAD_TIME_ERROR] = min(estimate.standard_error / estimate.dead_time, 1.0)
                 words = (

@@ -193,6 +193,8 @@ class Data:
     """Data of the channels that were prepared before."""
     statements: list[str] = field(default_factory=list)
     """What steps decided from the data, in words for the product."""
+    notes: list[str] = field(default_factory=list)
+    """What the data did not give though the campaign requests it, in words for the run."""
     _values: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, datum: Datum[T]) -> T:
@@ -210,5 +212,5 @@ class Data:
 
     def of_product(self) -> Data:
         """Return a copy for the steps of one product, which other products do not see."""
-        words, values = list(self.statements), dict(self._values)
-        return Data(self.source, self.channel, self.channels, words, values)
+        words, notes, values = list(self.statements), list(self.notes), dict(self._values)
+        return Data(self.source, self.channel, self.channels, words, notes, values)

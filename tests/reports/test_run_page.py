@@ -317,6 +317,12 @@ class TestDegenerateRuns:
         page = built(run_record(tmp_path, [outcome("s", products=(empty,))]), tmp_path / "report")
         assert "x.nc" in page.text
 
+    def test_what_the_data_did_not_give_is_in_verdict_and_findings(self, tmp_path):
+        note = "dead_time: estimate of photon_355o: the data give none"
+        run = run_record(tmp_path, [replace(outcome(name), notes=(note,)) for name in "ab"])
+        assert note in run_tables.verdict(run)
+        assert built(run, tmp_path / "report").text.count(note) >= 2
+
     def test_a_scene_without_a_usable_value_is_a_problem_in_the_verdict(self, tmp_path):
         bad = ProductRecord("x.nc", "elastic", "c", "", 0, 9, {}, 0, 0)
         good = replace(bad, path="y.nc", usable=5)
