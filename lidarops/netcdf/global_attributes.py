@@ -13,7 +13,7 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import GLUED, DetectionMode, is_glued
+from lidarops.records import GLUED, DetectionMode, LeftOut, PlannedStep, is_glued
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +114,14 @@ def _history(context: Context, date: datetime) -> str:
     program = f"lidarops {__version__} ({context.provenance.code_version})"
     plan = context.provenance.plan
 
-    channels = ("", context.channel)
-    done = [f"{step.name}: {step.words}" for step in plan.steps if step.channel in channels]
-    omitted = [
-        f"left out {omission.name}: {omission.reason}"
-        for omission in plan.left_out
-        if omission.channel in channels
-    ]
+    def name(entry: PlannedStep | LeftOut) -> str:
+        """Return the name of a step, with its channel where the product has another."""
+        other = entry.channel not in ("", context.channel)
+        return f"{entry.name} of {entry.channel}" if other else entry.name
+
+    # The plan of a product holds what it depends on, such as the corrections of glued channels.
+    done = [f"{name(step)}: {step.words}" for step in plan.steps]
+    omitted = [f"left out {name(omission)}: {omission.reason}" for omission in plan.left_out]
     lines = [*done, *omitted, f"wrote the {context.kind} product"]
     return "\n".join(f"{_iso(date)} {' '.join(line.split())} [{program}]" for line in lines)
 

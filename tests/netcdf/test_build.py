@@ -260,16 +260,30 @@ def test_dates_are_those_of_writing_or_of_the_environment(monkeypatch: pytest.Mo
         created()
 
 
-def test_history_has_one_line_for_each_step_of_the_channel():
+def test_history_has_one_line_for_each_step_of_the_plan():
     about = context("elastic")
     lines = build_product(MAKERS["elastic"](), about).attrs["history"].splitlines()
     assert all(line.startswith("2026-") and "lidarops" in line for line in lines)
     *done, omitted, last = lines
     assert [line.split()[1].rstrip(":") for line in done] == [
-        step.name for step in about.provenance.plan.steps if step.channel in ("", about.channel)
+        step.name for step in about.provenance.plan.steps
     ]
     assert "left out dark: photon counting has no dark signal" in omitted
     assert "wrote the elastic product" in last
+
+
+def test_the_history_of_a_glued_channel_names_the_steps_of_its_parts():
+    about = context("elastic")
+    plan = about.provenance.plan
+    own = tuple(replace(step, channel="glued_532o") for step in plan.steps)
+    part = replace(plan.steps[0], name="dead_time", channel="photon_532o")
+    of_glued = replace(
+        about.provenance, channel="glued_532o", plan=replace(plan, steps=(part, *own))
+    )
+    about = replace(about, channel="glued_532o", provenance=of_glued)
+    history = build_product(MAKERS["elastic"](), about).attrs["history"]
+    assert f"dead_time of photon_532o: {part.words}" in history
+    assert "left out dark of photon_532o: photon counting has no dark signal" in history
 
 
 def test_the_summary_states_the_detection():
