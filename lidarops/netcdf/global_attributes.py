@@ -189,15 +189,10 @@ def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]
         "geospatial_vertical_max": extents.highest,
         "geospatial_vertical_units": "m",
         "geospatial_vertical_positive": "up",
-        **_vertical_resolution(extents.step),
+        "geospatial_vertical_resolution": (
+            "not constant" if extents.step is None else f"{extents.step:.6g} m"
+        ),
     }
-
-
-def _vertical_resolution(step: float | None) -> dict[str, str]:
-    """Return the attribute; a level beam has none."""
-    if step == 0.0:
-        return {}
-    return {"geospatial_vertical_resolution": "not constant" if step is None else f"{step:.6g} m"}
 
 
 _SPREADS = {"crossing": "irregular: crossings of beams"}
