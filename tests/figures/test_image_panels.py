@@ -22,6 +22,7 @@ from support.products.made_products import MAKERS, context
 from lidarops.figures import svg
 from lidarops.figures.pixels import BLANK, NEGATIVE, REJECTED
 from lidarops.figures.raster import COLUMNS, colour_limits
+from lidarops.figures.wording import percent
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
@@ -110,7 +111,7 @@ def test_share_with_care_is_that_of_the_product():
     product = signal(times(START, 60, 60.0), bins=4000, bin_width=15.0)
     share = ((product["quality_flag"].values & int(Quality.PILE_UP)) != 0).mean()
     assert share > 0.0015
-    assert f"{100 * share:.1f} % of all bins: use with care (pile_up)" in drawn(product).words
+    assert f"; {percent(share)} of all bins: use with care (pile_up)" in drawn(product).words
 
 
 def test_far_noise_is_left_out_with_a_note():
