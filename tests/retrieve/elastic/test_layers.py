@@ -116,16 +116,14 @@ def correlated_noise(shape, correlation, rng):
     return signal.lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white)
 
 
-@pytest.mark.parametrize("count", [1000, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6])
-def test_correlated_noise_makes_no_layers(count, correlation):
+def test_correlated_noise_makes_no_layers(correlation):
     """The variances are of differences of neighbouring bins, as those of analog channels."""
     rng = np.random.default_rng(5)
     spread = np.sqrt(SHAPE * SHAPE[300])
-    power = SHAPE + spread * correlated_noise((count, RANGE.size), correlation, rng)
+    power = SHAPE + spread * correlated_noise((10_000, RANGE.size), correlation, rng)
     layers = detect(power, (1.0 - correlation) * spread**2)
-    rate = THRESHOLDS.cloud_false_alarm
-    assert np.mean(layers.cloudy) <= rate + 3.0 * np.sqrt(rate / count)
+    assert np.mean(layers.cloudy) <= THRESHOLDS.cloud_false_alarm
 
 
 @pytest.mark.parametrize(("correlation", "ratio"), [(0.0, 1.0), (0.3, 1.5), (0.6, 2.0)])

@@ -154,7 +154,11 @@ def test_block_errors_change_no_value_and_hardly_a_clear_case(monkeypatch):
     np.testing.assert_array_equal(value, value_without)
     known = np.isfinite(stated_without)
     assert np.all(stated[known] >= stated_without[known])
-    assert np.median(stated[known] / stated_without[known]) < 1.1
+    monkeypatch.setattr(_block_errors, "bent_fields", lambda at: np.zeros((1, len(at))))
+    value_without, stated_without = solve_all()
+    np.testing.assert_array_equal(value, value_without)
+    # Their limit is that of the median profile, so that without them some profiles have more.
+    assert 0.99 < np.median(stated[known] / stated_without[known]) < 1.1
 
 
 @pytest.mark.parametrize("offset", [1.0, 30.0, -30.0, 1e3])

@@ -203,11 +203,11 @@ def layer(x, y, z):
 
 
 @pytest.mark.parametrize("step", [5.0, 2.0])
-@pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 4.2), (layer, 6.0)])
+@pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 3.2), (layer, 5.0)])
 def test_single_outlying_bins_in_curved_air_change_little(field, most, step):
     """Lines from one to the next would remove the plume and raise the errors.
 
-    The ratio rose from below 4 when the errors of the clean signals became smaller.
+    They are compared with the scatter of clean signals about the truth, not with what is stated.
     """
     net = three_by_two()
     r = grid(net, step)
@@ -219,8 +219,8 @@ def test_single_outlying_bins_in_curved_air_change_little(field, most, step):
         beam[rng.integers(5, 25) : -4 : 25] = True
     result = solved(net, r, power + outlying * 30.0 * np.sqrt(variance), variance)
     near = result.near_crossing
-    error_ratio = (result.extinction_standard_error / clean.extinction_standard_error)[:, near]
-    assert np.nanmedian(error_ratio) < most
+    scatter = np.sqrt(np.nanmean((clean.extinction - field(*net.crossing.T))[:, near] ** 2))
+    assert np.nanmedian(result.extinction_standard_error[:, near]) < most * scatter
 
 
 @pytest.mark.parametrize("share", [0.02, 0.04])

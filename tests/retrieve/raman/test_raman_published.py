@@ -264,12 +264,12 @@ def test_values_agree_with_the_truth_within_stated_errors(case, air):
 def test_means_of_the_realisations_are_those_of_the_page(case):
     found = deviations(case, retrieved(case))
     limits = {"extinction": (5.0, 10.0), "backscatter": (3.0, 3.0), "lidar_ratio": (10.0, 10.0)}
-    if case.name == "355":
-        # 8 of 750 cells have a lidar ratio, all of two realisations; see the sums of realisations.
-        limits["lidar_ratio"] = (10.0, 11.0)
     for name, most in limits.items():
-        assert np.all(np.abs(found[name]) <= most), name
         np.testing.assert_allclose(found[name], FIGURES[case.name][name], atol=0.06, err_msg=name)
+        within = np.abs(found[name]) <= most
+        # Missed: 8 of 750 cells have a lidar ratio, of two realisations; sums of 15 have no bias.
+        missed = [False, case.name == "355" and name == "lidar_ratio"]
+        assert within.tolist() == np.logical_not(missed).tolist(), name
 
 
 def test_single_realisations_are_right_within_their_errors(case):
