@@ -68,7 +68,7 @@ def take(name: str, folder: Path) -> None:
     selection = SELECTIONS[name]
     result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     kept = {
-        title: [_row(row) for row in rows if _is_kept(row, selection)]
+        title: _by_case_and_method(row for row in rows if _is_kept(row, selection))
         for title, rows in result["tables"].items()
         if title.startswith(selection.titles)
     }
@@ -101,17 +101,17 @@ def _is_kept(row: dict[str, Any], selection: Selection) -> bool:
     return not selection.quantities or row["quantity"] in selection.quantities
 
 
-def _row(row: dict[str, Any]) -> list[Any]:
-    value = row["value"]
-    number = _rounded(value, DIGITS) if isinstance(value, float) else value
-    return [
-        row["case"],
-        row["method"],
-        row["quantity"],
-        number,
-        _rounded(row["error"], ERROR_DIGITS),
-        row["unit"],
-    ]
+def _by_case_and_method(rows: Iterable[dict[str, Any]]) -> list[list[Any]]:
+    """Return the quantities of each case and method: value, error and unit."""
+    groups: dict[tuple[str, str], dict[str, list[Any]]] = {}
+    for row in rows:
+        value = row["value"]
+        groups.setdefault((row["case"], row["method"]), {})[row["quantity"]] = [
+            _rounded(value, DIGITS) if isinstance(value, float) else value,
+            _rounded(row["error"], ERROR_DIGITS),
+            row["unit"],
+        ]
+    return [[*key, quantities] for key, quantities in groups.items()]
 
 
 def _rounded(value: float, digits: int) -> float:
@@ -136,8 +136,12 @@ def read(name: str) -> dict[str, Any]:
     return {
         **result,
         "tables": {
-            title: [Row(*row[:5], Unit(row[5])) for row in rows]
-            for title, rows in result["tables"].items()
+            title: [
+                Row(case, method, quantity, value, error, Unit(unit))
+                for case, method, quantities in groups
+                for quantity, (value, error, unit) in quantities.items()
+            ]
+            for title, groups in result["tables"].items()
         },
     }
 
