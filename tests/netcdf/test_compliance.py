@@ -24,8 +24,8 @@ SHAPES: dict[str, dict[str, Any]] = {
     "one_profile": {"zenith": 3.0, "profiles": 1},
     "many_profiles": {"zenith": 0.0, "profiles": 300},
 }
-# Five seconds each, and the same variables as the others.
-SLOW = {"one_profile", "many_profiles"}
+# Seconds each, and the same variables as the others; a product of missing values is horizontal too.
+SLOW = {"horizontal", "one_profile", "many_profiles"}
 
 
 def missing(kind: str) -> xr.Dataset:
