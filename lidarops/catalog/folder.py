@@ -18,6 +18,8 @@ from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, raman_wavelength
 
 _HEADER_BYTES: Final = 16384
+_SCRATCH: Final = "temp"
+"""Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
 _FILTER: Final = 2e-9
 """m; headers round wavelengths to nanometres, and those of water vapour are stated as 407 or 408.
 """
@@ -69,6 +71,9 @@ class FolderContents:
     """Path of each damaged raw file, and what is wrong with it."""
     other: tuple[str, ...]
     """Paths of files of no raw format."""
+    copies: tuple[str, ...] = ()
+    """Paths of files in which an acquisition keeps its last record, whose content another file of
+    the folder has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +137,15 @@ class InstrumentHeaders:
         return tuple(channel.name for channel in self._elastic)
 
     @property
+    def scanned_channels(self) -> tuple[str, ...]:
+        """All elastic channels: of a scan, polarisations and detections test each other."""
+        return tuple(
+            channel.name
+            for channel in self._by_mode
+            if channel.wavelength > 0 and not self._is_raman(channel)
+        )
+
+    @property
     def joined_channels(self) -> tuple[str, ...]:
         """The elastic channels, glued where they can be."""
         glued = {_label(name): name for name in self.pairs}
@@ -187,7 +201,9 @@ def read_folder(root: str) -> FolderContents:
     headers: dict[tuple[object, ...], list[tuple[str, RawHeader]]] = defaultdict(list)
     refused: list[tuple[str, str]] = []
     other: list[str] = []
-    for file in source.files():
+    files = list(source.files())
+    copies = [file for file in files if _is_copy(source, file, files)]
+    for file in (file for file in files if file not in copies):
         try:
             header = _header(source, file)
         except (RawFormatError, OSError) as error:
@@ -201,7 +217,25 @@ def read_folder(root: str) -> FolderContents:
         tuple(_group(members) for _, members in sorted(headers.items(), key=_place)),
         tuple(refused),
         tuple(other),
+        tuple(printable(file.path) for file in copies),
     )
+
+
+def _is_copy(source: Source, file: RawFile, files: Sequence[RawFile]) -> bool:
+    """Return whether a file of the acquisition has the content of another file of its folder."""
+    folder, stem = _split(file.path)
+    if stem != _SCRATCH:
+        return False
+    others = [
+        other.path
+        for other in files
+        if _split(other.path)[0] == folder and other.size == file.size and other != file
+    ]
+    try:
+        return bool(others) and source.digest(file.path) in map(source.digest, others)
+    except OSError:
+        # What cannot be read is refused with its reason.
+        return False
 
 
 def _header(source: Source, file: RawFile) -> RawHeader:

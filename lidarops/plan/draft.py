@@ -24,8 +24,6 @@ from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.steps.channels import file_channels
 from lidarops.steps.pointing import LEAST_SPREAD
 
-_SCRATCH: Final = "temp"
-"""Stem of the file into which the acquisition of Licel writes before it gives a name."""
 _NEAR: Final = 0.2
 """degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""
 _ALTITUDES: Final = (-500.0, 9000.0)
@@ -95,8 +93,7 @@ def draft_campaign(
     CatalogError
         If the folder holds no raw file that can be used.
     """
-    groups = [group for group in contents.groups if group.stem != _SCRATCH]
-    instruments = instruments_of(groups)
+    instruments = instruments_of(contents.groups)
     if not any(instrument.files for instrument in instruments):
         reasons = [reason for _, reason in contents.refused[:1]]
         raise CatalogError(
@@ -268,7 +265,6 @@ def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[
 
 def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
     """Yield comments on the files that no instrument has."""
-    scratch = [p for group in contents.groups if group.stem == _SCRATCH for p in group.files]
     tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
     rest = [path for path in contents.other if path not in tables]
     named = "? soundings, lidar ratios or overlap? Name them in the facts, as molecular_profile"
@@ -276,7 +272,7 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
         # A campaign reads no file outside of its folder.
         named += "; copy them below the folder of this file first"
     for title, paths in (
-        ("the last record of the acquisition, left out", scratch),
+        ("copies of the last record of the acquisition, left out", contents.copies),
         # As seen from the campaign file.
         (named, [f"{archive}/{path}" for path in tables]),
         ("of no raw format", rest),

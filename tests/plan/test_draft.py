@@ -226,10 +226,15 @@ def test_files_of_real_archives_are_those_of_their_headers(
 
 def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path: Path) -> None:
     """Without dead time, `poor_stratification` rejects all its cycles."""
-    drafted(data_root / "savant", tmp_path / "campaign.yaml")
+    _, text = drafted(data_root / "savant", tmp_path / "campaign.yaml")
+    assert "channels: [photon_355p, photon_355s, analog_355p, analog_355s]" in text
+    # One temp.dat is the copy of a record, the other one the only copy.
+    assert "2018A18/temp*" in text
+    assert "1 file, copies of the last record of the acquisition, left out:" in text
     options = ["--product", "multiangle", "--instrument", "u-c-vol-lidar", "--json"]
     shown = CliRunner().invoke(app, ["reprocess", str(tmp_path / "campaign.yaml"), *options])
-    (quality,) = json.loads(shown.stdout)["quality"].values()
+    qualities = json.loads(shown.stdout)["quality"]
+    (quality,) = (own for name, own in qualities.items() if "photon_355p" in name)
     assert quality["good"] + quality["care"] == 100
     # Of four lone records.
     assert quality["reject"] == 200
