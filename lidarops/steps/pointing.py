@@ -28,6 +28,12 @@ def no_scan(case: ChannelCase) -> str:
     if len(angles) < len(header_angles):
         return "headers lack zenith angles"
     spread = max(angles) - min(angles)
+    if spread < LEAST_SPREAD <= _azimuth_sector(case):
+        elevation = 90.0 - 0.5 * (max(angles) + min(angles))
+        return (
+            f"a plan-position scan (PPI) at {elevation:.3g} degree above the horizon, over an"
+            f" azimuth sector of {_azimuth_sector(case):.3g} degree: its slant paths do not differ"
+        )
     if spread < LEAST_SPREAD:
         return f"zenith angles span only {spread:g} degree: the beam does not scan"
     return ""
@@ -37,14 +43,21 @@ def moves(case: ChannelCase) -> bool:
     """Return whether the files of a scene point to several directions, of any pattern."""
     if case.facts.zenith_angle is not None:
         return False
-    granules, side = case.scene.granules, case.facts.azimuth
+    granules = case.scene.granules
     zenith = [granule.zenith_angle for granule in granules if granule.zenith_angle is not None]
     if zenith and max(zenith) - min(zenith) > FIXED:
         return True
+    return _azimuth_sector(case) > FIXED
+
+
+def _azimuth_sector(case: ChannelCase) -> float:
+    """Return the narrowest azimuth sector that holds all beams, degree."""
+    if case.facts.azimuth is not None:
+        return 0.0
+    granules = case.scene.granules
     azimuth = [granule.azimuth for granule in granules if granule.azimuth is not None]
     # The sector of all beams may hold north.
-    sector = 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
-    return side is None and sector > FIXED
+    return 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
 
 
 def fixed_zenith(case: ChannelCase) -> tuple[float, str]:

@@ -227,18 +227,32 @@ def low_scan(folder: Path, zenith_angles: list[float]) -> Campaign:
 def test_beams_near_the_horizon_are_left_out_with_a_reason(tmp_path):
     (outcome,) = reprocess(low_scan(tmp_path, [88.0, 87.5, 83.0, 80.0, 70.0])).scenes
     (step,) = (step for step in outcome.plan.steps if step.name == "multiangle")
-    assert "2 of 5 beam directions rise less than 3.0 degree" in step.reason
+    assert "less than 3.0 degree above the horizon, left out: 2 of 5 (40%)" in step.warning
     assert "a range-height scan (RHI) at azimuth 90 degree, 3 directions" in step.reason
     with xr.open_dataset(next(tmp_path.rglob("*multiangle*.nc"))) as product:
         np.testing.assert_allclose(product["beam_zenith_angle"], [70.0, 80.0, 83.0])
 
 
-@pytest.mark.parametrize("angles", [[89.9, 88.0, 84.0], [89.0, 87.2, 80.0], [88.0, 80.0, 80.1]])
+@pytest.mark.parametrize(
+    "angles", [[89.9, 88.0, 84.0], [89.0, 87.2, 80.0], [88.0, 80.0, 80.1], [20.0, 24.0, 26.0]]
+)
 def test_a_scan_without_leverage_is_known_before_it_is_read(tmp_path, angles):
     record = bring_up_to_date(low_scan(tmp_path, angles))
     (reason,) = record.empty_scenes.values()
-    assert "beam directions rise less than 3.0 degree" in reason
+    assert ("less than 3.0 degree above the horizon" in reason) == (max(angles) > 87.0)
     assert "no leverage" in reason
+
+
+def test_a_scan_of_one_elevation_is_named(tmp_path):
+    instrument = TREE["simulation"]["instruments"]["scanner"]
+    scan = {"zenith_angles": [80.0], "azimuth": 0, "further_azimuths": [60, 120, 180, 240, 300]}
+    settings, _ = campaign(
+        tmp_path, duration=800, instruments={"scanner": instrument | {"scan": scan}}
+    )
+    (reason,) = bring_up_to_date(settings).empty_scenes.values()
+    assert "a plan-position scan (PPI) at 10 degree above the horizon" in reason
+    assert "azimuth sector of 300 degree" in reason
+    assert "does not scan" not in reason
 
 
 def level_scan(folder: Path, sections: list[list[float]]) -> tuple[Campaign, xr.Dataset]:

@@ -93,7 +93,7 @@ class Beams:
     cycles: int = 0
     largest: int = 0
     """Number of directions of the cycle that has most."""
-    lone: tuple[int, ...] = ()
+    single: tuple[int, ...] = ()
     """The first granule of each cycle of one direction, which has no value."""
 
 
@@ -143,7 +143,7 @@ def _beams(pointings: Numbers, bounds: Numbers, step: float, highest: float) -> 
     profiles = np.flatnonzero(np.isin(directions.index, up))
     seen = np.unique(np.stack([cycle[profiles], directions.index[profiles]]), axis=1)[0]
     numbers, counts = np.unique(seen, return_counts=True)
-    lone = numbers[counts < _FEWEST_DIRECTIONS]
+    single = numbers[counts < _FEWEST_DIRECTIONS]
     return Beams(
         up.size,
         low,
@@ -154,7 +154,7 @@ def _beams(pointings: Numbers, bounds: Numbers, step: float, highest: float) -> 
         _pattern(angles, directions.azimuth[up]) if sides_known else f"{up.size} zenith angles",
         counts.size,
         int(counts.max()),
-        tuple(int(row) for row in np.searchsorted(cycle, lone)),
+        tuple(int(row) for row in np.searchsorted(cycle, single)),
     )
 
 
@@ -167,14 +167,37 @@ def _pattern(zenith_angle: Array, azimuth: Array) -> str:
     return f"a range-height scan (RHI) at azimuth {lowest:.0f} degree, {azimuth.size} directions"
 
 
-def _lone_beams(case: Case, directions: Beams) -> str:
-    """Return the warning of cycles of one beam; empty where there are none."""
-    if not directions.lone:
+def _low_beams(directions: Beams) -> str:
+    """Return the warning of beams that are left out as too low; empty where there are none."""
+    if not directions.low:
         return ""
-    first = case.scene.granules[directions.lone[0]].path
+    count = directions.low + directions.count
     return (
-        f"cycles of one beam only: {len(directions.lone)} of {directions.cycles}. All their values"
-        f" are rejected: leave their files out of `files` (first: {first})"
+        f"beam directions less than {LOWEST_ELEVATION:.1f} degree above the horizon, left out:"
+        f" {directions.low} of {count} ({directions.low / count:.0%})"
+    )
+
+
+def _without_leverage(directions: Beams) -> str:
+    """Return why slant paths do not differ enough for an optical depth; empty where they do."""
+    if directions.span >= THRESHOLDS.least_span or not directions.low + directions.count:
+        return ""
+    if directions.count < _FEWEST_DIRECTIONS:
+        return f"beam directions: {directions.count}, which give no leverage"
+    return (
+        f"slant paths differ by {directions.span:.2g} vertical paths, less than"
+        f" {THRESHOLDS.least_span:g}, which give no leverage"
+    )
+
+
+def _single_beams(case: Case, directions: Beams) -> str:
+    """Return the warning of cycles of one beam; empty where there are none."""
+    if not directions.single:
+        return ""
+    first = case.scene.granules[directions.single[0]].path
+    return (
+        f"cycles of one beam only: {len(directions.single)} of {directions.cycles}. All their"
+        f" values are rejected: leave their files out of `files` (first: {first})"
     )
 
 
@@ -331,11 +354,10 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
             yield Leave(reason)
             return
         directions = beams(case)
-        low = f"{directions.low} of {directions.low + directions.count} beam directions rise less"
-        low += f" than {LOWEST_ELEVATION:.1f} degree above the horizon"
-        lever = directions.count >= _FEWEST_DIRECTIONS and directions.span >= THRESHOLDS.least_span
-        if directions.low and not lever:
-            yield Leave(f"{low}: the rest has no leverage", number=float(directions.count))
+        without_leverage = _without_leverage(directions)
+        if without_leverage:
+            reasons = filter(None, (_low_beams(directions), without_leverage))
+            yield Leave("; ".join(reasons), number=float(directions.count))
             return
         settings = case.request
         words = f"{REQUESTED}, and the beam scans"
@@ -344,7 +366,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         if directions.cycles > 1:
             words += f", in {directions.cycles} cycles of at most {directions.largest}"
         yield Run(
-            f"{words}; {low} and are left out" if directions.low else words,
+            words,
             ScanSettings(
                 highest=settings.highest,
                 step=settings.step,
@@ -354,7 +376,9 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
                 layers=tuple(settings.layers),
                 least_signal_to_noise=settings.least_signal_to_noise,
             ),
-            warning=_lone_beams(case, directions),
+            warning="; ".join(
+                filter(None, (_low_beams(directions), _single_beams(case, directions)))
+            ),
         )
 
     def stream(self, settings: ScanSettings, data: Data) -> WholeProduct:
