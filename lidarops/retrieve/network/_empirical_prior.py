@@ -112,8 +112,8 @@ class Solution:
     """(profile, beam) True where the covariance of a beam is singular or missing."""
     constants: Array
     """(profile, beam) logarithms of signal over extinction at the last passages."""
-    cost: float
-    """-2 ln likelihood of all profiles."""
+    cost: Array
+    """(profile,) -2 ln likelihood."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ class Problem:
             (counts == 0) & (self.counts > 0),
             constants,
             # A prior must not become likelier by leaving a profile undetermined.
-            float(np.sum(np.where(determined, cost, _UNDETERMINED_COST))),
+            np.where(determined, cost, _UNDETERMINED_COST),
         )
 
     def mean(self) -> Problem:
@@ -381,13 +381,18 @@ def median(values: Array) -> Array:
 def _likeliest(problem: Problem, strength: float) -> Solution:
     """Solve with the largest deviation that is not much less likely than the likeliest one.
 
-    Where the likelihood does not separate deviations, the weaker prior is used.
+    Where the likelihood does not separate deviations, the weaker prior is used. Profiles whose
+    solution does not converge with every deviation do not count where others do: their likelihoods
+    follow from rounding errors.
     """
     solution = problem.solve(Prior(THRESHOLDS.deviations[-1], strength), _FIRST_PASSES)
     tried = []
     for deviation in reversed(THRESHOLDS.deviations):
         solution = problem.solve(Prior(deviation, strength), _NEXT_PASSES, solution.constants)
         tried.append(solution)
-    limit = min(solution.cost for solution in tried) + THRESHOLDS.likelihood_tolerance
-    likely = next(solution for solution in tried if solution.cost <= limit)
+    settled = np.all([solution.settled for solution in tried], axis=0)
+    counted = settled if settled.any() else np.ones_like(settled)
+    costs = [float(np.sum(solution.cost[counted])) for solution in tried]
+    limit = min(costs) + THRESHOLDS.likelihood_tolerance
+    likely = next(solution for solution, cost in zip(tried, costs, strict=True) if cost <= limit)
     return problem.solve(likely.prior, _LAST_PASSES, likely.constants)

@@ -268,7 +268,7 @@ def test_likelihood_agrees_with_the_dense_linear_model():
         )
 
     def measured(deviation):
-        return problem.solve(Prior(deviation), 1, fixed).cost
+        return problem.solve(Prior(deviation), 1, fixed).cost.sum()
 
     for deviation in (0.01, 0.1, 0.5):
         difference = dense(deviation) - dense(0.05)
@@ -387,6 +387,20 @@ def test_the_mean_of_profiles_detects_a_field_that_the_prior_excludes(field, det
     accepted = solved.profiles.prior
     assert detected or accepted.strength == 1.0
     assert _empirical_prior._improbable(problem.mean().solve(prior)) == detected
+
+
+def test_a_profile_that_does_not_converge_has_no_say_in_the_prior():
+    problem = fifty(homogeneous(1e-3), 0.05)
+    data = problem.data.take(np.arange(6))
+    data.log_value[0] += 3.0 * np.random.default_rng(0).standard_normal(data.log_value.shape[1])
+    whole, others = (
+        _empirical_prior._likeliest(replace(problem, data=data.take(rows)), 1.0)
+        for rows in (np.arange(6), np.arange(1, 6))
+    )
+    assert whole.settled.tolist() == [False, *[True] * 5]
+    # With its likelihood, which jumps from deviation to deviation, this was 1.
+    assert whole.prior == others.prior
+    np.testing.assert_array_equal(whole.logarithm[1:], others.logarithm)
 
 
 def test_the_mean_of_profiles_is_taken_beam_by_beam():
