@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import before_after
 import benchmark_results
 import campaign_keys
 import command_line
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 PARTS: Final[dict[str, Callable[[], str]]] = {
     "accuracy": partial(benchmark_results.page, "accuracy"),
+    "before-after": before_after.page,
     "background": partial(benchmark_results.page, "background"),
     "campaign-keys": campaign_keys.page,
     "command-line": command_line.page,

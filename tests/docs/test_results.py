@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 
+import before_after
 import benchmark_results
 import pytest
 import typer
 
 from lidarops.bench.harness.benchmark import BenchmarkKind
-from lidarops.bench.harness.rows import share_text
+from lidarops.bench.harness.rows import Figure, Unit, share_text
 from lidarops.bench.registry import Benchmark
 from lidarops.bench.stability import study
 from lidarops.bench.stability.random_scenes import BROKEN, VIOLATED, Verdict
@@ -165,6 +166,77 @@ def test_products_state_the_classes_that_miss_their_target() -> None:
             share = shares[row.case, row.method]
             stated = float(words.split(" ")[0]) / 100.0
             assert abs(share.value - stated) < 2.0 * share.error, (title, row.case, row.method)
+
+
+def _rows_before():
+    groups = json.loads((benchmark_results.RESULTS / "before.json").read_text())["groups"]
+    return [row for group in groups for row in group["rows"]]
+
+
+@pytest.mark.parametrize("row", _rows_before(), ids=lambda row: row["figure"])
+def test_a_figure_that_misses_its_target_says_why(row) -> None:
+    """Every figure of the independent study is measured today, and one that misses is explained."""
+    figure = before_after.measured(row["now"])
+    assert figure.value >= 0.0
+    missed = "MISSED" in before_after.verdict(figure, row["target"])
+    assert missed == bool(row.get("why"))
+
+
+STATED_BESIDE = {
+    ("near the cut", "background near the cut: false"): (
+        "homogeneous",
+        "background",
+        "0.3 percent",
+    ),
+    ("single profiles in layered air", "network, layered, blocks of 1: false"): (
+        *("visibility", ""),
+        "0.4 percent where extinction changes with height",
+    ),
+    ("networks of single profiles", "network, plume, blocks of 1: false"): (
+        *("visibility", ""),
+        "0.3 percent with a plume",
+    ),
+}
+"""As `STATED`, for groups and figures of the study of intervals."""
+
+
+@pytest.mark.parametrize("place", STATED_BESIDE)
+def test_products_state_what_the_study_of_intervals_misses(place) -> None:
+    kind, variable, words = STATED_BESIDE[place]
+    layout = kinds()[kind].part("variables", "LAYOUT")
+    comments = {data.name: data.comment for data in layout.data} | {"": layout.comment}
+    assert words in comments[variable]
+    figure = before_after.measured(["intervals", *place])
+    assert abs(figure.value - float(words.split(" ")[0]) / 100.0) < 2.0 * figure.error
+
+
+def test_every_false_share_that_misses_in_the_study_is_stated() -> None:
+    for row in _rows_before():
+        missed = "MISSED" in before_after.verdict(before_after.measured(row["now"]), row["target"])
+        if missed and row["now"][0] == "intervals" and row["now"][-1].endswith(": false"):
+            assert tuple(row["now"][1:]) in STATED_BESIDE
+
+
+def test_the_page_shows_before_and_now_with_errors() -> None:
+    text = before_after.page()
+    for row in _rows_before():
+        assert f"| {row['figure']} | {row['before']} |" in text
+    assert "`python tests/studies/intervals.py`" in text
+    assert "`lidarops bench stability --quick`" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "words"),
+    [
+        (0.95, 0.001, "94 to 97 % met"),
+        (0.9715, 0.001, "94 to 97 % undecided"),
+        (0.973, 0.001, "94 to 97 % MISSED"),
+        (0.93, 0.001, "94 to 97 % MISSED"),
+    ],
+)
+def test_figures_are_judged_within_their_errors(value: float, error: float, words: str) -> None:
+    figure = Figure(value, error, Unit.SHARE)
+    assert before_after.verdict(figure, {"least": 0.94, "most": 0.97}) == words
 
 
 def test_the_scoreboard_shows_ours_beside_all_others() -> None:

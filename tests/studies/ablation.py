@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -140,6 +141,16 @@ def _change(own: list[Counts], base: list[Counts], part: str, whole: str) -> tup
         value, without = value - base_value, without - base_without
     count = without.size
     return value, float(np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2)))
+
+
+def write_table(page: Path, mark: str, lines: Iterable[str]) -> None:
+    """Write the lines of a table into a page, between two marks of that name."""
+    text = page.read_text(encoding="utf-8")
+    before, begin, rest = text.partition(f"<!-- {mark} -->\n")
+    _, end, after = rest.partition(f"<!-- end of {mark} -->")
+    if not (begin and end):
+        raise ValueError(f"{page} has no marks of the name {mark!r}")
+    page.write_text("".join((before, begin, *(f"{line}\n" for line in lines), end, after)), "utf-8")
 
 
 def cluster_count(description: str | None, default: int) -> int:

@@ -30,6 +30,7 @@ import xarray as xr
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from studies.ablation import write_table
 from support.archives import network_campaigns
 
 from lidarops.bench.accuracy.network_cases import Air, signals
@@ -305,11 +306,7 @@ def table(out: Path, marker: str) -> None:
             # A table of one class only needs no row of all.
             if kept and (of_class or len({key[0] for key in kept}) > 1):
                 rows.append(_row(name, of_class or "all", kept, all_kept))
-    text = PAGE.read_text(encoding="utf-8")
-    before, _, rest = text.partition(f"<!-- {marker} -->\n")
-    _, _, after = rest.partition(f"<!-- end of {marker} -->")
-    whole = "\n".join((before + f"<!-- {marker} -->", *rows, f"<!-- end of {marker} -->" + after))
-    PAGE.write_text(whole, encoding="utf-8")
+    write_table(PAGE, marker, rows)
 
 
 def _read(path: Path) -> dict[tuple[str, int], dict[str, float]]:

@@ -125,9 +125,12 @@ LAYOUT: Final = Layout(
     " beam_latitude, beam_longitude and beam_altitude are the positions of the lidars. A gradient"
     " over the whole network mimics attenuation where the air is optically thin or the noise is"
     " high, and no test detects it there: total_extinction_standard_error allows for twice the"
-    " typical gradient. More profiles in a block and more beams constrain the field better. The"
-    " error that the prior leaves is common to all profiles, so that a mean over time does not"
-    " reduce it.",
+    " typical gradient. More profiles in a block and more beams constrain the field better. In"
+    " blocks of one profile, the share of simulated values without a flag that deviated by more"
+    " than 4 standard errors was 0.3 percent with a plume, and 0.4 percent where extinction changes"
+    " with height by a factor of e in 300 to 3000 m; most are of few networks, where noise hides"
+    " the field. The error that the prior leaves is common to all profiles, so that a mean over"
+    " time does not reduce it.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=(

@@ -86,6 +86,8 @@ def retrieve_optical_depth(
         m, ascending, above `station_altitude`; uniform for "joint".
     variance : (..., angle, altitude) float
         Variance of the noise alone, in the square of the unit of the signal, broadcast against it.
+        For counts, give that of a smoothed rate (`lidarops.retrieve.signal.counts_to_signal`):
+        variances from single counts make intervals too narrow.
     azimuth : (angle,) float, optional
         degree; the same for all angles if not given.
     method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
