@@ -1,4 +1,7 @@
-"""Ablation of the guards of the elastic inversion: ``python tests/studies/elastic_guards.py``."""
+"""Ablation of the guards of the elastic inversion: ``python tests/studies/elastic_guards.py``.
+
+It writes a table into ``docs/algorithms/elastic.md``.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from studies.ablation import Guard, cluster_count, measure, table
+from studies.ablation import Guard, cluster_count, measure, table, write_table
 
 from lidarops.bench.stability import random_elastic
 from lidarops.flags import Quality
@@ -26,6 +29,7 @@ from lidarops.retrieve.elastic import inversion, layers, outlying_bins
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
+PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/elastic.md"
 CLUSTERS: Final = 60
 PROFILES: Final = 10
 
@@ -149,4 +153,4 @@ GUARDS: Final = (
 if __name__ == "__main__":
     clusters = cluster_count(__doc__, CLUSTERS)
     counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), range(clusters), GUARDS)
-    sys.stdout.write("\n".join([*table(counts), ""]))
+    write_table(PAGE, "guards", table(counts))
