@@ -286,6 +286,7 @@ class _Instrument(_Work):
             if isinstance(stream, WholeProduct):
                 results = stream.results()
                 frame = _with_words(next(results), words[kind])
+                self.notes.update(dict.fromkeys(data[kind].notes))
                 yield self._written(contexts[kind], itertools.chain([frame], results))
 
 

@@ -36,6 +36,8 @@ class Source:
     ancillaries: Ancillaries
     station_altitude: float
     """m above mean sea level."""
+    shared: dict[Any, Any] = field(default_factory=dict)
+    """What one channel computed and others need too."""
 
     @property
     def geometry(self) -> xr.Dataset:
@@ -194,7 +196,8 @@ class Data:
     statements: list[str] = field(default_factory=list)
     """What steps decided from the data, in words for the product."""
     notes: list[str] = field(default_factory=list)
-    """What the data did not give though the campaign requests it, in words for the run."""
+    """What the report of the run states of the data, such as requested values that they do not
+    give."""
     _values: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, datum: Datum[T]) -> T:

@@ -164,6 +164,14 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     found = xr.load_dataset(Path(record.products) / product.path)
     assert found["blocked_zenith_angle"].values.tolist() == [87.0]
     assert found["blocked_azimuth"].values.tolist() == [87.0]
+    # Nearer than full overlap, and no light is used behind.
+    (beam,) = np.flatnonzero(found["beam_azimuth"] == 87.0)
+    assert np.nanmin(found["beam_obstruction"].values[:, beam]) == found["blocked_range"].values
+    assert np.isfinite(found["beam_obstruction"]).sum() == 1
+    assert not np.isfinite(found["beam_signal"].values[:, beam]).any()
+    assert record.scenes[0].notes == (
+        "blocked beams, 1 of 83: elevation 3, azimuth 87 degree from 62 m",
+    )
     assert (np.abs(found["analog_baseline"]) < 0.005).all()
     assert (found["usable"] < 2).all()
     rows = [int(np.abs(found["altitude"].values - 220.0 - z).argmin()) for z in HEIGHTS[1:]]

@@ -1,4 +1,4 @@
-"""Step of the product ``multiangle``: the analog baseline, from beams that are blocked."""
+"""Blocked beams of the product ``multiangle``, and the step of the analog baseline they show."""
 
 from __future__ import annotations
 
@@ -15,24 +15,26 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import PROFILES
-from lidarops.steps.data import BackgroundSettings, Data
+from lidarops.steps.data import Chunk, Data, Profiles
 from lidarops.steps.preparation import BACKGROUND
-from lidarops.steps.reading import ARCHIVE
 from lidarops.steps.step import Datum, Decisions, Leave, NoSettings, Run, Step
 from lidarops.steps.workload import Workload
 
-BASELINE: Final = Datum[AnalogBaseline]("baseline")
+BASELINE: Final = Datum[bool]("baseline")
+"""Whether an analog baseline is subtracted where a beam is blocked."""
 _UNKNOWN: Final = np.int32(Quality.INPUT_MISSING | Quality.SATURATED)
 """Bits of bins that show nothing; what blocks a beam may stand where the overlap is incomplete."""
-_TOGETHER: Final = 32
-"""Profiles that are read together; the result does not depend on it."""
+_NAMED: Final = 6
+"""Most blocked beams that a note names."""
+_TOGETHER: Final = 8
+"""Profiles that are averaged together; the result does not depend on it."""
 
 
 class Baseline(Step[ProductCase[MultiAngleSettings], NoSettings]):
     """Subtract the analog baseline that blocked beams show."""
 
     name = "baseline"
-    inputs = (ARCHIVE, PROFILES, BACKGROUND)
+    inputs = (PROFILES, BACKGROUND)
     outputs = (BASELINE,)
 
     def decide(self, case: ProductCase[MultiAngleSettings]) -> Decisions:
@@ -54,22 +56,20 @@ class Baseline(Step[ProductCase[MultiAngleSettings], NoSettings]):
             yield Run(reason, number=lowest)
 
     def carry_out(self, settings: NoSettings, data: Data) -> None:  # noqa: ARG002
-        """Give the baseline, where a beam is blocked."""
-        baseline = _baseline(data, data[BACKGROUND])
-        if baseline is not None:
-            data[BASELINE] = baseline
+        """Request the baseline of the blocked beams that the product finds."""
+        data[BASELINE] = True
 
     def cpu_time(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time by the number of bins of low beams, s."""
-        return 4e-7 * _low_profiles(work) * work.bins
+        """Return the CPU time of a second pass over all profiles, s: where a beam is blocked."""
+        return 4e-7 * work.profiles * work.bins if _low_profiles(work) else 0.0
 
     def held(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the bytes of the profiles that are read together."""
+        """Return the bytes of the low beams that are averaged together."""
         return _BYTES_OF_A_BIN * min(_TOGETHER, _low_profiles(work)) * work.bins
 
 
 _BYTES_OF_A_BIN: Final = 90.0
-"""Bytes per bin of a profile that is read for the baseline, at the peak."""
+"""Bytes per bin of a low beam while it is averaged, at the peak."""
 
 
 def _low_profiles(work: Workload) -> int:
@@ -78,20 +78,47 @@ def _low_profiles(work: Workload) -> int:
     return sum((granule.zenith_angle or 0.0) > limit for granule in work.scene.granules)
 
 
-def _baseline(data: Data, background: BackgroundSettings) -> AnalogBaseline | None:
-    archive, profiles = data[ARCHIVE], data[PROFILES]
-    low = 90.0 - archive["zenith_angle"].to_numpy() < THRESHOLDS.lowest_free
-    rows = np.flatnonzero(low)
-    beams = BlockedBeams(profiles.range, background.range)
-    for first in range(0, rows.size, _TOGETHER):
-        members = rows[first : first + _TOGETHER]
-        part = profiles.of(archive.isel(time=members))
+def blocked_beams(data: Data) -> BlockedBeams:
+    """Return the empty collection of the blocked beams of a scene."""
+    return BlockedBeams(data[PROFILES].range, data[BACKGROUND].range)
+
+
+def add_low_beams(beams: BlockedBeams, chunk: Chunk, profiles: Profiles) -> None:
+    """Take the beams of a chunk that are so low that they may be blocked."""
+    conditioned, first = chunk.profiles(profiles), chunk.rows.start
+    elevation = 90.0 - chunk.geometry["zenith_angle"].to_numpy()
+    low = np.flatnonzero(elevation < THRESHOLDS.lowest_free)
+    for start in range(0, low.size, _TOGETHER):
+        rows = low[start : start + _TOGETHER]
         power, variance, quality, length = (
-            part[name].to_numpy() for name in ("power", "variance", "quality", CORRELATION_LENGTH)
+            conditioned[name].to_numpy()[rows]
+            for name in ("power", "variance", "quality", CORRELATION_LENGTH)
         )
         missing = (quality & _UNKNOWN) != 0
-        beams.add(np.where(missing, np.nan, power), variance * length[:, np.newaxis], members)
-    return beams.baseline()
+        values = np.where(missing, np.nan, power)
+        beams.add(values, variance * length[:, np.newaxis], first + rows)
+
+
+def blocked_in_words(product: xr.Dataset) -> list[str]:
+    """Return a note on the low beams that are blocked, and from which range; none if all are free.
+
+    Obstructions of steeper beams are clouds.
+    """
+    nearest = product["beam_obstruction"].min("time").to_numpy()
+    elevation = 90.0 - product["beam_zenith_angle"].to_numpy()
+    blocked = np.flatnonzero(np.isfinite(nearest) & (elevation < THRESHOLDS.lowest_free))
+    if not blocked.size:
+        return []
+    sides = product["beam_azimuth"].to_numpy() if "beam_azimuth" in product.coords else None
+    words = [
+        f"elevation {elevation[beam]:.3g}"
+        + ("" if sides is None else f", azimuth {sides[beam]:.3g}")
+        + f" degree from {nearest[beam]:.0f} m"
+        for beam in blocked[:_NAMED]
+    ]
+    if blocked.size > _NAMED:
+        words.append(f"and {blocked.size - _NAMED} more (beam_obstruction of the product)")
+    return [f"blocked beams, {blocked.size} of {nearest.size}: {'; '.join(words)}"]
 
 
 def with_baseline(

@@ -6,6 +6,7 @@ A step that the retrieval decides from the data is planned where the beams permi
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -19,12 +20,20 @@ import xarray as xr
 from lidarops.constants import KNOWN_SHAPE_PAPERS, MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
 from lidarops.netcdf.variables import BACKGROUND_METHOD
-from lidarops.products.multiangle.baseline import BASELINE, Baseline, with_baseline
+from lidarops.products.multiangle.baseline import (
+    BASELINE,
+    Baseline,
+    add_low_beams,
+    blocked_beams,
+    blocked_in_words,
+    with_baseline,
+)
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
 from lidarops.records import Granule
 from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
+from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
@@ -414,12 +423,16 @@ class _Scans(WholeProduct):
 
     def __init__(self, settings: ScanSettings, data: Data) -> None:
         self._settings, self._station = settings, data.source.station_altitude
-        self._profiles = profiles = data[PROFILES]
-        self._geometry = geometry = data.source.geometry
-        self._baseline, overlap = data.get(BASELINE), data.get(OVERLAP)
+        self._data, self._profiles = data, data[PROFILES]
         self._background_method = data[BACKGROUND].method
         self._known_shape = self._background_method == "known_shape"
-        self._cycles = AltitudeCycles(
+        self._blocked = blocked_beams(data)
+        self._cycles = self._empty_cycles()
+
+    def _empty_cycles(self, baseline: AnalogBaseline | None = None) -> AltitudeCycles:
+        data, settings, profiles = self._data, self._settings, self._profiles
+        geometry, overlap = data.source.geometry, data.get(OVERLAP)
+        return AltitudeCycles(
             profiles.range,
             zenith_angle=geometry["zenith_angle"].to_numpy(),
             azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
@@ -431,7 +444,8 @@ class _Scans(WholeProduct):
             molecules=data[MOLECULES] if self._known_shape else None,
             wavelength=data[WAVELENGTH],
             overlap=None if overlap is None else overlap(profiles.range),
-            baseline=self._baseline,
+            baseline=baseline,
+            shapes=data.source.shared,
         )
 
     def ends(self) -> Indices:
@@ -440,19 +454,30 @@ class _Scans(WholeProduct):
 
     def add(self, chunk: Chunk) -> None:
         """Average the cycles of the next profiles over altitude cells."""
+        add_low_beams(self._blocked, chunk, self._profiles)
         self._cycles.add(chunk.profiles(self._profiles), chunk.rows.start)
+
+    def _without_baseline(self, baseline: AnalogBaseline) -> AltitudeCycles:
+        """Return the cycles of all profiles, read again, from which a baseline is subtracted."""
+        archive, cycles = self._data.source.archive, self._empty_cycles(baseline)
+        for first, past in itertools.pairwise([0, *cycles.ends(), archive.sizes["time"]]):
+            cycles.add(self._profiles.of(archive.isel(time=slice(first, past))), first)
+        return cycles
 
     def results(self) -> Iterator[xr.Dataset]:
         """Yield the optical depth of all cycles."""
         settings = self._settings
+        baseline = self._blocked.baseline() if self._data.get(BASELINE) else None
+        cycles = self._cycles if baseline is None else self._without_baseline(baseline)
         optical_depth = labeled.retrieve_optical_depth(
-            self._cycles.result(),
+            cycles.result(self._blocked.obstructions()),
             station_altitude=self._station,
             method=settings.method,
             regularisation=settings.regularisation,
             largest_gradient=settings.largest_gradient,
             layers=[(low + self._station, high + self._station) for low, high in settings.layers],
         )
+        self._data.notes.extend(blocked_in_words(optical_depth))
         optical_depth = optical_depth.assign(
             retrieval_method=LAYOUT.row("retrieval_method").code(optical_depth.attrs["method"]),
             background_method=BACKGROUND_METHOD.code(self._background_method),
@@ -460,8 +485,8 @@ class _Scans(WholeProduct):
         papers = self._papers()
         if papers:
             optical_depth = optical_depth.assign_attrs(references="\n".join(papers))
-        if self._baseline is not None:
-            optical_depth = with_baseline(optical_depth, self._baseline, self._geometry)
+        if baseline is not None:
+            optical_depth = with_baseline(optical_depth, baseline, self._data.source.geometry)
         least = settings.least_signal_to_noise
         return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
 

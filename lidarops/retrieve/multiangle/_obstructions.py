@@ -48,7 +48,7 @@ def obstruction_range(power: Array, variance: Array, distance: Array) -> Array:
     )
     samples = np.maximum(inside, 1.0)
     level, error = values / samples, np.sqrt(spread) / samples
-    # What is missing, such as saturated, is not dark.
+    # Missing bins, such as saturated ones, do not show darkness.
     seen = np.where(inside > 0, level, np.inf)
     before = slice(0, count - _BEHIND - 1)
     behind, noise = (

@@ -32,8 +32,8 @@ class AnalogBaseline:
     def at(self, distance: Array) -> Array:
         """Return the baseline at ranges in m.
 
-        Nearer than the first block it is as there. The line to the middle of the far range goes on
-        beyond, so that the mean of the far range is 0.
+        Nearer than the first block, it is that of the block. The line to the middle of the far
+        range goes on beyond, so that the mean of the far range is 0.
         """
         slope = (self.power[-1] - self.power[-2]) / (self.range[-1] - self.range[-2])
         beyond = np.maximum(distance - self.range[-1], 0.0)
@@ -123,29 +123,38 @@ class BlockedBeams:
 
     def baseline(self) -> AnalogBaseline | None:
         """Return the baseline; None where no profile is blocked, or all are."""
-        blocked = [part for part in self._profiles if np.isfinite(part.obstruction)]
-        free = [part.mean for part in self._profiles if not np.isfinite(part.obstruction)]
-        if not blocked or not free:
-            return None
-        light = _median(np.stack(free))
-        behind = [self._behind(part) for part in blocked]
-        dark = [_is_dark(part, light) for part in behind]
-        blocked = [part for part, kept in zip(blocked, dark, strict=True) if kept]
+        blocked = self._blocked()
         if not blocked:
             return None
-        mean = np.stack([part for part, kept in zip(behind, dark, strict=True) if kept])
-        variance = np.stack([part.variance for part in blocked])
+        mean = np.stack([self._behind(profile) for profile in blocked])
+        variance = np.stack([profile.variance for profile in blocked])
         known = np.isfinite(mean).any(axis=0)
         power, of_power = _combined(mean[:, known], variance[:, known])
         middles = 0.5 * (self._edges[:-1] + self._edges[1:])
-        of_tail = 1.0 / sum(1.0 / part.of_tail for part in blocked)
+        of_tail = 1.0 / sum(1.0 / profile.of_tail for profile in blocked)
         return AnalogBaseline(
             range=np.append(middles[known], self._distance[self._tail].mean()),
             power=np.append(power, 0.0),
             standard_error=np.sqrt(np.append(of_power, of_tail)),
-            profile=np.array([part.number for part in blocked], dtype=np.int64),
-            obstruction=np.array([part.obstruction for part in blocked]),
+            profile=np.array([profile.number for profile in blocked], dtype=np.int64),
+            obstruction=np.array([profile.obstruction for profile in blocked]),
         )
+
+    def obstructions(self) -> dict[int, float]:
+        """Return the range in m from which each blocked profile is blocked, by its number."""
+        return {profile.number: profile.obstruction for profile in self._blocked()}
+
+    def _blocked(self) -> list[_Profile]:
+        """Return the profiles that are dark behind an obstruction; none where none is free."""
+        free = [own.mean for own in self._profiles if not np.isfinite(own.obstruction)]
+        if len(free) in {0, len(self._profiles)}:
+            return []
+        light = _median(np.stack(free))
+        return [
+            own
+            for own in self._profiles
+            if np.isfinite(own.obstruction) and _is_dark(self._behind(own), light)
+        ]
 
     def _behind(self, part: _Profile) -> Array:
         """Return the means of the blocks behind the obstruction, NaN in front."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -12,7 +12,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.air.molecular import MolecularProfile, molecular_lidar_ratio
 from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
@@ -42,8 +42,10 @@ _DIMENSIONS: Final = {
     "dead_time_error": _CUBE,
 }
 """Of the arrays of cycles; see `AltitudeCycles.result`."""
+_OF_CELLS: Final = {name for name, dims in _DIMENSIONS.items() if dims == _CUBE}
 BATCH: Final = 64
 """Profiles averaged together, unless one cycle has more."""
+_LEVELS: Final = ("altitude", "pressure", "temperature")
 _BESIDE: Final = 4
 """Bins beyond the highest cell, of which its mean needs one."""
 
@@ -82,6 +84,8 @@ class AltitudeCycles:
         The signal is divided by it; NaN where it is not known.
     baseline : AnalogBaseline, optional
         Subtracted from the power of all profiles; its error is part of that of the background.
+    shapes : dict, optional
+        Keeps the signals of clean air along the beams, for other channels of the scan.
 
     Raises
     ------
@@ -104,6 +108,7 @@ class AltitudeCycles:
         wavelength: float = np.nan,
         overlap: Array | None = None,
         baseline: AnalogBaseline | None = None,
+        shapes: dict[Any, Any] | None = None,
     ) -> None:
         directions = scan_cycles.directions(zenith_angle, azimuth)
         numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
@@ -121,7 +126,11 @@ class AltitudeCycles:
             background_range=background_range,
             shapes=None
             if molecules is None
-            else _shapes(molecules, wavelength, order.zenith_angle, distance, station_altitude),
+            else _kept_shapes(
+                {} if shapes is None else shapes,
+                molecules,
+                (wavelength, order.zenith_angle, distance, station_altitude),
+            ),
             altitude=levels,
             slant_edges=slant_edges,
             baseline=baseline,
@@ -176,8 +185,15 @@ class AltitudeCycles:
                 )
             )
 
-    def result(self) -> xr.Dataset:
+    def result(self, obstructions: Mapping[int, float] | None = None) -> xr.Dataset:
         """Return the cycles of all profiles.
+
+        Parameters
+        ----------
+        obstructions : mapping of int to float, optional
+            m, range from which profiles are blocked, by their number in the scene; from
+            `lidarops.retrieve.multiangle.analog_baseline.BlockedBeams.obstructions`, which sees
+            obstructions nearer than full overlap too.
 
         Returns
         -------
@@ -196,6 +212,7 @@ class AltitudeCycles:
             name: (_DIMENSIONS[name], np.concatenate([piece[name] for piece in self._pieces]))
             for name in self._pieces[0]
         }
+        self._end_beams({name: values for name, (_, values) in cycles.items()}, obstructions or {})
         bounds = _cycle_bounds(self._bounds, order)
         coordinates = {
             "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
@@ -215,6 +232,17 @@ class AltitudeCycles:
             },
             coords=coordinates,
         )
+
+    def _end_beams(self, cycles: Mapping[str, _Block], obstructions: Mapping[int, float]) -> None:
+        """Remove the cells of beams behind obstructions, in place."""
+        order = self._order
+        ends = np.array([obstructions.get(int(number), np.inf) for number in order.profile])
+        for row in np.flatnonzero(np.isfinite(ends)):
+            visit = order.cycle[row], order.beam[row]
+            cycles["obstruction"][visit] = np.fmin(cycles["obstruction"][visit], ends[row])
+            behind = self._settings.slant_edges[order.beam[row], 1:] > ends[row]
+            for name in _OF_CELLS & cycles.keys():
+                cycles[name][visit][behind] = np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -470,6 +498,20 @@ def _net_bins(
     return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left, blocked, sky.background)
 
 
+def _kept_shapes(
+    kept: dict[Any, Any], molecules: MolecularProfile, arguments: tuple[float, Array, Array, float]
+) -> Array:
+    """Return `_shapes`, or those that were kept for the same arguments; only the last are kept."""
+    wavelength, zenith_angle, distance, station_altitude = arguments
+    arrays = (zenith_angle, distance, *(getattr(molecules, name) for name in _LEVELS))
+    key = (wavelength, station_altitude, *(array.tobytes() for array in arrays))
+    if key not in kept:
+        kept.clear()
+        kept[key] = _shapes(molecules, *arguments)
+    shapes: Array = kept[key]
+    return shapes
+
+
 def _shapes(
     molecules: MolecularProfile,
     wavelength: float,
@@ -486,11 +528,9 @@ def _shapes(
     climb = np.cos(np.radians(zenith_angle))[:, np.newaxis]
     altitude = station_altitude + climb * distance[in_front]
     shapes = np.zeros((zenith_angle.size, distance.size))
-    shapes[:, in_front] = known_shape.molecular_shape(
-        molecules.backscatter(altitude, wavelength),
-        molecules.extinction(altitude, wavelength),
-        distance[in_front],
-    )
+    extinction = molecules.extinction(altitude, wavelength)
+    backscatter = extinction / molecular_lidar_ratio(wavelength)
+    shapes[:, in_front] = known_shape.molecular_shape(backscatter, extinction, distance[in_front])
     return shapes
 
 
