@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarops.figures import pixels
 from lidarops.figures.kind_figures import ProductSource
-from lidarops.figures.panels import Axis, Figure, Image, Panel, finite
+from lidarops.figures.panels import Axis, Curve, Figure, Image, Layer, Mark, Panel, finite
 from lidarops.figures.series_data import require
 from lidarops.figures.wording import counted, utc
 from lidarops.retrieve.multiangle.scan_cycles import vertical_planes
@@ -28,6 +28,7 @@ VARIABLES: Final = (
     "beam_zenith_angle",
     "beam_azimuth",
     "beam_signal",
+    "beam_obstruction",
     "residual",
 )
 """Variables that `read_scan_image` needs."""
@@ -44,6 +45,8 @@ _BESIDE: Final = 0.51
 """A beam fills pixels to this share of the step to the next one."""
 _SHOWN: Final = (2.0, 98.0)
 """Percentiles of the signals at the ends of the colours; far signals are mostly noise."""
+_BEHIND: Final = 1.5
+"""A panel shows at least this many times the range of an obstruction."""
 _ASPECT: Final = 1.75
 """Width over height of a map."""
 
@@ -62,6 +65,8 @@ class ScanImage:
     """(beam,) degree."""
     signal: Floats
     """(beam, altitude) Range-corrected; NaN where it is not used."""
+    obstruction: Floats
+    """(beam,) m, range from which the beam is blocked; NaN for a free beam."""
 
     @property
     def distance(self) -> Floats:
@@ -89,10 +94,17 @@ def read_scan_image(product: xr.Dataset, _: ProductSource) -> ScanImage | None:
         product[name].values.astype(np.float64) for name in ("beam_zenith_angle", "beam_azimuth")
     )
     cycle = np.zeros(zenith_angle.size, dtype=np.int64)
+    obstruction = np.full(count.shape, np.nan)
+    if "beam_obstruction" in product.variables:
+        obstruction = product["beam_obstruction"].transpose("time", "beam").values.astype(float)
+    blocked = np.isfinite(obstruction)
     for beams in vertical_planes(zenith_angle, azimuth):
-        cycle[beams] = np.argmax(count[:, beams].sum(axis=1))
-    used = np.flatnonzero(count[cycle, np.arange(cycle.size)])
-    if not used.size:
+        # All beams of a plane may be blocked where they begin.
+        signals = count[:, beams].sum(axis=1) + 0.5 * blocked[:, beams].any(axis=1)
+        cycle[beams] = np.argmax(signals)
+    everything = np.arange(cycle.size)
+    used = np.flatnonzero((count[cycle, everything] > 0) | blocked[cycle, everything])
+    if not count[cycle, everything].any():
         return None
     which = {
         "time": xr.DataArray(cycle[used], dims="beam"),
@@ -108,6 +120,7 @@ def read_scan_image(product: xr.Dataset, _: ProductSource) -> ScanImage | None:
         zenith_angle[used],
         azimuth[used],
         np.where(np.isfinite(residual) & (signal > 0.0), signal, np.nan),
+        obstruction[cycle[used], used],
     )
 
 
@@ -125,6 +138,12 @@ def draw_scan_images(images: Sequence[ScanImage]) -> list[Figure]:
         f"{counted(len(shown), 'vertical plane')} of {len(planes)}; each beam is shown as far as"
         " its signal is used"
     )
+    blocked = image.obstruction[np.isfinite(image.obstruction)]
+    if blocked.size:
+        words += (
+            f"; {counted(blocked.size, 'beam')} blocked, from {blocked.min():.0f} m: crosses, and"
+            " lines behind"
+        )
     figures = [Figure("Range-height scans (RHI)", words, panels)]
     beams = _of_one_elevation(image)
     if beams.size >= _FEWEST_AZIMUTHS and len(planes) >= _FEWEST_AZIMUTHS:
@@ -141,18 +160,23 @@ def _range_height(image: ScanImage, beams: Indices, ends: tuple[float, float]) -
     toward = float(azimuth[np.argmax(zenith)])
     side = np.where(np.cos(np.radians(azimuth - toward)) < 0.0, -1.0, 1.0)
     reached = np.where(np.isfinite(image.signal[beams]), image.distance[beams], 0.0)
-    reached = side * reached.max(axis=1)
+    turned = np.radians(zenith)
+    # Behind an obstruction, the panel goes on.
+    shadow = _BEHIND * np.nan_to_num(image.obstruction[beams])
+    reached = side * np.maximum(reached.max(axis=1), shadow * np.sin(turned))
+    top = max(_top(image, beams), float((shadow * np.cos(turned)).max()))
     x = Axis(
         f"horizontal distance toward azimuth {toward:.0f}° (km)",
         min(float(reached.min()), 0.0) / 1e3,
         max(float(reached.max()), 1.0) / 1e3,
     )
-    y = Axis("height (km)", 0.0, _top(image, beams) / 1e3)
+    y = Axis("height (km)", 0.0, top / 1e3)
     along, up = _pixels(x, _WIDTH), _pixels(y, _RHI_HEIGHT)[::-1, np.newaxis]
     angle = np.degrees(np.arctan2(along, up))
     nearest = _nearest(angle, side * zenith)
     panel = _panel(image, beams, nearest, up * np.ones_like(angle), (x, y), ends)
-    return replace(panel, title=utc(image.time[beams[0]]))
+    shadows = _shadows(image.obstruction[beams], side * np.sin(turned), np.cos(turned), (x, y))
+    return replace(panel, layers=panel.layers + shadows, title=utc(image.time[beams[0]]))
 
 
 def _plan_position(image: ScanImage, beams: Indices, ends: tuple[float, float]) -> Panel:
@@ -177,7 +201,37 @@ def _plan_position(image: ScanImage, beams: Indices, ends: tuple[float, float]) 
     middle = beams[0]
     height = np.interp(np.hypot(east, north), image.distance[middle], image.height, right=np.inf)
     panel = _panel(image, beams, nearest, height, (x, y), ends, size=_PPI_HEIGHT)
-    return replace(panel, to_scale=True)
+    level = np.sin(np.radians(image.zenith_angle[beams]))
+    towards = level * np.sin(turned), level * np.cos(turned)
+    shadows = _shadows(image.obstruction[beams], *towards, (x, y))
+    return replace(panel, layers=panel.layers + shadows, to_scale=True)
+
+
+def _shadows(
+    obstruction: Floats, along: Floats, up: Floats, axes: tuple[Axis, Axis]
+) -> tuple[Layer, ...]:
+    """Return crosses where beams are blocked, and lines from there to the edge of the panel.
+
+    `along` and `up` are the steps of the beams on both axes per step along the beam.
+    """
+    blocked = np.flatnonzero(np.isfinite(obstruction))
+    if not blocked.size:
+        return ()
+    start = obstruction[blocked] / 1e3
+    steps = along[blocked], up[blocked]
+    with np.errstate(divide="ignore"):
+        limits = [
+            np.where(step > 0.0, axis.high / step, np.where(step < 0.0, axis.low / step, np.inf))
+            for step, axis in zip(steps, axes, strict=True)
+        ]
+    end = np.maximum(np.minimum(*limits), start)
+    gap = np.full(blocked.size, np.nan)
+    x, y = (np.stack([start * step, end * step, gap], axis=-1).ravel() for step in steps)
+    label = f"blocked: {counted(blocked.size, 'beam')}"
+    return (
+        Curve(x, y, "soft d1"),
+        Curve(start * steps[0], start * steps[1], "ink", Mark.CROSS, joined=False, label=label),
+    )
 
 
 def _panel(
