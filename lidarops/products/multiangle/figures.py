@@ -66,6 +66,7 @@ _USUAL: Final = 0.97
 _LEAST: Final = 0.01
 """Percent, smallest end of the colour scale."""
 _BEAM_TICKS: Final = 24
+_NAMED_PLANES: Final = 8
 _MAP: Final = 306
 """Height of the map of residuals, and its number of pixels."""
 
@@ -184,9 +185,9 @@ def _draw_residuals(contents: Sequence[ScanResiduals]) -> list[Figure]:
     residuals = contents[0]
     limit = max(_usual(residuals), _LEAST)
     beams = np.arange(residuals.zenith_angle.size, dtype=np.float64)
-    some = beams[:: -(-beams.size // _BEAM_TICKS)]
     ticks = tuple(
-        Tick(float(k), number(float(f"{residuals.zenith_angle[int(k)]:.3g}"))) for k in some
+        Tick(float(k), number(float(f"{residuals.zenith_angle[k]:.3g}")))
+        for k in _marked_beams(residuals.plane)
     )
     x = Axis(_beam_label(residuals), -0.5, beams.size - 0.5, ticks=ticks)
     y = Axis("altitude (km)", float(residuals.edges[0]) / 1e3, float(residuals.edges[-1]) / 1e3)
@@ -205,7 +206,7 @@ def _draw_residuals(contents: Sequence[ScanResiduals]) -> list[Figure]:
     words = (
         f"Mean of {counted(residuals.cycles, 'cycle')}, colours to {limit:.2g} percent; the root"
         f" mean square is largest, {rms[worst]:.2g} percent, at a zenith angle of"
-        f" {residuals.zenith_angle[worst]:.3g} degrees"
+        f" {residuals.zenith_angle[worst]:.3g} degrees{_sides(residuals)}"
     )
     return [Figure("Residuals of the fit against zenith angle and altitude", words, (upper, lower))]
 
@@ -237,15 +238,32 @@ def _rms(residuals: ScanResiduals, beams: Floats) -> tuple[Layer, ...]:
     return single, mean
 
 
+def _marked_beams(plane: NDArray[np.intp]) -> list[int]:
+    """Return the beams that have a tick: the same ones of each plane."""
+    starts = np.flatnonzero(np.diff(plane, prepend=-1))
+    shown = starts[:: -(-starts.size // _BEAM_TICKS)]
+    ends = [*starts[1:], plane.size]
+    members = [range(start, ends[np.searchsorted(starts, start)]) for start in shown]
+    step = -(-max(map(len, members)) * len(members) // _BEAM_TICKS)
+    return [beam for own in members for beam in own[::step]]
+
+
 def _beam_label(residuals: ScanResiduals) -> str:
-    names = [
-        "azimuth not known" if np.isnan(azimuth) else f"azimuth {azimuth:.4g}°"
-        for azimuth in residuals.azimuths
-    ]
-    if not names:
-        return "zenith angle of the beam (°)"
-    toward = "; ".join(names[:4]) + ("; ..." if len(names) > 4 else "")
-    return f"zenith angle of the beam (°), positive toward {toward}"
+    """Return the label of the axis of beams, which is short enough for a thumbnail."""
+    if np.isnan(residuals.azimuths).any():
+        return "zenith angle (°), azimuth not known"
+    if len(residuals.azimuths) == 1:
+        return f"zenith angle (°), positive toward {residuals.azimuths[0]:.4g}°"
+    return "zenith angle of the beam (°)"
+
+
+def _sides(residuals: ScanResiduals) -> str:
+    """Return the azimuths of the positive zenith angles of several planes, in words."""
+    planes = [f"{azimuth:.4g}" for azimuth in residuals.azimuths if np.isfinite(azimuth)]
+    if len(residuals.azimuths) < 2 or not planes:
+        return ""
+    more = ", ..." if len(planes) > _NAMED_PLANES else ""
+    return f"; planes, positive toward azimuth {', '.join(planes[:_NAMED_PLANES])}{more} degree"
 
 
 FIGURES: Final = KindFigures(
