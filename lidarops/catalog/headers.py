@@ -157,7 +157,8 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
             header.doubt,
             file=header.path,
             field="pointing",
-            remedy="give zenith_angle in the facts if it is known",
+            remedy="leave the file out, or give zenith_angle in the facts if the beam is fixed: it"
+            " holds for all files of the period",
         )
     shift = timedelta(seconds=facts.clock_offset)
     order = place.header_position

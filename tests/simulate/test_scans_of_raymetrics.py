@@ -99,7 +99,7 @@ def test_a_file_of_unknown_pointing_is_refused_unless_the_campaign_gives_it(smal
     found = granules(campaign)
     assert [granule.status for granule in found] == [Status.REFUSED] + [Status.GOOD] * 7
     assert "89 degree at azimuth 20 is not on the grid of its scan" in found[0].reason
-    assert "give zenith_angle" in found[0].reason
+    assert "give zenith_angle in the facts if the beam is fixed" in found[0].reason
     assert "stop lies 1 s before start" in " ".join(found[3].notes)
     assert found[3].stop - found[3].start == timedelta(seconds=2.05)
     facts = campaign.instruments["hill-lidar"].facts[0].model_copy(update={"zenith_angle": 12.0})
