@@ -28,6 +28,7 @@ MODULES: Final = (
     "lidarops.retrieve.signal.labeled_averaging",
     "lidarops.retrieve.homogeneous",
     "lidarops.retrieve.homogeneous.labeled",
+    "lidarops.retrieve.clouds",
     "lidarops.retrieve.elastic",
     "lidarops.retrieve.elastic.labeled",
     "lidarops.retrieve.raman.retrieval",

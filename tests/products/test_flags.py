@@ -52,6 +52,7 @@ OWN = {
         "weak_signal": 18,
         "no_lidar_ratio": 19,
         "negative_extinction": 20,
+        "partly_cloudy": 21,
     },
     "multiangle": {
         "no_leverage": 20,
@@ -89,7 +90,7 @@ LEFT = {
     "signal": 14,
     "homogeneous": 10,
     "elastic": 8,
-    "raman": 10,
+    "raman": 9,
     "multiangle": 3,
     "visibility": 10,
 }
@@ -138,6 +139,8 @@ SCENES = {
     "test_profiles_without_raman_signal_have_no_values",
     "RamanQuality.NEGATIVE_EXTINCTION": "test_raman_retrieval::"
     "test_an_overlap_that_is_not_full_where_stated_is_found",
+    "RamanQuality.PARTLY_CLOUDY": "test_raman_clouds::"
+    "test_a_cirrus_in_some_of_the_profiles_is_stated",
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
     "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"

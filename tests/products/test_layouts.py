@@ -130,6 +130,8 @@ def test_variables_without_standard_name():
             ),
             "aerosol_extinction_smoothing_error",
             "vertical_resolution",
+            "cloud_base_range",
+            "cloud_fraction",
             "overlap",
             "overlap_standard_error",
             "molecular_backscatter",

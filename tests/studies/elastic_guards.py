@@ -25,7 +25,8 @@ from lidarops.bench.stability import random_elastic
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import Rejection
-from lidarops.retrieve.elastic import inversion, layers, outlying_bins
+from lidarops.retrieve.clouds import layers, outlying_bins
+from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 

@@ -25,7 +25,8 @@ from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
 from lidarops.retrieve.background.known_shape import KnownShapeResult
-from lidarops.retrieve.elastic import inversion, layers
+from lidarops.retrieve.clouds import layers
+from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
 from lidarops.simulate.signal import backscatter_signal, bin_centres

@@ -16,7 +16,8 @@ from lidarops.netcdf.variables import ErrorKind
 from lidarops.products.elastic.variables import sources
 from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.background import known_shape
-from lidarops.retrieve.elastic import inversion, layers, outlying_bins
+from lidarops.retrieve.clouds import layers, outlying_bins
+from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.settings import ReferenceSettings
 

@@ -15,6 +15,7 @@ from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.records import Role
+from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.retrieve.signal.labeled_screening import Screening
@@ -45,7 +46,7 @@ Case = ProductCase[ElasticSettings]
 
 KNOWN_SHAPE: Final = Datum[bool]("known_shape")
 """That the background is fitted with the shape of the signal of clean air."""
-REFERENCE: Final = Datum[labeled.Reference]("reference")
+REFERENCE: Final = Datum[Reference]("reference")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,7 @@ class ReferenceWindow(Step[Case, ReferenceWindowSettings]):
 
     def carry_out(self, settings: ReferenceWindowSettings, data: Data) -> None:
         """Give the limits."""
-        data[REFERENCE] = labeled.Reference(**dict(settings))
+        data[REFERENCE] = Reference(**dict(settings))
 
 
 def _lidar_ratio(case: Case) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
+from lidarops.netcdf.cloud_rows import CLOUDS
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -33,7 +34,6 @@ from lidarops.netcdf.variables import (
     shots,
 )
 from lidarops.products.elastic.flags import FLAGS
-from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12
@@ -261,69 +261,7 @@ LAYOUT: Final = Layout(
             " departs from the shape of clean air; more_particles: another window has a lower ratio"
             " to air."
         ),
-        Row(
-            name="cloud_mask",
-            dims=_BINS,
-            dtype="i1",
-            units="1",
-            standard_name="status_flag",
-            long_name="clouds and dense layers in the mean profile",
-            coverage=Coverage.AUXILIARY,
-            states=("clear", "partly_cloudy", "cloudy", "unknown"),
-            comment="partly_cloudy: some of the averaged profiles show a cloud, not all. cloudy:"
-            " all of them do, or their mean does. unknown: no usable data, or the overlap may be"
-            " incomplete. From base to apparent top: beyond a cloud that attenuates strongly there"
-            " may be more. Profiles that are left out, or have no data there, do not count.",
-        ),
-        Row(
-            name="cloud_fraction",
-            dims=_BINS,
-            dtype="f4",
-            units="1",
-            long_name="share of the averaged profiles in which a cloud or dense layer is detected",
-            coverage=Coverage.AUXILIARY,
-            valid_min=0.0,
-            valid_max=1.0,
-            comment="The profiles of a mean are divided into up to"
-            f" {SIGNAL_THRESHOLDS.most_parts} parts, and clouds are sought in each, in cells of"
-            f" about {SIGNAL_THRESHOLDS.cell_length:g} m; only those with data there count. Missing"
-            " where no part has any, or where only the mean shows a cloud, so that cloud_mask is"
-            f" cloudy. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="cloud_base_range",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            long_name="range at which the lowest cloud or dense layer begins",
-            coverage=Coverage.AUXILIARY,
-            comment="Of all profiles in the mean. Missing where no cloud or dense layer was"
-            f" detected. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="cloud_base_altitude",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            standard_name="cloud_base_altitude",
-            long_name="altitude above the geoid at which the lowest cloud or dense layer begins",
-            coverage=Coverage.AUXILIARY,
-            comment="Of all profiles in the mean. Missing where no cloud or dense layer was"
-            " detected.",
-        ),
-        Row(
-            name="cloud_top_altitude",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            standard_name="cloud_top_altitude",
-            long_name="altitude above the geoid of the apparent top of the highest cloud or dense"
-            " layer",
-            coverage=Coverage.AUXILIARY,
-            comment="Of all profiles in the mean: where the signal is back at its level below the"
-            " base, which in a cloud that attenuates strongly is below the true top. Missing where"
-            " no cloud or dense layer was detected.",
-        ),
+        *CLOUDS,
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         *GLUING,

@@ -24,7 +24,7 @@ from lidarops.retrieve.signal.screening import cloud_contrast
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.channels import member_channel, range_channel, wavelength
-from lidarops.steps.conditioning import OVERLAP, PROFILES
+from lidarops.steps.conditioning import FULL_OVERLAP_RANGE, OVERLAP, PROFILES
 from lidarops.steps.data import (
     Chunk,
     Data,
@@ -131,7 +131,7 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
 
     name = "raman"
     settings = RetrievalSettings
-    inputs = (PROFILES, WAVELENGTH, OVERLAP, AVERAGE, MOLECULES)
+    inputs = (PROFILES, WAVELENGTH, FULL_OVERLAP_RANGE, OVERLAP, AVERAGE, MOLECULES)
     from_companions = (PROFILES, WAVELENGTH)
     parts = (_AVERAGE,)
 
@@ -297,6 +297,7 @@ class _Retrieval(RowProduct):
             assumptions=_assumptions(settings, data[WAVELENGTH], raman),
             water=None if water is None else self._water(water),
             overlap=None if overlap is None else overlap(elastic["range"].to_numpy()),
+            overlap_is_stated=data.get(FULL_OVERLAP_RANGE) is not None,
         )
         if settings.known_shape:
             retrieved = retrieved.assign_attrs(references=KNOWN_SHAPE_PAPERS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from lidarops.netcdf.cloud_rows import CLOUDS
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -269,6 +270,7 @@ LAYOUT: Final = Layout(
             "The elastic signal is corrected for the measured attenuation before it is compared"
             " with air."
         ),
+        *CLOUDS,
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         quality(_BINS, FLAGS),

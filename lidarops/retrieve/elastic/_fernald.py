@@ -17,11 +17,11 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.usable import usable
+
 Array = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
-
-HUGE: Final = 1e300
 
 # Rows that `_trace_path` writes.
 GAIN, RATIO, AIR, SHAPE = 0, 1, 2, 3
@@ -102,11 +102,6 @@ def _trace_path(
         path[OWN_AIR, i] = backscatter[i] * air_error[i]
         path[COLUMN, i], path[COLUMN_AIR, i] = column, column_air
         path[RATIO_ERROR, i], path[AIR_ERROR, i] = ratio_error[i], air_error[i]
-
-
-@_compiled
-def usable(power: float, variance: float) -> bool:
-    return abs(power) < HUGE and 0.0 <= variance < HUGE
 
 
 @_compiled

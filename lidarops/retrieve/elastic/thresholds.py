@@ -8,43 +8,8 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Limits of outlying bins, clouds and inversion."""
+    """Limits of the inversion."""
 
-    # Isolated outlying bins
-    outlying: float = 6.0
-    """Standard deviations of the noise by which an outlier lies beyond all neighbours.
-    Simulations: none of 1e8 bins of normal noise."""
-    least_contrast: float = 6.0
-    """Distance of an outlier from its neighbours over their spread in excess of noise. Peaks with a
-    full width at half maximum of 1.5 bins or more have less."""
-    spread_by_noise: float = 2.0
-    """Standard deviations of the noise that are subtracted from that spread. Assumed."""
-    most_equal: int = 4
-    """Neighbours of equal power: more of them mean few counts, whose noise is not normal. Assumed.
-    """
-    largest_step: float = 0.1
-    """Relative change of the signal across a bin: a cloud attenuates by more. Assumed."""
-    step_by_noise: float = 4.0
-    """Standard deviations of the noise of a bin, or 5.7 of the difference of the means of 4, by
-    which the signal may change across a bin. Assumed."""
-
-    # Clouds
-    window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0, 960.0)
-    """m; in which signals are averaged below and above a base. Assumed."""
-    cloud_false_alarm: float = 0.001
-    """Probability of a false cloud in a profile. Required of the product."""
-    top: float = 2.0
-    """Standard errors of the level below the base within which a layer has ended. Assumed."""
-    cloud_margin: float = 300.0
-    """m beyond the last bin of a cloud; its thin edge extends beyond its apparent top. Assumed."""
-    least_share_beyond: float = 0.1
-    """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
-
-    # Overlap
-    overlap_length: float = 60.0
-    """m; in which the ratio to air is averaged below a base and where it is largest. Assumed."""
-
-    # Inversion
     longest_gap: float = 150.0
     """m; a longer gap without data ends the integration. Assumed."""
     least_denominator: float = 0.05

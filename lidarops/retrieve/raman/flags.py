@@ -37,3 +37,11 @@ class RamanQuality(FlagBit):
             " error: the overlap may not be full where stated, or a background is wrong"
         ),
     )
+    PARTLY_CLOUDY = (
+        FIRST_OWN + 4,
+        Severity.CARE,
+        (
+            "some of the averaged profiles, not all, show a cloud here, or within the vertical"
+            " resolution: the mean is that of cloudy and clear air"
+        ),
+    )

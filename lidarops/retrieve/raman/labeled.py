@@ -1,7 +1,7 @@
 """The Raman retrieval of mean profiles in xarray.
 
 In this order: common bins of the channels, background of each, cells, extinction, backscatter and
-lidar ratio, water vapour, overlap.
+lidar ratio, clouds of the elastic signal, water vapour, overlap.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.background import estimate
+from lidarops.retrieve.clouds import labeled as _clouds
 from lidarops.retrieve.raman.cells import Cells, make_cells
+from lidarops.retrieve.raman.cloud_cells import largest_of_cells, state_of_cells, touched
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.overlap import overlap_of
 from lidarops.retrieve.raman.retrieval import (
@@ -36,6 +38,7 @@ from lidarops.retrieve.signal.labeled import (
     counts_per_power,
     dead_time_error,
 )
+from lidarops.retrieve.signal.screening import cloud_contrast
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -124,6 +127,7 @@ def retrieve(
     assumptions: Assumptions,
     water: WaterVapour | None = None,
     overlap: Array | None = None,
+    overlap_is_stated: bool = True,
 ) -> xr.Dataset:
     """Return the variables of the ``raman`` product of mean profiles.
 
@@ -142,6 +146,8 @@ def retrieve(
     overlap : (range,) float, optional
         Overlap function at the ranges of `elastic`, common to all channels; NaN where it is not
         known.
+    overlap_is_stated : bool
+        As for `lidarops.retrieve.elastic.labeled.invert_elastic`: what a rise of the signal says.
 
     Returns
     -------
@@ -177,6 +183,8 @@ def retrieve(
     quality[uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
     variables = _variables(result, cells, air, of_raman, settings)
+    sky = _Sky(molecules, station_altitude, climb, seen, overlap_is_stated)
+    variables |= _cloud_variables(channels[0].averages, assumptions, cells, result, sky)
     if water is not None:
         shape = replace(air, raman_depth=_depth(molecules, heights, distance, water.wavelength))
         signal, _ = channels[2].signal(shape.raman_shape, known_shape=assumptions.known_shape)
@@ -259,10 +267,10 @@ def without_signal(
         station_altitude=station_altitude,
         assumptions=replace(assumptions, known_shape=False),
     )
-    bits = np.int32(sum(RamanQuality))
+    missing = RamanQuality.WEAK_SIGNAL | RamanQuality.NO_REFERENCE | RamanQuality.NO_LIDAR_RATIO
     unknown = xr.full_like(product["overlap"], np.nan)
     return product.assign(
-        quality_flag=xr.full_like(product["quality_flag"], bits),
+        quality_flag=xr.full_like(product["quality_flag"], np.int32(missing)),
         overlap=unknown,
         overlap_standard_error=unknown,
     )
@@ -366,6 +374,52 @@ def _variables(
 
 def _budget(name: str, budget: Mapping[str, Array]) -> dict[str, Array]:
     return {f"{name}_error_{cause}": error for cause, error in budget.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Sky:
+    """What is known of the air and of the overlap along the beam."""
+
+    molecules: MolecularProfile
+    station_altitude: float
+    climb: float
+    overlap: Array
+    overlap_is_stated: bool
+
+
+def _cloud_variables(
+    averages: xr.Dataset, assumptions: Assumptions, cells: Cells, result: RamanResult, sky: _Sky
+) -> dict[str, Any]:
+    """Return the clouds of the elastic signal, and the quality with the bit of partial ones."""
+    both, settings = ("time", "range"), assumptions.settings
+    distance = averages["range"].to_numpy()
+    heights = sky.station_altitude + sky.climb * distance
+    air = _clouds.air_along(sky.molecules, heights, distance, settings.wavelength)
+    contrast = cloud_contrast(settings.wavelength)
+    means = _clouds.MeanProfiles(averages, distance, air, sky.overlap, contrast)
+    reference = _clouds.Reference(
+        settings.lowest,
+        settings.highest,
+        settings.width,
+        settings.scattering_ratio,
+        settings.reference_relative_error,
+    )
+    _, clouds = _clouds.signal_and_clouds(
+        means,
+        averages,
+        reference,
+        known_shape=assumptions.known_shape,
+        overlap_is_stated=sky.overlap_is_stated,
+    )
+    state = state_of_cells(clouds.state, cells, _clouds.UNKNOWN)
+    partly = touched(state == _clouds.PARTLY_CLOUDY, result.vertical_resolution, cells.step)
+    bits = np.where(partly, np.int32(RamanQuality.PARTLY_CLOUDY), np.int32(0))
+    return {
+        "quality_flag": (both, result.quality | bits),
+        "cloud_mask": (both, state),
+        "cloud_fraction": (both, largest_of_cells(clouds.fraction, cells)),
+        **_clouds.cloud_heights(clouds, distance, sky.station_altitude, sky.climb),
+    }
 
 
 def _overlap(

@@ -90,6 +90,7 @@ class ScreenedAverage:
         self._step = float(np.median(np.diff(distance))) if distance.size > 1 else 1.0
         self._bins = max(round(THRESHOLDS.cell_length / self._step), 1)
         self._first = int(np.searchsorted(records[-1].range, 0.0, side="right"))
+        self._first_range = float(records[-1].range[0]) + self._first * self._step
         self._past = min(record.range.size for record in records)
         self._open: list[tuple[_Mean, ...]] = []
         self._units: tuple[dict[str, Any], ...] = ()
@@ -119,10 +120,11 @@ class ScreenedAverage:
 
         They are as those of `ClockAverage.completed`, with these variables more: ``part_power``
         (background subtracted) and ``part_variance`` over (time, part, cell) of parts that are in
-        the mean, means over cells of ``bins`` (attribute) bins from the first range above zero on,
-        NaN where missing; ``part_quantum`` (the power of a count in a cell, 0 for analog records)
-        and ``part_profiles`` over (time, part), the numbers of their profiles, and
-        ``profiles_left_out`` over time. ``profiles`` and ``shots`` are those in the mean.
+        the mean, means over cells of ``bins`` (attribute) bins from the first range above zero of
+        the last record on (``first_range``), NaN where missing; ``part_quantum`` (the power of a
+        count in a cell, 0 for analog records) and ``part_profiles`` over (time, part), the numbers
+        of their profiles, and ``profiles_left_out`` over time. ``profiles`` and ``shots`` are those
+        in the mean.
         """
         batches, self._completed = self._completed, []
         yield from batches
@@ -191,7 +193,7 @@ class ScreenedAverage:
             for name in ("power", "variance")
         )
         return labeled.assign(
-            part_power=(along, power, {"bins": self._bins}),
+            part_power=(along, power, {"bins": self._bins, "first_range": self._first_range}),
             part_variance=(along, variance),
             part_quantum=(along[:2], np.stack([mean.cells.quantum for mean in means])),
             part_profiles=(("time", "part"), np.stack([mean.of_parts for mean in means])),

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.clouds.outlying_bins import bridge_outliers
 from lidarops.retrieve.elastic.inversion import invert_elastic
-from lidarops.retrieve.elastic.outlying_bins import bridge_outliers
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 GREEN = 532e-9

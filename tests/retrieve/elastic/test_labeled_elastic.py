@@ -698,7 +698,7 @@ def assert_missing_is_flagged(retrieved):
         values = retrieved[name].to_numpy()
         assert not np.isinf(values).any(), name
         assert (flags[np.isnan(values)] != 0).all(), name
-    rejected = (flags & int(ElasticQuality.NO_REFERENCE | labeled._WITHHELD)) != 0
+    rejected = (flags & int(ElasticQuality.NO_REFERENCE | labeled.WITHHELD)) != 0
     assert np.isnan(retrieved["aerosol_backscatter"].to_numpy()[rejected]).all()
     assert not (flags & ~np.int32(sum(FLAGS))).any()
 

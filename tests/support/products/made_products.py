@@ -303,6 +303,12 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "molecular_source": 0,
             "background_method": 2,
             "reference_rejections": ("time", np.zeros(profiles, np.int32)),
+            "cloud_mask": (dims, np.zeros(shape, np.int8)),
+            "cloud_fraction": (dims, np.zeros(shape)),
+            **{
+                f"cloud_{end}": ("time", np.full(profiles, np.nan))
+                for end in ("base_range", "base_altitude", "top_altitude")
+            },
             "background": ("time", rng.uniform(0.1, 2.0, profiles)),
             "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
             "quality_flag": (dims, flags),

@@ -13,7 +13,8 @@ from scipy import special
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
-from lidarops.retrieve.elastic import inversion, layers
+from lidarops.retrieve.clouds import layers
+from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from support.stiff.cases import (
     Accepted,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.elastic.outlying_bins import bridge_outliers
+from lidarops.retrieve.clouds.outlying_bins import bridge_outliers
 
 RANGE = 300.0 + 15.0 * np.arange(800)
 AIR = 1e10 * np.exp(-RANGE / 8000.0) / RANGE**2

@@ -14,8 +14,8 @@ from lidarops.retrieve.air.reference_window import (
     candidate_windows,
     choose_reference,
 )
-from lidarops.retrieve.elastic.layers import find_layers
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.clouds.layers import find_layers
+from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.screening import cloud_contrast
 
 AIR = MolecularProfile.us_standard()

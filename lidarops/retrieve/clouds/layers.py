@@ -12,10 +12,10 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.elastic._fernald import HUGE, usable
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.common.usable import HUGE, usable
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.screening import skewness_margin
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS

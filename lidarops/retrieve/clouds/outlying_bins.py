@@ -9,10 +9,10 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.elastic._fernald import HUGE, usable
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.common.usable import HUGE, usable
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

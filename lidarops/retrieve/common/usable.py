@@ -1,0 +1,15 @@
+"""Test of single values within compiled loops."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numba
+
+HUGE: Final = 1e300
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def usable(power: float, variance: float) -> bool:
+    """Return whether a power and its variance are finite, and the variance not negative."""
+    return abs(power) < HUGE and 0.0 <= variance < HUGE

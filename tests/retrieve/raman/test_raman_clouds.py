@@ -1,0 +1,165 @@
+"""Clouds in means of Raman and elastic signals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.raman_signals import LASER, make_sky, mean_over
+
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.raman.cells import make_cells
+from lidarops.retrieve.raman.cloud_cells import largest_of_cells, state_of_cells, touched
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.labeled import Assumptions, retrieve
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
+
+STEP = 15.0
+R = STEP * (np.arange(1000) + 0.5)
+HAZE = np.where(R < 4000.0, 1e-4 * np.exp(-R / 1500.0), 0.0)
+CIRRUS = np.where((R > 6000.0) & (R < 6300.0), 1e-4, 0.0)
+"""m-1; grey."""
+CLOUD_RATIO = 20.0
+WINDOW = (7000.0, 12_000.0, 4000.0)
+PROFILES = 6
+EXPOSURE = 1000.0
+"""Counts per MHz."""
+SKY = 2e-5
+
+
+def conditioned(counts):
+    """Return conditioned profiles of these counts, (time, range)."""
+    length = np.timedelta64(300, "s")
+    begin = np.datetime64("2026-03-01", "ns") + np.arange(PROFILES) * length
+    plane = ("time", "range")
+    return xr.Dataset(
+        {
+            "power": (plane, counts / EXPOSURE, {"units": "MHz", "dead_time_standard_error": 0.0}),
+            "variance": (plane, np.maximum(counts, 1.0) / EXPOSURE**2, {"units": "MHz2"}),
+            "quality": (plane, np.zeros(counts.shape, np.int32)),
+            "noise_correlation_length": ("time", np.ones(PROFILES)),
+        },
+        coords={
+            "time": begin + length // 2,
+            "time_bnds": (("time", "nv"), np.stack([begin, begin + length], axis=-1)),
+            "range": ("range", R, {"units": "m"}),
+        },
+    )
+
+
+def averages(profiles):
+    """Return the screened means over half an hour of both channels."""
+    shots = xr.DataArray(np.full(PROFILES, 10_000), dims="time")
+    times = profiles[0][["time", "time_bnds"]]
+    means = (
+        ClockAverage(times, R, seconds=1800, shots=shots, parts=THRESHOLDS.most_parts)
+        for _ in profiles
+    )
+    screening = Screening(cloud_contrast(LASER), 12_000.0)
+    average = ScreenedAverage([Record(of_channel, R) for of_channel in means], screening)
+    average.add(profiles)
+    ((elastic, raman),) = average.completed()
+    return elastic, raman
+
+
+def product_of(cloudy):
+    """Return the product of half an hour, `cloudy` of whose profiles have a cirrus."""
+    clear, seen = (make_sky(HAZE + cirrus, STEP, 3e5, window=WINDOW) for cirrus in (0.0, CIRRUS))
+    # The cirrus has another lidar ratio than the haze.
+    total = clear.air.backscatter + (HAZE + CIRRUS) / 50.0
+    bright = seen.elastic * (1.0 + CIRRUS * (1.0 / CLOUD_RATIO - 1.0 / 50.0) / total)
+    first = int(np.searchsorted(R, 1000.0))
+    assert clear.elastic[first] == pytest.approx(bright[first])
+    rng = np.random.default_rng(3)
+    profiles = [
+        conditioned(rng.poisson([of_cloud if k < cloudy else of_air for k in range(PROFILES)]))
+        for of_cloud, of_air in ((bright, clear.elastic), (seen.raman, clear.raman))
+    ]
+    elastic, raman = averages(profiles)
+    return retrieve(
+        elastic.assign_coords(zenith_angle=0.0),
+        raman,
+        molecules=MolecularProfile.us_standard(),
+        station_altitude=0.0,
+        assumptions=Assumptions(clear.settings, 60.0, 10_000.0, known_shape=True),
+        overlap=clear.air.overlap,
+    )
+
+
+@pytest.fixture(scope="module")
+def partly_cloudy():
+    return product_of(2)
+
+
+def inside(product, low, high):
+    r = product["range"].to_numpy()
+    return (low < r) & (r < high)
+
+
+def raised(product, bit):
+    return (product["quality_flag"].to_numpy()[0] & np.int32(bit)) != 0
+
+
+def test_a_cirrus_in_some_of_the_profiles_is_stated(partly_cloudy):
+    cloud = inside(partly_cloudy, 6000.0, 6300.0)
+    state, fraction = (
+        partly_cloudy[name].to_numpy()[0] for name in ("cloud_mask", "cloud_fraction")
+    )
+    assert (state[cloud] == 1).all()
+    np.testing.assert_allclose(fraction[cloud], 2 / 6)
+    elsewhere = inside(partly_cloudy, 300.0, 5850.0) | inside(partly_cloudy, 6500.0, 1e5)
+    assert (state[elsewhere] == 0).all()
+    assert partly_cloudy["cloud_base_altitude"][0] == pytest.approx(6000.0, abs=60.0)
+    assert partly_cloudy["cloud_top_altitude"][0] == pytest.approx(6300.0, abs=120.0)
+    assert raised(partly_cloudy, RamanQuality.PARTLY_CLOUDY)[cloud].all()
+
+
+def test_values_without_the_bit_are_right(partly_cloudy):
+    """In the mean of clear and cloudy air."""
+    r = partly_cloudy["range"].to_numpy()
+    true = HAZE + CIRRUS * 2 / PROFILES
+    length = np.nan_to_num(partly_cloudy["vertical_resolution"].to_numpy()[0], nan=60.0)
+    extinction = mean_over(true, STEP, r, length)
+    backscatter = HAZE / 50.0 + CIRRUS / CLOUD_RATIO * 2 / PROFILES
+    good = (partly_cloudy["quality_flag"].to_numpy()[0] == 0) & inside(partly_cloudy, 400.0, 7500.0)
+    assert good.sum() > 60
+    for name, values in (
+        ("aerosol_extinction", extinction),
+        ("aerosol_backscatter", mean_over(backscatter, STEP, r, np.full(r.size, 60.0))),
+    ):
+        error = partly_cloudy[f"{name}_standard_error"].to_numpy()[0]
+        away = (partly_cloudy[name].to_numpy()[0] - values) / error
+        assert np.abs(away[good]).max() < 4.0, name
+
+
+def test_a_cloud_in_all_profiles_is_no_partial_one():
+    product = product_of(PROFILES)
+    cloud = inside(product, 6060.0, 6240.0)
+    assert (product["cloud_mask"].to_numpy()[0, cloud] == 2).all()
+    assert not raised(product, RamanQuality.PARTLY_CLOUDY)[cloud].any()
+
+
+def test_clear_air_has_no_cloud():
+    product = product_of(0)
+    assert not product["cloud_mask"].to_numpy()[0, inside(product, 300.0, 1e5)].any()
+    assert np.isnan(product["cloud_base_range"]).all()
+
+
+def test_states_of_cells_are_those_of_their_bins():
+    cells = make_cells(np.arange(8) + 0.5, 8.0, 2.0)
+    state = np.array([[0, 1, 3, 3, 3, 0, 2, 1]], np.int8)
+    assert state_of_cells(state, cells, 3).tolist() == [[1, 3, 0, 2]]
+    fraction = np.array([[0.0, 0.5, np.nan, np.nan, np.nan, 0.0, 1.0, 0.5]])
+    np.testing.assert_array_equal(largest_of_cells(fraction, cells), [[0.5, np.nan, 0.0, 1.0]])
+
+
+def test_a_cloud_takes_part_in_the_values_within_the_resolution():
+    mask = np.zeros((2, 9), np.bool_)
+    mask[:, 4] = True
+    resolution = np.array([np.full(9, np.nan), np.full(9, 250.0)])
+    near = touched(mask, resolution, 60.0)
+    assert np.flatnonzero(near[0]).tolist() == [4]
+    assert np.flatnonzero(near[1]).tolist() == [2, 3, 4, 5, 6]
