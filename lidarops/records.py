@@ -1,4 +1,4 @@
-"""Frozen records that all packages share: the vocabulary of lidarops, without logic.
+"""Frozen records that all packages share: the vocabulary of lidarops, and its words.
 
 A *granule* is one raw file as catalogued. A *scene* is the granules that are processed together.
 A *plan* lists the steps that run for one scene, and those that are left out, with the reasons. A

@@ -96,7 +96,7 @@ def open_products(
         )
     root, all_products = _find(source, selection)
     if not all_products:
-        raise ProductError("no product found", file=_path_of(source), remedy="select less strictly")
+        raise ProductError("no product found", file=store, remedy=_remedy(store))
     by_group = groups(all_products)
     if len(by_group) > 1:
         raise ProductError(
@@ -106,6 +106,14 @@ def open_products(
         )
     (products,) = by_group.values()
     return masked(_opened(root, products), usable)
+
+
+def _remedy(folder: str | None) -> str:
+    """Return what to do where a folder holds no products."""
+    stores = [] if folder is None else [path for path in Path(folder).glob("*") if is_store(path)]
+    if not stores:
+        return "select less strictly"
+    return f"open one of the stores in it: {', '.join(sorted(path.name for path in stores))}"
 
 
 def _path_of(source: Paths) -> str | None:

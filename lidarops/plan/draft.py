@@ -162,7 +162,8 @@ def _instrument(key: str, headers: InstrumentHeaders, site: _Site) -> Iterator[s
     groups = headers.signal
     count = sum(len(group.files) for group in groups)
     start, stop = min(g.start for g in groups), max(g.stop for g in groups)
-    yield f"  # {count} files, {start:%Y-%m-%d %H:%M} to {stop:%Y-%m-%d %H:%M} by their clock"
+    files = "1 file" if count == 1 else f"{count} files"
+    yield f"  # {files}, {start:%Y-%m-%d %H:%M} to {stop:%Y-%m-%d %H:%M} by their clock"
     yield f"  {key}:"
     yield f"    station: {site.key}"
     yield f"    files: {_list(headers.files)}"

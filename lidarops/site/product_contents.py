@@ -233,11 +233,13 @@ def citation(product: xr.Dataset) -> str:
     if not title:
         return ""
     year = attribute(product, "date_issued", attribute(product, "date_created", ""))[:4]
-    who = f"{creator or publisher} ({year})" if year else creator or publisher
+    who = " ".join(filter(None, (creator or publisher, year and f"({year})")))
     doi = attribute(product, "doi", "")
     identifier = doi or ":".join(filter(None, (authority, key)))
     issued = publisher if publisher != creator else ""
-    parts = (who, title, version and f"Version {version}", issued, identifier)
+    # As in styles of citation: without an author the title comes first.
+    begin = [who, title] if creator or publisher else [f"{title.rstrip('.')} {who}".strip()]
+    parts = (*begin, version and f"Version {version}", issued, identifier)
     return " ".join(f"{part.rstrip('.')}." for part in parts if part)
 
 

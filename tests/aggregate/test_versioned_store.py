@@ -326,6 +326,8 @@ def test_wrong_versions_and_stores_raise_clear_errors(tmp_path: Path):
         open_products(tmp_path, version="nothing")
     with pytest.raises(ProductError, match="no product found"):
         open_products(store, channel="nothing")
+    with pytest.raises(ProductError, match=rf"open one of the stores in it: {KIND}"):
+        open_products(store.parent)
     for file in (store / "snapshots").iterdir():
         file.write_bytes(b"nothing")
     with pytest.raises(ProductError, match=f"stores/{KIND}: the store cannot be read"):

@@ -663,7 +663,10 @@ def test_a_section_is_left_out_where_it_holds_no_triple_of_the_cubic():
     (step,) = (step for step in plan.steps if step.name == "homogeneous")
     assert step.settings["sections"] == [[1500, 7500]]
     assert step.settings["lag"] == 300
-    assert any("fewer than 601 bins" in reason for reason in decided(plan, "section_inside")[1])
+    assert any(
+        "fewer than 601 bins, which the cubic needs for lag: 300" in reason
+        for reason in decided(plan, "section_inside")[1]
+    )
 
 
 @pytest.mark.parametrize(("given", "windows"), [({"photon_532o": [2.0, 0.1]}, 1), (None, 0)])

@@ -64,6 +64,7 @@ def test_a_second_campaign_beside_the_first_has_its_own_output(tmp_path: Path) -
         for name in ("first.yaml", "second.yaml")
     ]
     assert outputs == ["out", "out-second"]
+    assert "# 1 file, " in (tmp_path / "first.yaml").read_text(encoding="utf-8")
     options = ["init", str(tmp_path / "raw"), str(tmp_path / "first.yaml"), "--force"]
     assert CliRunner().invoke(app, options).exit_code == 0
     assert Path(load_campaign(tmp_path / "first.yaml").output).name == "out"

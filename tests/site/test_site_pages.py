@@ -27,7 +27,7 @@ from lidarops.errors import CatalogError
 from lidarops.flags import Quality
 from lidarops.site import build, values
 from lidarops.site.build import build_site
-from lidarops.site.product_contents import campaign
+from lidarops.site.product_contents import campaign, citation
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import read_values
 
@@ -271,6 +271,12 @@ def test_citation_and_licence_are_those_of_the_file(output: Path) -> None:
             assert str(product.attrs[name]) in cited
         assert product.attrs["date_issued"][:4] in cited
         assert f"Licence: {product.attrs['license']}" in text
+
+
+def test_a_citation_without_an_author_begins_with_the_title() -> None:
+    attributes = {"title": "Mini: signals.", "date_issued": "2026-03-02", "id": "a"}
+    assert citation(xr.Dataset(attrs=attributes)) == "Mini: signals (2026). a."
+    assert citation(xr.Dataset(attrs={"title": "Mini"})) == "Mini."
 
 
 def test_a_site_with_copies_can_be_served_alone(tmp_path: Path) -> None:

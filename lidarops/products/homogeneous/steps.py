@@ -304,6 +304,12 @@ def _outside(case: Case, near: float, far: float) -> Leave:
         f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
         f" holds fewer than {_fewest_bins(case.request)} bins"
     )
+    fewest = _fewest_bins(case.request)
+    if fewest > FEWEST_BINS and far <= case.last:
+        reason = (
+            f"section {near:g}-{far:g} m holds {bins:.0f}, fewer than {fewest} bins, which the"
+            f" cubic needs for lag: {case.request.lag}"
+        )
     return Leave(reason, number=bins, rule="section_inside")
 
 
