@@ -31,6 +31,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
+from lidarops.netcdf.write import is_chunked
 from lidarops.records import DetectionMode
 from lidarops.system.files import within
 
@@ -98,8 +99,9 @@ class Template:
 
     def is_inline(self, name: str) -> bool:
         """Return whether the values of a variable are stored with the references."""
-        dims = set(self.variables[name].dims) - {"time", "nv"}
-        return not dims
+        variable = self.variables[name]
+        dims = set(variable.dims) - {"time", "nv"}
+        return not dims or not is_chunked(variable, "time")
 
 
 def read_template(root: Path, first: Facts) -> Template:

@@ -11,7 +11,7 @@ import math
 import os
 import secrets
 import unicodedata
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +32,9 @@ from lidarops.netcdf.skeleton import Skeleton
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
+CONTIGUOUS_BYTES: Final = 2048
+"""Up to this size, a variable without rows is stored as it is: the index of a chunk takes 2.1 kB.
+"""
 """Largest chunk: a chunk is the whole variable, or as many whole rows as fit."""
 
 OTHER_DIMENSION: Final = "_nc4_non_coord_"
@@ -222,7 +225,11 @@ class RowFile:
         self._rows = 0
         self.written: Written | None = None
         """The file, when it is complete and has its name."""
-        self._chunks = {name: _chunk(var) for name, var in skeleton.variables.items() if var.dims}
+        self._chunks = {
+            name: _chunk(variable)
+            for name, variable in skeleton.variables.items()
+            if is_chunked(variable, skeleton.unlimited)
+        }
         self._columns = {
             name: RowBlocks(name, variable.shape[0], self._chunks[name][0])
             for name, variable in skeleton.with_rows().items()
@@ -316,6 +323,20 @@ def written_file(file: RowFile | None, path: Path) -> Written:
     return file.written
 
 
+def is_chunked(variable: xr.Variable, unlimited: Hashable | None) -> bool:
+    """Return whether a variable is stored in deflated chunks, and not as it is.
+
+    Parameters
+    ----------
+    variable : xr.Variable
+    unlimited : hashable, optional
+        The dimension of rows, of which there may be more.
+    """
+    if unlimited in variable.dims:
+        return True
+    return bool(variable.dims) and variable.nbytes > CONTIGUOUS_BYTES
+
+
 def _chunk(variable: xr.Variable) -> tuple[int, ...]:
     return chunk_sizes(variable.shape, variable.dtype.itemsize)
 
@@ -377,7 +398,12 @@ class _DefinedAtOnce(netCDF4.Dataset):
 
 
 def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
-    """Write all definitions and scalars, but no chunk."""
+    """Write all definitions and the variables without chunks."""
+    chunked = {
+        name
+        for name, variable in skeleton.variables.items()
+        if is_chunked(variable, skeleton.unlimited)
+    }
     # In memory until the end, because HDF5 may crash on a full disk.
     with _DefinedAtOnce(
         path, "w", format=model, clobber=False, diskless=True, persist=True
@@ -386,18 +412,19 @@ def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
         for name, size in skeleton.sizes().items():
             file.createDimension(name, None if name == skeleton.unlimited else size)
         targets = {
-            name: _define(file, name, variable) for name, variable in skeleton.variables.items()
+            name: _define(file, name, variable, chunked=name in chunked)
+            for name, variable in skeleton.variables.items()
         }
         file.end_definitions()
         for name, target in targets.items():
-            if not skeleton.variables[name].dims:
+            if name not in chunked:
                 target[...] = skeleton.variables[name].values
 
 
-def _define(file: netCDF4.Dataset, name: str, variable: xr.Variable) -> Any:
+def _define(file: netCDF4.Dataset, name: str, variable: xr.Variable, *, chunked: bool) -> Any:
     attributes = dict(variable.attrs)
     storage: dict[str, Any] = {}
-    if variable.dims:
+    if chunked:
         storage = {
             "compression": "zlib",
             "complevel": COMPRESSION_LEVEL,
