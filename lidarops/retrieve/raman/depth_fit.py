@@ -14,13 +14,12 @@ bias. Where signal is strong the data decide, where it is weak the smoothness do
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.lapack import dpbtrf, dpbtrs
 
+from lidarops.retrieve.raman._smooth_solution import restricted_scores, solve
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -136,8 +135,7 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
         return None
     information = _working(values, noise, used)[0]
     mean = float(information.mean())
-    # LAPACK copies right-hand sides in another order.
-    inverse = _solved(information, weight * mean, np.eye(signal.size, order="F"))
+    inverse = solve(information, weight * mean, np.eye(signal.size))
     return DepthFit.of(used, information, inverse, walk * mean)
 
 
@@ -164,7 +162,8 @@ def _scored(signal: Array, noise: SignalNoise, depth: Array, weight: float) -> A
     for _ in range(_ITERATIONS):
         information, response = _working(signal, noise, depth)
         absolute = weight * float(information.mean())
-        step = _solved(information, absolute, information * response) - depth
+        right = (information * response)[:, np.newaxis]
+        step = solve(information, absolute, right)[:, 0] - depth
         longest = float(np.abs(step).max())
         if not np.isfinite(longest):
             return None
@@ -174,44 +173,6 @@ def _scored(signal: Array, noise: SignalNoise, depth: Array, weight: float) -> A
     return None
 
 
-def _solved(information: Array, weight: float, right: Array) -> Array:
-    """Return the solution of the linear problem, refined once.
-
-    Information and smoothness differ by up to 14 orders of magnitude; the refinement restores the
-    digits that the factor loses.
-    """
-    factor = _factor(information, weight)
-    solved = dpbtrs(factor, right)[0]
-    bend = np.diff(solved, 2, axis=0)
-    bend *= weight
-    left = (information * solved.T).T
-    left[2:] += bend
-    left[1:-1] -= 2.0 * bend
-    left[:-2] += bend
-    return np.asarray(solved + dpbtrs(factor, right - left)[0])
-
-
-def _factor(information: Array, weight: float) -> Array:
-    """Return the banded Cholesky factor of information and smoothness; NaN where there is none."""
-    bands = weight * _penalty(information.size)
-    bands[2] += information
-    factor, fault = dpbtrf(bands)
-    return np.asarray(factor) if fault == 0 else np.full_like(bands, np.nan)
-
-
-@cache
-def _penalty(cells: int) -> Array:
-    """Return the sum of squared second differences as the upper bands of a quadratic form."""
-    bands = np.zeros((3, cells))
-    bands[2] = 6.0
-    bands[2, [0, -1]], bands[2, [1, -2]] = 1.0, 5.0
-    bands[1, 1:] = -4.0
-    bands[1, [1, -1]] = -2.0
-    bands[0, 2:] = 1.0
-    bands.setflags(write=False)
-    return bands
-
-
 def _likely_weights(information: Array, response: Array) -> tuple[float, float]:
     """Return relative weights of smoothness by restricted likelihood: to be used, and for errors.
 
@@ -219,15 +180,8 @@ def _likely_weights(information: Array, response: Array) -> tuple[float, float]:
     likely weight then often leaves no structure, with errors that are too small.
     """
     mean = float(information.mean())
-    right = information * response
     weights = _weights(information.size)
-    scores = np.empty(weights.size)
-    for number, weight in enumerate(weights):
-        factor = _factor(information, weight * mean)
-        solved = dpbtrs(factor, right)[0]
-        logarithm = 2.0 * np.log(factor[2]).sum()
-        misfit = float(right @ (response - solved))
-        scores[number] = misfit + logarithm - (information.size - 2) * np.log(weight)
+    scores = restricted_scores(information, response, weights * mean)
     share = np.exp(-0.5 * (scores - np.nanmin(scores)))
     below = np.cumsum(np.nan_to_num(share)) / np.nansum(share)
     shares = (THRESHOLDS.rougher_share, THRESHOLDS.walk_share)

@@ -13,6 +13,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.raman import backscatter as _backscatter
+from lidarops.retrieve.raman._negative_depth import falling
 from lidarops.retrieve.raman.backscatter import Backscatter
 from lidarops.retrieve.raman.cells import Cells
 from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth, root_of_squares
@@ -416,7 +417,8 @@ class _Solution:
         budget = _summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
         budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
         empty = np.full(molecular.size, np.nan)
-        negative = _negative(profile.fit, [cause.depth for cause in causes], partial)
+        usable = ~partial & (profile.fit.expected_error <= THRESHOLDS.most_uncertain)
+        negative = _negative(profile.fit, [cause.depth for cause in causes], usable)
         if calibrated is None:
             absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)
             return cls(number, profile, budget, empty, absent, (empty, empty, empty), negative)
@@ -432,26 +434,14 @@ class _Solution:
         return cls(number, profile, budget, value, of_backscatter, ratios, negative)
 
 
-def _negative(fit: DepthFit, effects: Sequence[Array], partial: Mask) -> Mask:
+def _negative(fit: DepthFit, effects: Sequence[Array], usable: Mask) -> Mask:
     """Return the cells from which on extinction is negative in total, by more than its error.
 
     The total is from a cell to any other beyond. Air without particles has none, so that overlap
     is not complete there, or the background is wrong.
     """
-    usable = np.flatnonzero(~partial & (fit.expected_error <= THRESHOLDS.most_uncertain))
-    negative = np.zeros(partial.size, dtype=np.bool_)
-    depth = fit.depth[usable]
-    near, far = np.nonzero(np.triu(depth[:, np.newaxis] > depth, 1))
-    squares, own = (depth[near] - depth[far]) ** 2, np.diag(fit.inverse)
-    near, far = usable[near], usable[far]
-    noise = own[near] + own[far] - 2.0 * fit.inverse[near, far]
-    least = THRESHOLDS.negative**2
-    beyond_noise = squares > least * noise
-    near, far, variance = near[beyond_noise], far[beyond_noise], noise[beyond_noise]
-    for effect in effects:
-        variance += (effect[near] - effect[far]) ** 2
-    negative[near[squares[beyond_noise] > least * variance]] = True
-    return negative
+    compared = np.flatnonzero(usable)
+    return falling(fit.depth, fit.inverse, np.stack(effects), compared, THRESHOLDS.negative)
 
 
 def _ratio(profile: _Profile, partial: Mask, ratio: float) -> _backscatter.Ratio:
