@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -9,26 +10,34 @@ import xarray as xr
 
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import time_methods
-from lidarops.bench.harness.rows import Chapter, Results, Study
+from lidarops.bench.harness.rows import CPU_TIME, Chapter, Results, Row, Study, cpu_time, rows_of
 from lidarops.bench.harness.timing import READ
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.retrieval import RamanSettings
 from lidarops.retrieve.signal.labeled import condition
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage, joined
+from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 PROFILES: Final = 720
 BINS: Final = 4000
 CHANNELS: Final = {"355": 355e-9, "387": 386.7e-9, "408": 407.5e-9, "532": 532e-9, "607": 607.4e-9}
-"""m, by name. The pairs are 355 with 387 and 408, 532 with 607."""
+"""m, by name."""
+PRODUCTS: Final = (("355", "387", "408"), ("532", "607"))
+"""Channels of each product: laser, nitrogen and, of one, water vapour."""
 _STEP: Final = 7.5
 _SECONDS: Final = 60
 _COUNTS: Final = 300.0
 """Mean counts of a bin of a profile at 1 km."""
 _BACKGROUND: Final = 0.02
+_HIGHEST: Final = 12_000.0
+"""m, of the reference window."""
 AVERAGES: Final = "signals and means"
 RETRIEVALS: Final = "two pairs and water vapour"
+WHOLE: Final = "both, of the whole night"
 
 
 def measure_raman(effort: Effort, *, profiles: int = PROFILES) -> Study:
@@ -42,15 +51,27 @@ def measure_raman(effort: Effort, *, profiles: int = PROFILES) -> Study:
     }
     case = f"{profiles} profiles to {means['355'].sizes['time']} means, five channels"
     rows = time_methods(case, calls, effort.repeats or 3)
+    rows += _whole(case, rows, profiles)
     effort.progress(1)
     chapter = Chapter(
         "A night of two Raman pairs",
         f"{len(CHANNELS)} channels of photon counting, {BINS} bins: signals with noise and quality,"
-        " means over half an hour; then extinction, backscatter and lidar ratio of two pairs, and"
-        " water vapour. Reading and writing of files are left out. One thread.",
+        " means over half an hour without outlying parts; then extinction, backscatter and lidar"
+        " ratio of two pairs, and water vapour. Reading and writing of files are left out. One"
+        " thread.",
         [Results("CPU time of a profile", rows, f"Reads: multiples of {READ}.", case="night")],
     )
     return Study("Raman: time of a night", effort.date, [chapter])
+
+
+def _whole(case: str, rows: Sequence[Row], profiles: int) -> list[Row]:
+    """Return the CPU time of all profiles together, without the read."""
+    total = profiles * sum(
+        row.value
+        for row in rows
+        if row.quantity == CPU_TIME and row.method != READ and isinstance(row.value, float)
+    )
+    return rows_of(case, WHOLE, {"lidarops": True, "profiles": 1, CPU_TIME: cpu_time(total)})
 
 
 def night(profiles: int) -> xr.Dataset:
@@ -79,19 +100,34 @@ def night(profiles: int) -> xr.Dataset:
 
 
 def means_of(counts: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the means of each channel, by name."""
-    means = {}
-    for name in CHANNELS:
-        shots = counts[f"photon_{name}_shots"]
-        average = ClockAverage(
-            counts[["time", "time_bnds"]], counts["range"].to_numpy(), seconds=1800.0, shots=shots
-        )
+    """Return the means of each channel, by name, without the parts outlying in its product."""
+    distance, geometry = counts["range"].to_numpy(), counts[["time", "time_bnds"]]
+    means: dict[str, xr.Dataset] = {}
+    for names in PRODUCTS:
+        records = [
+            Record(
+                ClockAverage(
+                    geometry,
+                    distance,
+                    seconds=1800.0,
+                    shots=counts[f"photon_{name}_shots"],
+                    parts=THRESHOLDS.most_parts,
+                ),
+                distance,
+            )
+            for name in names
+        ]
+        average = ScreenedAverage(records, Screening(cloud_contrast(CHANNELS[names[0]]), _HIGHEST))
         for first in range(0, counts.sizes["time"], 90):
             chunk = counts.isel(time=slice(first, first + 90))
             average.add(
-                condition(chunk, f"photon_{name}", dead_time=4e-9, full_overlap_range=300.0)
+                [
+                    condition(chunk, f"photon_{name}", dead_time=4e-9, full_overlap_range=300.0)
+                    for name in names
+                ]
             )
-        means[name] = average.result()
+        batches = zip(*average.completed(), strict=True)
+        means |= {name: joined(iter(of)) for name, of in zip(names, batches, strict=True)}
     return means
 
 
@@ -113,7 +149,7 @@ def _pair(
         angstrom_exponent=1.2,
         angstrom_standard_error=0.5,
         lowest=6000.0,
-        highest=12_000.0,
+        highest=_HIGHEST,
         width=2000.0,
         scattering_ratio=1.0,
         reference_relative_error=0.02,
