@@ -430,7 +430,7 @@ class _Solution:
             + (calibrated.total * calibrated.reference) ** 2
         )
         value = calibrated.total - molecular
-        ratios = _lidar_ratio(profile.extinction, calibrated, value, noise, causes)
+        ratios = _lidar_ratio(profile.extinction, calibrated, value, noise, causes, usable)
         return cls(number, profile, budget, value, of_backscatter, ratios, negative)
 
 
@@ -536,6 +536,7 @@ def _lidar_ratio(
     value: Array,
     noise: Array,
     causes: Sequence[_Cause],
+    usable: Mask,
 ) -> tuple[Array, Array, Array]:
     """Return the lidar ratio with random and systematic error, from equally smoothed values."""
     kernel = extinction.kernel
@@ -547,7 +548,8 @@ def _lidar_ratio(
     own = kernel[:, known] ** 2 @ calibrated.own[known] ** 2
     level = calibrated.reference * total
     error = np.sqrt(root_of_squares(of_smooth) ** 2 + own + level**2)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    # The reciprocal of backscatter far below zero overflows; no value is given there.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         uncertainty = (error / smooth) ** 2
         inverse = _backscatter.inverse_of_weak(smooth, error)
         ratio = extinction.value * inverse
@@ -563,7 +565,7 @@ def _lidar_ratio(
         # The variance of a reciprocal to the second order.
         random *= inverse**2 * (1.0 + 8.0 * uncertainty)
         systematic *= inverse**2
-        likely = _likely(extinction, smooth, error)
+        likely = _likely(extinction, smooth, error, complete & usable)
         # The error is in proportion to total backscatter: this is that of the likely one.
         least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
     certain = complete & (smooth > 0.0) & (likely > least)
@@ -574,16 +576,21 @@ def _lidar_ratio(
     )
 
 
-def _likely(extinction: Extinction, backscatter: Array, error: Array) -> Array:
+def _likely(extinction: Extinction, backscatter: Array, error: Array, known: Mask) -> Array:
     """Return the weighted mean of backscatter and of what extinction lets expect, m-1 sr-1.
 
-    Its noise and that of the lidar ratio are independent, so that it selects no lidar ratios by
-    their noise; backscatter alone would keep those whose backscatter is too high.
+    With weights by the lidar ratio of all `known` cells together, its noise and that of the lidar
+    ratio of a cell are independent, so that it selects no lidar ratios by their noise; backscatter
+    alone would keep those whose backscatter is too high.
     """
+    variance = extinction.noise_error**2 + extinction.resolution_error**2
+    weight = np.where(known, extinction.value / variance, 0.0)
+    least, most = THRESHOLDS.plausible_lidar_ratios
+    total, scattered = (float(weight @ values) for values in (extinction.value, backscatter))
+    together = min(max(total / scattered, least), most) if scattered > 0.0 else most
     typical = THRESHOLDS.typical_lidar_ratio
-    other = np.hypot(extinction.noise_error, extinction.resolution_error) / typical
-    weight = error**2 / (error**2 + other**2)
-    return np.asarray(backscatter + weight * (extinction.value / typical - backscatter))
+    share = error**2 / (error**2 + variance / (typical * together))
+    return np.asarray(backscatter + share * (extinction.value / typical - backscatter))
 
 
 def _joined(

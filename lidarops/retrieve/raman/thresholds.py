@@ -28,6 +28,11 @@ class Thresholds:
     """sr, by which extinction helps to decide whether backscatter is certain enough for a lidar
     ratio. Decided by backscatter alone, lidar ratios of few counts are too small on average: those
     are kept whose backscatter is too high by noise."""
+    plausible_lidar_ratios: tuple[float, float] = (20.0, 120.0)
+    """sr, least and greatest of the profile, by which extinction is weighted in that decision; 120
+    where its backscatter is not above zero. Assumed. With 50 sr for all profiles, selection makes
+    lidar ratios of 90 sr of few counts too small by 10 %, instead of 3 %
+    (`tests/retrieve/raman/test_raman_coverage.py`)."""
     negative: float = 4.0
     """Standard errors by which the optical depth between two cells must be below zero to contradict
     the signal. 1 of 3,000 profiles of simulated haze does
