@@ -23,7 +23,7 @@ from lidarops.retrieve.signal.labeled_screening import Screening
 from lidarops.retrieve.signal.screening import cloud_contrast
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
-from lidarops.steps.channels import member_channel, range_channel, wavelength
+from lidarops.steps.channels import file_channels, member_channel, range_channel, wavelength
 from lidarops.steps.conditioning import FULL_OVERLAP_RANGE, OVERLAP, PROFILES
 from lidarops.steps.data import (
     Chunk,
@@ -218,16 +218,29 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
         """Return the CPU time by the number of averages, s."""
         return 0.1 + 0.02 * _averages(work)
 
-    def held(self, settings: RetrievalSettings, work: Workload) -> float:  # noqa: ARG002
+    def held(self, settings: RetrievalSettings, work: Workload) -> float:
         """Return the bytes of the averages that are completed together, and of their solution."""
+        names = (work.channel, *self.companions(settings))
+        records = sum(len(file_channels(name)) for name in names)
         together = min(_averages(work), MEANS_TOGETHER)
-        return (_BYTES_OF_A_BIN * together + _BYTES_OF_PARTS) * work.bins
+        return bytes_held(records, together, work.bins, settings.farthest / settings.cell)
 
 
-_BYTES_OF_PARTS: Final = 4500.0
-"""Bytes per bin of the parts of the open average: of three channels, each of two records."""
-_BYTES_OF_A_BIN: Final = 500.0
-"""Bytes per bin of an average that is open or being solved, of three channels."""
+def bytes_held(records: int, means: int, bins: int, cells: float) -> float:
+    """Return the bytes of means of some records that are completed and solved together."""
+    of_means = records * (_BYTES_OF_A_BIN * means + _BYTES_OF_PARTS) * bins
+    return of_means + (_BYTES_OF_A_PROFILE * means + _BYTES_OF_A_SOLUTION) * cells**2
+
+
+_BYTES_OF_PARTS: Final = 500.0
+"""Bytes per bin of the parts of the open average of a record, of which glued channels have two."""
+_BYTES_OF_A_BIN: Final = 205.0
+"""Bytes per bin of a complete average of a record. Both are measured
+(`tests/products/test_raman_memory.py`), as are those of the solution."""
+_BYTES_OF_A_PROFILE: Final = 33.0
+"""Bytes per pair of cells of each fitted profile: four matrices, kept until all are solved."""
+_BYTES_OF_A_SOLUTION: Final = 80.0
+"""Bytes per pair of cells of the profile that is being solved."""
 
 
 def _averages(work: Workload) -> int:
