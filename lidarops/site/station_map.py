@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 WIDTH: Final = 460
 _HEIGHT: Final = 260
-_LEFT: Final = 58
+_LEFT: Final = 76
 _FOOT: Final = 26
 _EDGE: Final = 12
 """Space above and at the right."""
