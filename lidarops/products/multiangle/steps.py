@@ -386,7 +386,7 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
                 least_signal_to_noise=settings.least_signal_to_noise,
             ),
             warning="; ".join(
-                filter(None, (_low_beams(directions), _single_beams(case, directions)))
+                filter(None, (_single_beams(case, directions), _low_beams(directions)))
             ),
         )
 
