@@ -140,7 +140,8 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     glued : xr.Dataset
         From `glue`.
     """
-    bins = int(photon["part_power"].attrs["bins"])
+    cells_of_parts = photon["part_power"].attrs
+    bins = int(cells_of_parts["bins"])
     distance = photon["range"].to_numpy()
     cells = distance[distance > 0.0][bins // 2 :: bins][: photon.sizes["cell"]]
     middle = (0.5 * (glued["glue_bottom"] + glued["glue_top"])).to_numpy()[
@@ -155,7 +156,7 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     )
     # Without a line it is not known which record holds.
     power[~np.isfinite(middle[:, 0, 0])] = np.nan
-    return {"part_power": (along, power, {"bins": bins}), "part_variance": (along, variance)}
+    return {"part_power": (along, power, cells_of_parts), "part_variance": (along, variance)}
 
 
 def _whole_profiles(array: xr.DataArray) -> xr.DataArray:
