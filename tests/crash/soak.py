@@ -5,6 +5,18 @@ only the first process, of runs on the command line, with dask workers and as fl
 site, publish and report, at random moments. In half of them calls of the system fail now and then.
 After each kill the ledger holds only what is on the disk, and every product and published file is
 absent or right; after each round of kills, undisturbed commands give what they give without kills.
+
+Most commands are forks of this process, which has loaded what they need: a command with its checks
+takes about one second of CPU time. Some start afresh by the console script, and all of dask and
+Prefect do.
+Moments are counted in CPU time of the command, so that kills fall evenly on it on any machine.
+``--jobs`` soaks that many archives beside each other.
+
+A file is renamed first and entered in the ledger then, because the two cannot be one operation:
+the other order would enter files that do not exist. A kill in between leaves a file that the
+ledger does not know. That shows only where the bytes differ from those before, so where a part of
+the files of a scene could not be read before or now. Then only one scene of each worker may be
+concerned, ``verify`` must name these files, each must be right, and the next run makes them again.
 """
 
 from __future__ import annotations
@@ -18,13 +30,16 @@ import re
 import shutil
 import signal
 import sys
+import sysconfig
+import threading
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
 import h5py
 
@@ -41,16 +56,20 @@ from lidarops.netcdf.comparison import compare_products  # noqa: E402
 from lidarops.records import Grade  # noqa: E402
 
 RUN_ID = re.compile(rb"\d{8}T\d{6}-[0-9a-f]{6}")
-SCENES = 4
+SCENES = 2
 FILES = 6
 """Raw files of a scene of the archive."""
-STEPS = 12
+STEPS = 25
 """Kills of a round, after which undisturbed commands follow."""
+FRESH = 12
+"""One of so many commands starts by the console script."""
 RATES = (0.0005, 0.005, 0.05)
 """Shares of the calls on files that fail in a disturbed command."""
 TAG = "LIDAROPS_TEST_SOAK"
 COMMANDS = ("reprocess", "force", "site", "aggregate", "publish", "report")
 WEIGHTS = (6, 2, 2, 2, 2, 1)
+GROUPS = {"cluster": 4.0, "pool": 4.0, "flow": 20.0}
+"""CPU time in s of commands that start interpreters."""
 TRACEBACK = 99
 """Exit code of a command that ended with a traceback."""
 GIVE_UP = 120.0
@@ -63,14 +82,26 @@ class Tally:
 
     kills: Counter[str] = field(default_factory=Counter)
     ended: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
+    """Calls of the system that failed on purpose."""
     disturbed: int = 0
-    """Commands in which calls of the system failed."""
+    """Commands in which calls of the system may fail."""
+    unentered: int = 0
+    """Kills between the renaming of a changed product and its entry in the ledger."""
     rounds: int = 0
     tracebacks: int = 0
     """Disturbed commands that ended with a traceback instead of a message."""
     corrupted: int = 0
     slowest_end: float = 0.0
     """s that the last child of a killed process lived on."""
+
+    def add(self, other: Tally) -> None:
+        for name, value in vars(other).items():
+            if isinstance(value, Counter):
+                getattr(self, name).update(value)
+            else:
+                join = max if name == "slowest_end" else sum
+                setattr(self, name, join((getattr(self, name), value)))
 
 
 class Soak:
@@ -88,16 +119,55 @@ class Soak:
         """Digest of a product of some files of its scene -> whether it is right."""
         self.calm = folder / "calm"
         crash_archive.make(self.calm, scenes=SCENES)
-        self.took = {name: self._timed(self.calm, name) for name in COMMANDS}
-        self.took |= {"cluster": 20.0, "pool": 20.0, "flow": 40.0}
+        _load_commands(self.calm, folder / "loading")
+        self.took = {name: self._timed(name) for name in COMMANDS} | GROUPS
+        self.start_up = self._timed("reprocess", fresh=True)
         self.whole = crash_archive.products(self.calm)
         self.views = _views(self.calm)
 
-    def _timed(self, place: Path, name: str) -> float:
-        began = time.monotonic()
-        code = _wait(_start(_command(place, name), place))
-        assert code == 0, f"{name} without kills ended with {code}"
-        return time.monotonic() - began
+    def _timed(self, name: str, *, fresh: bool = False) -> float:
+        """Return the CPU time in s of an undisturbed command."""
+        process = _start(_command(self.calm, name), self.calm, fresh=fresh)
+        status, took = _watch(process)
+        assert status == 0, f"{name} without kills ended with {status}"
+        return took
+
+    def run_jobs(self, jobs: int, kills: int, seconds: float) -> int:
+        """Soak in processes with folders of their own; return how many of them failed."""
+        processes = {
+            os.fork() or self._job(job, kills // jobs + (job < kills % jobs), seconds): job
+            for job in range(jobs)
+        }
+        failed = 0
+        while processes:
+            process, status = os.wait()
+            failed += status != 0
+            file = self._folder_of(processes.pop(process)) / "tally.json"
+            if file.exists():
+                tally = json.loads(file.read_text())
+                self.tally.add(
+                    Tally(**{k: Counter(v) if isinstance(v, dict) else v for k, v in tally.items()})
+                )
+        return failed
+
+    def _folder_of(self, job: int) -> Path:
+        return self.folder / f"job{job}"
+
+    def _job(self, job: int, kills: int, seconds: float) -> NoReturn:
+        failed = 1
+        try:
+            self.folder = self._folder_of(job)
+            self.folder.mkdir()
+            self.rng = random.Random(self.rng.random() + job)
+            self.run(kills, seconds)
+            failed = 0
+        except BaseException:  # noqa: BLE001 - the process is a fork of the soak, and must not go on
+            traceback.print_exc()
+        finally:
+            (self.folder / "tally.json").write_text(json.dumps(vars(self.tally)))
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(failed)
 
     def run(self, kills: int, seconds: float) -> None:
         until = time.monotonic() + seconds
@@ -119,40 +189,44 @@ class Soak:
         name = self.rng.choices(COMMANDS, WEIGHTS)[0]
         # These start interpreters, which takes most of their time.
         name = {14: "cluster", 29: "pool", 44: "cluster", 59: "flow"}.get(number % 60, name)
+        fresh = name not in GROUPS and number % FRESH == 0
         disturbed = self.rng.random() < 0.5
         self.disturbed |= disturbed
         self.tally.disturbed += disturbed
         wrong = f"{self.rng.getrandbits(31)} {self.rng.choice(RATES)}" if disturbed else ""
-        process = _start(_command(place, name), place, wrong)
-        moment = time.monotonic() + self.rng.uniform(0.0, self.took[name])
-        done, status = os.waitpid(process, os.WNOHANG)
-        while not done and time.monotonic() < moment:
-            time.sleep(0.002)
-            done, status = os.waitpid(process, os.WNOHANG)
-        if done:
-            self.tally.ended[name] += 1
-            self.tally.tracebacks += os.waitstatus_to_exitcode(status) == TRACEBACK
-        else:
+        moment = self.rng.uniform(0.0, self.took[name] + fresh * self.start_up)
+        process = _start(_command(place, name), place, wrong, fresh=fresh)
+        status, _ = _watch(process, place if name in GROUPS else None, moment)
+        label = f"{name}{', console script' if fresh else ''}"
+        if status is None:
             alone = self.rng.random() < 0.5
             (os.kill if alone else os.killpg)(process, signal.SIGKILL)
             os.waitpid(process, 0)
-            self.tally.kills[f"{name}{', first process' if alone else ''}"] += 1
+            self.tally.kills[f"{label}{', first process' if alone else ''}"] += 1
+        else:
+            self.tally.ended[label] += 1
+            self.tally.tracebacks += status == TRACEBACK
         began = time.monotonic()
         while left := _processes(place):
             assert time.monotonic() - began < GIVE_UP, f"{name}: {left} live on"
             time.sleep(0.02)
         self.tally.slowest_end = max(self.tally.slowest_end, time.monotonic() - began)
-        self._check(place, killed=not done)
+        self._check(place, killed=status is None, workers=2 if name in ("cluster", "flow") else 1)
 
-    def _check(self, place: Path, *, killed: bool) -> None:
-        wrong = {
-            path
-            for path in crash_archive.wrong_rows(place)
-            # The next run sees that the file is another one, and makes it again.
-            if not (killed and self.disturbed and (place / "out/products" / path).exists())
-        }
-        assert wrong <= self.unentered
-        self.unentered = set(crash_archive.wrong_rows(place))
+    def _check(self, place: Path, *, killed: bool, workers: int) -> None:
+        unentered = set(crash_archive.wrong_rows(place))
+        new = unentered - self.unentered
+        if new:
+            self.tally.unentered += 1
+            assert killed, f"the ledger does not hold {new}"
+            assert self.disturbed, f"the ledger does not hold {new}"
+            assert all((place / "out/products" / path).exists() for path in new)
+            scenes = {path.rpartition("_")[2] for path in new}
+            assert len(scenes) <= workers, f"products of several scenes are not entered: {new}"
+            _, output = _called(["verify", _campaign(place), "--json"], place)
+            named = {Path(wrong["path"]).name for wrong in json.loads(output)["mismatches"]}
+            assert named >= {Path(path).name for path in unentered}, output
+        self.unentered = unentered
         for root in (place / "out/products", place / "published"):
             for path, digest in _digests(root).items():
                 # Of a file that could not be read, the product says so, and the next run mends it.
@@ -164,6 +238,9 @@ class Soak:
 
     def _conclude(self, place: Path) -> None:
         """Run everything undisturbed, and compare it with what was never disturbed."""
+        file = _log_of_faults(place)
+        self.tally.faults.update(file.read_text().split() if file.exists() else ())
+        file.unlink(missing_ok=True)
         changed = self._corrupt(place) if self.rng.random() < 0.3 else ""
         for name in ("reprocess", "site", "aggregate", "publish"):
             code, output = _called(_command(place, name), place)
@@ -194,7 +271,7 @@ class Soak:
             with h5py.File(product) as file:
                 of_part = file.attrs["lidarops_input_count"].item() < FILES
             words = ["reproduce", str(product), "--archive", str(self.calm / "raw")]
-            self.parts[digest] = of_part and _called(words, self.calm)[0] == 0
+            self.parts[digest] = of_part and _called(words, self.folder)[0] == 0
         return self.parts[digest]
 
     def _new_views(self, place: Path) -> dict[str, str]:
@@ -242,10 +319,58 @@ def _command(place: Path, name: str) -> list[str]:
         "pool": ["site", out, "--workers", "2"],
         "aggregate": ["aggregate", out],
         "publish": ["publish", campaign, f"file://{place}/published"],
+        "verify": ["verify", campaign, "--json"],
+        "catalog": ["catalog", campaign, "--json"],
     }[name]
 
 
-def _start(words: Sequence[str], place: Path, wrong: str = "", output: int | None = None) -> int:
+def _load_commands(calm: Path, place: Path) -> None:
+    """Run the commands within this process, so that its forks have modules and kernels loaded."""
+    shutil.copytree(calm / "raw", place / "raw")
+    shutil.copy(calm / "campaign.yaml", place)
+    with (place / "output.txt").open("w") as output, redirect_stdout(output):
+        for name in (*COMMANDS, "verify", "catalog"):
+            with suppress(SystemExit):
+                app(_command(place, name))
+    assert threading.active_count() == 1, "a fork would lack a thread"
+    shutil.rmtree(place)
+
+
+def _watch(
+    process: int, group: Path | None = None, moment: float = float("inf")
+) -> tuple[int | None, float]:
+    """Return the exit code of a process, none if it still runs at a moment, and its CPU time in s.
+
+    With the folder of its commands, the time is that of all processes that descend from it.
+    """
+    took = 0.0
+    while True:
+        members = [process] if group is None else _processes(group)
+        now = sum(_cpu_time(member) for member in members)
+        took = max(took, now)
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status), took
+        if took > moment:
+            return None, took
+        time.sleep(0.003 if group is None else 0.05)
+
+
+def _cpu_time(process: int) -> float:
+    """Return the CPU time of a process in s, by the clock that clock_getcpuclockid(3) gives."""
+    with suppress(OSError):
+        return time.clock_gettime((~process << 3) | 2)
+    return 0.0
+
+
+def _start(
+    words: Sequence[str],
+    place: Path,
+    wrong: str = "",
+    output: int | None = None,
+    *,
+    fresh: bool = False,
+) -> int:
     """Start a command as the first process of a group, with faults by the seed and rate given."""
     process = os.fork()
     if process:
@@ -261,11 +386,15 @@ def _start(words: Sequence[str], place: Path, wrong: str = "", output: int | Non
         os.environ["PYTHONPATH"] = f"{Path(faults.__file__).parent}:{TESTS.parent}"
         if wrong:
             os.environ[faults.VARIABLE] = f"{wrong} {place}"
+            os.environ[faults.LOG] = str(_log_of_faults(place))
         if words[0] == "-m":
             os.execv(sys.executable, [sys.executable, *words])
         if "--workers" in words:
             # A pool needs a parent that it can import anew.
             os.execv(sys.executable, [sys.executable, "-m", "lidarops", *words])
+        if fresh:
+            script = Path(sysconfig.get_path("scripts")) / "lidarops"
+            os.execv(script, [str(script), *words])
         faults.install_from_environment()
         app(list(words))
     except SystemExit as ended:
@@ -276,6 +405,11 @@ def _start(words: Sequence[str], place: Path, wrong: str = "", output: int | Non
     finally:
         sys.stdout.flush()
         os._exit(code)
+
+
+def _log_of_faults(place: Path) -> Path:
+    """Return the file in which the processes of a folder note the calls that failed on purpose."""
+    return place.with_name(f"{place.name}.faults")
 
 
 def _wait(process: int) -> int:
@@ -333,13 +467,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this time")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     soak = Soak(options.folder, options.seed)
-    try:
-        soak.run(options.kills, options.seconds)
-    finally:
-        print(json.dumps(vars(soak.tally)))
+    failed = soak.run_jobs(options.jobs, options.kills, options.seconds)
+    print(json.dumps(vars(soak.tally)))
+    sys.exit(failed)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 KILLS = int(os.environ.get("LIDAROPS_TEST_KILLS", "12"))
-"""1000 take hours."""
+"""1000 take about an hour of CPU time."""
 
 
 @pytest.mark.slow

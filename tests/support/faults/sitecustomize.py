@@ -1,7 +1,8 @@
 """Lets calls of the system fail now and then: loaded by every Python process whose path names it.
 
 ``LIDAROPS_TEST_FAULTS`` is ``SEED RATE FOLDER``: calls on files below the folder fail at that rate,
-as disks and networks fail. Without it nothing is changed.
+as disks and networks fail. Without it nothing is changed. ``LIDAROPS_TEST_FAULTS_LOG`` names a file
+to which the error of each call that failed is appended.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ import os
 import random
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 VARIABLE = "LIDAROPS_TEST_FAULTS"
+LOG = "LIDAROPS_TEST_FAULTS_LOG"
 READING = (errno.EIO, errno.ESTALE, errno.EACCES)
 WRITING = (errno.ENOSPC, errno.EIO, errno.ESTALE, errno.EACCES)
 _READERS = ("open", "pread", "preadv", "read", "stat", "fstat", "scandir", "listdir")
@@ -42,10 +45,12 @@ def install(seed: int, rate: float, root: str) -> None:
                 active = False
                 try:
                     hit = concerned(arguments[0])
+                    number = rng.choice(numbers)
+                    if hit:
+                        _note(number)
                 finally:
                     active = True
                 if hit:
-                    number = rng.choice(numbers)
                     raise OSError(number, os.strerror(number), str(arguments[0]))
             return function(*arguments, **options)
 
@@ -57,6 +62,12 @@ def install(seed: int, rate: float, root: str) -> None:
         setattr(os, name, failing(getattr(os, name), WRITING))
     opened = failing(io.open, READING)
     io.open = builtins.open = opened  # type: ignore[assignment]
+
+
+def _note(number: int) -> None:
+    if log := os.environ.get(LOG):
+        with Path(log).open("a") as file:
+            file.write(f"{errno.errorcode[number]}\n")
 
 
 def install_from_environment() -> None:
