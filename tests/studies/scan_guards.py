@@ -101,7 +101,7 @@ GUARDS: Final = (
         )
     ),
     Guard("path variation", off=_off((_path_variation, "path_variation_from", _nothing))),
-    Guard("gradients that residuals show", off=_at(_block, gradient_limit=1e9)),
+    Guard("gradients that residuals show", off=_at(_block, gradient_noise=0.0)),
     Guard("outlying beams", off=_off((_block, "_has_outliers", _never))),
     Guard(
         "outlying beams: moments", off=_off((robust_weights, "clean_moments", lambda _: (1.0, 1.0)))

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.special import ndtr, ndtri, stdtrit
+from scipy.special import ndtri, stdtrit
 
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle import _sample_mask, robust_weights
@@ -20,6 +20,8 @@ Array = npt.NDArray[np.float64]
 
 _UNKNOWNS: Final = 3
 """Constant, optical depth and a gradient."""
+_LEAST_REST: Final = 1e-3
+"""Least share of an error that a fit leaves in a residual."""
 _DEPENDENT: Final = 1e-8
 """Squared length of a column outside those before it, over its own, up to which it depends on
 them."""
@@ -44,6 +46,8 @@ class BeamBlock:
     """Beams that an altitude needs to be within the reach."""
     gaps: npt.NDArray[np.bool_]
     """(profile,): whether samples are missing between others."""
+    dead_time_change: Array | None = None
+    """(profile, angle, altitude): of the signal, with one standard error of the dead time."""
 
     @property
     def path(self) -> Array:
@@ -75,13 +79,16 @@ class Regression:
         return self.table[:, number]
 
 
-def make_beam_block(signal: Array, variance: Array, scan: Scan) -> BeamBlock:
+def make_beam_block(
+    signal: Array, variance: Array, scan: Scan, dead_time_change: Array | None = None
+) -> BeamBlock:
     """Return logarithms and geometry of one block.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
     scan : Scan
+    dead_time_change : (profile, angle, altitude) float, optional
     """
     logarithm = np.empty(signal.shape)
     noise = np.empty(signal.shape)
@@ -99,6 +106,7 @@ def make_beam_block(signal: Array, variance: Array, scan: Scan) -> BeamBlock:
         surrounds_zenith(scan.tilted_azimuths),
         min(3, max(int(scan.usable.sum()), 2)),
         _sample_mask.profiles_with_gaps(noise < np.inf, signal, variance),
+        dead_time_change,
     )
 
 
@@ -121,11 +129,11 @@ def regress(beams: BeamBlock, *, inhomogeneity: float | None, robust: bool) -> R
     return _fit_robustly(beams, inhomogeneity)
 
 
-def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
-    """Return the largest horizontal gradient of ln backscatter that residuals of a block show.
+def open_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> Array:
+    """Return the horizontal gradient of ln backscatter that residuals leave open, m-1, (altitude,).
 
-    The error of a gradient follows from the scatter of the beams of all profiles about it. The
-    altitudes of a beam may be correlated.
+    It is the largest that is shown at any altitude of the block, by all profiles within 500 m of
+    it, but no larger than the residuals around an altitude allow there; 0 if none is shown.
 
     Parameters
     ----------
@@ -133,36 +141,76 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     fit : Regression
     altitude : (altitude,) float
         m.
-
-    Returns
-    -------
-    float
-        m-1, of all profiles within 1000 m of altitude; 0 if all are within chance.
     """
-    weights = np.where(np.isnan(fit.residual), 0.0, weights_of(beams, fit))
+    # Selection and logarithms bias noisy samples, which together would look like a gradient. The
+    # profiles decide together, lest a sample be selected by the noise around it.
+    middle = np.count_nonzero(beams.noise < np.inf, axis=0, keepdims=True) // 2
+    typical = np.take_along_axis(np.sort(beams.noise, axis=0), middle, axis=0)
+    clear = np.isfinite(fit.residual) & (typical < THRESHOLDS.gradient_noise)
+    weights = np.where(clear, weights_of(beams, fit), 0.0)
     weights *= ((fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0))[:, np.newaxis]
-    inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
-    residual = np.nan_to_num(fit.residual)
     plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
     square = np.zeros(altitude.size)
     for distance in _along_axes(beams.design[:2]):
         left, length = orthogonal_columns(weights, (distance,), plain)[-1]
         lever = np.where(np.isfinite(length), weights * left * altitude, 0.0)
-        product, weight = (
-            inside @ values.reshape(-1, altitude.size).T
-            for values in (lever * residual, lever * left * altitude)
-        )
-        total, whole = product.sum(axis=1), weight.sum(axis=1)
-        gradient = total / np.where(whole > 0.0, whole, np.inf)
-        squares = (weight**2).sum(axis=1)
-        # Beams with little weight do not tell the scatter of those that decide.
-        freedom = whole**2 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
-        scatter = ((product - gradient[:, np.newaxis] * weight) ** 2).sum(axis=1)
-        variance = scatter * (1.0 + _UNKNOWNS / np.maximum(freedom, 1.0))
-        limit = stdtrit(np.maximum(freedom, 1.0), ndtr(THRESHOLDS.gradient_limit))
-        seen = (freedom >= 1.0) & (total**2 > limit**2 * variance) & (variance > 0.0)
-        square += np.where(seen, gradient**2, 0.0)
-    return float(np.sqrt(square.max(initial=0.0)))
+        gradient, error, limit = _gradient(beams, fit, lever, left, altitude)
+        size = np.abs(gradient)
+        shown = np.max(size, where=size > limit * error, initial=0.0)
+        square += np.minimum(shown, size + THRESHOLDS.gradient_margin * error) ** 2
+    return np.asarray(np.sqrt(square))
+
+
+def _gradient(
+    beams: BeamBlock, fit: Regression, lever: Array, left: Array, altitude: Array
+) -> tuple[Array, Array, Array]:
+    """Return gradients along an axis, their errors, and the errors beyond which they are shown.
+
+    The error follows from the scatter of the beams of all profiles about the gradient, whose
+    altitudes may be correlated, and from the error of the dead time, which all beams share.
+
+    Parameters
+    ----------
+    beams : BeamBlock
+    fit : Regression
+    lever : (profile, angle, altitude) float
+        Weight of a residual in the sum that gives the gradient.
+    left : (profile, angle, altitude) float
+        Horizontal distance over altitude that constant and path do not explain.
+    altitude : (altitude,) float
+        m.
+    """
+    residual = np.nan_to_num(fit.residual)
+    # A fit leaves beams of large leverage less than their error.
+    whole = lever / np.sqrt(np.maximum(1.0 - np.nan_to_num(fit.leverage), _LEAST_REST))
+    arm = left * altitude
+    total, weight, product, part = (
+        _around(values, altitude)
+        for values in (lever * residual, lever * arm, whole * residual, whole * arm)
+    )
+    information = weight.sum(axis=1)
+    known = np.where(information > 0.0, information, np.inf)
+    gradient = total.sum(axis=1) / known
+    own = np.minimum(weight / known[:, np.newaxis], 1.0 - _LEAST_REST)
+    scatter = (((product - gradient[:, np.newaxis] * part) / (1.0 - own)) ** 2).sum(axis=1)
+    shift = np.zeros(altitude.size)
+    if beams.dead_time_change is not None:
+        expected = np.exp(beams.logarithm - residual)
+        change = np.where(lever != 0.0, beams.dead_time_change / expected, 0.0)
+        shift = _around(lever * change, altitude).sum(axis=1)
+    squares = (own**2).sum(axis=1)
+    # Beams with little weight do not tell the scatter of those that decide.
+    freedom = 1.0 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
+    error = np.where(freedom >= 1.0, np.sqrt(scatter + shift**2) / known, np.inf)
+    tested = np.count_nonzero(freedom >= 1.0)
+    chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(tested), 1)
+    return gradient, error, stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
+
+
+def _around(values: Array, altitude: Array) -> Array:
+    """Return sums over the altitudes around each, (altitude, profile times angle)."""
+    inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
+    return np.asarray(inside @ values.reshape(-1, altitude.size).T)
 
 
 def _along_axes(distances: Array) -> list[Array]:

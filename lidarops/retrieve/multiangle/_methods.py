@@ -50,15 +50,19 @@ class BlockSettings:
     """Strength of the penalty of "mld" and "mld_prior"; chosen from the noise where None."""
 
 
-def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> MultiAngleResult:
+def solve_cycles(
+    signal: Array, variance: Array, dead_time_change: Array | None, settings: BlockSettings
+) -> MultiAngleResult:
     """Return the solution of the profiles of one block, without quality bits.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
+    dead_time_change : (profile, angle, altitude) float or None
+        Of the signal, with one standard error of the dead time.
     settings : BlockSettings
     """
-    beams = _block.make_beam_block(signal, variance, settings.scan)
+    beams = _block.make_beam_block(signal, variance, settings.scan, dead_time_change)
     fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
     method, reason = _choose_method(beams, settings)
     profiles = _solve(method, beams, fit, settings)
@@ -342,13 +346,13 @@ def _gradient_slopes(
 ) -> Array:
     """Return the error of optical depth by a gradient to the east and to the north.
 
-    The gradient is the declared one, or that which the residuals show where it is larger. One that
-    is too large for air raises `poor_stratification`.
+    The gradient is the declared one, or that which the residuals leave open where it is larger. One
+    that is too large for air raises `poor_stratification`.
     """
-    shown = _block.visible_gradient(beams, fit, settings.height)
-    if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
-        profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth)
-    scale = max(settings.largest_gradient, shown) * settings.height
+    gradient = _block.open_gradient(beams, fit, settings.height)
+    distorted = gradient > max(settings.largest_gradient, THRESHOLDS.largest_gradient)
+    profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth) & distorted
+    scale = np.maximum(settings.largest_gradient, gradient) * settings.height
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
 

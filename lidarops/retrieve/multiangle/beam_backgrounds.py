@@ -38,9 +38,20 @@ class ScanSignals:
     response: Array
     """(beam, altitude) m2: mean of the square of range over overlap, the change of the signal per
     change of the background."""
+    dead_time_change: Array | None = None
+    """(time, beam, altitude): of the signal, with one standard error of the dead time; None for
+    analog."""
 
     @classmethod
-    def of(cls, signal: Array, noise: Array, left: Array, path: Array, response: Array) -> Self:
+    def of(
+        cls,
+        signal: Array,
+        noise: Array,
+        left: Array,
+        path: Array,
+        response: Array,
+        dead_time_change: Array | None = None,
+    ) -> Self:
         """Return the signals of beams.
 
         Parameters
@@ -51,15 +62,17 @@ class ScanSignals:
             (`Thresholds.common_background`, of the variance) is common to all beams; NaN for
             missing beams.
         path, response : (beam, altitude) float
+        dead_time_change : (time, beam, altitude) float, optional
         """
         left = np.nan_to_num(left)
         covariance = _COMMON * left[:, :, np.newaxis] * left[:, np.newaxis]
         covariance += (1.0 - _COMMON) * left[:, np.newaxis] ** 2 * np.eye(left.shape[1])
         variance = noise + (left[..., np.newaxis] * response) ** 2
-        return cls(signal, noise, variance, covariance, path, response)
+        return cls(signal, noise, variance, covariance, path, response, dead_time_change)
 
     def of_beams(self, beams: npt.NDArray[np.int64]) -> Self:
         """Return the signals of some beams."""
+        change = self.dead_time_change
         return replace(
             self,
             signal=self.signal[:, beams],
@@ -68,6 +81,7 @@ class ScanSignals:
             covariance=self.covariance[:, beams[:, np.newaxis], beams],
             path=self.path[beams],
             response=self.response[beams],
+            dead_time_change=None if change is None else change[:, beams],
         )
 
     def agreed(self, retrieval: MultiAngleResult) -> Self:

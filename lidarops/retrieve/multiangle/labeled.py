@@ -182,6 +182,7 @@ def _agreed_signals(
         left,
         slant_paths.slant_path(zenith_angle, height),
         beams["response"].to_numpy(),
+        beams["dead_time_error"].to_numpy() if "dead_time_error" in beams else None,
     )
     for _ in range(_LINEARISATIONS if (left > 0.0).any() else 0):
         signals = prior.agreed(_solve(signals, zenith_angle, altitude, **settings))
@@ -238,9 +239,9 @@ def _dead_time_variables(
     retrieval: MultiAngleResult, signals: ScanSignals, beams: xr.Dataset, station_altitude: float
 ) -> dict[str, xr.Variable]:
     """Return the errors by the dead time; none for analog signals."""
-    if "dead_time_error" not in beams:
+    if signals.dead_time_change is None:
         return {}
-    shift = signals.shift_by(retrieval, beams["dead_time_error"].to_numpy())
+    shift = signals.shift_by(retrieval, signals.dead_time_change)
     thickness = np.diff(beams["altitude"].to_numpy(), prepend=station_altitude)
     errors = {
         "optical_depth": np.abs(shift),
@@ -308,7 +309,12 @@ def _solve(
 ) -> MultiAngleResult:
     """Return the result of the method."""
     return optical_depth.retrieve_optical_depth(
-        beams.signal, zenith_angle, altitude, variance=beams.variance, **settings
+        beams.signal,
+        zenith_angle,
+        altitude,
+        variance=beams.variance,
+        dead_time_change=beams.dead_time_change,
+        **settings,
     )
 
 

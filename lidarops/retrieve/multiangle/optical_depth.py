@@ -69,6 +69,7 @@ def retrieve_optical_depth(
     robust: bool = True,
     layers: Sequence[tuple[float, float]] = (),
     regularisation: float | None = None,
+    dead_time_change: npt.ArrayLike | None = None,
 ) -> MultiAngleResult:
     """Retrieve optical depth and extinction from signals at several zenith angles.
 
@@ -108,6 +109,9 @@ def retrieve_optical_depth(
         Strength of the penalty of "mld" and "mld_prior", dimensionless, for slant paths scaled to a
         span of 1; by default the largest with residuals not larger than the noise, at each
         altitude.
+    dead_time_change : (..., angle, altitude) float, optional
+        Change of the signal with one standard error of the dead time, in all beams together, which
+        looks like a horizontal gradient near the lidar; NaN where there is no signal.
 
     Returns
     -------
@@ -137,7 +141,19 @@ def retrieve_optical_depth(
         _layers(layers, np.append(height, 0.0) + station_altitude),
         _regularisation(regularisation, chosen),
     )
-    result = _methods.solve_cycles(rows, noise, settings)
+    change: Array | None = None
+    if dead_time_change is not None:
+        change = np.nan_to_num(
+            inputs.real_array(dead_time_change, "dead_time_change").astype(np.float64)
+        )
+        if change.shape != leading + scan.path.shape:
+            raise RetrievalInputError(
+                f"has the shape {change.shape}",
+                field="dead_time_change",
+                remedy="give that of the signal",
+            )
+        change = change.reshape(rows.shape)
+    result = _methods.solve_cycles(rows, noise, change, settings)
     observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
     result.quality[:] = _quality(result, observed)
     return result.with_leading_axes(leading)

@@ -130,9 +130,15 @@ class Thresholds:
     # Horizontal gradient (`_block`, `_methods`).
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
-    gradient_limit: float = 4.0
-    """Standard errors beyond which a gradient is part of the error, of a normal distribution: that
-    of Student's is the same probability; assumed."""
+    gradient_noise: float = 0.04
+    """Variance of a logarithm from which a sample is left out of that test. Noisier samples are
+    biased, and together look like a gradient: deviations from level air are 1.1 standard errors
+    without them, 1.4 with them (`test_level_air_shows_no_gradient`)."""
+    gradient_false_alarm: float = 1e-3
+    """Probability that chance shows a gradient along an axis at any altitude of a block; chosen."""
+    gradient_margin: float = 2.0
+    """Standard errors by which the gradient at an altitude may exceed that of the residuals there,
+    if one is shown elsewhere; chosen."""
     largest_gradient: float = 3e-4
     """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
     no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted
