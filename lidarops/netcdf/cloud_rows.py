@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops.netcdf.variables import NO_STANDARD_NAME, Coverage, Row
+from lidarops.retrieve.clouds.thresholds import THRESHOLDS as CLOUD_THRESHOLDS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 CLOUDS: Final = (
@@ -18,9 +19,12 @@ CLOUDS: Final = (
         coverage=Coverage.AUXILIARY,
         states=("clear", "partly_cloudy", "cloudy", "unknown"),
         comment="partly_cloudy: some of the averaged profiles show a cloud, not all. cloudy:"
-        " all of them do, or their mean does. unknown: no usable data, or the overlap may be"
-        " incomplete. From base to apparent top: beyond a cloud that attenuates strongly there"
-        " may be more. Profiles that are left out, or have no data there, do not count.",
+        " all of them do, or their mean does. unknown: no usable data, the overlap may be"
+        " incomplete, or noise would hide a cloud: in the noise of the mean,"
+        f" {CLOUD_THRESHOLDS.visible_depth:g} m with"
+        f" {CLOUD_THRESHOLDS.visible_excess:g} times the least excess over air that makes a cloud"
+        " would not be found. From base to apparent top: beyond a cloud that attenuates strongly"
+        " there may be more. Profiles that are left out, or have no data there, do not count.",
     ),
     Row(
         name="cloud_fraction",

@@ -6,7 +6,7 @@ rise may be that of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -92,7 +92,7 @@ class Clouds:
     fraction: Array
     """Share of the profiles with a cloud; NaN where only the mean shows it, or is examined."""
     unknown: Mask
-    """Bins in which neither the mean nor a part of it can show a cloud."""
+    """Bins in which neither the mean nor a part of it can show a cloud, or noise would hide it."""
 
     @property
     def state(self) -> npt.NDArray[np.int8]:
@@ -209,6 +209,18 @@ class MeanProfiles:
             quantum=self.quantum,
         )
 
+    def visible_air(self, power: Array, cloudy: Mask) -> Mask:
+        """Return where noise would not hide a cloud in a signal without background."""
+        return _layers.find_visible_air(
+            power,
+            self.distance,
+            self.variance,
+            cloudy=cloudy,
+            molecular_attenuated=self.air.shape,
+            contrast=self.contrast,
+            quantum=self.quantum,
+        )
+
 
 def _quantum(averages: xr.Dataset) -> npt.ArrayLike:
     """Return the power of a single count in a bin of each mean, (time,); 0 of analog records."""
@@ -234,7 +246,9 @@ def signal_and_clouds(
         signal, layers = _signal_beyond_clouds(means, known_shape=known_shape)
     mask = (layers.mask | (fraction == 1.0)) & ~doubtful
     unknown = (doubtful | ~np.isfinite(signal.power)) & ~mask & np.isnan(fraction)
-    return signal, Clouds(mask, np.where(mask & (fraction == 0.0), np.nan, fraction), unknown)
+    clouds = Clouds(mask, np.where(mask & (fraction == 0.0), np.nan, fraction), unknown)
+    hidden = np.isfinite(signal.power) & ~means.visible_air(signal.power, clouds.any)
+    return signal, replace(clouds, unknown=unknown | hidden & ~clouds.any)
 
 
 def _cloud_fraction(averages: xr.Dataset, means: MeanProfiles) -> Array:

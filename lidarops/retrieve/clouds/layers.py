@@ -117,6 +117,121 @@ def find_layers(
     ----------
     pal1992, wang2001.
     """
+    tests = _tests(power, range, variance, molecular_attenuated, contrast, false_alarm, quantum)
+    mask = np.zeros(tests.power.shape, dtype=np.bool_)
+    _mark_layers(
+        frozen(tests.power),
+        frozen(tests.variance),
+        frozen(tests.shape),
+        tests.lengths,
+        float(contrast),
+        tests.certainty,
+        frozen(tests.limits),
+        frozen(tests.margins),
+        mask,
+    )
+    layers = Layers.of(mask.reshape(*tests.leading, tests.grid.size), tests.grid.values)
+    return replace(layers, mask=tests.grid.turn(layers.mask))
+
+
+def find_visible_air(
+    power: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    variance: npt.ArrayLike,
+    *,
+    cloudy: Mask,
+    molecular_attenuated: npt.ArrayLike,
+    contrast: float = SIGNAL_THRESHOLDS.cloud_contrast,
+    quantum: npt.ArrayLike = 0.0,
+) -> Mask:
+    r"""Return the bins in which noise would not hide a layer, (..., range).
+
+    The layer is 480 m deep, with twice the least excess over the air around it: a ratio of
+    :math:`2 c - 1`. With the mean ratio :math:`\rho` of the bins outside of layers that lie within
+    half that depth, and its variance :math:`\sigma^2`, it passes both tests of `find_layers` where
+
+    .. math:: \frac{(2 c - 2) \rho}{\sqrt 2\,\sigma} \geq t, \qquad
+       \frac{(c - 1) \rho}{\sigma \sqrt{1 + c^2}} \geq u .
+
+    Noise that lowers its rise hides it in half of the cases at the limit.
+
+    Parameters
+    ----------
+    power, range, variance, molecular_attenuated, contrast, quantum
+        As for `find_layers`.
+    cloudy : (..., range) bool
+        Bins in layers.
+
+    Raises
+    ------
+    RetrievalInputError
+        For invalid arguments.
+    """
+    rate = THRESHOLDS.cloud_false_alarm
+    tests = _tests(power, range, variance, molecular_attenuated, contrast, rate, quantum)
+    bins = max(round(THRESHOLDS.visible_depth / tests.step), 2)
+    of_depth = int(np.searchsorted(tests.lengths, bins))
+    marked = tests.grid.turn(np.asarray(cloudy)).reshape(tests.power.shape)
+    known = np.isfinite(tests.power) & np.isfinite(tests.variance) & ~marked
+    signal, air, noise = (
+        _sums_around(np.where(known, values, 0.0), bins)
+        for values in (tests.power, tests.shape, tests.variance)
+    )
+    error = np.sqrt(noise)
+    limit, margin = (values[:, of_depth, np.newaxis] for values in (tests.limits, tests.margins))
+    excess = THRESHOLDS.visible_excess * (contrast - 1.0)
+    rises = excess * signal - margin >= limit * math.sqrt(2.0) * error
+    exceeds = (excess + 1.0 - contrast) * signal - margin >= (
+        tests.certainty * limit * math.hypot(1.0, contrast) * error
+    )
+    visible = (air > 0.0) & (signal > 0.0) & rises & exceeds
+    return tests.grid.turn(visible.reshape(*tests.leading, tests.grid.size))
+
+
+def _sums_around(values: Array, bins: int) -> Array:
+    """Return sums over a number of bins around each, from the far end, so that they keep digits."""
+    size = values.shape[-1]
+    beyond = np.zeros((values.shape[0], size + 1))
+    beyond[:, :size] = np.cumsum(values[:, ::-1], axis=-1)[:, ::-1]
+    first = np.maximum(np.arange(size) - bins // 2, 0)
+    past = np.minimum(np.arange(size) - bins // 2 + bins, size)
+    return np.asarray(beyond[:, first] - beyond[:, past])
+
+
+@dataclass(frozen=True, slots=True)
+class _Tests:
+    """Profiles in ascending range, and what a rise is compared with."""
+
+    grid: inputs.RangeGrid
+    leading: tuple[int, ...]
+    step: float
+    """m."""
+    power: Array
+    """(profile, bin)."""
+    variance: Array
+    """(profile or 1, bin)."""
+    shape: Array
+    """(profile or 1, bin)."""
+    lengths: npt.NDArray[np.int64]
+    """Bins of the windows, ascending."""
+    certainty: float
+    """Share of `limits` by which the rise exceeds the contrast."""
+    limits: Array
+    """Standard errors of the rise, (profile, length)."""
+    margins: Array
+    """Sums of power above a base that are subtracted there, (profile, length)."""
+
+
+def _tests(
+    power: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    variance: npt.ArrayLike,
+    molecular_attenuated: npt.ArrayLike,
+    contrast: float,
+    false_alarm: float,
+    quantum: npt.ArrayLike,
+) -> _Tests:
+    """Return the validated arguments of `find_layers` and the limits of its tests."""
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
     noise = inputs.variance_rows(variance, grid, leading)
@@ -133,23 +248,13 @@ def find_layers(
     # A window has at least two bins.
     lengths = np.unique(np.maximum(np.rint(np.array(THRESHOLDS.window_lengths) / step), 2.0))
     anywhere, at_an_edge = -ndtri(false_alarm / lengths.size / np.array([grid.size, 2.0]))
-    mask = np.zeros(rows.shape, dtype=np.bool_)
     values = rows.astype(np.float64, copy=False)
     limits = anywhere * _excess_noise(values, noise, lengths)
     margins = skewness_margin(limits) * np.reshape(quantum, (-1, 1))
-    _mark_layers(
-        frozen(values),
-        frozen(noise),
-        frozen(shape),
-        lengths.astype(np.int64),
-        float(contrast),
-        at_an_edge / anywhere,
-        frozen(limits),
-        frozen(margins),
-        mask,
-    )
-    layers = Layers.of(mask.reshape(*leading, grid.size), grid.values)
-    return replace(layers, mask=grid.turn(layers.mask))
+    return _Tests(
+        grid, leading, step, values, noise, shape, lengths.astype(np.int64),
+        float(at_an_edge / anywhere), limits, np.broadcast_to(margins, limits.shape),
+    )  # fmt: skip
 
 
 def _excess_noise(power: Array, variance: Array, lengths: Array) -> Array:

@@ -39,6 +39,11 @@ class Thresholds:
     """m beyond the last bin of a cloud; its thin edge extends beyond its apparent top. Assumed."""
     least_share_beyond: float = 0.1
     """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
+    visible_depth: float = 480.0
+    """m; depth of the layer that noise must not hide where a bin is stated to be clear. By
+    definition; a cirrus of optical depth 0.05 is deeper (`test_layers.py`)."""
+    visible_excess: float = 2.0
+    """Its excess over the least one of a cloud. By definition; with 1, noise hides every layer."""
 
     # Overlap
     overlap_length: float = 60.0

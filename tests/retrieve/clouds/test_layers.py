@@ -14,7 +14,7 @@ from lidarops.retrieve.air.reference_window import (
     candidate_windows,
     choose_reference,
 )
-from lidarops.retrieve.clouds.layers import find_layers
+from lidarops.retrieve.clouds.layers import find_layers, find_visible_air
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.screening import cloud_contrast
 
@@ -245,6 +245,44 @@ def test_single_counts_of_a_mean_are_no_clouds():
     expected = 1e12 * attenuated(np.zeros(RANGE.size)) + 0.02
     power, variance = counted(np.broadcast_to(expected, (4000, RANGE.size)), 0.0, rng)
     assert np.mean(detect(power - 0.02, variance, quantum=1.0).cloudy) <= 1.5e-3
+
+
+@pytest.mark.parametrize("wavelength", [BLUE, 532e-9, 1064e-9])
+def test_a_layer_is_found_where_noise_would_not_hide_it(wavelength):
+    """480 m deep, of twice the least excess: in half of the cases where its limit lies."""
+    rng = np.random.default_rng(14)
+    contrast = cloud_contrast(wavelength)
+    _, power, shape = of_wavelength(wavelength, np.zeros(RANGE.size))
+    of_air = np.broadcast_to(3e15 * power, (300, RANGE.size))
+    settings = {"molecular_attenuated": shape, "contrast": contrast, "quantum": 1.0}
+
+    def searched(expected):
+        counts, variance = counted(expected, 100.0, rng)
+        return counts, RANGE, variance, find_layers(counts, RANGE, variance, **settings).mask
+
+    *air, cloudy = searched(of_air)
+    visible = find_visible_air(*air, cloudy=cloudy, **settings).mean(axis=0)
+    assert (visible[RANGE < 3000.0] == 1.0).all()
+    limit = RANGE[np.argmax(visible < 0.5)]
+    found = []
+    for base in (0.75 * limit, limit, 1.33 * limit):
+        layer = between(base, base + 480.0)
+        mask = searched(of_air * (1.0 + 2.0 * (contrast - 1.0) * layer))[-1]
+        found.append(mask[:, layer].any(axis=-1).mean())
+    assert found[0] > 0.95
+    assert 0.3 < found[1] < 0.75
+    assert found[2] < 0.2
+
+
+def test_bins_beside_a_layer_are_judged_without_it():
+    """Beyond a cloud that hides the light, no layer could be seen; beside a gap one could."""
+    rng = np.random.default_rng(15)
+    counts, variance = counted(3e15 * attenuated(0.0 * RANGE, CLOUDS["stratus"]), 1.0, rng)
+    counts[between(600.0, 900.0)] = np.nan
+    cloudy = detect(counts, variance).mask
+    visible = find_visible_air(counts, RANGE, variance, cloudy=cloudy, molecular_attenuated=SHAPE)
+    assert visible[between(300.0, 600.0) | between(900.0, 1200.0)].all()
+    assert not visible[RANGE > 2000.0].any()
 
 
 def test_all_layers_are_masked_and_the_lowest_is_reported():

@@ -189,6 +189,20 @@ def test_bins_without_usable_data_are_not_clear():
     assert (fraction[beside] == 0.0).all()
 
 
+def test_bins_in_which_noise_would_hide_a_cloud_are_not_clear():
+    """Of a weak lidar: a cloud that is found beyond the clear air stays one."""
+    cirrus = layer(9000.0, 9480.0, 30.0 * MOLECULES)
+    clear, cloudy = (
+        retrieved(averages(profiles([light(HAZE, cloud) / 150.0] * PROFILES)))
+        for cloud in (0.0, cirrus)
+    )
+    state = clear["cloud_mask"].to_numpy()[0]
+    assert (state[between(0.0, 4000.0)] == CLEAR).all()
+    assert (state[between(9000.0, 15_000.0)] == UNKNOWN).all()
+    assert (clear["cloud_fraction"] == 0.0).all()
+    assert (cloudy["cloud_mask"].to_numpy()[0, between(9060.0, 9420.0)] == 2).all()
+
+
 def test_the_mean_alone_shows_bins_beyond_the_last_whole_cell():
     means = averages(profiles([light(HAZE)] * PROFILES)).isel(range=slice(0, 1998))
     assert means["part_power"].attrs["bins"] == 4
