@@ -239,6 +239,29 @@ def test_a_cirrus_stands_out_at_each_wavelength(wavelength):
     assert np.mean(core.any(axis=-1)) > 0.9
 
 
+@pytest.mark.parametrize(
+    ("wavelength", "ratios", "least", "most"),
+    [
+        (532e-9, (3.0, 4.0), 0.85, 0.95),
+        (BLUE, (3.0, 4.0), 0.0, 0.001),
+        (BLUE, (5.0, 6.0), 0.99, 1.0),
+    ],
+)
+def test_a_grey_cirrus_has_to_be_brighter_to_be_a_cloud_at_355_nm(wavelength, ratios, least, most):
+    """Of scattering ratios at 532 nm, 480 or 1000 m deep, in little noise."""
+    rng = np.random.default_rng(21)
+    excess = rng.uniform(*ratios, (1000, 1)) - 1.0
+    depth = rng.choice([480.0, 1000.0], (1000, 1))
+    inside = between(9000.0, 9000.0 + depth)
+    _, power, shape = of_wavelength(wavelength, excess * BACKSCATTER * inside, 25.0)
+    spread = np.full(RANGE.size, np.interp(9000.0, RANGE, shape) / 30.0)
+    mask = find_layers(
+        power + spread * rng.standard_normal(power.shape), RANGE, spread**2,
+        molecular_attenuated=shape, contrast=cloud_contrast(wavelength),
+    ).mask  # fmt: skip
+    assert least <= (mask & inside).any(axis=-1).mean() <= most
+
+
 def test_single_counts_of_a_mean_are_no_clouds():
     """Beyond 9 km a window of 60 m holds less than a count, of a very skewed distribution."""
     rng = np.random.default_rng(13)
