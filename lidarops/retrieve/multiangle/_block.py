@@ -142,6 +142,8 @@ def open_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> Array:
     altitude : (altitude,) float
         m.
     """
+    if not beams.noise.size:
+        return np.zeros(altitude.size)
     # Selection and logarithms bias noisy samples, which together would look like a gradient. The
     # profiles decide together, lest a sample be selected by the noise around it.
     middle = np.count_nonzero(beams.noise < np.inf, axis=0, keepdims=True) // 2
