@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntFlag, StrEnum
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -171,7 +171,7 @@ class Row:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Layout:
     """Variables and global texts of one kind of product."""
 
@@ -190,7 +190,7 @@ class Layout:
     weighed: tuple[str, ...] = ()
     """Variables that raise LOW_SIGNAL_TO_NOISE where they are small against their error."""
 
-    @property
+    @cached_property
     def variables(self) -> tuple[Row, ...]:
         """Data rows, each followed by its derived rows: standard error, summary of flags."""
         return tuple(_with_derived(self.data))
@@ -214,6 +214,10 @@ class Layout:
         """Whether any variable is stored with a shortened mantissa."""
         return any(row.significant_bits for row in self.variables)
 
+    @cached_property
+    def _rows(self) -> dict[str, Row]:
+        return {row.name: row for row in (*self.coordinates, *self.variables)}
+
     def row(self, name: str) -> Row:
         """Return the row of a variable or coordinate.
 
@@ -222,14 +226,13 @@ class Layout:
         ProductError
             If the layout has no such variable.
         """
-        rows = {row.name: row for row in (*self.coordinates, *self.variables)}
-        if name not in rows:
+        if name not in self._rows:
             raise ProductError(
                 "is not a variable of this kind of product",
                 field=name,
-                remedy=f"its variables are {', '.join(rows)}",
+                remedy=f"its variables are {', '.join(self._rows)}",
             )
-        return rows[name]
+        return self._rows[name]
 
 
 @cache
