@@ -53,3 +53,14 @@ def test_a_tagged_commit_has_the_version_of_its_tag(repository: Path, version: s
     heading = re.search(rf"^## {re.escape(version)} - (\S+)$", changelog, re.MULTILINE)
     assert heading
     assert date.fromisoformat(heading[1])
+
+
+def test_upper_bounds_of_packages_have_their_reason(repository: Path) -> None:
+    lines = (repository / "pyproject.toml").read_text(encoding="utf-8").splitlines()
+    bounded = [re.search(r'"[\w\[\]-]+[^"]*<\d', line) is not None for line in lines]
+    assert sum(bounded) > 5
+    for number, line in enumerate(lines):
+        if bounded[number] and "#" not in line:
+            # One comment may be the reason of the bounds below it.
+            above = next(n for n in range(number, 0, -1) if not bounded[n])
+            assert lines[above].lstrip().startswith("#"), line
