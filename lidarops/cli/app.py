@@ -112,9 +112,21 @@ def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[
                 show_error(_of_system(error))
                 raise typer.Exit(REFUSED) from error
 
-        return app.command(name)(wrapped)
+        return app.command(name, help=_paragraphs(function.__doc__ or ""))(wrapped)
 
     return registered
+
+
+def _paragraphs(text: str) -> str:
+    """Return a text with each paragraph in one line, for a terminal of any width."""
+    lines = (" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+    return "\n\n".join(filter(None, lines))
+
+
+def from_here(place: Path | str) -> str:
+    """Return a path within the working folder relative to it, any other place as it is."""
+    path, here = Path(place), Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else place)
 
 
 def _of_system(error: OSError) -> LidarOpsError:

@@ -24,6 +24,7 @@ from lidarops.cli.app import (
     WaitOption,
     command,
     exit_with_status,
+    from_here,
     progress_bar,
     say,
     show_error,
@@ -363,7 +364,7 @@ def _print_places(result: Result, page: Path | None) -> None:
     from lidarops.figures.wording import counted
 
     if page is not None:
-        say(f"report:   {page}")
+        say(f"report:   {from_here(page)}")
     if result.internal:
         on_page = page is not None and set(result.internal) <= _processed_scenes(result)
         scenes = counted(len(result.internal), "scene")
@@ -410,7 +411,8 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         typer.echo(NO_SCENE)
     elif result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
-        say(f"products: {campaign.products_root}{ended}{never_made(result.findings)}")
+        place = from_here(campaign.products_root)
+        say(f"products: {place}{ended}{never_made(result.findings)}")
     else:
         state = "the archive is not what the campaign states, see above"
         if not result.findings.failed:

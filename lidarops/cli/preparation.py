@@ -12,6 +12,7 @@ from lidarops.cli.app import (
     CampaignFile,
     OutOption,
     command,
+    from_here,
     progress_bar,
     say,
 )
@@ -41,7 +42,7 @@ def simulate(
     with progress_bar("simulate", len(planned.paths)) as bar, cluster as client:
         simulated = write_simulation(planned, client=client, progress=bar.advance)
     write_plain(simulated.truth, settings.truth_path)
-    say(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
+    say(f"{len(simulated.paths)} raw files and truth.nc in {from_here(settings.archive)}")
 
 
 @command()

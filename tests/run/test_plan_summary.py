@@ -14,7 +14,7 @@ from support.archives import raw_archives
 from typer.testing import CliRunner
 
 from lidarops.cli import app
-from lidarops.cli.app import show_rows, wrapped
+from lidarops.cli.app import from_here, show_rows, wrapped
 
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 SCREEN = 24
@@ -143,3 +143,19 @@ def test_rows_become_paragraphs_where_columns_are_too_narrow(
         "Refused", "  file:", f"    {path}", "  reason: is truncated", "",
     ]  # fmt: skip
     assert wrapped("one two", "  ") == ["  one two"]
+
+
+def test_help_fills_its_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sentences of the documentation of a command do not break where its lines do."""
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = CliRunner().invoke(app, ["plan", "--help"]).output
+    assert re.search(r"reasons\. Also shows the estimated CPU time", shown)
+
+
+def test_places_within_the_working_folder_are_relative_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert from_here(tmp_path / "out/products") == "out/products"
+    assert from_here(tmp_path.parent / "out") == str(tmp_path.parent / "out")
+    assert from_here("s3://bucket/raw") == "s3://bucket/raw"
