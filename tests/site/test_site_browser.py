@@ -194,6 +194,18 @@ def test_no_page_needs_sideways_scrolling(site: Path, watched: Watched) -> None:
             assert wide <= width, (name, width)
 
 
+def test_names_in_tables_are_not_broken_on_a_phone(site: Path, watched: Watched) -> None:
+    watched.page.set_viewport_size({"width": 390, "height": 800})
+    for name, file in _pages(site).items():
+        watched.open(file)
+        watched.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        lines = watched.page.evaluate(
+            """[...document.querySelectorAll('th code, td li code')]
+                .map(e => [e.getClientRects().length, e.textContent])"""
+        )
+        assert [text for count, text in lines if count > 1] == [], name
+
+
 @both_schemes
 def test_images_are_drawn_and_thumbnails_load(site: Path, watched: Watched) -> None:
     for file in _pages(site).values():
