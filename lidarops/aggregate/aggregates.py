@@ -40,6 +40,8 @@ class AggregateOptions:
     store: bool = False
     runs: Mapping[str, str] = field(default_factory=dict)
     """Product path -> run that made it, for the snapshots of stores."""
+    products_at: str = ""
+    """Address to which the STAC catalog links products; empty: in the output."""
 
 
 @dataclass(slots=True)
@@ -108,7 +110,7 @@ def make_aggregates(
     if options.store:
         _try(made, partial(_stores, made, products, options))
     if options.stac:
-        _try(made, partial(_stac, made, products, options.selection))
+        _try(made, partial(_stac, made, products, options))
     return made
 
 
@@ -193,7 +195,7 @@ def _store(
     made.failed += done.failed
 
 
-def _stac(made: AggregateResult, products: Sequence[Facts], selection: ProductSelection) -> None:
-    if selection != EVERYTHING:
+def _stac(made: AggregateResult, products: Sequence[Facts], options: AggregateOptions) -> None:
+    if options.selection != EVERYTHING:
         raise ProductError("the STAC catalog lists all products", remedy="run without a selection")
-    made.stac = write_stac(made.root, products)
+    made.stac = write_stac(made.root, products, options.products_at)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
+from urllib.parse import quote
 
 from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate.facts import FOLDER, Facts
@@ -17,13 +19,15 @@ from lidarops.netcdf.variables import layout_of
 
 _NETCDF: Final = "application/x-netcdf"
 _PREFIX: Final = "lidarops"
+_ADDRESS: Final = re.compile(r"(?:https?://[^\s\"<>]+)?\Z")
 
 
-def write_stac(root: Path, products: Sequence[Facts]) -> str:
+def write_stac(root: Path, products: Sequence[Facts], products_at: str = "") -> str:
     """Write a self-contained STAC catalog of products; replace a previous one.
 
     All links are relative, including those to products, so that the whole output can be moved or
-    served from anywhere. The content does not depend on time or place of writing.
+    served from anywhere; or those to products lead to an address. The content does not depend on
+    time or place of writing.
 
     Parameters
     ----------
@@ -31,6 +35,8 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
         Folder that product paths are relative to; the catalog is written to its
         ``aggregates/stac``.
     products : sequence of Facts
+    products_at : str, optional
+        Address at which the products are published; default: beside the catalog in the output.
 
     Returns
     -------
@@ -40,7 +46,8 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
     Raises
     ------
     ProductError
-        If two products have the same file name, or there are no products.
+        If two products have the same file name, there are no products, or `products_at` is no
+        address.
     LidarOpsError
         If pystac is not installed.
     OSError
@@ -49,6 +56,10 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
     pystac = need("pystac")
     if not products:
         raise ProductError("there is no product to list", file=root)
+    if not _ADDRESS.match(products_at):
+        raise ProductError(
+            f"{products_at!r} is no address of products", remedy="give https://..., or none"
+        )
     _refuse_equal_names(products)
     catalog = pystac.Catalog(
         id=" ".join(sorted({product.campaign for product in products})),
@@ -61,7 +72,7 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
             catalog.add_child(_collection(pystac, kind, of_kind))
     catalog.normalize_hrefs(target.resolve().as_posix(), skip_unresolved=False)
     for item in catalog.get_items(recursive=True):
-        _link_product(item, root.resolve())
+        _link_product(item, root.resolve(), products_at)
     # Written beside the old catalog, so that readers find a complete one.
     building = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
@@ -147,8 +158,12 @@ def _item(pystac: Any, product: Facts) -> Any:
     return item
 
 
-def _link_product(item: Any, root: Path) -> None:
-    """Make the link to the product relative to the item."""
+def _link_product(item: Any, root: Path, products_at: str) -> None:
+    """Make the link to the product lead to its address, or relative to the item."""
     asset = item.assets["product"]
+    if products_at:
+        place = quote(asset.href.removeprefix("products/"))
+        asset.href = f"{products_at.rstrip('/')}/{place}"
+        return
     folder = Path(item.get_self_href()).parent
     asset.href = Path(os.path.relpath(root / asset.href, folder)).as_posix()

@@ -52,6 +52,13 @@ def aggregate(
         typer.Option(help="Weights of the profiles in a mean: shots, plain or inverse-variance."),
     ] = "shots",
     stac: Annotated[bool, typer.Option("--stac", help="Also write a STAC catalog.")] = False,
+    products_at: Annotated[
+        str,
+        typer.Option(
+            help="Address of published products, to which the STAC catalog links them; default:"
+            " where they are in the output."
+        ),
+    ] = "",
     store: Annotated[
         bool,
         typer.Option(
@@ -83,6 +90,7 @@ def aggregate(
         stac,
         store,
         runs,
+        products_at,
     )
     with progress_bar("aggregate", None) as bar:
         made = make_aggregates(root, options, progress=bar.advance)

@@ -58,6 +58,16 @@ def test_every_link_is_relative(archive: Path):
         assert all(href.startswith(("./", "../")) for href in hrefs), hrefs
 
 
+def test_a_published_catalog_links_published_products(archive: Path):
+    catalog = archive / write_stac(archive, facts_of(archive), "https://example.org/lidar/")
+    items = [json.loads(file.read_text()) for file in catalog.parent.glob("*/*/*.json")]
+    published = {item["assets"]["product"]["href"] for item in items}
+    paths = [facts.path.removeprefix("products/") for facts in facts_of(archive)]
+    assert published == {f"https://example.org/lidar/{path}" for path in paths}
+    with pytest.raises(ProductError, match="is no address"):
+        write_stac(archive, facts_of(archive), "../products")
+
+
 def test_a_second_catalog_replaces_the_first(archive: Path):
     catalog = archive / write_stac(archive, facts_of(archive))
     first = {file: file.read_bytes() for file in catalog.parent.rglob("*.json")}
