@@ -496,7 +496,8 @@ class _Effects:
             yield name, none, elastic.relative(-getattr(elastic, name), elastic.value)
         error, depth = self.settings.molecular_relative_error, self.air.depth
         yield "molecular", error * (depth + self.air.raman_depth), 2.0 * error * depth
-        of_overlap = self.settings.overlap_relative_error * (1.0 - self.air.overlap)
+        # Of the signal, in proportion to the overlap itself.
+        of_overlap = self.settings.overlap_relative_error * (1.0 / self.air.overlap - 1.0)
         yield "overlap", of_overlap, of_overlap
 
     def _of_signals(self, changes: Sequence[tuple[str, Array, Array]]) -> Iterator[_Cause]:

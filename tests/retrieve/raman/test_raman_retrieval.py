@@ -97,6 +97,24 @@ def test_errors_are_the_change_by_their_cause(sky, cause, settings, changed):
     np.testing.assert_allclose(change, before.lidar_ratio_systematic[0, near], rtol=0.05, atol=2e-3)
 
 
+def test_errors_of_the_overlap_are_the_change_by_it(sky):
+    overlap = np.where(R >= 300.0, 1.0 - (1.0 - np.minimum(R / 2000.0, 1.0)) ** 2, np.nan)
+    seen = np.nan_to_num(overlap, nan=1.0)
+    sky = replace(sky, raman=sky.raman * seen, elastic=sky.elastic * seen)
+    # One minus the overlap is 1e-3 of itself larger.
+    of_overlap = (overlap, 1.0 - 1.001 * (1.0 - overlap))
+    before, after = (
+        retrieved(replace(sky, air=replace(sky.air, overlap=o)), overlap_relative_error=1e-3)
+        for o in of_overlap
+    )
+    near = (R > 450.0) & (R < 5000.0)
+    assert overlap[near].min() < 0.45
+    for name in ("extinction", "backscatter"):
+        change = np.abs(getattr(after, name) - getattr(before, name))[0, near]
+        stated = getattr(before, f"{name}_budget")["overlap"][0, near]
+        np.testing.assert_allclose(change, stated, rtol=0.03, atol=0.02 * stated.max())
+
+
 def test_errors_of_the_background_are_the_change_by_it(sky):
     near = (R > 600.0) & (R < 5000.0)
     error = np.array([1e-4 * sky.raman[160]])
