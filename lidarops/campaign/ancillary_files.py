@@ -233,7 +233,7 @@ def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
     name : str
         Path of the file below `folder`. Columns: ``altitude`` (m above mean sea level, rising),
         ``lidar_ratio`` and ``lidar_ratio_standard_error`` (sr). A name that ends in ``.nc`` means
-        NetCDF; in a product with measured lidar ratios, their weighted means over time are used.
+        NetCDF; in a product with measured lidar ratios, their means over time are used.
 
     Raises
     ------
@@ -325,27 +325,32 @@ def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -
 def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:
     """Return the mean over time of the lidar ratios of a product, where there are any.
 
-    Values are weighted by their random errors; systematic errors are those of all times.
+    Values are weighted by laser shots. Their errors, and limits of values, would follow the noise
+    of backscatter: low values have small errors, and by them 60 sr become 49
+    (`tests/campaign/test_ancillary_files.py`). Systematic errors are those of all times.
     """
     ratio, random, systematic = (
         raw[f"lidar_ratio{error}"][1] for error in ("", "_error_random", "_error_systematic")
     )
+    known = np.isfinite(ratio) & (random > 0.0) & (raw["usable"][1] < _REJECTED)
+    weight = np.where(known, raw["shots"][1][:, np.newaxis], 0.0)
+    weight /= np.maximum(weight.sum(axis=0), 1.0)
+
+    def mean(values: Array) -> Array:
+        return np.asarray((weight * np.where(known, values, 0.0)).sum(axis=0))
+
+    together = mean(ratio)
     least, largest = _LIDAR_RATIOS
-    known = (ratio >= least) & (ratio <= largest) & (random > 0.0) & (raw["usable"][1] < _REJECTED)
-    weight = np.where(known, 1.0 / np.where(known, random, 1.0) ** 2, 0.0)
-    total = weight.sum(axis=0)
-    measured = total > 0.0
+    measured = (together >= least) & (together <= largest)
     if not measured.any():
         raise AncillaryError(
             "holds no usable value", file=name, field="lidar_ratio", remedy="choose another night"
         )
-
-    def mean(values: Array) -> Array:
-        sums = (weight * np.where(known, values, 0.0)).sum(axis=0)
-        return np.asarray(sums[measured] / total[measured])
-
-    error = np.hypot(np.sqrt(1.0 / total[measured]), mean(systematic))
-    return LidarRatio(raw["altitude"][1][measured], mean(ratio), error)
+    # Values that noise makes too large have the relative error of the mean.
+    excess = np.maximum(np.where(known, ratio, 0.0) / np.where(measured, together, 1.0), 1.0)
+    by_noise = np.sqrt(((weight * np.where(known, random, 0.0) / excess) ** 2).sum(axis=0))
+    error = np.hypot(by_noise, mean(systematic))
+    return LidarRatio(raw["altitude"][1][measured], together[measured], error[measured])
 
 
 def _read(folder: Path, name: str) -> bytes:

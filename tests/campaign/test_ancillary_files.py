@@ -23,6 +23,7 @@ from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
+from lidarops.retrieve.raman.backscatter import inverse_of_weak
 from lidarops.steps.dependence import ancillary_files
 
 ALTITUDE = np.linspace(0.0, 20_000.0, 41)
@@ -149,31 +150,58 @@ def test_lidar_ratios_are_linear_between_their_altitudes(tmp_path: Path) -> None
     assert digest == hashlib.sha256((tmp_path / "s.csv").read_bytes()).hexdigest()
 
 
-def _product(folder: Path, ratio: object, usable: object) -> None:
-    """Write the variables of a product with measured lidar ratios over 3 times and 2 heights."""
-    plane, shape = ("time", "range"), (3, 2)
+def _product(folder: Path, ratio: object, random: object, usable: object) -> None:
+    """Write the variables of a product with measured lidar ratios over times and heights."""
+    plane, values = ("time", "range"), np.asarray(ratio, float)
+    times, heights = values.shape
     xr.Dataset(
         {
-            "lidar_ratio": (plane, np.broadcast_to(np.asarray(ratio, float), shape)),
-            "lidar_ratio_error_random": (plane, np.array([[3.0, 3.0], [6.0, 3.0], [3.0, 3.0]])),
-            "lidar_ratio_error_systematic": (plane, np.full(shape, 2.0)),
-            "usable": (plane, np.broadcast_to(np.asarray(usable, np.int8), shape)),
+            "lidar_ratio": (plane, values),
+            "lidar_ratio_error_random": (plane, np.broadcast_to(random, values.shape)),
+            "lidar_ratio_error_systematic": (plane, np.full(values.shape, 2.0)),
+            "usable": (plane, np.broadcast_to(np.asarray(usable, np.int8), values.shape)),
+            "shots": ("time", np.where(np.arange(times) == 1, 500, 1000)),
         },
-        coords={"altitude": ("range", np.array([1000.0, 2000.0]))},
+        coords={"altitude": ("range", 1000.0 * np.arange(1, heights + 1))},
     ).to_netcdf(folder / "night.nc")
 
 
-def test_measured_lidar_ratios_are_averaged_by_their_random_errors(
-    tmp_path: Path,
-) -> None:
-    _product(tmp_path, [[50.0, 40.0], [60.0, 40.0], [np.nan, 40.0]], [[0, 2], [1, 2], [0, 2]])
+def test_measured_lidar_ratios_are_averaged_by_shots(tmp_path: Path) -> None:
+    ratio = np.array([[50.0, 40.0], [60.0, 40.0], [np.nan, 40.0]])
+    random = np.array([[3.0, 3.0], [6.0, 3.0], [3.0, 3.0]])
+    _product(tmp_path, ratio, random, [[0, 2], [1, 2], [0, 2]])
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
     assert profile.altitude.tolist() == [1000.0]
-    assert profile.ratio[0] == pytest.approx((50.0 / 9 + 60.0 / 36) / (1 / 9 + 1 / 36))
-    assert profile.standard_error[0] == pytest.approx(np.hypot((1 / 9 + 1 / 36) ** -0.5, 2.0))
-    _product(tmp_path, 40.0, 2)
+    mean = (2 * 50.0 + 60.0) / 3
+    assert profile.ratio[0] == pytest.approx(mean)
+    by_noise = np.hypot(2 * 3.0, 6.0 * mean / 60.0) / 3
+    assert profile.standard_error[0] == pytest.approx(np.hypot(by_noise, 2.0))
+    _product(tmp_path, ratio, random, 2)
     with pytest.raises(AncillaryError, match="usable"):
         lidar_ratio_profile(tmp_path, "night.nc")
+
+
+@pytest.mark.parametrize(
+    ("times", "of_backscatter", "of_extinction"), [(20, 0.25, 0.12), (20, 0.05, 0.3), (4, 0.1, 0.1)]
+)
+def test_means_of_measured_lidar_ratios_have_no_bias(
+    tmp_path: Path, times: int, of_backscatter: float, of_extinction: float
+) -> None:
+    rng, shape = np.random.default_rng(1), (times, 3000)
+    backscatter = 1.0 + of_backscatter * rng.standard_normal(shape)
+    extinction = 60.0 * (1.0 + of_extinction * rng.standard_normal(shape))
+    # Values and errors as the Raman retrieval has them.
+    inverse = inverse_of_weak(backscatter, np.full(shape, of_backscatter))
+    ratio = extinction * inverse
+    square = (60.0 * of_extinction) ** 2 + (ratio * of_backscatter) ** 2
+    square *= inverse**2 * (1.0 + 8.0 * (of_backscatter / backscatter) ** 2)
+    _product(tmp_path, ratio, np.sqrt(square), 0)
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    # With weights by the errors, 49 and 58 sr in the first and the last case.
+    assert profile.ratio.mean() == pytest.approx(60.0, abs=0.5)
+    by_noise = np.sqrt(profile.standard_error**2 - 2.0**2)
+    away = np.abs(profile.ratio - 60.0) / by_noise
+    assert 0.92 < np.mean(away < 1.96) < 0.985
 
 
 @pytest.mark.parametrize(
