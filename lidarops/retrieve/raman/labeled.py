@@ -6,6 +6,7 @@ lidar ratio, clouds of the elastic signal, water vapour, overlap.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -49,6 +50,8 @@ _ANY: Final = int(
 )
 _WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
+_DIGITS_OF_A_BIN: Final = 6
+"""Digits of the difference of ranges in bins, which are no more certain: 1e-6 bins are 10 um."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,44 +81,83 @@ class Assumptions:
     """m, full width at half maximum of the filter of nitrogen; None where all lines pass."""
 
 
-class _Channel:
-    """Means of one channel on the bins that all channels have in common."""
+@dataclass(frozen=True, slots=True)
+class _Bins:
+    """Bins of a channel for the ranges that all channels have in common."""
 
-    def __init__(self, averages: xr.Dataset, bins: slice, distance: Array) -> None:
-        averages = averages.isel(range=bins).assign_coords(range=("range", distance))
+    inside: slice
+    share: float
+    """Weight of the bin beyond in the value at a common range; 0 where ranges agree."""
+
+
+class _Channel:
+    """Means of one channel, whose values are given at the ranges that all channels have."""
+
+    def __init__(self, averages: xr.Dataset, bins: _Bins, distance: Array) -> None:
+        averages = averages.isel(range=bins.inside)
+        self._share, self._distance = bins.share, distance
+        if not bins.share:
+            averages = averages.assign_coords(range=("range", distance))
         self.averages = averages
-        self.quality = averages["quality"].to_numpy().astype(np.int32)
-        hidden = (self.quality & np.int32(_WITHHELD)) != 0
-        self.power = np.where(hidden, np.nan, averages["power"].to_numpy())
+        quality = averages["quality"].to_numpy().astype(np.int32)
+        hidden = (quality & np.int32(_WITHHELD)) != 0
+        self.quality = quality[:, :-1] | quality[:, 1:] if bins.share else quality
+        self._power = np.where(hidden, np.nan, averages["power"].to_numpy())
         noise = actual_noise(averages)
-        self.variance = noise.variance * noise.correlation_length[:, np.newaxis]
+        self._variance = noise.variance * noise.correlation_length[:, np.newaxis]
         counts = counts_per_power(averages, averages["shots"].to_numpy())
         scale = noise.excess * noise.correlation_length
-        self.counts = None if counts is None else counts / scale
+        self._counts = None if counts is None else counts / scale
+
+    @property
+    def known(self) -> Booleans:
+        """Whether there is a value at a common range, (profile, bin)."""
+        return np.isfinite(self._at_common(self._power))
 
     def signal(self, shape: Array, *, known_shape: bool) -> tuple[ChannelSignal, Booleans]:
-        """Return the signal without background, and whether the background is uncertain."""
-        r = self.averages["range"].to_numpy()
+        """Return the signal without background, and whether the background is uncertain.
+
+        `shape` is that of clean air at the common ranges.
+        """
+        r, own = self.averages["range"].to_numpy().astype(np.float64), shape
+        if self._share:
+            # Without the square of range, it is nearly a line over one bin.
+            own = np.interp(r, self._distance, shape * self._distance**2) / r**2
         if known_shape:
             sky = estimate.from_known_shape(
-                self.power, r, self.variance, shape, exposure=self.counts
+                self._power, r, self._variance, own, exposure=self._counts
             )
         else:
-            sky = estimate.from_tail(self.power, r, self.variance)
+            sky = estimate.from_tail(self._power, r, self._variance)
         background = sky.background
         change = dead_time_error(self.averages, xr.DataArray(background, dims="time"))
         error = np.zeros((1, r.size))
         if change is not None:
             error = np.nan_to_num(change.transpose("time", "range").to_numpy())
+        values = (self._power - background[:, np.newaxis], self._variance, error)
+        if self._share:
+            # Noise of neighbours is common to them then. That of a smooth fit is as without.
+            factors = (own, shape), (own**2, shape**2), (own, shape)
+            values = tuple(
+                self._at_common(part / of_bins) * of_common
+                for part, (of_bins, of_common) in zip(values, factors, strict=True)
+            )
+        power, variance, error = values
         signal = ChannelSignal(
-            self.power - background[:, np.newaxis],
-            self.variance,
+            power,
+            variance,
             np.nan_to_num(background),
             sky.standard_error,
             error,
-            self.counts,
+            self._counts,
         )
         return signal, sky.uncertain
+
+    def _at_common(self, values: Array) -> Array:
+        """Return values of the bins at the common ranges, (..., bin), between bins by lines."""
+        if not self._share:
+            return values
+        return (1.0 - self._share) * values[..., :-1] + self._share * values[..., 1:]
 
 
 def retrieve(
@@ -137,7 +179,7 @@ def retrieve(
         Means over the same times: ``power``, ``variance``, ``quality`` over (time, range) and
         ``shots``, ``profiles`` over time, with the scalar coordinate ``zenith_angle`` (degree),
         from `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. Bins of both
-        have equal widths; ranges are those of `elastic`, to half a bin.
+        have equal widths; ranges are those of `elastic`, to which `raman` is interpolated.
     molecules : MolecularProfile
     station_altitude : float
         m above mean sea level.
@@ -167,7 +209,7 @@ def retrieve(
         _Channel(averages, part, distance)
         for averages, part in zip((elastic, *others), bins, strict=True)
     ]
-    seen = np.ones(distance.size) if overlap is None else overlap[bins[0]]
+    seen = np.ones(distance.size) if overlap is None else overlap[bins[0].inside]
     settings = assumptions.settings
     heights = station_altitude + climb * distance
     air = _air(molecules, heights, distance, settings, assumptions.filter_width, seen)
@@ -278,20 +320,27 @@ def without_signal(
 
 def _common_bins(
     elastic: xr.Dataset, others: list[xr.Dataset], climb: float, altitude: float
-) -> tuple[Array, list[slice]]:
-    """Return the ranges that all channels have, and the bins of each there."""
+) -> tuple[Array, list[_Bins]]:
+    """Return the ranges that all channels have, those of `elastic`, and the bins of each there."""
     distance = elastic["range"].to_numpy().astype(np.float64)
     width = float(np.median(np.diff(distance)))
     grids = [one["range"].to_numpy().astype(np.float64) for one in others]
-    shifts = [round((distance[0] - grid[0]) / width) for grid in grids]
-    first = max(0, *(-shift for shift in shifts))
-    stop = min(distance.size, *(g.size - s for g, s in zip(grids, shifts, strict=True)))
+    # Ranges of equal bins differ by rounding.
+    leads = [round((distance[0] - grid[0]) / width, _DIGITS_OF_A_BIN) for grid in grids]
+    shifts = [math.floor(lead) for lead in leads]
+    shares = [lead - shift for lead, shift in zip(leads, shifts, strict=True)]
+    needed = [shift + (share > 0.0) for shift, share in zip(shifts, shares, strict=True)]
     # An offset may give negative ranges, without light; above the atmosphere there is no air.
+    nearest = [int(np.argmax(grid > 0)) - s for grid, s in zip(grids, shifts, strict=True)]
+    first = max(0, *nearest)
+    stop = min(distance.size, *(g.size - n for g, n in zip(grids, needed, strict=True)))
     inside = (distance > 0) & (altitude + climb * distance < HIGHEST)
     first = max(first, int(np.argmax(inside)))
     stop = min(stop, distance.size - int(np.argmax(inside[::-1])))
-    slices = [slice(first, stop), *(slice(first + s, stop + s) for s in shifts)]
-    return distance[first:stop], slices
+    bins = [_Bins(slice(first, stop), 0.0)]
+    for shift, last, share in zip(shifts, needed, shares, strict=True):
+        bins.append(_Bins(slice(first + shift, stop + last), share))
+    return distance[first:stop], bins
 
 
 def _depth(
@@ -333,7 +382,7 @@ def _quality(cells: Cells, channels: list[_Channel], overlap: Array) -> Flags:
     for channel in channels:
         parts = cells.split(channel.quality & np.int32(_ANY))
         bits |= np.bitwise_or.reduce(parts, axis=-1).astype(np.int32)
-        bits[cells.known(channel.power) == 0] |= _MISSING
+        bits[~cells.split(channel.known).any(axis=-1)] |= _MISSING
     unknown = np.isnan(cells.split(overlap)).any(axis=-1)
     bits[:, unknown] |= np.int32(Quality.INCOMPLETE_OVERLAP)
     return bits
