@@ -134,7 +134,7 @@ class _Channel:
         error = np.zeros((1, r.size))
         if change is not None:
             error = np.nan_to_num(change.transpose("time", "range").to_numpy())
-        values = (self._power - background[:, np.newaxis], self._variance, error)
+        values: tuple[Array, ...] = (self._power - background[:, np.newaxis], self._variance, error)
         if self._share:
             # Noise of neighbours is common to them then. That of a smooth fit is as without.
             factors = (own, shape), (own**2, shape**2), (own, shape)
