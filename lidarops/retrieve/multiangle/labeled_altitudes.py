@@ -46,6 +46,9 @@ _OF_CELLS: Final = {name for name, dims in _DIMENSIONS.items() if dims == _CUBE}
 BATCH: Final = 64
 """Profiles averaged together, unless one cycle has more."""
 _LEVELS: Final = ("altitude", "pressure", "temperature")
+_FEW: Final = 16
+"""Profiles whose bins are prepared together, so that they stay in the cache of the processor; the
+result does not depend on it."""
 _BESIDE: Final = 4
 """Bins beyond the highest cell, of which its mean needs one."""
 
@@ -176,8 +179,9 @@ class AltitudeCycles:
             cycle = self._order.cycle[batch] - self._order.cycle[batch.start]
             self._pieces.append(
                 _batch_on_altitudes(
-                    tuple(part[members - first] for part in profiles),
-                    None if change is None else (change[0][members - first], change[1]),
+                    profiles,
+                    change,
+                    members - first,
                     self._weights[members],
                     cycle,
                     self._order.beam[batch],
@@ -370,6 +374,7 @@ def _batches(order: _Order) -> Iterator[slice]:
 def _batch_on_altitudes(
     profiles: tuple[_Block, ...],
     dead_time: tuple[_Block, float] | None,
+    rows: Integers,
     shots: Array,
     cycle: Integers,
     beam: Integers,
@@ -378,61 +383,66 @@ def _batch_on_altitudes(
     """Return the arrays of the cycles of a batch by name.
 
     `dead_time` holds the change of the power by the dead time, and that of the background over its
-    square; None for analog.
+    square; None for analog. `rows` are those of the batch in the profiles, sorted by cycle and
+    beam, as `shots`, `cycle` and `beam` are.
     """
-    power, variance, quality, length = profiles
-    bins = _net_bins(power, variance, quality, length, beam, settings)
-    if dead_time is not None:
-        of_sky = dead_time[1] * bins.background**2
-        change = dead_time[0][:, settings.covered] - of_sky[:, np.newaxis]
-        bins = bins._replace(change=np.where(np.isfinite(bins.power), change, np.nan))
     beams = len(settings.slant_edges)
-    visit = cycle * beams + beam
-    first = np.flatnonzero(np.diff(visit, prepend=-1))
-    if first.size < visit.size:
-        bins = _visit_means(bins, shots, first)
     shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
-    signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
-    flags = np.zeros((shape[0], shape[2]), dtype=np.int32)
-    left_by_beam, blocked = np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
-    changed = None if bins.change is None else np.full(shape, np.nan)
-    left_by_beam[cycle[first], beam[first]] = bins.left
-    blocked[cycle[first], beam[first]] = np.where(
+    cycles: dict[str, _Block] = {
+        "signal": np.full(shape, np.nan),
+        "variance": np.full(shape, np.nan),
+        "quality": np.zeros((shape[0], shape[2]), dtype=np.int32),
+        "left": np.full(shape[:2], np.nan),
+        "obstruction": np.full(shape[:2], np.nan),
+    }
+    if dead_time is not None:
+        cycles["dead_time_error"] = np.full(shape, np.nan)
+    first = np.flatnonzero(np.diff(cycle * beams + beam, prepend=-1))
+    for few, visits in _few_visits(first, rows.size):
+        power, variance, quality, length = (values[rows[few]] for values in profiles)
+        bins = _net_bins(power, variance, quality, length, beam[few], settings)
+        if dead_time is not None:
+            of_sky = dead_time[1] * bins.background**2
+            change = dead_time[0][rows[few], settings.covered] - of_sky[:, np.newaxis]
+            bins = bins._replace(change=np.where(np.isfinite(bins.power), change, np.nan))
+        if visits.size < bins.left.size:
+            bins = _visit_means(bins, shots[few], visits - few.start)
+        _fill_cells(cycles, bins, cycle[visits], beam[visits], settings)
+    return cycles
+
+
+def _few_visits(first: Integers, profiles: int) -> Iterator[tuple[slice, Integers]]:
+    """Yield the profiles of some visits of directions, and the first profile of each."""
+    ends = np.append(first[1:], profiles)
+    low = 0
+    while low < first.size:
+        high = max(int(np.searchsorted(ends, first[low] + _FEW, side="right")), low + 1)
+        yield slice(int(first[low]), int(ends[high - 1])), first[low:high]
+        low = high
+
+
+def _fill_cells(
+    cycles: dict[str, _Block], bins: _Bins, cycle: Integers, beam: Integers, settings: _Settings
+) -> None:
+    """Average the bins of visits over the cells of their beams, in place."""
+    cycles["left"][cycle, beam] = bins.left
+    cycles["obstruction"][cycle, beam] = np.where(
         np.isfinite(bins.obstruction), bins.obstruction, np.nan
     )
-    beam, cycle = beam[first], cycle[first]
-    near, gain = settings.covered, settings.gain
+    distance, gain = settings.distance[settings.covered], settings.gain
     for number in np.unique(beam):
-        rows = beam == number
-        means = average_over_cells(
-            bins.power[rows],
-            bins.variance[rows],
-            bins.quality[rows],
-            gain,
-            settings.distance[near],
-            settings.slant_edges[number],
-        )
+        rows = np.flatnonzero(beam == number)
+        noise = bins.variance[rows], bins.quality[rows]
+        cells = gain, distance, settings.slant_edges[number]
+        means = average_over_cells(bins.power[rows], *noise, *cells)
         # The background is common to all bins of a beam.
-        noise = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
-        signal[cycle[rows], number], spread[cycle[rows], number] = at_centres(means.signal, noise)
-        flags[cycle[rows]] |= means.quality
-        if changed is not None and bins.change is not None:
-            changed[cycle[rows], number] = average_over_cells(
-                bins.change[rows],
-                bins.variance[rows],
-                bins.quality[rows],
-                gain,
-                settings.distance[near],
-                settings.slant_edges[number],
-            ).signal
-    cycles: dict[str, _Block] = {
-        "signal": signal,
-        "variance": spread,
-        "quality": flags,
-        "left": left_by_beam,
-        "obstruction": blocked,
-    }
-    return cycles if changed is None else cycles | {"dead_time_error": changed}
+        variance = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
+        visits = cycle[rows], number
+        cycles["signal"][visits], cycles["variance"][visits] = at_centres(means.signal, variance)
+        cycles["quality"][cycle[rows]] |= means.quality
+        if bins.change is not None:
+            change = average_over_cells(bins.change[rows], *noise, *cells).signal
+            cycles["dead_time_error"][visits] = change
 
 
 class _Bins(NamedTuple):
@@ -525,13 +535,15 @@ def _shapes(
             f"is {wavelength}", field="wavelength", remedy="give m, or leave the molecules out"
         )
     in_front = distance > 0
-    climb = np.cos(np.radians(zenith_angle))[:, np.newaxis]
+    # The vertical planes of a volume have the same zenith angles.
+    angles, place = np.unique(zenith_angle, return_inverse=True)
+    climb = np.cos(np.radians(angles))[:, np.newaxis]
     altitude = station_altitude + climb * distance[in_front]
-    shapes = np.zeros((zenith_angle.size, distance.size))
+    shapes = np.zeros((angles.size, distance.size))
     extinction = molecules.extinction(altitude, wavelength)
     backscatter = extinction / molecular_lidar_ratio(wavelength)
     shapes[:, in_front] = known_shape.molecular_shape(backscatter, extinction, distance[in_front])
-    return shapes
+    return shapes[place]
 
 
 def _visit_means(bins: _Bins, shots: Array, first: npt.NDArray[np.intp]) -> _Bins:
