@@ -281,7 +281,7 @@ class Grade(StrEnum):
     NONE = "none"
     """The same values and texts; the old file stays."""
     MINOR = "minor"
-    """Texts, flags, or values within a tenth of their stated errors."""
+    """Texts, few flags, or values within a tenth of their stated errors."""
     MAJOR = "major"
 
 
@@ -314,6 +314,8 @@ class Change:
     """Number of values that are missing or rejected in only one of both."""
     flags: int = 0
     """Number of flags and states that differ."""
+    moved: str = ""
+    """How values are of another place, time, wavelength, unit or state, as a phrase."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
@@ -325,6 +327,7 @@ class Change:
             "share": self.share,
             "came_or_went": self.lost,
             "other_flags": self.flags,
+            "other_meaning": self.moved,
             "causes": list(self.causes),
         }
 

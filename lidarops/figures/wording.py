@@ -49,7 +49,9 @@ def change_in_words(change: Change) -> str:
         return "the same"
     if not change.share:
         return "the same values, other texts"
-    words = [f"{counted(change.lost, 'value')} came or went"] if change.lost else []
+    words = [change.moved] if change.moved else []
+    if change.lost:
+        words.append(f"{counted(change.lost, 'value')} came or went")
     if change.largest:
         words.append(f"up to {_measured(change)} in {change.variable}")
     if change.flags:

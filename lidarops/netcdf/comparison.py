@@ -23,6 +23,10 @@ MINOR: Final = 0.1
 """Largest difference of a minor change, in standard errors: an interval of 95 % that is off by it
 covers 94.9 %."""
 
+MOST_STATES: Final = 0.01
+"""Largest share of the values whose state (good, care or reject; cloud or none) differs in a minor
+change, but for a single one: whoever keeps good values only then keeps 99 % of them."""
+
 _MAKING: Final = frozenset(
     {
         "id", "history", "product_version", "date_created", "date_modified", "date_issued",
@@ -34,6 +38,8 @@ _BLOCK: Final = 1 << 26
 """Bytes of a variable that are compared at a time."""
 _MOST_CAUSES: Final = 20
 _ERROR: Final = "_standard_error"
+_MEANING: Final = ("standard_name", "units")
+"""Attributes of a variable without which its values mean something else."""
 _SAME: Final = ("kind", "station", "instrument", "channel", "scene")
 """Attributes ``lidarops_...`` that versions of a product share."""
 
@@ -48,6 +54,8 @@ class _Difference:
     lost: int = 0
     """Number of those that are missing or rejected in only one of both."""
     flags: int = 0
+    moved: str = ""
+    """How its values are of another place, time, wavelength, unit or state."""
     largest: float = 0.0
     measure: Measure = Measure.SIZE
 
@@ -65,9 +73,10 @@ def compare_products(old: Path, new: Path) -> Change:
     Change
         None where values and texts are the same, apart from those that state how and when a
         product was made; minor where all values are within `MINOR` standard errors of `old`, or
-        within that share of their size where no error is stated, and the same values are missing
-        and rejected. Values that are rejected in both are not measured, and other flags of a
-        value are counted only.
+        within that share of their size where no error is stated, at the same coordinates and in
+        the same units, the same values are missing and rejected, and at most `MOST_STATES` of the
+        values are in another state. Values that are rejected in both are not measured, and other
+        flags of a value are counted only.
 
     Raises
     ------
@@ -81,7 +90,7 @@ def compare_products(old: Path, new: Path) -> Change:
             xr.open_dataset(new, engine="netcdf4", decode_cf=False, cache=False) as after,
         ):
             _refuse_another(before, after, new)
-            differences = [d for d in _differences(before, after) if d.count or d.lost]
+            differences = [d for d in _differences(before, after) if d.count or d.lost or d.moved]
             same_texts = _texts(before) == _texts(after)
             sizes = {name: part[name].size for part in (before, after) for name in _measured(part)}
     # The type of HDF5's error depends on the place of the damage.
@@ -90,7 +99,8 @@ def compare_products(old: Path, new: Path) -> Change:
     most = max(differences, key=lambda d: d.largest, default=_Difference("", 0))
     lost = sum(d.lost for d in differences)
     first_lost = next((d.variable for d in differences if d.lost), "")
-    grade = Grade.MAJOR if lost or most.largest > MINOR else Grade.MINOR
+    moved = next((d.moved for d in differences if d.moved), "")
+    grade = Grade.MAJOR if lost or moved or most.largest > MINOR else Grade.MINOR
     if not differences and same_texts:
         grade = Grade.NONE
     return Change(
@@ -102,6 +112,7 @@ def compare_products(old: Path, new: Path) -> Change:
         measure=most.measure,
         lost=lost,
         flags=sum(d.flags for d in differences),
+        moved=moved,
     )
 
 
@@ -143,6 +154,7 @@ def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
         size = (old if name in old.variables else new)[name].size
         yield _Difference(name, size, lost=size)
     quantities = dict(_quantities(old))
+    places = _places(old) | _places(new)
     for name in names:
         if name not in new.variables:
             continue
@@ -152,16 +164,28 @@ def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
             yield _Difference(name, size, lost=size)
             continue
         count = sum(int(_differs(before, after, part).sum()) for part in _parts(before))
-        if name in before.dims:
-            # Values of another place or time.
-            yield _Difference(name, count, lost=count)
+        allowed = max(MOST_STATES * before.size, 1)
+        many = f"other states of {name}" if count > allowed else ""
+        if any(before.attrs.get(key) != after.attrs.get(key) for key in _MEANING):
+            yield _Difference(name, before.size, moved=f"another meaning of {name}")
+        elif name in places:
+            yield _Difference(name, count, moved=f"another {name}" if count else "")
         elif name == USABLE:
             # What it changes is counted as lost values, or as flags of quality_flag.
-            yield _Difference(name, count)
+            yield _Difference(name, count, moved=many)
         elif "flag_meanings" in before.attrs:
-            yield _Difference(name, count, flags=count)
+            of_states = "flag_masks" not in before.attrs
+            yield _Difference(name, count, flags=count, moved=many if of_states else "")
         else:
             yield _difference(old, new, name, quantities.get(name, name), count)
+
+
+def _places(product: xr.Dataset) -> set[str]:
+    """Return the variables that state where, when and at which wavelength values are."""
+    names = {str(name) for name in product.dims}
+    for attributes in (product.attrs, *(array.attrs for array in product.variables.values())):
+        names |= {*str(attributes.get("coordinates", "")).split(), attributes.get("bounds", "")}
+    return names
 
 
 def _quantities(product: xr.Dataset) -> Iterator[tuple[str, str]]:

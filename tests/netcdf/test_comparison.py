@@ -151,12 +151,53 @@ def test_without_a_stated_error_the_difference_is_a_share_of_the_value(tmp_path:
     assert "up to 50 % of the value in reduced_chi2" in change_in_words(found)
 
 
-def test_values_of_another_time_are_major(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [
+        ("time", 3600.0),
+        ("time_bnds", 900.0),
+        ("longitude", 0.9),
+        ("station_altitude", 60.0),
+        ("altitude", 300.0),
+        ("wavelength", -22.0),
+    ],
+)
+def test_values_of_another_place_time_or_wavelength_are_major(
+    name: str, step: float, tmp_path: Path
+):
     """An hour is a small share of the seconds since 1970."""
     files = [written(tmp_path / name, homogeneous()) for name in ("old.nc", "new.nc")]
     with netCDF4.Dataset(files[1], "a") as product:
-        product["time"][:] += 3600.0
-    assert compare_products(*files).grade is Grade.MAJOR
+        product[name][...] += step
+    change = compare_products(*files)
+    assert change.grade is Grade.MAJOR
+    assert change_in_words(change).startswith(f"another {name}; ")
+
+
+def test_other_units_are_major(tmp_path: Path):
+    files = [written(tmp_path / name, homogeneous()) for name in ("old.nc", "new.nc")]
+    with netCDF4.Dataset(files[1], "a") as product:
+        product[NAME].units = "km-1"
+    change = compare_products(*files)
+    assert change.grade is Grade.MAJOR
+    assert change_in_words(change).startswith(f"another meaning of {NAME}; ")
+
+
+@pytest.mark.parametrize(("share", "grade"), [(0.005, Grade.MINOR), (0.5, Grade.MAJOR)])
+@pytest.mark.parametrize("name", ["usable", "cloud_mask"])
+def test_many_values_of_another_state_are_major(
+    name: str, share: float, grade: Grade, tmp_path: Path
+):
+    """Good values that are all to be used with care are lost to whoever wants good ones."""
+    files = [written(tmp_path / file, elastic(), kind="elastic") for file in ("old.nc", "new.nc")]
+    for file, state in zip(files, (0, 1), strict=True):
+        with netCDF4.Dataset(file, "a") as product:
+            states = np.zeros(product[name].size, np.int8)
+            states[: int(share * states.size)] = state
+            product[name][...] = states.reshape(product[name].shape)
+    change = compare_products(*files)
+    assert change.grade is grade
+    assert (f"other states of {name}" in change_in_words(change)) == (grade is Grade.MAJOR)
 
 
 @pytest.mark.parametrize(
