@@ -573,6 +573,8 @@ class RunRecord:
     """Scene -> why it can give no product; the first of those that the run examined."""
     more_empty_scenes: int = 0
     """Number of further scenes without product."""
+    frozen: Mapping[str, str] = field(default_factory=dict)
+    """Product of a frozen period that would be replaced -> why."""
     cut_short: bool = False
     """Whether the run was killed or met a full disk: it names only scenes that ended before."""
 

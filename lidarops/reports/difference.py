@@ -54,6 +54,10 @@ def difference(record: RunRecord, folder: Path) -> RunDifference:
     made = [(count, words) for count, words in counts if count] or [(0, "made")]
     products = f"{counted(made[0][0], 'product')} {made[0][1]}"
     products += "".join(f", {count:,} {words}" for count, words in made[1:]) + "."
+    if record.frozen:
+        products += (
+            f" {counted(len(record.frozen), 'product')} of frozen periods would be replaced."
+        )
     try:
         before = _before(record, folder)
     except CatalogError:

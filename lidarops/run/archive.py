@@ -579,6 +579,7 @@ class _Pass:
             self.gathered.set_aside,
             findings,
             empty_scenes=empty_scenes,
+            frozen=self.gathered.frozen,
             lost_worker=self.lost_worker,
         )
 

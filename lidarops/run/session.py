@@ -180,6 +180,7 @@ class Session:
         findings: Findings,
         *,
         empty_scenes: Mapping[str, str] | None = None,
+        frozen: Mapping[str, str] | None = None,
         lost_worker: bool = False,
     ) -> RunRecord:
         """Close the run in the ledger and return its record.
@@ -192,6 +193,8 @@ class Session:
         findings : Findings
         empty_scenes : mapping of str to str, optional
             Scene -> why it can give no product.
+        frozen : mapping of str to str, optional
+            Product of a frozen period that would be replaced -> why.
         lost_worker : bool, optional
             Whether a worker may have left half a file.
         """
@@ -204,6 +207,7 @@ class Session:
             scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
             empty_scenes=listed,
             more_empty_scenes=len(empty_scenes or {}) - len(listed),
+            frozen=dict(frozen or {}),
         )
         if self._journal:
             self._save(record)

@@ -13,7 +13,7 @@ from support.products.fabricated import START
 from lidarops.records import Change, Grade, ProductRecord, RunRecord, Stamp
 from lidarops.reports import run_page
 from lidarops.reports.difference import difference
-from lidarops.reports.run_record import save_run_record
+from lidarops.reports.run_record import load_run_record, save_run_record
 
 PRODUCT = ProductRecord("h/a.nc", "homogeneous", "c", "a" * 64, 9, 100, {}, 90, 90)
 
@@ -112,3 +112,12 @@ def test_the_outcome_is_amber_where_a_product_is_empty(
     page = run_page.build_report(record, tmp_path / "report").page.read_text("utf-8")
     assert f'<p class="verdict {css}">' in page
     assert ("no usable value" in page) == (usable == 0)
+
+
+def test_the_report_names_frozen_products_that_would_be_replaced(tmp_path: Path) -> None:
+    record = run(tmp_path, 1, frozen={"h/old.nc": "its plan changed"})
+    assert "1 product of frozen periods would be replaced." in compared(tmp_path, record)
+    page = run_page.build_report(record, tmp_path / record.id).page.read_text(encoding="utf-8")
+    assert "h/old.nc" in page
+    assert "its plan changed" in page
+    assert load_run_record(tmp_path / record.id).frozen == record.frozen
