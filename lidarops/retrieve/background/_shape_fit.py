@@ -46,13 +46,15 @@ class ShapeNoise(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits of the two tests for a window free of aerosol."""
+    """Limits of the two tests for a window free of aerosol, and the odds that it has some."""
 
     waves: float
     """Limit of the chi-square of the mean residuals of `GROUPS` groups (it uses 2 degrees of
     freedom)."""
     deviation: float
     """Limit of the curvature and of the differences of backgrounds, in standard errors."""
+    aerosol: float
+    """Odds that the next shorter window is the first one without aerosol."""
 
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -266,6 +268,47 @@ def _choose(rows: Array, limits: Limits) -> int:
     return int(shortest)
 
 
+@_inlined
+def _relative_odds(rows: Array, chosen: int, limits: Limits, odds: Array) -> None:
+    """Fill how likely it is that the far range is clean from each window on, relative to others.
+
+    Steps of the background between neighbouring windows are independent. Those beyond the first
+    clean window are noise; each one before it has the odds of aerosol instead.
+    """
+    odds[:] = 0.0
+    misfit = 0.0
+    shorter = -1
+    for k in range(rows.shape[0] - 1, -1, -1):
+        if not math.isfinite(rows[k, BACKGROUND]):
+            continue
+        gap = rows[shorter, BACKGROUND_VARIANCE] - rows[k, BACKGROUND_VARIANCE]
+        if shorter >= 0 and gap > 0.0:
+            step = rows[shorter, BACKGROUND] - rows[k, BACKGROUND]
+            misfit += step * step / gap
+        shorter = k
+        if k == chosen or _passes(rows[k], limits):
+            odds[k] = limits.aerosol**k * math.exp(-0.5 * misfit)
+
+
+@_compiled
+def _include_choice(rows: Array, chosen: int, limits: Limits, odds: Array, row: Array) -> None:
+    """Fill the fit of the chosen window; the variance of its background includes the choice.
+
+    It is the mean square about the chosen background, over all windows from which on the far
+    range may be clean.
+    """
+    row[:] = rows[chosen]
+    _relative_odds(rows, chosen, limits, odds)
+    total = square = 0.0
+    for k in range(rows.shape[0]):
+        if odds[k] > 0.0:
+            step = rows[k, BACKGROUND] - row[BACKGROUND]
+            total += odds[k]
+            square += odds[k] * (rows[k, BACKGROUND_VARIANCE] + step * step)
+    if total > 0.0:
+        row[BACKGROUND_VARIANCE] = square / total
+
+
 @_summing
 def _prepare(
     power: Array,
@@ -351,7 +394,7 @@ def fit_shape(
     windows = firsts.shape[1]
     usable, values, scaled = np.empty(bins), np.empty(bins), np.empty(bins)
     weights, residuals, lever = np.empty(bins), np.empty(bins), np.empty(bins)
-    rows = np.empty((windows, COLUMNS))
+    rows, odds = np.empty((windows, COLUMNS)), np.empty(windows)
     for k in range(count):
         exposure = noise.exposure[k % noise.exposure.shape[0]]
         first_bins = firsts[k % firsts.shape[0]]
@@ -381,6 +424,6 @@ def fit_shape(
             )
             rows[j, WINDOW] = j
         chosen = _choose(rows, limits) if windows > 1 else 0
-        out[k] = rows[chosen]
+        _include_choice(rows, chosen, limits, odds, out[k])
         out[k, AMPLITUDE] /= unit
         out[k, AMPLITUDE_VARIANCE] /= unit * unit

@@ -27,9 +27,11 @@ class KnownShapeResult:
     background: Array
     """In the unit of the power; NaN where there is none."""
     background_standard_error: Array
+    """Of random noise, and of the choice of the window where there is more than one."""
     amplitude: Array
     """Power over shape."""
     amplitude_standard_error: Array
+    """Of random noise."""
     chi2: Array
     """Sum of the squared residuals over their variances."""
     degrees_of_freedom: npt.NDArray[np.int64]
@@ -150,9 +152,12 @@ def fit_known_shape(
     Returns
     -------
     KnownShapeResult
-        With the leading axes of `power`. The standard errors cover random noise. They do not
-        cover an error of the shape, which `curvature` and `waves` show only where it exceeds the
-        noise.
+        With the leading axes of `power`. The standard errors cover random noise. Where windows
+        are tried, that of the background also covers aerosol that the tests may miss: it is the
+        root mean square about the chosen background over all windows that pass the tests, each
+        weighted by the odds that the far range is clean from its start on
+        (`Thresholds.aerosol_odds`). They do not cover an error of the shape, which `curvature`
+        and `waves` show only where it exceeds the noise.
 
     Raises
     ------
@@ -261,7 +266,8 @@ def _limits(false_alarm: float) -> _shape_fit.Limits:
     """Return the limits of waves and curvature for a joint rate of false alarms."""
     rate = 0.5 * false_alarm
     waves = special.chdtri(_shape_fit.GROUPS - 2.0, rate)
-    return _shape_fit.Limits(float(waves), float(-special.ndtri(0.5 * rate)))
+    deviation = -special.ndtri(0.5 * rate)
+    return _shape_fit.Limits(float(waves), float(deviation), THRESHOLDS.aerosol_odds)
 
 
 def _result(

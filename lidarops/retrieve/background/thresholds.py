@@ -38,6 +38,10 @@ class Thresholds:
     chosen."""
     rejection: float = 1e-2
     """Probability that a window is rejected where the shape is right; chosen."""
+    aerosol_odds: float = 0.05
+    """Odds of aerosol between the starts of two windows, before the data are seen; simulations of
+    the benchmark of stability: 95 % of the backgrounds are within 1.96 standard errors, 96 % with
+    0.08, 92.5 % with 0."""
     negative: float = 3.0
     """Standard errors below zero beyond which an amplitude is flagged negative; assumed."""
     largest_condition: float = 30.0
