@@ -1,8 +1,10 @@
 r"""Compiled solutions of :math:`(\mathrm{diag}(i) + \lambda D^\top D)\, x = b`.
 
-:math:`D` takes second differences, so that the matrix has five diagonals. It is factored as
-:math:`L\, \mathrm{diag}(d)\, L^\top`. The order of every sum is fixed, so the bits of a result do
-not depend on the library of linear algebra.
+:math:`D` takes second differences, so that the matrix has five diagonals. It is never formed: the
+factor :math:`L\, \mathrm{diag}(d)\, L^\top` comes from rotations of the rows of
+:math:`\sqrt i` and :math:`\sqrt\lambda D`. Weights exceed information by up to 16 orders of
+magnitude; of the roots, doubles hold both. The order of every sum is fixed, so the bits of a
+result do not depend on the library of linear algebra.
 """
 
 from __future__ import annotations
@@ -17,36 +19,75 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def factor(information: Array, weight: float) -> tuple[Array, Array, Array]:
-    """Return d and both diagonals of L, NaN from where the matrix is not positive definite.
+def _triangle(rows: Array) -> None:
+    """Rotate rows in place until those below the diagonal are 0 in all columns but the last."""
+    count, columns = rows.shape
+    for j in range(columns - 1):
+        for i in range(j + 1, count):
+            if rows[i, j] == 0.0:
+                continue
+            length = np.hypot(rows[j, j], rows[i, j])
+            cosine, sine = rows[j, j] / length, rows[i, j] / length
+            for k in range(j, columns):
+                upper, lower = rows[j, k], rows[i, k]
+                rows[j, k] = cosine * upper + sine * lower
+                rows[i, k] = cosine * lower - sine * upper
+            rows[i, j] = 0.0
+
+
+@_compiled
+def factor(
+    information: Array, weight: float, response: Array
+) -> tuple[Array, Array, Array, Array, float]:
+    """Return d and both diagonals of L, the right-hand side of its transpose, and the misfit.
 
     Parameters
     ----------
-    information : (cell,) float
+    information, response : (cell,) float
         At least 4 cells.
     weight : float
         Of the sum of squared second differences.
+
+    Returns
+    -------
+    (cell,) float64, (cell,) float64, (cell,) float64
+        NaN where the matrix is singular.
+    (cell,) float64
+        Right-hand side: the solution of the transposed L is that of the least sum.
+    float
+        The least sum of squares: of responses by their information, and of smoothness.
     """
     cells = information.size
-    pivot, near, far = np.empty(cells), np.zeros(cells), np.zeros(cells)
+    pivot, near, far, target = np.empty(cells), np.zeros(cells), np.zeros(cells), np.zeros(cells)
+    misfit, bend = 0.0, np.sqrt(weight)
+    # Columns: this cell and the next two, and the right-hand side. Rows: two that the cells before
+    # leave, the information of this cell, and its second difference.
+    rows = np.zeros((4, 4))
     for i in range(cells):
-        # The first and last two second differences are missing.
-        edge = min(i, cells - 1 - i)
-        bend = 1.0 if edge == 0 else 5.0 if edge == 1 else 6.0
-        value = weight * bend + information[i]
-        if i > 0:
-            value -= near[i - 1] * near[i - 1] * pivot[i - 1]
-        if i > 1:
-            value -= far[i - 2] * far[i - 2] * pivot[i - 2]
-        pivot[i] = value if value > 0.0 else np.nan
-        if i < cells - 1:
-            beside = -4.0 * weight if 0 < i < cells - 2 else -2.0 * weight
-            if i > 0:
-                beside -= far[i - 1] * near[i - 1] * pivot[i - 1]
-            near[i] = beside / pivot[i]
-        if i < cells - 2:
-            far[i] = weight / pivot[i]
-    return pivot, near, far
+        root = np.sqrt(information[i])
+        rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = root, 0.0, 0.0, root * response[i]
+        inside = bend if i < cells - 2 else 0.0
+        rows[3, 0], rows[3, 1], rows[3, 2], rows[3, 3] = inside, -2.0 * inside, inside, 0.0
+        _triangle(rows)
+        misfit += rows[3, 3] ** 2
+        first = rows[0, 0] if rows[0, 0] != 0.0 else np.nan
+        pivot[i], target[i] = first * first, rows[0, 3] / first
+        near[i], far[i] = rows[0, 1] / first, rows[0, 2] / first
+        for row in range(2):
+            rows[row, 0], rows[row, 1] = rows[row + 1, 1], rows[row + 1, 2]
+            rows[row, 2], rows[row, 3] = 0.0, rows[row + 1, 3]
+    return pivot, near, far, target, misfit
+
+
+@_compiled
+def least_sum(information: Array, weight: float, response: Array) -> Array:
+    """Return the solution of the least sum of squares, (cell,)."""
+    _, near, far, solved, _ = factor(information, weight, response)
+    for i in range(information.size - 2, -1, -1):
+        solved[i] -= near[i] * solved[i + 1]
+        if i < information.size - 2:
+            solved[i] -= far[i] * solved[i + 2]
+    return solved
 
 
 @_compiled
@@ -87,10 +128,9 @@ def _substitute(pivot: Array, near: Array, far: Array, right: Array) -> None:
 def solve(information: Array, weight: float, right: Array) -> Array:
     """Return the solutions of right-hand sides (cell, side), refined once.
 
-    Information and smoothness differ by up to 14 orders of magnitude; the refinement restores the
-    digits that the factor loses.
+    The refinement restores the digits that the squares of the roots lose.
     """
-    pivot, near, far = factor(information, weight)
+    pivot, near, far, _, _ = factor(information, weight, np.zeros(information.size))
     solved = right.copy()
     _substitute(pivot, near, far, solved)
     cells, sides = right.shape
@@ -118,17 +158,9 @@ def restricted_scores(information: Array, response: Array, weights: Array) -> Ar
     weights : (weight,) float
         Of the sum of squared second differences.
     """
-    cells = response.size
     scores = np.empty(weights.size)
-    solved = np.empty((cells, 1))
     for number in range(weights.size):
-        pivot, near, far = factor(information, weights[number])
-        for i in range(cells):
-            solved[i, 0] = information[i] * response[i]
-        _substitute(pivot, near, far, solved)
-        misfit, logarithm = 0.0, 0.0
-        for i in range(cells):
-            misfit += information[i] * response[i] * (response[i] - solved[i, 0])
-            logarithm += np.log(pivot[i])
-        scores[number] = misfit + logarithm - (cells - 2) * np.log(weights[number])
+        pivot, _, _, _, misfit = factor(information, weights[number], response)
+        logarithm = np.log(pivot).sum()
+        scores[number] = misfit + logarithm - (response.size - 2) * np.log(weights[number])
     return scores

@@ -19,7 +19,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.raman._smooth_solution import restricted_scores, solve
+from lidarops.retrieve.raman._smooth_solution import least_sum, restricted_scores, solve
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -29,7 +29,8 @@ _LEAST_WEIGHT: Final = 1e-2
 _PER_DECADE: Final = 2
 _START: Final = 1e6
 """The same for the first fit: a length of about 30 cells."""
-_ITERATIONS: Final = 50
+_ITERATIONS: Final = 200
+"""Strong signals with jumps take more than 50."""
 _CONVERGED: Final = 1e-9
 _LONGEST_STEP: Final = 2.0
 """Largest change of the logarithm of the signal in one iteration."""
@@ -110,7 +111,8 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
     Returns
     -------
     DepthFit or None
-        None where fewer than 8 cells have data, or the data hold no signal.
+        None where fewer than 8 cells have data, the data hold no signal, or one that no smooth
+        depth follows.
 
     References
     ----------
@@ -162,8 +164,7 @@ def _scored(signal: Array, noise: SignalNoise, depth: Array, weight: float) -> A
     for _ in range(_ITERATIONS):
         information, response = _working(signal, noise, depth)
         absolute = weight * float(information.mean())
-        right = (information * response)[:, np.newaxis]
-        step = solve(information, absolute, right)[:, 0] - depth
+        step = least_sum(information, absolute, response) - depth
         longest = float(np.abs(step).max())
         if not np.isfinite(longest):
             return None

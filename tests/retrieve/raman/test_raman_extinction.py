@@ -80,6 +80,24 @@ def test_weights_of_means_are_those_of_the_cells_that_overlap():
     np.testing.assert_allclose(weights[2], [0.0, 1 / 3, 1 / 3, 1 / 3])
 
 
+@pytest.mark.parametrize("light", [3.0, 300.0])
+def test_errors_do_not_depend_on_the_number_of_cells(light):
+    bins = 7.5 * (np.arange(2000) + 0.5)
+    layer = np.where(bins < 3500.0, 1e-4, 1e-6)
+    counts = np.random.default_rng(1).poisson(make_sky(layer, 7.5, light).raman).astype(float)
+    at = np.arange(600.0, 5000.0, 60.0)
+    errors, depths = [], []
+    for length in (60.0, 7.5):
+        sky = make_sky(layer, 7.5, light, cell=length)
+        (cells,) = cell_signals(sky.signal(counts[np.newaxis]), sky.air.raman_shape, sky.cells)
+        fixed = np.where(sky.quality[0] == 0, cells.noise.fixed, np.inf)
+        fit = fit_depth(cells.value, SignalNoise(cells.noise.per_signal, fixed))
+        depths.append(np.interp(at, sky.cells.range, fit.depth))
+        errors.append(np.interp(at, sky.cells.range, fit.standard_error))
+    np.testing.assert_allclose(errors[1], errors[0], rtol=0.15)
+    np.testing.assert_allclose(depths[1], depths[0], atol=errors[0].max())
+
+
 def test_no_signal_gives_no_fit():
     fixed = np.ones(50)
     assert fit_depth(np.full(50, -1.0), SignalNoise(np.zeros(50), fixed)) is None
