@@ -119,8 +119,12 @@ class ChannelFacts(SettingsModel):
         description="of a Raman channel of water vapour: mixing ratio per ratio of its signal to"
         " that of nitrogen",
     )
-    water_vapour_calibration_error: float = quantity(
-        0.0, unit="kg kg-1", ge=0, allow_inf_nan=False, description="standard error"
+    water_vapour_calibration_error: float | None = quantity(
+        None,
+        unit="kg kg-1",
+        ge=0,
+        allow_inf_nan=False,
+        description="standard error of water_vapour_calibration, which needs it",
     )
     lidar_ratio: float | None = quantity(
         None,
@@ -147,6 +151,15 @@ class ChannelFacts(SettingsModel):
             raise ValueError(
                 "lidar_ratio_profile is given together with lidar_ratio or its standard error; give"
                 " one of the two"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _calibration_with_error(self) -> Self:
+        if self.water_vapour_calibration and self.water_vapour_calibration_error is None:
+            raise ValueError(
+                "water_vapour_calibration is given without water_vapour_calibration_error; give its"
+                " standard error in kg kg-1"
             )
         return self
 

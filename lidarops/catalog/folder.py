@@ -15,14 +15,11 @@ from lidarops.errors import RawFormatError
 from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import ChannelLayout, DetectionMode
-from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, raman_wavelength
+from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 
 _HEADER_BYTES: Final = 16384
 _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
-_FILTER: Final = 2e-9
-"""m; headers round wavelengths to nanometres, and those of water vapour are stated as 407 or 408.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,9 +153,8 @@ class InstrumentHeaders:
         """Elastic channels -> channels of their nitrogen Raman lines."""
         pairs: dict[str, str] = {}
         for elastic in self._elastic:
-            line = raman_wavelength(elastic.wavelength, NITROGEN_SHIFT)
             for raman in self._by_mode:
-                near = abs(raman.wavelength - line) < _FILTER
+                near = is_raman_line(raman.wavelength, elastic.wavelength, NITROGEN_SHIFT)
                 if near and raman.bin_width == elastic.bin_width:
                     pairs.setdefault(elastic.name, raman.name)
         return pairs
@@ -183,7 +179,7 @@ class InstrumentHeaders:
 
     def _is_raman(self, channel: ChannelLayout) -> bool:
         return any(
-            abs(channel.wavelength - raman_wavelength(other.wavelength, shift)) < _FILTER
+            is_raman_line(channel.wavelength, other.wavelength, shift)
             for other in self.layout
             for shift in (NITROGEN_SHIFT, WATER_SHIFT)
         )

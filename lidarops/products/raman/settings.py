@@ -84,6 +84,17 @@ class RamanProductSettings(ChannelProduct):
                 raise located_error(f"names no Raman channel of {name}", "nitrogen")
         return self
 
+    @model_validator(mode="after")
+    def _reaches_a_reference_window(self) -> Self:
+        least = self.reference.lowest + self.reference.width
+        if self.highest < least:
+            raise located_error(
+                f"{self.highest:g} m is below the end of the lowest reference window,"
+                f" {least:g} m: give {least:g} m or more, or a smaller reference.lowest",
+                "highest",
+            )
+        return self
+
     def companions(self, channel: str) -> tuple[str, ...]:
         """Return the Raman channels of an elastic channel."""
         pairs = (self.nitrogen, self.water_vapour)

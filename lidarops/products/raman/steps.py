@@ -17,6 +17,12 @@ from lidarops.records import LeftOut, PlannedStep
 from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.retrieval import RamanSettings
+from lidarops.retrieve.raman.scattering import (
+    NITROGEN_SHIFT,
+    WATER_SHIFT,
+    is_raman_line,
+    raman_wavelength,
+)
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.retrieve.signal.labeled_screening import Screening
@@ -107,8 +113,8 @@ def _limits(case: Case) -> _Limits:
     return _Limits(stretch, reach, reason)
 
 
-def _absent(case: Case, channel: str) -> str:
-    """Return why a Raman channel cannot be used; empty where it can."""
+def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
+    """Return why a Raman channel of a gas cannot be used; empty where it can."""
     layout = case.scene.layout
     try:
         found = member_channel(layout, channel)
@@ -121,8 +127,12 @@ def _absent(case: Case, channel: str) -> str:
         )
     length = wavelength(found, channel_facts(case.facts, range_channel(channel)))
     own = wavelength(case.channel, channel_facts(case.facts, range_channel(case.channel.name)))
-    if not length > own:
-        return f"the wavelength of {channel}, {length * 1e9:g} nm, is not beyond {own * 1e9:g} nm"
+    if not is_raman_line(length, own, shift):
+        return (
+            f"{channel} measures {length * 1e9:g} nm, but the Raman line of {gas} for"
+            f" {own * 1e9:g} nm is at {raman_wavelength(own, shift) * 1e9:.1f} nm: name the channel"
+            " of that line, or correct wavelength in the facts"
+        )
     return ""
 
 
@@ -140,12 +150,12 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
         request, name = case.request, case.channel.name
         limits = _limits(case)
         nitrogen, water = request.nitrogen[name], request.water_vapour.get(name)
-        reason = limits.reason or _absent(case, nitrogen)
+        reason = limits.reason or _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
         if reason:
             yield Leave(reason)
             return
         facts = None if water is None else channel_facts(case.facts, range_channel(water))
-        absent = "" if water is None else _absent(case, water)
+        absent = "" if water is None else _absent(case, water, "water vapour", WATER_SHIFT)
         if facts is not None and not absent and facts.water_vapour_calibration is None:
             absent = f"the facts of {water} give no water_vapour_calibration"
         if facts is None or absent:
@@ -324,7 +334,7 @@ class _Retrieval(RowProduct):
         # `Raman.decide` names the channel only with its calibration.
         name = cast("str", settings.water_vapour)
         constant = cast("float", settings.calibration)
-        error = settings.calibration_standard_error or 0.0
+        error = cast("float", settings.calibration_standard_error)
         return labeled.WaterVapour(averages, _of(self._data, name)[WAVELENGTH], constant, error)
 
 

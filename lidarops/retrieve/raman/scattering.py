@@ -17,6 +17,9 @@ NITROGEN_SHIFT: Final = 233_070.0
 """m-1, of the vibrational Raman lines of nitrogen (`wandinger2005`)."""
 WATER_SHIFT: Final = 365_700.0
 """m-1, of those of water vapour (`whiteman2003`)."""
+LINE_TOLERANCE: Final = 2e-9
+"""m, by which a channel may be off a Raman line. Headers round wavelengths of laser and channel to
+1 nm, which makes up to 1.2 nm at 607 nm, and state that of water vapour as 407 or 408 nm."""
 MASS_RATIO: Final = 18.01528 / 28.9644
 """Molar mass of water over that of dry air."""
 
@@ -36,6 +39,11 @@ _LINES: Final = 41
 def raman_wavelength(wavelength: float, shift: float) -> float:
     """Return the wavelength in m of Raman scattering with a shift in m-1."""
     return 1.0 / (1.0 / wavelength - shift)
+
+
+def is_raman_line(channel: float, wavelength: float, shift: float) -> bool:
+    """Return whether a channel at a wavelength in m has the Raman line of a laser wavelength."""
+    return abs(channel - raman_wavelength(wavelength, shift)) < LINE_TOLERANCE
 
 
 def particle_ratio(exponent: float, wavelength: float, raman: float) -> float:
