@@ -711,7 +711,7 @@ BACKGROUND_METHOD: Final = _coded(
     " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
     " the far range where the fit fails. Haze that falls with height nearly as air does leaves no"
     " trace in that fit: with simulated haze of 0.6 to 3 times the backscatter of air at the ground"
-    " and a scale height of 3 km, 12 percent of the backgrounds deviated by more than 4 standard"
+    " and a scale height of 3 km, 10 percent of the backgrounds deviated by more than 4 standard"
     " errors.",
 )
 

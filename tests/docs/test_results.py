@@ -143,11 +143,11 @@ STATED = {
     ("background", "plume"): (*BACKGROUND, "1.1 percent with a plume"),
     ("background, known shape", "shape of hazy air"): (
         *("signal", "background_method"),
-        "12 percent of the backgrounds deviated by more than 4 standard errors",
+        "10 percent of the backgrounds deviated by more than 4 standard errors",
     ),
     ("voltage", "analog noise below half a step"): (
         *("signal", ""),
-        "52 percent of such simulated means deviated by more than 4 of them",
+        "62 percent of such simulated means deviated by more than 4 of them",
     ),
 }
 """By quantity and class: product, variable (none: the file), and the words of its comment."""

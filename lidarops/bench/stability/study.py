@@ -54,7 +54,7 @@ class Draws:
 
 DRAWS: Final = (
     Draws("homogeneous", random_homogeneous.score_homogeneous, 1000, 400, 15, 1e-3),
-    Draws("signal chain", random_signals.score_signals, 50, 1500, 60, 0.05),
+    Draws("signal chain", random_signals.score_signals, 50, 1500, 400, 0.05),
     Draws("elastic", random_elastic.score_elastic, 20, 1500, 40, 0.05),
     Draws("multi-angle", random_scans.score_scans, 8, 2000, 60, 0.13),
     Draws("scans of any and of calm air", random_scans.score_scan_methods, 8, 750, 40, 0.13),

@@ -32,7 +32,7 @@ LAYOUT: Final = Layout(
     " background, which is common to them. lidarops_steps states the method of the background."
     " Where the noise of an analog record is below half a step of the digitizer, its bins share"
     " their rounding error: the standard error of a bin covers it, that of a mean over bins does"
-    " not (52 percent of such simulated means deviated by more than 4 of them).",
+    " not (62 percent of such simulated means deviated by more than 4 of them).",
     sampled="range",
     weighed=("signal",),
     coordinates=coordinates((RANGE,), altitude("range")),
