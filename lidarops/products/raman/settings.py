@@ -64,6 +64,14 @@ class RamanProductSettings(ChannelProduct):
     molecular_relative_error: float = quantity(
         0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
     )
+    molecular_slope_error: float | None = quantity(
+        None,
+        unit="m-1",
+        ge=0,
+        le=1e-3,
+        description="standard error of the derivative of the logarithm of the density of the air"
+        " over height; by default 1.6e-5 of the standard atmosphere, 2e-6 of a molecular_profile",
+    )
     overlap_relative_error: float = quantity(
         0.1, unit="1", ge=0, le=1, description="standard error of 1 - overlap, relative"
     )

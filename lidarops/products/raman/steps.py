@@ -59,6 +59,14 @@ LEAST_SIGNAL: Final = 4.0
 0.2 % of scenes."""
 
 
+STANDARD_SLOPE_ERROR: Final = 1.6e-5
+"""m-1, of the derivative of the logarithm of the density of the standard atmosphere: root mean
+square from 0.1 to 12 km of its deviation from the sounding of Manaus
+(`tests/end_to_end/test_raman.py`), 16 K warmer."""
+SOUNDING_SLOPE_ERROR: Final = 2e-6
+"""m-1, the same of a sounding or model: 0.5 K over 1 km. Assumed."""
+
+
 class RetrievalSettings(SettingsModel):
     """Settings of the step ``raman``; lengths are along the beam."""
 
@@ -78,6 +86,7 @@ class RetrievalSettings(SettingsModel):
     angstrom_exponent: float
     angstrom_standard_error: float
     molecular_relative_error: float
+    molecular_slope_error: float = quantity(unit="m-1", description="along the beam")
     overlap_relative_error: float
     filter_width: float | None = quantity(None, unit="m")
     least_signal_to_noise: float
@@ -111,6 +120,14 @@ def _limits(case: Case) -> _Limits:
             f" above {window.lowest:g} m"
         )
     return _Limits(stretch, reach, reason)
+
+
+def _slope_error(case: Case) -> float:
+    """Return the error of the derivative of the logarithm of the density of air, m-1 of height."""
+    stated = case.request.molecular_slope_error
+    if stated is not None:
+        return stated
+    return SOUNDING_SLOPE_ERROR if case.facts.molecular_profile else STANDARD_SLOPE_ERROR
 
 
 def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
@@ -179,6 +196,7 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
             angstrom_exponent=request.angstrom_exponent,
             angstrom_standard_error=request.angstrom_standard_error,
             molecular_relative_error=request.molecular_relative_error,
+            molecular_slope_error=_slope_error(case) / limits.stretch,
             overlap_relative_error=request.overlap_relative_error,
             filter_width=request.filter_width,
             least_signal_to_noise=request.least_signal_to_noise,
@@ -272,6 +290,7 @@ def _assumptions(settings: RetrievalSettings, laser: float, raman: float) -> lab
             reference_relative_error=settings.reference_relative_error,
             molecular_relative_error=settings.molecular_relative_error,
             overlap_relative_error=settings.overlap_relative_error,
+            molecular_slope_error=settings.molecular_slope_error,
         ),
         cell=settings.cell,
         highest=settings.farthest,

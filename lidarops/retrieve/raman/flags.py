@@ -19,7 +19,10 @@ class RamanQuality(FlagBit):
     WEAK_SIGNAL = (
         FIRST_OWN + 1,
         Severity.REJECT,
-        "the smoothed Raman signal is less than 5 times its standard error",
+        (
+            "the smoothed Raman signal is less than 5 times its standard error, or jumps so that no"
+            " smooth one follows it"
+        ),
     )
     NO_LIDAR_RATIO = (
         FIRST_OWN + 2,
@@ -34,7 +37,8 @@ class RamanQuality(FlagBit):
         Severity.REJECT,
         (
             "beyond, the Raman signal falls less than in air without particles, by more than its"
-            " error: the overlap may not be full where stated, or a background is wrong"
+            " error: the overlap may not be full where stated, a background is wrong, or the air is"
+            " not that of molecular_source"
         ),
     )
     PARTLY_CLOUDY = (

@@ -116,6 +116,8 @@ class RamanSettings:
     """Of the density of air."""
     overlap_relative_error: float = 0.0
     """Of one minus the overlap."""
+    molecular_slope_error: float = 0.0
+    """m-1 along the beam, of the derivative of the logarithm of the density of air."""
 
     @property
     def ratio(self) -> float:
@@ -242,6 +244,8 @@ def cell_signals(signal: ChannelSignal, shape: Array, cells: Cells) -> list[Cell
 class _AirCells:
     """Clean air in cells, (cell,)."""
 
+    range: Array
+    """m."""
     backscatter: Array
     """m-1 sr-1."""
     depth: Array
@@ -252,7 +256,7 @@ class _AirCells:
     @classmethod
     def of(cls, air: AirColumn, cells: Cells) -> Self:
         """Return the means of cells."""
-        profiles = (air.backscatter, air.depth, air.raman_depth, air.known_overlap)
+        profiles = (air.range, air.backscatter, air.depth, air.raman_depth, air.known_overlap)
         return cls(*(cells.mean(profile) for profile in profiles))
 
 
@@ -476,10 +480,18 @@ class _Effects:
     def causes(self) -> Iterator[_Cause]:
         """Yield the effect of one standard error of each cause but noise."""
         none, total = np.zeros(self.partial.size), self._total()
-        of_density = self.settings.molecular_relative_error * (total - self.air.backscatter)
+        molecular, settings = self.air.backscatter, self.settings
+        shares = none if self.calibrated is None else self.calibrated.shares
+        away = self.air.range - shares @ self.air.range
+        # Of the air that is assumed in the window, and that is subtracted.
+        shifts = {
+            "molecular": settings.molecular_relative_error * (total - molecular),
+            "slope": -settings.molecular_slope_error * away * molecular,
+        }
         for cause in self._of_signals(list(self._changes())):
-            shift = of_density if cause.name == "molecular" else none
-            yield replace(cause, backscatter=cause.backscatter + shift)
+            shifted = cause.backscatter + shifts.get(cause.name, none)
+            name = "molecular" if cause.name == "slope" else cause.name
+            yield replace(cause, name=name, backscatter=shifted)
         error = self.settings.reference_relative_error
         yield _Cause("reference", none, error * total, none)
         change = self.settings.ratio_error / (1.0 + self.settings.ratio)
@@ -496,6 +508,7 @@ class _Effects:
             yield name, none, elastic.relative(-getattr(elastic, name), elastic.value)
         error, depth = self.settings.molecular_relative_error, self.air.depth
         yield "molecular", error * (depth + self.air.raman_depth), 2.0 * error * depth
+        yield "slope", -self.settings.molecular_slope_error * self.air.range, none
         # Of the signal, in proportion to the overlap itself.
         of_overlap = self.settings.overlap_relative_error * (1.0 / self.air.overlap - 1.0)
         yield "overlap", of_overlap, of_overlap

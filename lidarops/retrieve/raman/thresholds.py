@@ -37,7 +37,7 @@ class Thresholds:
     """Standard errors by which the optical depth between two cells must be below zero to contradict
     the signal. 1 of 3,000 profiles of simulated haze does
     (`tests/retrieve/raman/test_raman_coverage.py`); in the night of Manaus, whose overlap is not
-    full where it was stated to be, all values up to 7.4 km (`tests/end_to_end/test_raman.py`)."""
+    full where it was stated to be, all values up to 6 km (`tests/end_to_end/test_raman.py`)."""
     fewest_cells: int = 8
     """Cells with data of a profile that is fitted. Assumed."""
     many_counts: float = 1000.0

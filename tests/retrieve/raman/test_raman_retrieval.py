@@ -9,6 +9,8 @@ import pytest
 from support.raman_signals import make_sky
 
 from lidarops.flags import Quality
+from lidarops.products.raman.steps import STANDARD_SLOPE_ERROR
+from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.scattering import (
@@ -113,6 +115,41 @@ def test_errors_of_the_overlap_are_the_change_by_it(sky):
         change = np.abs(getattr(after, name) - getattr(before, name))[0, near]
         stated = getattr(before, f"{name}_budget")["overlap"][0, near]
         np.testing.assert_allclose(change, stated, rtol=0.03, atol=0.02 * stated.max())
+
+
+def test_errors_of_the_slope_of_air_are_the_change_by_it(sky):
+    before = retrieved(sky, molecular_slope_error=1e-6)
+    steeper, molecular = np.exp(1e-6 * R), sky.air.backscatter
+    window = (before.reference_bottom < R) & (before.reference_top > R)
+    # The density in the reference window stays.
+    steeper *= molecular[window].sum() / (steeper * molecular)[window].sum()
+    air = replace(sky.air, density=sky.air.density * steeper, backscatter=molecular * steeper)
+    after = retrieved(replace(sky, air=air))
+    near = (R > 600.0) & (R < 5000.0)
+    np.testing.assert_allclose(before.extinction_budget["molecular"][0, near], 5.3e-7, rtol=0.02)
+    for name in ("extinction", "backscatter"):
+        change = np.abs(getattr(after, name) - getattr(before, name))[0, near]
+        stated = getattr(before, f"{name}_budget")["molecular"][0, near]
+        np.testing.assert_allclose(change, stated, rtol=0.03, atol=0.02 * stated.max())
+
+
+def test_errors_cover_the_standard_atmosphere_in_the_tropics(sky):
+    # 300 K at the ground, 6.5 K less each km: 12 K warmer than the standard, below 11 km.
+    height = np.arange(0.0, 14_000.0, 100.0)
+    temperature = 300.0 - 6.5e-3 * height
+    pressure = 101_325.0 * (temperature / 300.0) ** (9.80665 * 0.0289644 / 8.31432 / 6.5e-3)
+    tropical = MolecularProfile.from_profile(height, pressure, temperature)
+    density = sky.air.density * tropical.number_density(R)
+    density /= MolecularProfile.us_standard().number_density(R)
+    shape = density / sky.air.density
+    # The signal is that of tropical air, and the retrieval takes the standard.
+    truth = replace(sky, raman=sky.raman * shape)
+    found = retrieved(truth, molecular_slope_error=STANDARD_SLOPE_ERROR)
+    away = found.extinction - retrieved(sky).extinction
+    for low, high in ((600.0, 5000.0), (5000.0, 11_000.0)):
+        heights = (low < R) & (high > R)
+        scatter = np.sqrt(np.mean((away / found.extinction_standard_error)[0, heights] ** 2))
+        assert 0.1 < scatter < 1.0
 
 
 def test_errors_of_the_background_are_the_change_by_it(sky):
