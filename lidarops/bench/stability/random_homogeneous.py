@@ -31,8 +31,8 @@ _LENGTHS: Final = (100.0, 12e3)
 _STEPS: Final = (3.75, 7.5, 15.0, 37.5)
 _BINS: Final = (8, 800)
 _SOLVABLE: Final = 0.075
-"""Largest least standard error of extinction over extinction + 1 / mean range of a solvable path:
-4 of them reach the lower bound of the search, -0.3 / last range."""
+"""Largest `least_relative_error` of a solvable path: 4 such errors of a thin path reach the lower
+bound of the search, -0.3 / last range."""
 _DEEPEST: Final = 600.0
 """Two-way optical depth from the lidar to the first bin above which the amplitude at range zero
 leaves the range of floats."""
@@ -204,9 +204,11 @@ FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
 
 
 def least_relative_error(paths: Paths) -> Array:
-    """Return the least error of extinction over extinction + 1 / mean range, (profile,).
+    """Return the least error of extinction over the scale on which the signal falls, (profile,).
 
-    From the inverse information matrix of background, amplitude and extinction with unit noise,
+    The scale is extinction + 1 / mean range, at most half of 1 / bin width: of a signal that dies
+    within a bin, the transmission of one bin is what the data determine. The error is from the
+    inverse information matrix of background, amplitude and extinction with unit noise,
     by elimination of the two linear unknowns.
     """
     shape = paths.clean
@@ -219,8 +221,9 @@ def least_relative_error(paths: Paths) -> Array:
     norm = np.maximum(np.sum(flat**2, axis=1, keepdims=True), np.finfo(float).tiny)
     remainder = remainder - flat * np.sum(remainder * flat, axis=1, keepdims=True) / norm
     least = 1.0 / np.sqrt(np.maximum(np.sum(remainder**2, axis=1), np.finfo(float).tiny))
+    bin_width = float(paths.range[1] - paths.range[0])
     scale = paths.extinction[:, 0] + 1.0 / float(paths.range.mean())
-    return np.asarray(least / scale)
+    return np.asarray(least / np.minimum(scale, 0.5 / bin_width))
 
 
 def visible_misfit(range_: Array, signal: Array) -> Array:

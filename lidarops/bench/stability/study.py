@@ -91,7 +91,8 @@ _NOTE: Final = (
     "knows the shape of the violation, but not its sign, misses 7 % or more of these at our rate "
     "of false alarms (half at 3.5 deviations). Share of the detectable: false values among those "
     "whose violation is detectable but raised no flag. Rejected but accurate: differs by "
-    f"less than {FINE:g} errors. Needlessly flagged: flagged although the value can be determined."
+    f"less than {FINE:g} errors. Needlessly flagged: flagged although the value can be determined; "
+    "extinction of a signal that dies within a bin is judged by the transmission of one bin."
 )
 
 

@@ -179,7 +179,21 @@ def test_difficulty_of_random_paths_is_that_of_the_information_matrix():
             float(r[0]), float(r[-1] - r[0]), float(paths.extinction[k, 0]),
             float(paths.signal[k, 0]), bins=r.size,
         )  # fmt: skip
-        assert relative_error[k] == pytest.approx(difficulty(same), rel=1e-5)
+        scale = paths.extinction[k, 0] + 1.0 / r.mean()
+        at_most = 0.5 / (r[1] - r[0])
+        expected = difficulty(same) * scale / min(scale, at_most)
+        assert relative_error[k] == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_signal_that_dies_within_a_bin_is_not_solvable():
+    """Its extinction is known only as far as the transmission of one bin is."""
+    paths, _ = random_homogeneous.random_paths(3, 1)
+    paths = replace(
+        paths, range=np.arange(100.0, 1600.0, 37.5), extinction=np.full((1, 1), 0.1),
+        signal=np.full((1, 1), 1e4),
+    )  # fmt: skip
+    least = random_homogeneous.least_relative_error(paths)[0]
+    assert least > THRESHOLDS.largest_relative_error
 
 
 @pytest.mark.parametrize("draws", study.DRAWS, ids=lambda rate: rate.retrieval)
