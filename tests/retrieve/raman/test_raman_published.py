@@ -40,17 +40,17 @@ FIGURES = {
     "355": {
         "extinction": (0.2, -5.3),
         "backscatter": (0.6, -2.7),
-        "lidar_ratio": (0.5, 10.7),
+        "lidar_ratio": (0.5, 10.5),
         "line": (2.9, -21.0),
     },
     "532": {
         "extinction": (2.4, 0.0),
         "backscatter": (-1.5, 0.1),
-        "lidar_ratio": (3.9, 2.9),
+        "lidar_ratio": (3.9, 2.7),
         "line": (1.1, -10.5),
     },
 }
-COVERED = {"355": (0.938, 0.967, 0.973), "532": (0.960, 0.918, 0.955)}
+COVERED = {"355": (0.938, 0.967, 0.973), "532": (0.961, 0.918, 0.955)}
 
 
 def channel(counts, variance=None):
