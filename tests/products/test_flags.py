@@ -53,6 +53,8 @@ OWN = {
         "no_lidar_ratio": 19,
         "negative_extinction": 20,
         "partly_cloudy": 21,
+        "cloud": 22,
+        "doubtful_water_vapour": 23,
     },
     "multiangle": {
         "no_leverage": 20,
@@ -90,7 +92,7 @@ LEFT = {
     "signal": 14,
     "homogeneous": 10,
     "elastic": 8,
-    "raman": 9,
+    "raman": 7,
     "multiangle": 3,
     "visibility": 10,
 }
@@ -141,6 +143,9 @@ SCENES = {
     "test_an_overlap_that_is_not_full_where_stated_is_found",
     "RamanQuality.PARTLY_CLOUDY": "test_raman_clouds::"
     "test_a_cirrus_in_some_of_the_profiles_is_stated",
+    "RamanQuality.CLOUD": "test_raman_clouds::test_a_cloud_in_all_profiles_is_no_partial_one",
+    "RamanQuality.DOUBTFUL_WATER_VAPOUR": "test_raman_channels::"
+    "test_a_broken_channel_of_water_vapour_concerns_water_vapour_alone",
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
     "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"

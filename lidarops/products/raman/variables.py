@@ -260,7 +260,8 @@ LAYOUT: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="Below the range of full overlap, from the lidar ratio measured above it."
+            comment="Below the range of full overlap, from the lidar ratio measured above it;"
+            " beyond, as the campaign states it, and missing where it states none."
             f" {NO_STANDARD_NAME}",
         ),
         MOLECULAR_SOURCE,

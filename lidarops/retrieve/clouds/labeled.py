@@ -40,6 +40,7 @@ WITHHELD: Final = int(
 )
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
 PARTLY_CLOUDY: Final = 1
+CLOUDY: Final = 2
 UNKNOWN: Final = 3
 """States of a bin (`Clouds.state`)."""
 _PARTS: Final = ("part_power", "part_variance")
@@ -96,7 +97,7 @@ class Clouds:
 
     @property
     def state(self) -> npt.NDArray[np.int8]:
-        """0 clear, `PARTLY_CLOUDY`, 2 cloudy, `UNKNOWN`."""
+        """0 clear, `PARTLY_CLOUDY`, `CLOUDY`, `UNKNOWN`."""
         return np.where(self.unknown, np.int8(UNKNOWN), self.mask + self.any.astype(np.int8))
 
     @property

@@ -49,3 +49,19 @@ class RamanQuality(FlagBit):
             " resolution: the mean is that of cloudy and clear air"
         ),
     )
+    CLOUD = (
+        FIRST_OWN + 5,
+        Severity.CARE,
+        (
+            "the mean of the profiles shows a cloud here, or within the vertical resolution:"
+            " multiple scattering makes extinction too small, by more than its error states"
+        ),
+    )
+    DOUBTFUL_WATER_VAPOUR = (
+        FIRST_OWN + 6,
+        Severity.CARE,
+        (
+            "water vapour is missing or may be wrong: its channel has no data, is saturated, counts"
+            " too fast or has an uncertain background; other values are not concerned"
+        ),
+    )

@@ -31,8 +31,8 @@ from lidarops.retrieve.raman.retrieval import (
     cell_signals,
     retrieve_raman,
 )
-from lidarops.retrieve.raman.scattering import nitrogen_line_share, particle_ratio
-from lidarops.retrieve.raman.water_vapour import mixing_ratio
+from lidarops.retrieve.raman.scattering import nitrogen_line_share
+from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 from lidarops.retrieve.signal.labeled import (
     CORRELATION_LENGTH,
     actual_noise,
@@ -49,6 +49,7 @@ _ANY: Final = int(
     Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
 )
 _WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
+_DOUBTED: Final = _WITHHELD | int(Quality.PILE_UP)
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 _DIGITS_OF_A_BIN: Final = 6
 """Digits of the difference of ranges in bins, which are no more certain: 1e-6 bins are 10 um."""
@@ -220,18 +221,21 @@ def retrieve(
     of_raman, raman_uncertain = channels[1].signal(
         air.raman_shape, known_shape=assumptions.known_shape
     )
-    quality = _quality(cells, channels, seen)
+    quality = _quality(cells, channels[:2], seen)
     uncertain = elastic_uncertain | raman_uncertain
     quality[uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
-    variables = _variables(result, cells, air, of_raman, settings)
+    stated = seen if overlap_is_stated or overlap is not None else np.full_like(seen, np.nan)
+    variables = _variables(result, cells, air, of_raman, settings, stated)
     sky = _Sky(molecules, station_altitude, climb, seen, overlap_is_stated)
     variables |= _cloud_variables(channels[0].averages, assumptions, cells, result, sky)
     if water is not None:
-        shape = replace(air, raman_depth=_depth(molecules, heights, distance, water.wavelength))
-        signal, _ = channels[2].signal(shape.raman_shape, known_shape=assumptions.known_shape)
-        pair = (of_raman, air), (signal, shape)
-        variables |= _water(pair, cells, result, settings, water)
+        pair = _Pair((of_raman, air), channels[2], water)
+        of_water, doubtful = _water(pair, cells, result, (molecules, heights), assumptions)
+        variables |= of_water
+        dims, bits = variables["quality_flag"]
+        doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
+        variables["quality_flag"] = (dims, bits | doubt)
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
     return xr.Dataset(
         {
@@ -394,6 +398,7 @@ def _variables(
     air: AirColumn,
     raman: ChannelSignal,
     settings: RamanSettings,
+    overlap: Array,
 ) -> dict[str, Any]:
     both = ("time", "range")
     profiles: dict[str, Array] = {
@@ -409,7 +414,7 @@ def _variables(
         "lidar_ratio_error_random": result.lidar_ratio_random,
         "lidar_ratio_error_systematic": result.lidar_ratio_systematic,
         "vertical_resolution": result.vertical_resolution,
-        **_overlap(result, cells, air, raman, settings),
+        **_overlap(result, cells, air, raman, settings, overlap),
     }
     return {
         **{name: (both, values) for name, values in profiles.items()},
@@ -439,7 +444,7 @@ class _Sky:
 def _cloud_variables(
     averages: xr.Dataset, assumptions: Assumptions, cells: Cells, result: RamanResult, sky: _Sky
 ) -> dict[str, Any]:
-    """Return the clouds of the elastic signal, and the quality with the bit of partial ones."""
+    """Return the clouds of the elastic signal, and the quality with their bits."""
     both, settings = ("time", "range"), assumptions.settings
     distance = averages["range"].to_numpy()
     heights = sky.station_altitude + sky.climb * distance
@@ -461,12 +466,20 @@ def _cloud_variables(
         overlap_is_stated=sky.overlap_is_stated,
     )
     state = state_of_cells(clouds.state, cells, _clouds.UNKNOWN)
-    partly = touched(state == _clouds.PARTLY_CLOUDY, result.vertical_resolution, cells.step)
-    bits = np.where(partly, np.int32(RamanQuality.PARTLY_CLOUDY), np.int32(0))
+    fraction = largest_of_cells(clouds.fraction, cells)
+    # A cloud of most profiles is one of their mean as well.
+    partly = (state == _clouds.PARTLY_CLOUDY) | ((fraction > 0.0) & (fraction < 1.0))
+    quality = result.quality
+    for mask, bit in (
+        (partly, RamanQuality.PARTLY_CLOUDY),
+        (state == _clouds.CLOUDY, RamanQuality.CLOUD),
+    ):
+        near = touched(mask, result.vertical_resolution, cells.step)
+        quality = quality | np.where(near, np.int32(bit), np.int32(0))
     return {
-        "quality_flag": (both, result.quality | bits),
+        "quality_flag": (both, quality),
         "cloud_mask": (both, state),
-        "cloud_fraction": (both, largest_of_cells(clouds.fraction, cells)),
+        "cloud_fraction": (both, fraction),
         **_clouds.cloud_heights(clouds, distance, sky.station_altitude, sky.climb),
     }
 
@@ -477,53 +490,88 @@ def _overlap(
     air: AirColumn,
     raman: ChannelSignal,
     settings: RamanSettings,
+    overlap: Array,
 ) -> dict[str, Array]:
-    """Return the overlap of each profile, from a signal that is not corrected for overlap."""
+    """Return the overlap of each profile: that of the campaign, `overlap`, where it is stated.
+
+    Below, it is measured by a signal that is not corrected for overlap.
+    """
+    stated = cells.mean(overlap)
+    stated_error = settings.overlap_relative_error * (1.0 - stated)
     unity = replace(air, overlap=np.ones(air.overlap.size))
     value, error = np.full((2, *result.quality.shape), np.nan)
     signals = cell_signals(raman, unity.raman_shape, cells)
     for row, (signal, bits) in enumerate(zip(signals, result.quality, strict=True)):
+        partial = (bits & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
         found = overlap_of(
             signal.value,
             signal.variance,
             result.raman_depth[row],
             result.backscatter[row],
             (result.lidar_ratio[row], result.lidar_ratio_standard_error[row]),
-            (bits & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0,
+            partial,
             cells.step,
             settings.ratio,
         )
-        value[row], error[row] = found.value, found.standard_error
+        value[row] = np.where(partial, found.value, stated)
+        error[row] = np.where(partial, found.standard_error, stated_error)
     return {"overlap": value, "overlap_standard_error": error}
 
 
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Channels of nitrogen and water vapour."""
+
+    nitrogen: tuple[ChannelSignal, AirColumn]
+    channel: _Channel
+    water: WaterVapour
+
+
 def _water(
-    pair: tuple[tuple[ChannelSignal, AirColumn], tuple[ChannelSignal, AirColumn]],
+    pair: _Pair,
     cells: Cells,
     result: RamanResult,
-    settings: RamanSettings,
-    water: WaterVapour,
-) -> dict[str, Any]:
-    """Return the mixing ratio of water vapour and its errors, from nitrogen and water vapour."""
+    sources: tuple[MolecularProfile, Array],
+    assumptions: Assumptions,
+) -> tuple[dict[str, Any], Booleans]:
+    """Return the mixing ratio of water vapour with its errors, and the cells that are doubtful."""
+    (nitrogen, air), water = pair.nitrogen, pair.water
+    (molecules, heights), settings = sources, assumptions.settings
+    density = molecules.number_density(heights)
+    depth = _depth(molecules, heights, air.range, water.wavelength)
+    # The share of the lines of nitrogen that the filter passes is not that of water vapour.
+    shape = replace(air, raman_depth=depth, density=density)
+    vapour, uncertain = pair.channel.signal(shape.raman_shape, known_shape=assumptions.known_shape)
+    share = air.density / density
+    errors = (
+        water.constant_standard_error / water.constant,
+        settings.molecular_relative_error * cells.mean(air.raman_depth - depth),
+        # That of water vapour is not known: assumed to change by as much.
+        cells.mean(share / share[0] - 1.0),
+    )
     partial = (result.quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
-    laser = settings.wavelength
-    of_water = particle_ratio(settings.angstrom_exponent, laser, water.wavelength)
+    particles = particle_transmission(settings, water.wavelength)
     value, random, systematic = np.full((3, *result.quality.shape), np.nan)
-    signals = (cell_signals(signal, air.raman_shape, cells) for signal, air in pair)
-    for row, (nitrogen, vapour) in enumerate(zip(*signals, strict=True)):
+    signals = (
+        cell_signals(nitrogen, air.raman_shape, cells),
+        cell_signals(vapour, shape.raman_shape, cells),
+    )
+    for row, (of_nitrogen, of_water) in enumerate(zip(*signals, strict=True)):
         found = mixing_ratio(
-            vapour,
-            nitrogen,
+            of_water,
+            of_nitrogen,
             (result.raman_depth[row], result.raman_depth_error[row]),
             partial[row],
             constant=water.constant,
-            constant_standard_error=water.constant_standard_error,
-            ratios=(1.0, settings.ratio, of_water),
+            particles=particles,
+            relative_errors=errors,
         )
         value[row], random[row], systematic[row] = found.value, found.random, found.systematic
     names = ("", "_standard_error", "_error_random", "_error_systematic")
     arrays = (value, np.hypot(random, systematic), random, systematic)
+    doubted = cells.split((pair.channel.quality & np.int32(_DOUBTED)) != 0).any(axis=-1)
+    doubtful = np.isnan(value) | doubted | uncertain[:, np.newaxis]
     return {
         f"water_vapour_mixing_ratio{name}": (("time", "range"), array)
         for name, array in zip(names, arrays, strict=True)
-    }
+    }, doubtful

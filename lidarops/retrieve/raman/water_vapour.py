@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.raman.backscatter import inverse_mean
-from lidarops.retrieve.raman.retrieval import CellSignal
+from lidarops.retrieve.raman.retrieval import CellSignal, RamanSettings
+from lidarops.retrieve.raman.scattering import particle_ratio
 
 Array = npt.NDArray[np.float64]
 
@@ -19,9 +21,31 @@ class MixingRatio:
 
     value: Array
     random: Array
-    """Standard error by noise and background."""
+    """Standard error by noise and backgrounds."""
     systematic: Array
-    """Standard error by calibration and dead time."""
+    """Standard error by all other causes."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleTransmission:
+    r"""Transmission of particles at the nitrogen line over that at the line of water vapour."""
+
+    exponent: float
+    r"""Of its logarithm per fitted optical depth, :math:`(\kappa_W - \kappa) / (1 + \kappa)`."""
+    standard_error: float
+    """By the Ångström exponent."""
+
+
+def particle_transmission(settings: RamanSettings, wavelength: float) -> ParticleTransmission:
+    """Return the transmission ratio of particles for a water vapour channel at a wavelength, m."""
+    laser = settings.wavelength
+    nitrogen = settings.ratio
+    water = particle_ratio(settings.angstrom_exponent, laser, wavelength)
+    exponent = (water - nitrogen) / (1.0 + nitrogen)
+    of_nitrogen = nitrogen * np.log(laser / settings.raman_wavelength)
+    of_water = water * np.log(laser / wavelength)
+    slope = (of_water - of_nitrogen - exponent * of_nitrogen) / (1.0 + nitrogen)
+    return ParticleTransmission(exponent, float(abs(slope)) * settings.angstrom_standard_error)
 
 
 def mixing_ratio(
@@ -31,8 +55,8 @@ def mixing_ratio(
     partial: npt.NDArray[np.bool_],
     *,
     constant: float,
-    constant_standard_error: float,
-    ratios: tuple[float, float, float],
+    particles: ParticleTransmission,
+    relative_errors: Sequence[Array | float],
 ) -> MixingRatio:
     r"""Return the mixing ratio, with the calibration constant of both channels.
 
@@ -50,28 +74,32 @@ def mixing_ratio(
         Fitted optical depth of the nitrogen signal, up to a constant, and its error by noise.
     partial : (cell,) bool
         Cells without full overlap.
-    constant, constant_standard_error : float
+    constant : float
         Calibration constant, kg kg-1 per ratio of the signals.
-    ratios : (float, float, float)
-        Particle extinction at the wavelengths of the laser, of nitrogen and of water vapour, over
-        that at the laser's.
+    particles : ParticleTransmission
+    relative_errors : sequence of float or (cell,) float
+        Relative standard errors of the constant and of what else all profiles share.
 
     References
     ----------
     `whiteman2003`.
     """
-    _, of_nitrogen, of_water = ratios
     depth, error = fit
     nearest = float(depth[np.flatnonzero(np.isfinite(depth))[:1]].sum())
-    particles = (depth - nearest) / (1.0 + of_nitrogen)
+    beyond = depth - nearest
     with np.errstate(divide="ignore", invalid="ignore"):
         own = nitrogen.variance / nitrogen.value**2
     level = np.where(partial, nitrogen.value, np.exp(-depth))
     square = np.where(partial, own, error**2)
     factor = constant * inverse_mean(level, square)
-    factor *= np.exp((of_water - of_nitrogen) * particles)
+    factor *= np.exp(particles.exponent * beyond)
     value = factor * water.value
-    noise = factor**2 * (water.variance + water.background**2) + value**2 * square
-    relative = constant_standard_error / constant
-    systematic = np.hypot(value * relative, factor * water.dead_time)
+    background, dead_time = (
+        nitrogen.relative(change, level) for change in (nitrogen.background, nitrogen.dead_time)
+    )
+    noise = factor**2 * (water.variance + water.background**2)
+    noise += value**2 * (square + background**2)
+    shared = dead_time**2 + (particles.standard_error * beyond) ** 2
+    shared += sum(np.square(relative) for relative in relative_errors)
+    systematic = np.sqrt(value**2 * shared + (factor * water.dead_time) ** 2)
     return MixingRatio(value, np.sqrt(noise), systematic)

@@ -140,6 +140,17 @@ def test_a_cloud_in_all_profiles_is_no_partial_one():
     cloud = inside(product, 6060.0, 6240.0)
     assert (product["cloud_mask"].to_numpy()[0, cloud] == 2).all()
     assert not raised(product, RamanQuality.PARTLY_CLOUDY)[cloud].any()
+    assert raised(product, RamanQuality.CLOUD)[cloud].all()
+    assert not raised(product, RamanQuality.CLOUD)[inside(product, 1000.0, 5000.0)].any()
+
+
+def test_a_cloud_of_most_profiles_is_partial_and_one_of_the_mean():
+    product = product_of(PROFILES - 1)
+    cloud = inside(product, 6060.0, 6240.0)
+    assert (product["cloud_mask"].to_numpy()[0, cloud] == 2).all()
+    np.testing.assert_allclose(product["cloud_fraction"].to_numpy()[0, cloud], 5 / 6)
+    for bit in (RamanQuality.PARTLY_CLOUDY, RamanQuality.CLOUD):
+        assert raised(product, bit)[cloud].all()
 
 
 def test_clear_air_has_no_cloud():
