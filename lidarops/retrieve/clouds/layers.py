@@ -24,6 +24,9 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 _TOP: Final = THRESHOLDS.top
+_LEAST_FALL: Final = THRESHOLDS.least_fall
+_VISIBLE_FALL: Final = THRESHOLDS.visible_fall
+_BEYOND: Final = THRESHOLDS.windows_beyond
 _ROUNDING: Final = 1e-9
 """Relative rise that the rounding of sums can cause."""
 
@@ -41,8 +44,8 @@ class Layers:
     """m, of the first bin of the lowest layer; NaN where there is none."""
     mask: Mask
     """(..., range): bins of all layers, from base to apparent top, the last bin before the signal
-    is back at its level below the base. In a layer that attenuates strongly this is below the true
-    top."""
+    is back at its level below the base and falls no more. Below the true top where a layer hides
+    its upper part in noise."""
     cloudy: Mask
 
     @classmethod
@@ -79,7 +82,11 @@ def find_layers(
     over :math:`L` bins exceeds the stated one in the far half of the profile, with four standard
     errors (`lidarops.retrieve.signal.noise_correlation`).
     The base is where the statistic peaks. The top is where the mean of the next window is again
-    within 2 standard errors of the level below the base.
+    within 2 standard errors of the level below the base, and from where the ratio no longer falls:
+    a layer that attenuates, or whose upper part is thin, is still brighter than the air above it
+    where it is no brighter than that below it. The ratio falls where the mean of a window exceeds
+    that of the next one, or of the next eight, by :math:`1 + (c - 1) / 10`, with :math:`u`. The
+    window is the shortest in which noise does not hide a fall by :math:`(c - 1) / 4`.
 
     A layer that begins within one window of the first bin is not detected. With a `contrast` of
     1 all layers are detected that rise significantly.
@@ -384,6 +391,62 @@ def _end(sums: Array, base: int, length: int) -> int:
 
 
 @_compiled
+def _falls(
+    sums: Array, i: int, length: int, beyond: int, contrast: float, least: float, margin: float
+) -> bool:
+    """Return whether the ratio to air exceeds that of the window beyond by more than `contrast`.
+
+    By more than `least` standard errors, and it does not rise within the window.
+    """
+    stop = i + length
+    high, high_variance = _mean(sums, i, stop)
+    low, low_variance = _mean(sums, stop, stop + beyond)
+    # With too high a background the ratio falls for ever, below zero.
+    excess = high - contrast * max(low, 0.0) - margin / (sums[SHAPE, i] - sums[SHAPE, stop])
+    error = math.sqrt(high_variance + contrast * contrast * low_variance)
+    if not excess > max(least * error, _ROUNDING * high):
+        return False
+    # Within a window that begins in the gap below another layer it rises.
+    middle = i + length // 2
+    near, near_variance = _mean(sums, i, middle)
+    far, far_variance = _mean(sums, middle, stop)
+    return not far - near > _TOP * math.sqrt(near_variance + far_variance)
+
+
+@_compiled
+def _top(
+    sums: Array,
+    end: int,
+    lengths: npt.NDArray[np.int64],
+    contrast: float,
+    certainty: float,
+    limits: Array,
+    margins: Array,
+) -> int:
+    """Return the first bin from an apparent end on from which the ratio to air no longer falls.
+
+    The window is the shortest in which noise does not hide such a fall: a longer one would reach
+    the top of aerosol above the layer.
+    """
+    slight = 1.0 + _LEAST_FALL * (contrast - 1.0)
+    bins = int(sums.shape[1]) - 1
+    for i in range(end, bins):
+        falls = False
+        for k, length in enumerate(lengths):
+            least = certainty * limits[k]
+            for beyond in (length, _BEYOND * length):
+                falls = falls or _falls(sums, i, length, beyond, slight, least, margins[k])
+            level, variance = _mean(sums, i + length, i + 2 * length)
+            if falls or _VISIBLE_FALL * (contrast - 1.0) * level > least * math.sqrt(
+                2.0 * variance
+            ):
+                break
+        if not falls:
+            return i
+    return bins
+
+
+@_compiled
 def _mark_layers(
     power: Array,
     variance: Array,
@@ -426,4 +489,5 @@ def _mark_layers(
             if base < 0:
                 break
             end = _end(sums, base, length)
+            end = _top(sums, end, lengths, contrast, certainty, limits[k], margins[k])
             layers[k, base:end] = True

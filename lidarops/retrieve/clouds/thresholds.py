@@ -35,6 +35,15 @@ class Thresholds:
     """Probability of a false cloud in a profile. Required of the product."""
     top: float = 2.0
     """Standard errors of the level below the base within which a layer has ended. Assumed."""
+    least_fall: float = 0.1
+    """Fall of the ratio to air within a layer, in least excesses of a cloud. Assumed: aerosol
+    above a cloud falls slower."""
+    visible_fall: float = 0.25
+    """Fall that noise must not hide in a window at the top, in least excesses. With 0.5, longer
+    parts of weak layers are missed; with 0.15, windows reach the top of aerosol above a cloud."""
+    windows_beyond: int = 8
+    """Length of the air that a window is compared with, in windows. With 4, a third of the bins
+    above the peak of a deep cirrus is missed (`test_layers.py`)."""
     cloud_margin: float = 300.0
     """m beyond the last bin of a cloud; its thin edge extends beyond its apparent top. Assumed."""
     least_share_beyond: float = 0.1

@@ -239,6 +239,83 @@ def test_a_cirrus_stands_out_at_each_wavelength(wavelength):
     assert np.mean(core.any(axis=-1)) > 0.9
 
 
+def edge(distance, scale):
+    """Return 1 at negative distances in m from an edge of a scale in m, 0 at positive ones."""
+    return 0.5 - 0.5 * np.tanh(distance / scale)
+
+
+TOPS = {
+    "weak cirrus": 1e-5 * np.exp(-0.5 * ((RANGE - 9000.0) / 350.0) ** 2),
+    "cirrus": 2e-5 * np.exp(-0.5 * ((RANGE - 9000.0) / 600.0) ** 2),
+    "cirrus with a sharp top": 2e-5 * between(8000.0, 9500.0),
+    "cirrus that attenuates": 1e-4 * (RANGE >= 8000.0) * edge(RANGE - 9000.0, 160.0),
+    "stratocumulus": 1e-3 * (RANGE >= 1500.0) * edge(RANGE - 1800.0, 60.0),
+}
+"""Backscatter of clouds, m-1 sr-1, of a lidar ratio of 20 sr."""
+
+
+def found_tops(wavelength, name, ratio):
+    """Return scattering ratio, excess of means over 150 m over noise, and masks of noisy profiles.
+
+    With a signal-to-noise ratio of a bin of clean air at 9 km.
+    """
+    rng = np.random.default_rng(22)
+    air, power, shape = of_wavelength(wavelength, TOPS[name], 20.0)
+    spread = np.hypot(np.interp(9000.0, RANGE, shape) / ratio, 0.003 * power)
+    masks = find_layers(
+        power + spread * rng.standard_normal((100, RANGE.size)), RANGE, spread**2,
+        molecular_attenuated=shape, contrast=cloud_contrast(wavelength),
+    ).mask  # fmt: skip
+    total = 1.0 + TOPS[name] / air
+    return total, (1.0 - 1.0 / total) * power / spread * np.sqrt(10.0), masks
+
+
+@pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
+@pytest.mark.parametrize("cloud", TOPS)
+@pytest.mark.parametrize("ratio", [1.0, 5.0, 30.0])
+def test_a_layer_holds_its_upper_part(wavelength, cloud, ratio):
+    """Down to half the least excess, as far as means over 150 m show it, but for 180 m."""
+    total, excess, masks = found_tops(wavelength, cloud, ratio)
+    half = 1.0 + 0.5 * (cloud_contrast(wavelength) - 1.0)
+    above = RANGE[np.argmax(total)] <= RANGE
+    true_top = RANGE[above & (total > half) & (excess > 5.0)].max()
+    tops = np.where(masks, RANGE, 0.0).max(axis=-1)
+    assert true_top - np.median(tops) <= 180.0
+    assert np.percentile(tops, 95) <= RANGE[above & (total > 1.02)].max() + 15.0
+
+
+def test_aerosol_above_a_cloud_is_outside_of_it():
+    """In three of four skies; in others the top of the aerosol is close to that of the cloud."""
+    rng = np.random.default_rng(23)
+    for name in ("stratus", "cumulus"):
+        base, depth, _ = CLOUDS[name]
+        for scale in (1e18, 1e20, 1e22):
+            sky = scale * attenuated(aerosol(200, rng), CLOUDS[name])
+            mask = detect(*counted(sky, 100.0, rng)).mask & (RANGE < 4000.0)
+            tops = np.where(mask, RANGE, 0.0).max(axis=-1)
+            assert np.percentile(tops, 75) <= base + depth + 15.0
+
+
+@pytest.mark.parametrize("ratio", [1.0, 30.0])
+def test_air_between_two_layers_is_outside_of_them(ratio):
+    rng = np.random.default_rng(24)
+    layers = 2e-5 * (between(8000.0, 8500.0) | between(9000.0, 9500.0))
+    _, power, shape = of_wavelength(532e-9, layers, 20.0)
+    spread = np.interp(9000.0, RANGE, shape) / ratio
+    noisy = power + spread * rng.standard_normal((100, RANGE.size))
+    mask = find_layers(noisy, RANGE, spread**2 + 0.0 * noisy, molecular_attenuated=shape).mask
+    assert mask[:, between(8560.0, 8940.0)].mean() < 0.02
+
+
+def test_a_layer_ends_beyond_an_opaque_cloud_where_the_background_is_too_high():
+    """Up to a standard deviation of a bin."""
+    rng = np.random.default_rng(25)
+    counts, variance = counted(1e20 * attenuated(0.0 * RANGE, CLOUDS["stratus"]), 1e4, rng)
+    for too_high in (1.0, 10.0, 100.0):
+        top = RANGE[detect(counts - too_high, variance).mask].max()
+        assert top < 1600.0
+
+
 @pytest.mark.parametrize(
     ("wavelength", "ratios", "least", "most"),
     [
