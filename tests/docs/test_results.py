@@ -192,6 +192,14 @@ STATED_BESIDE = {
         *("visibility", ""),
         "0.4 percent where extinction changes with height",
     ),
+    (
+        "varying lidar ratio",
+        "network, lidar ratio varies by 10 %, 2 % declared, the default: false",
+    ): (*("visibility", ""), "4.5 percent of simulated values deviated"),
+    (
+        "varying lidar ratio",
+        "network, lidar ratio varies by 10 %, declared: false",
+    ): (*("visibility", ""), "0.4 percent with 10 percent"),
     ("networks of single profiles", "network, plume, blocks of 1: false"): (
         *("visibility", ""),
         "0.3 percent with a plume",

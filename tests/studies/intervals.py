@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 from unittest import mock
 
@@ -34,7 +35,7 @@ from lidarops.bench.stability.random_scenes import COVERED, FALSE
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import _compressed, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
-from lidarops.retrieve.network import extinction_field
+from lidarops.retrieve.network import extinction_field, labeled
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 
@@ -86,6 +87,49 @@ def network_blocks(cluster: int, *, profiles: int, air: str) -> Parts:
     kept = np.isfinite(error) & ~result.flags.flagged & result.near_crossing
     name = f"network, {air}, blocks of {profiles}"
     yield from _errors(name, error, result.extinction_standard_error, kept)
+
+
+def varying_lidar_ratio(cluster: int, *, amount: float) -> Parts:
+    """Yield the errors of a network in air whose lidar ratio varies by an rms amount."""
+    rng = np.random.default_rng((86, cluster))
+    noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
+    net = random_networks._random_network(rng).network()
+    if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
+        return
+    clean = signals(net, random_networks._plume(rng))
+    wave = 2.0 * np.pi / np.exp(rng.uniform(np.log(300.0), np.log(3000.0), 2))
+    # A wave of random length and direction across the plane of the beams.
+    at = net.origin[:, :, np.newaxis] + net.direction[:, :, np.newaxis] * clean.range
+    phase = wave[0] * at[:, 0] + wave[1] * at[:, 2] + rng.uniform(0.0, 2.0 * np.pi)
+    ratio = np.exp(amount * np.sqrt(2.0) * np.sin(phase))
+    power, variance = replace(clean, power=clean.power / ratio).draw(
+        noise, 6, int(rng.integers(2**31))
+    )
+    solver = _solver(net, clean.range, power, variance)
+    result = solver.solve(power)
+    error = result.extinction - clean.truth(6)
+    kept = np.isfinite(error) & ~result.flags.flagged & result.near_crossing
+    of_ratio = labeled._lidar_ratio_error(solver, result, 1.0)
+    for words, declared in (
+        ("not declared", 0.0), ("2 % declared, the default", 0.02), ("declared", amount)
+    ):  # fmt: skip
+        stated = np.hypot(result.extinction_standard_error, declared * of_ratio)
+        name = f"network, lidar ratio varies by {100 * amount:g} %, {words}"
+        yield from _errors(name, error, stated, kept)
+
+
+def _solver(net: Any, distance: Any, power: Any, variance: Any) -> labeled._Solver:
+    """Return the solver of products, for its systematic errors."""
+    signals = SimpleNamespace(
+        power=power, variance=variance, overlap=None,
+        range=np.broadcast_to(distance, (net.beams, distance.size)),
+    )  # fmt: skip
+    beams = [
+        SimpleNamespace(exponent=1.0, instrument=beam, nearest=100.0) for beam in range(net.beams)
+    ]
+    settings = SimpleNamespace(prior="block", multiplier=None, block_intervals=len(power))
+    intervals = np.arange(len(power))
+    return labeled._Solver(beams, net, settings, signals, intervals)  # type: ignore[arg-type]
 
 
 # Homogeneous paths ----------------------------------------------------------------------------
@@ -368,6 +412,7 @@ RATES: Final[dict[str, tuple[int, tuple[Callable[[int], Parts], ...]]]] = {
         800,
         (partial(network_blocks, profiles=1, air="layered"),),
     ),
+    "varying lidar ratio": (150, (partial(varying_lidar_ratio, amount=0.1),)),
     "correlated noise": (150, tuple(partial(correlated_noise, correlation=r) for r in (0.6, 0.9))),
     "near the cut": (400, (near_the_cut,)),
     "short sections": (150, (short_sections,)),
