@@ -238,8 +238,8 @@ def _scenes(scores: Scores) -> Chapter:
         "of a block are solved at once, and share inhomogeneity, smoothness and truth. Our methods "
         "estimate the scatter. The peers know it, solve each altitude on its own but for the "
         "spline, and use each sample that exceeds 3 times its noise. This selects bright samples "
-        "and causes the bias of straight lines in clear air; our methods avoid it by selecting "
-        "with the mean signal of a window of altitudes.",
+        "and causes the bias of straight lines in clear air; our methods and the spline avoid it "
+        "by selecting with the mean signal of a window of altitudes.",
         [
             Results(
                 scene,

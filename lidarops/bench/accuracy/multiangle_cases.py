@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
+from scipy.ndimage import uniform_filter1d
 from scipy.optimize import lsq_linear
 
 from lidarops.bench.harness.rows import Array
@@ -33,6 +34,8 @@ _STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
 _LEAST_SNR: Final = 3.0
 _FEWEST_BEAMS: Final = 3
 _FEWEST_KNOTS: Final = 5
+_RUN: Final = 9
+"""Altitudes of the running mean by which the spline peer selects samples."""
 _LEAST_SCATTER: Final = 1e-20
 
 AUTO: Final = "auto"
@@ -367,8 +370,8 @@ def with_prior(scan: Scan, prior: Array) -> Array:
 def scan_peers() -> Mapping[str, ScanSolver]:
     """Return methods written directly with numpy and scipy.
 
-    They know the true scatter, and use samples of more than 3 times their noise. All but the
-    spline solve each altitude on its own.
+    They know the true scatter, and use samples of more than 3 times their noise, the spline those
+    of which a running mean is. All but the spline solve each altitude on its own.
     """
     return {LINES: lines, SPLINE: spline, TIKHONOV: tikhonov, BOUNDED: bounded}
 
@@ -381,13 +384,19 @@ _Line = tuple[Array, Array, Array]
 
 def lines(scan: Scan) -> ScanEstimates:
     """Fit straight lines to all altitudes at once: Kano-Hamilton in closed form."""
+    return _fit_lines(scan, scan.signal)
+
+
+def _fit_lines(scan: Scan, level: Array) -> ScanEstimates:
+    """Fit straight lines to logarithms at a level of the signal, which also selects samples."""
     x = scan.scene.path[:, np.newaxis]
-    used = scan.signal > _LEAST_SNR * np.sqrt(scan.variance)
+    used = level > _LEAST_SNR * np.sqrt(scan.variance)
     with np.errstate(divide="ignore", invalid="ignore"):
-        scatter = scan.variance / scan.signal**2 + scan.scene.inhomogeneity**2
+        scatter = scan.variance / level**2 + scan.scene.inhomogeneity**2
         # Without scatter and noise, all beams have the same weight.
         weight = np.where(used, 1.0 / np.maximum(scatter, _LEAST_SCATTER), 0.0)
-        y = np.where(used, np.log(np.where(used, scan.signal, 1.0)), 0.0)
+        positive = np.where(used, level, 1.0)
+        y = np.where(used, np.log(positive) + (scan.signal - level) / positive, 0.0)
         total = weight.sum(axis=1, keepdims=True)
         away = x - (weight * x).sum(axis=1, keepdims=True) / total
         information = (weight * away**2).sum(axis=1)
@@ -398,15 +407,21 @@ def lines(scan: Scan) -> ScanEstimates:
 
 
 def spline(scan: Scan) -> ScanEstimates:
-    """Smooth the optical depths of `lines` by a cubic spline, its strength by cross validation."""
-    unsmoothed = lines(scan)
+    """Smooth optical depths by a cubic spline, its strength by generalised cross validation.
+
+    A running mean of the signal selects samples, so that noise does not: bright samples alone would
+    bias the lines.
+    """
+    level = uniform_filter1d(scan.signal, _RUN, axis=-1, mode="nearest")
+    unsmoothed = _fit_lines(scan, level)
     error = np.asarray(unsmoothed.standard_error)
     smooth = np.full(unsmoothed.optical_depth.shape, np.nan)
     for t, depth in enumerate(unsmoothed.optical_depth):
         known = np.isfinite(depth)
         if known.sum() >= _FEWEST_KNOTS:
-            height = scan.scene.altitude[known]
-            curve = make_smoothing_spline(height, depth[known], w=1.0 / error[t, known] ** 2)
+            # Scipy finds no strength for metres, or weights far from 1.
+            height, weight = 1e-3 * scan.scene.altitude[known], 1.0 / error[t, known] ** 2
+            curve = make_smoothing_spline(height, depth[known], w=weight / weight.mean())
             smooth[t, known] = curve(height)
     return ScanEstimates(smooth)
 
