@@ -70,9 +70,9 @@ CLOUDS: Final = (
         long_name="altitude above the geoid of the apparent top of the highest cloud or dense"
         " layer",
         coverage=Coverage.AUXILIARY,
-        comment="Of all profiles in the mean: where the signal is back at its level below the"
-        " base, which in a cloud that attenuates strongly is below the true top. Missing where"
-        " no cloud or dense layer was detected.",
+        comment="Of all profiles in the mean: where the ratio to air falls no more, or noise"
+        " hides that it does: then this is below the true top. Missing where no cloud or dense"
+        " layer was detected.",
     ),
 )
 """Of `lidarops.retrieve.clouds.labeled.Clouds`."""

@@ -361,16 +361,20 @@ def _signal_beyond_clouds(
     if not known_shape or not cloudy.any():
         return signal, clouds
     # Only beyond the cloud does the signal have the shape of air: fit the background there.
-    step = float(np.median(np.diff(means.distance)))
-    hidden = np.zeros_like(cloudy)
-    margin = min(round(THRESHOLDS.cloud_margin / step), hidden.shape[1])
-    hidden[:, margin:] = cloudy[:, : hidden.shape[1] - margin]
-    hidden |= cloudy
+    hidden = with_margin(cloudy, means.distance)
     beyond = ~np.logical_or.accumulate(hidden[:, ::-1], axis=-1)[:, ::-1]
     enough = beyond.sum(axis=-1) >= THRESHOLDS.least_share_beyond * means.distance.size
     refitted = cloudy.any(axis=-1) & enough
     signal = _subtract_background(means, beyond | ~refitted[:, np.newaxis], known_shape=True)
     return signal, means.find_clouds(signal.power)
+
+
+def with_margin(mask: Mask, distance: Array) -> Mask:
+    """Return the bins of layers, and those in which their thin upper edge may be."""
+    bins = round(THRESHOLDS.cloud_margin / float(np.median(np.diff(distance))))
+    counts: npt.NDArray[np.int64] = np.cumsum(mask, axis=-1, dtype=np.int64)
+    counts[:, bins + 1 :] -= counts[:, : -bins - 1].copy()
+    return np.asarray(counts > 0)
 
 
 def _less_than_air(
@@ -440,7 +444,7 @@ def _subtract_background(means: MeanProfiles, usable: Mask, *, known_shape: bool
 def reference_window(
     signal: MeanSignal, means: MeanProfiles, reference: Reference, clouds: Mask
 ) -> _reference.ReferenceWindow:
-    """Return the window of clean air outside of clouds, (time, range), of each mean."""
+    """Return the window of clean air outside of clouds, (time, range), and of their margins."""
     highest = min(reference.highest, float(means.distance[-1]))
     width = min(reference.width, highest - reference.lowest)
     candidates = _reference.candidate_windows(
@@ -453,5 +457,5 @@ def reference_window(
         molecular_attenuated=means.air.shape,
         candidates=candidates,
         background_standard_error=np.nan_to_num(signal.background_standard_error),
-        exclude=clouds,
+        exclude=with_margin(clouds, means.distance),
     )

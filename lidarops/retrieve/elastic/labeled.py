@@ -25,6 +25,7 @@ from lidarops.retrieve.clouds.labeled import (
     cloud_heights,
     reference_window,
     signal_and_clouds,
+    with_margin,
 )
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
@@ -135,10 +136,11 @@ def invert_elastic(
     )
     quality = means.quality
     quality |= _solution_flags(solution, window, signal, quality)
-    cloudy = _with_beyond(clouds.mask, distance, window)
+    cloudy = _with_beyond(with_margin(clouds.mask, distance), distance, window)
+    partly = _with_beyond(with_margin(clouds.partly, distance), distance, window)
     for mask, bit in (
         (cloudy, ElasticQuality.CLOUD),
-        (_with_beyond(clouds.partly, distance, window) & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
+        (partly & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
         (_with_beyond(_negative(solution), distance, window), ElasticQuality.NEGATIVE_BACKSCATTER),
         (means.unknown_overlap, ElasticQuality.UNKNOWN_OVERLAP),
     ):

@@ -14,6 +14,7 @@ from lidarops.retrieve.air.reference_window import (
     candidate_windows,
     choose_reference,
 )
+from lidarops.retrieve.clouds.labeled import with_margin
 from lidarops.retrieve.clouds.layers import find_layers, find_visible_air
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.screening import cloud_contrast
@@ -282,6 +283,15 @@ def test_a_layer_holds_its_upper_part(wavelength, cloud, ratio):
     tops = np.where(masks, RANGE, 0.0).max(axis=-1)
     assert true_top - np.median(tops) <= 180.0
     assert np.percentile(tops, 95) <= RANGE[above & (total > 1.02)].max() + 15.0
+
+
+@pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
+@pytest.mark.parametrize("cloud", TOPS)
+def test_the_margin_of_a_layer_holds_the_edge_that_noise_hides(wavelength, cloud):
+    total, excess, masks = found_tops(wavelength, cloud, 30.0)
+    half = 1.0 + 0.5 * (cloud_contrast(wavelength) - 1.0)
+    edge_bins = (total > half) & (excess > 5.0) & (np.arange(RANGE.size) >= np.argmax(total))
+    assert with_margin(masks, RANGE)[:, edge_bins].mean() > 0.99
 
 
 def test_aerosol_above_a_cloud_is_outside_of_it():
