@@ -129,11 +129,12 @@ def regress(beams: BeamBlock, *, inhomogeneity: float | None, robust: bool) -> R
     return _fit_robustly(beams, inhomogeneity)
 
 
-def open_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> Array:
-    """Return the horizontal gradient of ln backscatter that residuals leave open, m-1, (altitude,).
+def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
+    """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
 
     It is the largest that is shown at any altitude of the block, by all profiles within 500 m of
-    it, but no larger than the residuals around an altitude allow there; 0 if none is shown.
+    it, beyond what an error of the dead time explains; 0 if none is shown. It holds at all
+    altitudes: an optical depth is that of the air below, too.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def open_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> Array:
         m.
     """
     if not beams.noise.size:
-        return np.zeros(altitude.size)
+        return 0.0
     # Selection and logarithms bias noisy samples, which together would look like a gradient. The
     # profiles decide together, lest a sample be selected by the noise around it.
     middle = np.count_nonzero(beams.noise < np.inf, axis=0, keepdims=True) // 2
@@ -152,24 +153,19 @@ def open_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> Array:
     weights = np.where(clear, weights_of(beams, fit), 0.0)
     weights *= ((fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0))[:, np.newaxis]
     plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
-    square = np.zeros(altitude.size)
+    square = 0.0
     for distance in _along_axes(beams.design[:2]):
         left, length = orthogonal_columns(weights, (distance,), plain)[-1]
         lever = np.where(np.isfinite(length), weights * left * altitude, 0.0)
-        gradient, error, limit = _gradient(beams, fit, lever, left, altitude)
-        size = np.abs(gradient)
-        shown = np.max(size, where=size > limit * error, initial=0.0)
-        square += np.minimum(shown, size + THRESHOLDS.gradient_margin * error) ** 2
-    return np.asarray(np.sqrt(square))
+        square += _shown(beams, fit, lever, left, altitude) ** 2
+    return float(np.sqrt(square))
 
 
-def _gradient(
-    beams: BeamBlock, fit: Regression, lever: Array, left: Array, altitude: Array
-) -> tuple[Array, Array, Array]:
-    """Return gradients along an axis, their errors, and the errors beyond which they are shown.
+def _shown(beams: BeamBlock, fit: Regression, lever: Array, left: Array, altitude: Array) -> float:
+    """Return the largest gradient along an axis that is beyond chance and the dead time, m-1.
 
-    The error follows from the scatter of the beams of all profiles about the gradient, whose
-    altitudes may be correlated, and from the error of the dead time, which all beams share.
+    The error by chance follows from the scatter of the beams of all profiles about the gradient,
+    whose altitudes may be correlated. An error of the dead time is common to all beams.
 
     Parameters
     ----------
@@ -203,10 +199,13 @@ def _gradient(
     squares = (own**2).sum(axis=1)
     # Beams with little weight do not tell the scatter of those that decide.
     freedom = 1.0 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
-    error = np.where(freedom >= 1.0, np.sqrt(scatter + shift**2) / known, np.inf)
-    tested = np.count_nonzero(freedom >= 1.0)
-    chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(tested), 1)
-    return gradient, error, stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
+    tested = freedom >= 1.0
+    error = np.where(tested, np.sqrt(scatter) / known, np.inf)
+    chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(np.count_nonzero(tested)), 1)
+    limit = stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
+    explained = THRESHOLDS.gradient_dead_time * np.abs(shift) / known
+    size = np.abs(gradient)
+    return float(np.max(size, where=size - explained > limit * error, initial=0.0))
 
 
 def _around(values: Array, altitude: Array) -> Array:

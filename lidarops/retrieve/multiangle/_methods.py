@@ -346,13 +346,13 @@ def _gradient_slopes(
 ) -> Array:
     """Return the error of optical depth by a gradient to the east and to the north.
 
-    The gradient is the declared one, or that which the residuals leave open where it is larger. One
-    that is too large for air raises `poor_stratification`.
+    The gradient is the declared one, or that which the residuals show where it is larger. One that
+    is too large for air raises `poor_stratification`.
     """
-    gradient = _block.open_gradient(beams, fit, settings.height)
-    distorted = gradient > max(settings.largest_gradient, THRESHOLDS.largest_gradient)
-    profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth) & distorted
-    scale = np.maximum(settings.largest_gradient, gradient) * settings.height
+    shown = _block.visible_gradient(beams, fit, settings.height)
+    if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
+        profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth)
+    scale = max(settings.largest_gradient, shown) * settings.height
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
 

@@ -83,5 +83,7 @@ def test_level_air_shows_no_gradient():
 def test_what_the_dead_time_explains_is_no_gradient():
     """The stated error of the dead time decides whether bent signals near the lidar reject."""
     assert rejected(one_sided(1, dead_time=0.1)) == 1.0
-    assert rejected(one_sided(1, dead_time=0.1, change=0.05)) == 0.0
+    assert rejected(one_sided(1, dead_time=0.1, change=0.1)) == 0.0
     assert rejected(one_sided(1, gradient=1e-3, change=0.05)) == 1.0
+    # Several errors of the dead time would explain this one.
+    assert rejected(one_sided(1, gradient=5e-4, change=0.05)) == 1.0
