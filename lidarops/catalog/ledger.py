@@ -191,11 +191,12 @@ class Ledger(Granules):
 
     # Runs
 
-    def begin_run(self, run: Run, token: str) -> None:
-        """Enter a starting run, and close runs whose process died."""
+    def begin_run(self, run: Run, token: str, *, swept: bool = True) -> None:
+        """Enter a starting run; close runs whose process died, if what they left is swept."""
         with self.transaction() as connection:
             self._hold(connection, token)
-            connection.execute(self._closing())
+            if swept:
+                connection.execute(self._closing())
             values = asdict(run) | {
                 "campaign": self.campaign,
                 "started": naive(run.started),

@@ -81,29 +81,40 @@ def drop(output: Path, kept: str) -> None:
             (output / kept).unlink(missing_ok=True)
 
 
-def sweep(output: Path) -> list[str]:
+def sweep(output: Path) -> tuple[list[str], bool]:
     """Remove hidden temporary files that killed processes left among products and reports.
 
     Returns
     -------
     list of str
         Paths of the removed files.
+    bool
+        Whether all could be found and removed; if not, a later run has to try again.
     """
-    swept = []
-    for path in temporary_files(output):
-        with suppress(OSError):
-            path.unlink()
+    swept: list[str] = []
+    failures: list[OSError] = []
+    for path in temporary_files(output, failures):
+        try:
+            path.unlink(missing_ok=True)
             swept.append(str(path))
-    return swept
+        except OSError as error:
+            failures.append(error)
+    return swept, not failures
 
 
-def temporary_files(output: Path) -> Iterator[Path]:
+def temporary_files(output: Path, failures: list[OSError] | None = None) -> Iterator[Path]:
     """Yield the hidden temporary files among products and reports that no living process writes.
 
-    A run must not be at work, but somebody may build a report.
+    A run must not be at work, but somebody may build a report. Folders that exist and cannot be
+    read are appended to the failures.
     """
+
+    def note(error: OSError) -> None:
+        if failures is not None and not isinstance(error, FileNotFoundError):
+            failures.append(error)
+
     for kept in ("products", FOLDER, "report"):
-        for folder, _, names in os.walk(output / kept):
+        for folder, _, names in os.walk(output / kept, onerror=note):
             for name in names:
                 path = Path(folder, name)
                 temporary = name.startswith(".") and name.endswith(".tmp")

@@ -559,9 +559,11 @@ class _Pass:
         """Remove what a killed run left, if this one has not; another run may be at work."""
         if self.session is None and self.store.has_dead_run():
             _acquire(self.lock)
-            for path in versions.sweep(Path(self.campaign.output)):
+            paths, complete = versions.sweep(Path(self.campaign.output))
+            for path in paths:
                 _LOG.warning("removed %s, left by a killed process", path)
-            self.store.close_runs(self.lock.token)
+            if complete:
+                self.store.close_runs(self.lock.token)
 
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:

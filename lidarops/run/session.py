@@ -98,14 +98,17 @@ class Session:
 
     def begin(self) -> None:
         """Enter the run in the ledger, and remove temporary files of killed runs."""
-        self._sweep()
-        self._store.begin_run(self._run, self._lock.token)
+        swept = self._sweep()
+        self._store.begin_run(self._run, self._lock.token, swept=swept)
         if self._journal:
             self._journal.begin(self._record((), Findings()))
 
-    def _sweep(self) -> None:
-        for path in versions.sweep(self._output):
+    def _sweep(self) -> bool:
+        """Return whether all temporary files of killed runs could be removed."""
+        paths, complete = versions.sweep(self._output)
+        for path in paths:
             _LOG.warning("removed %s, left by a killed process", path)
+        return complete
 
     def take(self, judged: Judgement, *, note: bool) -> None:
         """Prepare for a scene that is about to start: keep replaced versions.

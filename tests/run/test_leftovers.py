@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import NoReturn
 
 import pytest
@@ -628,6 +629,28 @@ def test_temporary_files_of_a_killed_run_are_named_by_verify_and_removed_by_the_
     assert reprocess(archive.write()) is None
     assert not left.exists()
     assert CliRunner().invoke(app, command).exit_code == 0
+
+
+def test_a_temporary_file_that_could_not_be_removed_is_removed_by_a_later_run(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = archive.folder / "out/products/.half.nc.0123.tmp"
+    left.write_bytes(b"half of a product")
+    _killed(archive)
+    next((archive.folder / "out/products").rglob("[!.]*.nc")).unlink()
+    unlink = Path.unlink
+
+    def failing(path: Path, missing_ok: bool = False) -> None:
+        if path.name == left.name:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+        unlink(path, missing_ok)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", failing)
+        assert reprocess(archive.write()) is not None
+    assert left.exists()
+    assert reprocess(archive.write()) is None
+    assert not left.exists()
 
 
 def test_temporary_files_of_a_run_at_work_are_left_alone(archive: Archive) -> None:
