@@ -10,9 +10,8 @@ demo: .venv/.runtime
 	$(BIN)/lidarops simulate catalogs/demo.yaml
 	$(BIN)/python -m flows.reprocess catalogs/demo.yaml; test $$? -le 1
 
-# Files in order, so that two workers seldom compile the same functions at the same time.
 test: .venv/.dev
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
 # Schedules on SQLite and PostgreSQL, and Slurm: needs their Debian packages, and root for Slurm.
 test-deployment: .venv/.dev
