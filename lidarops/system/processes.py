@@ -6,6 +6,7 @@ started, or one is lost, this process does the work.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import gc
 import logging
@@ -22,6 +23,8 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
 from multiprocessing import forkserver, resource_tracker
+from multiprocessing.context import BaseContext
+from multiprocessing.process import BaseProcess
 from typing import Any, Final, Generic, Self, TypeVar
 
 _BATCHES_AHEAD: Final = 8
@@ -130,6 +133,7 @@ class Processes(Generic[Kept]):
         self._kept = kept
         self._number = number
         self._pool: ProcessPoolExecutor | None = None
+        self._started: list[BaseProcess] = []
         # A daemonic process, such as a dask worker, may not have child processes.
         self._alone = number < 2 or bool(multiprocessing.current_process().daemon)
 
@@ -209,7 +213,7 @@ class Processes(Generic[Kept]):
         if self._pool is None:
             self._pool = ProcessPoolExecutor(
                 self._number,
-                mp_context=multiprocessing.get_context(start_method()),
+                mp_context=_context(self._started),
                 initializer=_prepare,
                 initargs=(self._kept,),
             )
@@ -237,6 +241,27 @@ class Processes(Generic[Kept]):
             if self._pool is not None:
                 self._pool.shutdown(wait=False, cancel_futures=True)
                 self._pool = None
+            if isinstance(error, BrokenProcessPool):
+                self._kill()
+
+    def _kill(self) -> None:
+        """Kill what is left of a broken pool: it misses a process that it was just starting."""
+        for process in self._started:
+            if process.is_alive():
+                process.kill()
+
+
+def _context(started: list[BaseProcess]) -> BaseContext:
+    """Return the context of new processes, which are also appended to a list."""
+    whole: Any = multiprocessing.get_context(start_method())
+    context: BaseContext = copy.copy(whole)
+
+    def process(*arguments: Any, **options: Any) -> BaseProcess:
+        started.append(whole.Process(*arguments, **options))
+        return started[-1]
+
+    setattr(context, "Process", process)  # noqa: B010 - a class there, a function here
+    return context
 
 
 _LOADED: dict[int, dict[str, str]] = {}

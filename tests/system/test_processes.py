@@ -13,7 +13,9 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
+from concurrent.futures.process import _ExecutorManagerThread
 from itertools import count, islice
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -111,6 +113,36 @@ class TestEach:
         for child in left:
             child.join(60)
         alive = [child for child in left if child.is_alive()]
+        for child in alive:
+            child.kill()
+        assert not alive
+
+    def test_ends_a_process_that_starts_while_another_is_lost(self, monkeypatch) -> None:
+        """The executor neither terminates it nor sends it an end: it does not know it yet."""
+        start, terminate = BaseProcess.start, _ExecutorManagerThread.terminate_broken
+        starts, begun = count(), threading.Event()
+        others = multiprocessing.active_children()
+
+        def slowly(process: BaseProcess) -> None:
+            start(process)
+            if next(starts):
+                begun.set()
+                # Until the process waits for work.
+                time.sleep(2.0)
+
+        def waiting(thread: _ExecutorManagerThread, cause: object) -> None:
+            begun.wait(60)
+            terminate(thread, cause)
+
+        monkeypatch.setattr(BaseProcess, "start", slowly)
+        monkeypatch.setattr(_ExecutorManagerThread, "terminate_broken", waiting)
+        with Processes(2, 2) as pool:
+            assert list(pool.map_items(deadly, range(40), at_a_time=6)) == doubled(range(40))
+        assert begun.is_set()
+        started = [child for child in multiprocessing.active_children() if child not in others]
+        for child in started:
+            child.join(5)
+        alive = [child for child in started if child.is_alive()]
         for child in alive:
             child.kill()
         assert not alive
