@@ -195,18 +195,18 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
         part["vertical_optical_depth_standard_error"] for part in (products["photon_355s"], found)
     ]
     spread = np.sqrt(sum(error.values[:, rows] ** 2 for error in errors))
-    assert (np.abs(analog - photon) < 2.0 * spread).all()
+    # Of all stated errors; the largest is 0.79, at 600 m.
+    assert (np.abs(analog - photon) < 0.8 * spread).all()
     # Without the baseline, 0.05 too large.
     row = int(np.abs(found["altitude"].values - 220.0 - 1500.0).argmin())
     assert found["vertical_optical_depth"].values[:, row] == pytest.approx([0.12, 0.12], abs=0.01)
 
 
-# With 5 % all are rejected: residuals contradict the stated dead time by more than its error.
-@pytest.mark.parametrize("uncertainty", [0.1, 0.15])
-def test_the_better_known_the_dead_time_the_more_values_stay_usable(
+@pytest.mark.parametrize("uncertainty", [0.05, 0.1, 0.15])
+def test_values_are_usable_where_the_stated_dead_time_explains_the_residuals(
     uncertainty, data_root, tmp_path
 ):
-    """Bins of larger loads are used near the lidar; their errors look like a gradient of air."""
+    """An error of the dead time looks like a gradient of air; 5 % do not explain it here."""
     tree = yaml.safe_load(CAMPAIGN.read_text())
     lidar = tree["instruments"]["savant"]
     dead_time = {"dead_time": 6.8e-9, "dead_time_uncertainty": uncertainty}
@@ -220,7 +220,10 @@ def test_the_better_known_the_dead_time_the_more_values_stay_usable(
     assert record is not None
     (product,) = record.scenes[0].products
     found = xr.load_dataset(Path(record.products) / product.path)
-    assert (found["usable"] < 2).mean() >= 0.95
+    if uncertainty < 0.1:
+        assert (found["usable"] == 2).all()
+    else:
+        assert (found["usable"] < 2).mean() >= 0.95
     assert np.all(deviation(found, "photon_355s") < 2.0)
 
 
