@@ -74,10 +74,10 @@ def _whole(case: str, rows: Sequence[Row], profiles: int) -> list[Row]:
     return rows_of(case, WHOLE, {"lidarops": True, "profiles": 1, CPU_TIME: cpu_time(total)})
 
 
-def night(profiles: int) -> xr.Dataset:
+def night(profiles: int, bins: int = BINS) -> xr.Dataset:
     """Return the counts of the channels over clean air, as of an open archive."""
     rng = np.random.default_rng(1)
-    distance = _STEP * (np.arange(BINS) + 0.5)
+    distance = _STEP * (np.arange(bins) + 0.5)
     shape = MolecularProfile.us_standard().number_density(distance) / distance**2
     mean = _COUNTS * shape / np.interp(1000.0, distance, shape) + _BACKGROUND
     length = np.timedelta64(_SECONDS, "s")
@@ -86,7 +86,7 @@ def night(profiles: int) -> xr.Dataset:
     unit = {"detection_mode": DetectionMode.PHOTON, "bin_width": _STEP}
     variables: dict[str, Any] = {}
     for name in CHANNELS:
-        counts = rng.poisson(mean, (profiles, BINS)).astype(np.int32)
+        counts = rng.poisson(mean, (profiles, bins)).astype(np.int32)
         variables[f"photon_{name}"] = (both, counts, unit)
         variables[f"photon_{name}_shots"] = ("time", np.full(profiles, 1200, np.int32), {})
     return xr.Dataset(
@@ -101,34 +101,41 @@ def night(profiles: int) -> xr.Dataset:
 
 def means_of(counts: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return the means of each channel, by name, without the parts outlying in its product."""
-    distance, geometry = counts["range"].to_numpy(), counts[["time", "time_bnds"]]
     means: dict[str, xr.Dataset] = {}
     for names in PRODUCTS:
-        records = [
-            Record(
-                ClockAverage(
-                    geometry,
-                    distance,
-                    seconds=1800.0,
-                    shots=counts[f"photon_{name}_shots"],
-                    parts=THRESHOLDS.most_parts,
-                ),
-                distance,
-            )
-            for name in names
-        ]
-        average = ScreenedAverage(records, Screening(cloud_contrast(CHANNELS[names[0]]), _HIGHEST))
+        average = screened_average(counts, names)
         for first in range(0, counts.sizes["time"], 90):
-            chunk = counts.isel(time=slice(first, first + 90))
-            average.add(
-                [
-                    condition(chunk, f"photon_{name}", dead_time=4e-9, full_overlap_range=300.0)
-                    for name in names
-                ]
-            )
+            average.add(signals(counts.isel(time=slice(first, first + 90)), names))
         batches = zip(*average.completed(), strict=True)
         means |= {name: joined(iter(of)) for name, of in zip(names, batches, strict=True)}
     return means
+
+
+def signals(counts: xr.Dataset, names: Sequence[str]) -> list[xr.Dataset]:
+    """Return the signals of channels, with noise and quality."""
+    return [
+        condition(counts, f"photon_{name}", dead_time=4e-9, full_overlap_range=300.0)
+        for name in names
+    ]
+
+
+def screened_average(counts: xr.Dataset, names: Sequence[str]) -> ScreenedAverage:
+    """Return the means over half an hour of the channels of a product, still without profiles."""
+    distance, geometry = counts["range"].to_numpy(), counts[["time", "time_bnds"]]
+    records = [
+        Record(
+            ClockAverage(
+                geometry,
+                distance,
+                seconds=1800.0,
+                shots=counts[f"photon_{name}_shots"],
+                parts=THRESHOLDS.most_parts,
+            ),
+            distance,
+        )
+        for name in names
+    ]
+    return ScreenedAverage(records, Screening(cloud_contrast(CHANNELS[names[0]]), _HIGHEST))
 
 
 def retrieved(means: dict[str, xr.Dataset]) -> list[xr.Dataset]:
