@@ -6,7 +6,7 @@ import tracemalloc
 
 import pytest
 
-from lidarops.bench.throughput.raman_night import night, screened_average, signals
+from lidarops.bench.throughput.raman_night import night, night_signals, screened_average
 from lidarops.products.raman.steps import bytes_held
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
@@ -19,7 +19,7 @@ NAMES = ("355", "387")
 def peak(means: int, bins: int, cell: float) -> tuple[float, int]:
     """Return the peak of bytes beyond the profiles, and the number of cells."""
     counts = night(30 * means, bins)
-    profiles = [profile.load() for profile in signals(counts, NAMES)]
+    profiles = [profile.load() for profile in night_signals(counts, NAMES)]
     tracemalloc.start()
     average = screened_average(counts, NAMES)
     average.add(profiles)

@@ -105,13 +105,13 @@ def means_of(counts: xr.Dataset) -> dict[str, xr.Dataset]:
     for names in PRODUCTS:
         average = screened_average(counts, names)
         for first in range(0, counts.sizes["time"], 90):
-            average.add(signals(counts.isel(time=slice(first, first + 90)), names))
+            average.add(night_signals(counts.isel(time=slice(first, first + 90)), names))
         batches = zip(*average.completed(), strict=True)
         means |= {name: joined(iter(of)) for name, of in zip(names, batches, strict=True)}
     return means
 
 
-def signals(counts: xr.Dataset, names: Sequence[str]) -> list[xr.Dataset]:
+def night_signals(counts: xr.Dataset, names: Sequence[str]) -> list[xr.Dataset]:
     """Return the signals of channels, with noise and quality."""
     return [
         condition(counts, f"photon_{name}", dead_time=4e-9, full_overlap_range=300.0)
