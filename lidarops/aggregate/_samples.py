@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened, refuse_changed
-from lidarops.aggregate.means_variables import averaged, budget_of, systematic
+from lidarops.aggregate.means_variables import averaged, budget_of, states_clouds, systematic
 from lidarops.kinds import flags_of
+from lidarops.netcdf.cloud_rows import CLOUD_FRACTION, CLOUD_MASK
 from lidarops.netcdf.stored_flags import with_current_flags
-from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row
+from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row, layout_of
 from lidarops.system.files import within
 
 
@@ -32,6 +33,9 @@ class Profiles:
     flags: NDArray[np.int32]
     """Bits at the places of now, whatever their places in the file."""
     shots: Array
+    cloud_fraction: Array | None
+    """Share of cloudy profiles of each value; NaN where it is not known. None for kinds that seek
+    no clouds."""
 
 
 def read_profiles(root: Path, facts: Facts) -> Profiles:
@@ -64,7 +68,19 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
             {row.name: _sample(product, facts.kind, row, usable) for row in rows},
             flags,
             product["shots"].values.astype(np.float64),
+            _cloud_fraction(product, facts.kind),
         )
+
+
+def _cloud_fraction(product: xr.Dataset, kind: str) -> Array | None:
+    """Return the share of cloudy profiles: 1 also where only the mean shows a cloud."""
+    if not states_clouds(kind):
+        return None
+    if CLOUD_FRACTION not in product:
+        return np.full(product[QUALITY_FLAG].shape, np.nan)
+    fraction = numbers(product, CLOUD_FRACTION)
+    cloudy = product[CLOUD_MASK].values == layout_of(kind).row(CLOUD_MASK).code("cloudy")
+    return np.where(cloudy & np.isnan(fraction), 1.0, fraction)
 
 
 def _sample(product: xr.Dataset, kind: str, row: Row, usable: NDArray[np.bool_]) -> Sample:

@@ -28,6 +28,7 @@ from lidarops.aggregate.means_variables import MeansDescription, Period, Weights
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
+from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
 from lidarops.netcdf.variables import layout_of
 from lidarops.netcdf.write import write_product
 
@@ -36,6 +37,7 @@ _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
 Record = Mapping[str, NDArray[Any]]
 
 
+_ALL_BITS: Final = np.int32(-1)
 _WEIGHED: Final = np.int32(Quality.LOW_SIGNAL_TO_NOISE)
 
 
@@ -122,11 +124,16 @@ class _PeriodSums:
     profiles: int = 0
     usable: Any = 0
     """Number of usable profiles, with the shape of the flags without time."""
+    good: Any = 0
+    """Number of profiles whose value has no bit."""
     flags: Any = 0
     """Bits of all values."""
     usable_flags: Any = 0
     """Bits of the usable values."""
+    common_flags: Any = _ALL_BITS
+    """Bits that all usable values have."""
     shots: float = 0.0
+    clouds: _CloudSums | None = None
 
     def add(self, profiles: Profiles, chosen: NDArray[np.intp]) -> None:
         for name, sample in profiles.samples.items():
@@ -138,20 +145,34 @@ class _PeriodSums:
         usable = (flags & np.int32(flags_of(self.kind).rejecting)) == 0
         self.profiles += chosen.size
         self.usable = self.usable + usable.sum(axis=0)
+        self.good = self.good + (flags == 0).sum(axis=0)
         self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)
         # Of the mean, not of its members: see `record`.
         kept = np.where(usable, flags & ~_WEIGHED, np.int32(0))
         self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
-        self.shots += float(profiles.shots[chosen].sum())
+        common = np.bitwise_and.reduce(np.where(usable, flags, _ALL_BITS), axis=0)
+        self.common_flags = self.common_flags & common
+        shots = profiles.shots[chosen]
+        self.shots += float(shots.sum())
+        if profiles.cloud_fraction is not None:
+            self.clouds = self.clouds or _CloudSums()
+            weights = np.ones(shots.size) if self.weights is Weights.PLAIN else shots
+            self.clouds.add(profiles.cloud_fraction[chosen], usable, weights)
 
     def record(self) -> dict[str, NDArray[Any]]:
         """Return the variables of the period, without dimension time."""
-        flags = np.where(self.usable > 0, self.usable_flags, self.flags)
+        usable_flags = self.usable_flags
+        if self.clouds is not None:
+            usable_flags = _cloudy_flags(self.kind, usable_flags, self.common_flags)
+        flags = np.where(self.usable > 0, usable_flags, self.flags)
         weighed = layout_of(self.kind).weighed
         variables: dict[str, NDArray[Any]] = {
             "usable_share": self.usable / np.float64(self.profiles),
+            "good_share": self.good / np.float64(self.profiles),
             "shots": np.asarray(self.shots),
         }
+        if self.clouds is not None:
+            variables[CLOUD_FRACTION] = self.clouds.mean()
         for name, sums in self.quantities.items():
             mean = sums.mean()
             variables[name] = mean.mean
@@ -167,6 +188,32 @@ class _PeriodSums:
                 unflagged = ~np.isfinite(mean.mean) & (flags == 0)
                 flags = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags)
         return {**variables, "quality_flag": flags}
+
+
+@dataclass(slots=True)
+class _CloudSums:
+    """Weighted sums of the share of cloudy profiles of usable values."""
+
+    value: Any = 0.0
+    weight: Any = 0.0
+
+    def add(self, fraction: Array, usable: NDArray[np.bool_], weights: Array) -> None:
+        used = usable & np.isfinite(fraction)
+        of_values = np.where(used, weights.reshape(-1, *(1,) * (fraction.ndim - 1)), 0.0)
+        self.value = self.value + (of_values * np.where(used, fraction, 0.0)).sum(axis=0)
+        self.weight = self.weight + of_values.sum(axis=0)
+
+    def mean(self) -> Array:
+        known = self.weight > 0.0
+        return np.where(known, self.value / np.where(known, self.weight, 1.0), np.nan)
+
+
+def _cloudy_flags(kind: str, flags: Any, common: Any) -> Any:
+    """Return the bits of a mean, of which some values or all in it are those of clouds."""
+    bits = (flags_of(kind).named(word) for word in ("cloud", "partly_cloudy"))
+    cloud, partly = (np.int32(bit or 0) for bit in bits)
+    some = ((flags & (cloud | partly)) != 0) & ((common & cloud) == 0)
+    return np.where(some, flags & ~cloud | partly, flags)
 
 
 def _weights(weights: Weights, sample: Sample, shots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -190,6 +237,8 @@ class _Year:
     """Attributes that are equal in all products so far."""
     modified: str = ""
     """``date_modified`` of the newest product so far; such times in UTC sort as texts."""
+    version: int = 0
+    """Sum of the versions of the products so far."""
 
     def note(self, profiles: Profiles) -> None:
         path = profiles.facts.path
@@ -197,6 +246,7 @@ class _Year:
             self.inputs[path] = profiles.facts
             so_far = profiles.attributes if self.shared is None else self.shared
             self.shared = shared_attributes([so_far, profiles.attributes])
+            self.version += int(profiles.attributes["product_version"])
             self.modified = max(self.modified, str(profiles.attributes.get("date_modified", "")))
 
     def close(self, key: np.datetime64, sums: _PeriodSums) -> None:
@@ -273,6 +323,7 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
             last,
             len(year.inputs),
             year.modified,
+            year.version,
             means_version(group.kind),
         )
         periods = Periods(bounds.astype(np.float64), year.records)

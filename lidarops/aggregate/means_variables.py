@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops import __version__
+from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     TIME,
@@ -118,6 +119,11 @@ def _error_comment(row: Row) -> str:
     return budget.comment or _ALL_SHARED
 
 
+def states_clouds(kind: str) -> bool:
+    """Return whether products of a kind state the share of cloudy profiles of each value."""
+    return any(row.name == CLOUD_FRACTION for row in layout_of(kind).data)
+
+
 def budget_of(row: Row) -> ErrorBudget | None:
     """Return the error budget of a quantity; None if errors are independent between profiles."""
     independent = row.error_kind in (None, ErrorKind.RANDOM)
@@ -143,7 +149,8 @@ def layout(kind: str, period: Period, weights: Weights) -> Layout:
     Layout
         ``<name>``, ``<name>_standard_error``, ``<name>_standard_deviation`` and
         ``<name>_observations`` of each quantity with standard errors; systematic errors;
-        ``usable_share``, ``quality_flag`` and ``shots``.
+        ``usable_share``, ``good_share``, ``cloud_fraction`` where products have it,
+        ``quality_flag`` and ``shots``.
     """
     source = layout_of(kind)
     time = replace(TIME, long_name=f"middle of the {period.value}, UTC")
@@ -169,13 +176,30 @@ _ADJECTIVE: Final = {Period.DAY: "Daily", Period.MONTH: "Monthly"}
 
 def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
     flags = source.row("quality_flag")
+    shares = tuple(_shares(source, flags, clouds=states_clouds(kind)))
+    of_values = (*(row.name for row in shares), flags.name)
     for row in averaged(kind):
         names = systematic(kind, row.name)
-        yield from _mean_rows(row, weights, names)
+        ancillaries = (*names, *of_values) if row.dims == flags.dims else names
+        yield from _mean_rows(row, weights, ancillaries)
         for name in names:
             error = _interval_error(row, name) if row.lower_end else source.row(name)
             yield _averaged_error(error, row)
-    yield Row(
+    yield from shares
+    comment = (
+        "Bits of the values in the mean; if there is no usable value, bits of all values."
+        " low_signal_to_noise is that of the mean: it is smaller than its standard error."
+    )
+    if states_clouds(kind):
+        comment += " cloud: all usable values have it; partly_cloudy: some have one of the two."
+    yield replace(flags, comment=comment)
+    shots = source.row("shots")
+    yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
+
+
+def _shares(source: Layout, flags: Row, *, clouds: bool) -> Iterator[Row]:
+    """Yield the rows that tell of which profiles a mean is made."""
+    share = Row(
         name="usable_share",
         dims=flags.dims,
         dtype="f4",
@@ -186,22 +210,31 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
         valid_max=1.0,
         comment=NO_STANDARD_NAME,
     )
+    yield share
     yield replace(
-        flags,
-        comment="Bits of the values in the mean; if there is no usable value, bits of all values."
-        " low_signal_to_noise is that of the mean: it is smaller than its standard error.",
+        share,
+        name="good_share",
+        long_name="share of the profiles of the period whose value has no quality bit",
+        comment=f"The others of usable_share are to be used with care. {NO_STANDARD_NAME}",
     )
-    shots = source.row("shots")
-    yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
+    if clouds:
+        fraction = source.row(CLOUD_FRACTION)
+        yield replace(
+            fraction,
+            long_name=f"mean over time of {fraction.long_name}",
+            cell_methods=_cell_methods(fraction, "mean"),
+            comment="Of the profiles whose value no quality bit rejects, weighted by shots where"
+            " the weights of values are their variances, else as values. One of which only the"
+            " mean shows a cloud is cloudy. Missing where no such profile was examined."
+            f" {NO_STANDARD_NAME}",
+        )
 
 
-def _mean_rows(row: Row, weights: Weights, systematic_errors: Sequence[str]) -> Iterator[Row]:
-    """Yield the rows of the mean of a quantity."""
+def _mean_rows(row: Row, weights: Weights, further: Sequence[str]) -> Iterator[Row]:
+    """Yield the rows of the mean of a quantity, with further ancillary variables."""
     weighting, errors = f"Weights: {weights.description}.", _error_comment(row)
     count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
-    ancillaries = (*systematic_errors, spread, count)
-    if len(row.dims) > 1:
-        ancillaries = (*ancillaries, "usable_share", "quality_flag")
+    ancillaries = (spread, count, *further)
     yield replace(
         row,
         long_name=f"mean over time of {row.long_name}",
@@ -300,11 +333,13 @@ def global_attributes(
         **texts,
         "id": about.id,
         "processing_level": table.processing_level,
-        "product_version": f"{__version__}+{about.code_version}",
+        "product_version": str(about.version),
         "history": f"{about.modified} averaged {about.inputs} products over UTC"
         f" {about.period.value}s, weights {about.weights.value} [{program}]",
         "comment": f"{_replaced(comment, source.comment, table.comment)} Dates of creation and"
-        " change are those of the newest product, so that equal inputs give equal files.",
+        " change are those of the newest product, and product_version is the sum of those of the"
+        " products, so that equal inputs give equal files: it grows with each product that is added"
+        " or replaced.",
         # As ACDD has it: the times of the first and last value, which are middles of periods.
         "time_coverage_start": _iso(about.first),
         "time_coverage_end": _iso(about.last),
@@ -340,6 +375,8 @@ class MeansDescription:
     """Number of products."""
     modified: str
     """``date_modified`` of the newest product."""
+    version: int
+    """Sum of the versions of the products."""
     code_version: str
 
 

@@ -8,9 +8,11 @@ from lidarops.netcdf.variables import NO_STANDARD_NAME, Coverage, Row
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS as CLOUD_THRESHOLDS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
+CLOUD_MASK: Final = "cloud_mask"
+CLOUD_FRACTION: Final = "cloud_fraction"
 CLOUDS: Final = (
     Row(
-        name="cloud_mask",
+        name=CLOUD_MASK,
         dims=("time", "range"),
         dtype="i1",
         units="1",
@@ -27,7 +29,7 @@ CLOUDS: Final = (
         " there may be more. Profiles that are left out, or have no data there, do not count.",
     ),
     Row(
-        name="cloud_fraction",
+        name=CLOUD_FRACTION,
         dims=("time", "range"),
         dtype="f4",
         units="1",

@@ -108,6 +108,71 @@ def test_daily_means_of_the_usable_values(tmp_path: Path):
     assert (means.quality_flag == 0).all()
 
 
+def partly_cloudy(data: xr.Dataset) -> xr.Dataset:
+    """Change six profiles of elastic values: clear, clear, a third, only the mean, unknown, bad."""
+    bits = {bit.word: np.int32(bit) for bit in flags_of("elastic")}
+    flags = np.zeros((6, data.sizes["range"]), np.int32)
+    flags[1, :] = bits["low_signal_to_noise"]
+    flags[2, :20] = bits["partly_cloudy"]
+    flags[3, :30] = bits["cloud"]
+    flags[4, :] = bits["cloud"]
+    flags[5, :] = bits["no_reference"] | bits["cloud"]
+    fraction = np.zeros(flags.shape)
+    fraction[2, :20], fraction[3, :30], fraction[4], fraction[5] = 1.0 / 3.0, np.nan, np.nan, 1.0
+    mask = np.zeros(flags.shape, np.int8)
+    mask[2, :20], mask[3, :30], mask[4], mask[5] = 1, 2, 3, 2
+    for name, values in (
+        ("quality_flag", flags), ("cloud_fraction", fraction), ("cloud_mask", mask)
+    ):  # fmt: skip
+        data[name] = (("time", "range"), values)
+    for name in list(data.data_vars):
+        if name != "cloud_fraction" and data[name].dtype.kind == "f":
+            data[name] = data[name].fillna(1e-7)
+    data["shots"] = ("time", np.array([600, 600, 1200, 600, 600, 600], np.int32))
+    return data
+
+
+@pytest.mark.parametrize("weights", list(Weights))
+def test_means_state_the_share_of_cloudy_profiles(weights: Weights, tmp_path: Path):
+    add_day(tmp_path, 0, "elastic", profiles=6, change=partly_cloudy)
+    mean = only(tmp_path, means_of(tmp_path, weights=weights)).isel(time=0)
+    thin, all_shots = (1.0, 5.0) if weights is Weights.PLAIN else (2.0, 6.0)
+    # The unknown profile is not examined, and the rejected one is not in the mean.
+    examined = all_shots - 1.0
+    expected = np.repeat([(thin / 3.0 + 1.0) / examined, 1.0 / examined, 0.0], [20, 10, 10])
+    np.testing.assert_allclose(mean.cloud_fraction, expected, rtol=1e-6)
+    assert mean.aerosol_extinction_observations.values.tolist() == [5] * 40
+    np.testing.assert_allclose(mean.usable_share, 5.0 / 6.0)
+    np.testing.assert_allclose(mean.good_share, np.repeat([1, 2, 3], [20, 10, 10]) / 6.0)
+    names = mean.aerosol_extinction.attrs["ancillary_variables"].split()
+    assert {"cloud_fraction", "good_share", "usable_share"} <= set(names)
+
+
+def test_a_mean_is_cloudy_where_all_its_values_are(tmp_path: Path):
+    """Of five usable values, one to three are cloudy; of one product, all are."""
+
+    def overcast(data: xr.Dataset) -> xr.Dataset:
+        cloud = np.int32(flags_of("elastic").named("cloud"))
+        return data.assign(quality_flag=data.quality_flag * 0 + cloud)
+
+    add_day(tmp_path, 0, "elastic", profiles=6, change=partly_cloudy)
+    add_day(tmp_path, 1, "elastic", change=overcast)
+    flags = only(tmp_path, means_of(tmp_path)).quality_flag.values
+    both = [np.int32(flags_of("elastic").named(word)) for word in ("cloud", "partly_cloudy")]
+    seen = flags & (both[0] | both[1])
+    assert (seen[0] == both[1]).all()
+    assert (seen[1] == both[0]).all()
+
+
+def test_versions_of_means_count_those_of_their_products(tmp_path: Path):
+    add_day(tmp_path, 0)
+    assert only(tmp_path, means_of(tmp_path)).attrs["product_version"] == "1"
+    add_day(tmp_path, 1)
+    assert only(tmp_path, means_of(tmp_path)).attrs["product_version"] == "2"
+    add_day(tmp_path, 1, version=2)
+    assert only(tmp_path, means_of(tmp_path)).attrs["product_version"] == "3"
+
+
 def test_a_profile_of_few_shots_has_little_weight(tmp_path: Path):
     """As the last mean of a night, over a few files: its error is ten times that of the others."""
     shots = np.array([600, 600, 600, 600, 6], np.int32)
@@ -343,11 +408,15 @@ def test_every_kind_has_means_with_attributes_of_the_table(kind: str, tmp_path: 
             deviation = means[f"{row.name}_standard_deviation"]
             assert deviation.attrs["cell_methods"].startswith("time: standard_deviation")
             assert mode.value == means.attrs["lidarops_detection_mode"]
-    for name in ("usable_share", "quality_flag", "usable", "shots"):
+    for name in ("usable_share", "good_share", "quality_flag", "usable", "shots"):
         assert name in means
+    assert ("cloud_fraction" in means) == (kind in ("elastic", "raman"))
 
 
-@pytest.mark.parametrize(("kind", "period"), [("signal", Period.DAY), ("visibility", Period.MONTH)])
+@pytest.mark.parametrize(
+    ("kind", "period"),
+    [("elastic", Period.DAY), ("signal", Period.DAY), ("visibility", Period.MONTH)],
+)
 def test_means_comply(kind: str, period: Period, tmp_path: Path):
     for day in range(2):
         add_day(tmp_path, day, kind)
