@@ -38,7 +38,13 @@ SHARED = {
 }
 OWN = {
     "signal": {},
-    "homogeneous": {"poorly_determined": 17, "poor_fit": 18, "at_bound": 19, "not_level": 20},
+    "homogeneous": {
+        "poorly_determined": 17,
+        "poor_fit": 18,
+        "at_bound": 19,
+        "not_level": 20,
+        "noise_uncertain": 21,
+    },
     "elastic": {
         "cloud": 17,
         "no_reference": 18,
@@ -90,7 +96,7 @@ RETIRED = {"multiangle": {25, 30}}
 LEFT = {
     "shared": 3,
     "signal": 14,
-    "homogeneous": 10,
+    "homogeneous": 9,
     "elastic": 8,
     "raman": 7,
     "multiangle": 3,
@@ -156,6 +162,8 @@ SCENES = {
     "test_single_altitudes_stay_valid_if_shot_energy_jitters",
     "HomogeneousQuality.NOT_LEVEL": "test_archives::"
     "test_the_campaign_knows_the_pointing_better_than_the_header",
+    "HomogeneousQuality.NOISE_UNCERTAIN": "test_homogeneous_limits::"
+    "test_errors_from_estimated_noise_are_widened_as_the_page_tells",
     "NetworkQuality.PRIOR_DOMINATED": "test_labeled_network::test_a_missing_beam_gives_a_reason",
 }
 """The test of a scene that raises the bit; the bit stands in it by name."""

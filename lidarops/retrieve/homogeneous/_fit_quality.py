@@ -66,6 +66,8 @@ class _Limits:
     trend: Array
     outlier: Array
     widening: Array
+    far: Array
+    """Share of the values beyond `_FAR` standard errors by the scatter of the noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimi
     limits_of = _known_limits if known_variance else _estimated_limits
     counts = [np.array([float(count)]) for count in (bins, bins - 2, shapes)]
     limits = limits_of(counts[0], counts[1], counts[2], 3)
-    misfit, _, outlier, widening = (float(limit[0]) for limit in limits)
+    misfit, _, outlier, widening, _ = (float(limit[0]) for limit in limits)
     curvature, square = _shape_limits(bins, shapes, known_variance=known_variance)
     return CommonLimits(
         THRESHOLDS.least_signal,
@@ -182,6 +184,7 @@ def judge_fit(
             (HomogeneousQuality.POOR_FIT, reduced <= limits.misfit),
             (Quality.NOT_HOMOGENEOUS, fit.trend / mean_noise <= limits.trend),
             (Quality.OUTLIER, fit.largest / np.sqrt(noise) <= limits.outlier),
+            (HomogeneousQuality.NOISE_UNCERTAIN, limits.far <= THRESHOLDS.false_estimated),
         )
         # Test for a pass, not for a failure: a comparison with NaN does not pass.
         quality = np.zeros(fit.status.shape, dtype=np.int32)
@@ -275,18 +278,16 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
         np.where(shapes > 0, special.chdtri(shapes, _FALSE_ALARM), np.inf),
         _outlier_limit(-special.ndtri(0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
         np.ones_like(bins),
+        np.zeros_like(bins),
     )
 
 
 def _widening(dof: Array) -> Array:
     """Return the factor on standard errors of which the noise is estimated.
 
-    An error over its estimate follows Student's distribution. 1.96 of them hold 95 percent, or
-    more where few bins would otherwise put too many values beyond 4 of them.
+    An error over its estimate follows Student's distribution; 1.96 of them hold 95 percent.
     """
-    inside = -special.stdtrit(dof, _OUTSIDE) / -special.ndtri(_OUTSIDE)
-    far = -special.stdtrit(dof, 0.5 * THRESHOLDS.false_estimated) / _FAR
-    return np.asarray(np.maximum(inside, far))
+    return np.asarray(special.stdtrit(dof, _OUTSIDE) / special.ndtri(_OUTSIDE))
 
 
 def _estimated_limits(
@@ -296,9 +297,11 @@ def _estimated_limits(
     dof = np.where(independent, _DIFFERENCE_DOF * differences, _residual_dof(bins, unknowns))
     neighbours = differences + 2.0
     ratio = np.exp(_RATIO / np.sqrt(neighbours) + _RATIO_SHORT / neighbours)
+    widening = _widening(dof)
     return (
         np.where(independent, ratio, np.inf),
         np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - _FALSE_ALARM), np.inf),
         _outlier_limit(-special.stdtrit(dof, 0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
-        _widening(dof),
+        widening,
+        2.0 * special.stdtr(dof, -_FAR * widening),
     )

@@ -24,3 +24,11 @@ class HomogeneousQuality(FlagBit):
             " gradient of backscatter would mimic extinction"
         ),
     )
+    NOISE_UNCERTAIN = (
+        FIRST_OWN + 4,
+        Severity.CARE,
+        (
+            "the noise is estimated from fewer than 32 bins: more than 1 in 1000 values may differ"
+            " by more than 4 standard errors, while 1.96 of them hold 95 percent"
+        ),
+    )

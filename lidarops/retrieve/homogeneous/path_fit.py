@@ -155,10 +155,10 @@ def fit_homogeneous_path(
     HomogeneousResult
         Without `variance`, the noise is estimated from second differences of the residuals
         along range and scales the standard errors; with n bins they have 0.51 (n - 2) degrees
-        of freedom. They are widened by Student's distribution, so that 1.96 of them hold 95 percent
-        and at most 0.05 percent of the values are beyond 4: by 1 percent at 225 bins, 5 at 50, 31
-        at 20, and by a factor of 3.9 at 8. The second condition makes the intervals of fewer than
-        34 bins too wide: those of 20 bins hold 97.0 percent, those of 8 bins 99.6.
+        of freedom. They are widened by Student's distribution, so that 1.96 of them hold 95
+        percent: by 1 percent at 225 bins, 5 at 50, 15 at 20, and 60 at 8. No factor can also hold
+        the normal share of values within 4 of them: beyond are 0.03 percent at 50 bins, 0.12 at 20
+        and 0.7 at 8. NOISE_UNCERTAIN marks values from fewer than 32 bins.
 
         With a correlation length s, standard errors are sqrt(s) times those of independent bins,
         and where s exceeds 1, noise is estimated from second differences of bins a twentieth of

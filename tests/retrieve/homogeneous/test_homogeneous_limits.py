@@ -15,7 +15,7 @@ from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
 
 @pytest.mark.parametrize(
-    ("variance", "share"), [(1.0, 0.19), (None, 0.12)], ids=["known noise", "estimated noise"]
+    ("variance", "share"), [(1.0, 0.19), (None, 0.18)], ids=["known noise", "estimated noise"]
 )
 def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance, share):
     """The second bin then holds noise, which looks like the transmission of the first."""
@@ -30,7 +30,9 @@ def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance, shar
     kept = bits == 0
     false = np.abs(fit.extinction - extinction) > 4.0 * fit.extinction_standard_error
     assert kept.sum() > 300
-    assert np.sum(false & kept) <= 1
+    # Noise that is estimated from 16 bins puts some values beyond 4 errors, which are marked.
+    assert np.sum(false & kept & (fit.quality & int(HomogeneousQuality.NOISE_UNCERTAIN) == 0)) <= 1
+    assert np.mean(false[kept]) < 8e-3
     # The limit of the slope alone would keep these.
     others = bits & ~int(HomogeneousQuality.POORLY_DETERMINED) == 0
     others &= fit.extinction_standard_error < 0.15 * fit.extinction
@@ -39,10 +41,11 @@ def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance, shar
 
 @pytest.mark.parametrize("method", ["compressed", "direct"])
 @pytest.mark.parametrize(
-    ("bins", "factor", "held"),
-    [(225, 1.01, 0.95), (50, 1.05, 0.95), (34, 1.08, 0.95), (20, 1.31, 0.97), (8, 3.9, 0.996)],
-)
-def test_errors_from_estimated_noise_are_widened_as_the_page_tells(method, bins, factor, held):
+    ("bins", "factor", "far"),
+    [(225, 1.01, 1e-4), (50, 1.05, 3e-4), (32, 1.08, 5.5e-4), (31, 1.09, 5.8e-4),
+     (20, 1.15, 1.2e-3), (8, 1.60, 7.1e-3)],
+)  # fmt: skip
+def test_errors_from_estimated_noise_are_widened_as_the_page_tells(method, bins, factor, far):
     r = np.linspace(1000.0, 4000.0, bins)
     noise = np.random.default_rng(34).normal(size=bins)
     power = 100.0 + 1e5 * (r[0] / r) ** 2 * np.exp(-4e-4 * (r - r[0])) + noise
@@ -51,10 +54,47 @@ def test_errors_from_estimated_noise_are_widened_as_the_page_tells(method, bins,
     )
     level = np.sqrt(known.reduced_chi2 / estimated.reduced_chi2)
     widening = estimated.extinction_standard_error / (level * known.extinction_standard_error)
-    assert widening == pytest.approx(factor, abs=0.006 if bins > 8 else 0.06)
+    assert widening == pytest.approx(factor, abs=0.006)
     freedom = 18.0 / 35.0 * (bins - 2)
-    assert 1.0 - 2.0 * stats.t.sf(1.96 * widening, freedom) == pytest.approx(held, abs=5e-4)
-    assert 2.0 * stats.t.sf(4.0 * widening, freedom) <= 5e-4 * (1.0 + 1e-9)
+    assert 1.0 - 2.0 * stats.t.sf(1.96 * widening, freedom) == pytest.approx(0.95, abs=1e-4)
+    assert 2.0 * stats.t.sf(4.0 * widening, freedom) == pytest.approx(far, rel=0.05)
+    assert bool(estimated.quality & int(HomogeneousQuality.NOISE_UNCERTAIN)) == (bins < 32)
+    assert known.quality & int(HomogeneousQuality.NOISE_UNCERTAIN) == 0
+
+
+def of_estimated_noise(bins, seed):
+    """Return |error| over stated error of extinction and background, of values that are kept."""
+    rng = np.random.default_rng((36, bins, seed))
+    r = np.exp(rng.uniform(np.log(250.0), np.log(6000.0))) + rng.choice([15.0, 60.0]) * np.arange(
+        bins
+    )
+    extinction, height = (
+        np.exp(rng.uniform(np.log(low), np.log(high), (1000, 1)))
+        for low, high in ((1e-6, 3e-2), (10.0, 3e6))
+    )
+    power = height * (r[0] / r) ** 2 * np.exp(-2.0 * extinction * (r - r[0]))
+    fit = fit_homogeneous_path(100.0 + power + rng.normal(size=power.shape), r)
+    kept = fit.quality & rejecting((*Quality, *HomogeneousQuality)) == 0
+    marked = fit.quality & int(HomogeneousQuality.NOISE_UNCERTAIN) != 0
+    assert np.all(marked == (bins < 32))
+    return np.stack(
+        [
+            np.abs(fit.extinction - extinction[:, 0])[kept] / fit.extinction_standard_error[kept],
+            np.abs(fit.background - 100.0)[kept] / fit.background_standard_error[kept],
+        ]
+    )
+
+
+@pytest.mark.parametrize("bins", [8, 12, 16, 24, 32])
+def test_intervals_of_short_sections_with_estimated_noise_hold_what_they_state(bins):
+    """Those of 8 bins held 99.8 percent while their errors were widened for the far tail."""
+    errors = np.concatenate([of_estimated_noise(bins, seed) for seed in range(24)], axis=1)
+    assert errors.shape[1] > 12_000
+    held = np.mean(errors < 1.96, axis=1)
+    assert np.all((held > 0.94) & (held < 0.965))
+    far = np.mean(errors > 4.0, axis=1)
+    # The page states these limits: of values that the flag marks, and of others.
+    assert np.all(far < (5e-3 if bins < 32 else 1e-3))
 
 
 def test_missing_bins_do_not_change_the_limit_of_steep_signals():
