@@ -155,20 +155,35 @@ class ScanSignals:
 
     def _samples(self, retrieval: MultiAngleResult) -> tuple[Array, Array, Array]:
         """Return weight, relative change per background, and residual; 0 where there is none."""
+        seen = np.isfinite(retrieval.residual)
         scatter = np.nan_to_num(retrieval.inhomogeneity)[:, np.newaxis] ** 2
-        depth, level = (
-            values[:, np.newaxis] for values in (retrieval.optical_depth, retrieval.log_intercept)
-        )
+        expected = self._expected(seen, retrieval.optical_depth, scatter)
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             # That of the fit: the noise of the signal would be common to change and residual.
-            expected = np.exp(level - 2.0 * self.path * depth)
             weight = 1.0 / (self.noise / expected**2 + scatter)
             change, residual = self.response / expected, self.signal / expected - 1.0
-            used = np.isfinite(retrieval.residual) & np.isfinite(residual * change * weight)
+            used = seen & np.isfinite(residual * change * weight)
         weight, change, residual = (
             np.where(used, values, 0.0) for values in (weight, change, residual)
         )
         return weight, change, residual
+
+    def _expected(self, seen: npt.NDArray[np.bool_], optical_depth: Array, scatter: Array) -> Array:
+        """Return the signals that fit best to the optical depths; NaN where there are none.
+
+        The intercepts of single altitudes do not belong to the optical depths of a profile: where
+        few beams are left, together they would give signals off by many orders of magnitude.
+        """
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            share = np.exp(-2.0 * self.path * optical_depth[:, np.newaxis])
+            expected = np.zeros_like(share)
+            # First without inhomogeneity, which is relative to the expected signal.
+            for _ in range(2):
+                variance = self.noise + scatter * expected**2
+                product = np.where(seen, share * self.signal / variance, 0.0).sum(axis=1)
+                square = np.where(seen, share**2 / variance, 0.0).sum(axis=1)
+                expected = share * (product / square)[:, np.newaxis]
+            return np.where(expected > 0.0, expected, np.nan)
 
 
 class _Regression:

@@ -31,13 +31,13 @@ def scans(cycles, rng, *, common, noise=0.01, beams=slice(None)):
     return ScanSignals.of(*parts), wrong[:, beams]
 
 
-def fit(signals, beams=slice(None)):
+def fit(signals, beams=slice(None), method="kano_hamilton"):
     return retrieve_optical_depth(
         signals.signal,
         ZENITH[beams],
         HEIGHT,
         variance=signals.variance,
-        method="kano_hamilton",
+        method=method,
         inhomogeneity=0.0,
         largest_gradient=0.0,
         robust=False,
@@ -86,6 +86,25 @@ def test_two_beams_agree_with_any_background():
     after = agreed(prior, pair)
     np.testing.assert_allclose(after.covariance, prior.covariance, rtol=1e-6)
     np.testing.assert_allclose(after.signal, prior.signal, rtol=1e-6)
+
+
+def test_altitudes_that_two_noisy_beams_reach_say_nothing_about_backgrounds():
+    """Their own optical depths are off by hundreds, and those of the smooth profile are not."""
+    prior, wrong = scans(20, np.random.default_rng(6), common=0.5, noise=0.02)
+    signal, noise = prior.signal.copy(), prior.noise.copy()
+    few = slice(-12, None)
+    signal[:, 2:, few] = np.nan
+    signal[:, :2, few] *= 1.0 + 0.3 * np.random.default_rng(7).normal(size=(20, 2, 12))
+    noise[:, :2, few] = (0.3 * CLEAN[:2, few]) ** 2
+    left = np.broadcast_to(LEFT, wrong.shape)
+    high = ScanSignals.of(signal, noise, left, PATH, RESPONSE)
+    after = high.agreed(fit(high, method="joint"))
+    result = fit(after, method="joint")
+    found = (signal - after.signal)[..., 0] / RESPONSE[:, 0]
+    assert np.all(np.abs(found) < 4.0 * LEFT)
+    error = np.hypot(after.shift(result), result.optical_depth_standard_error)
+    assert np.nanmax(error) < 0.5
+    assert np.nanmax(np.abs(result.optical_depth - DEPTH) / error) < 5.0
 
 
 def test_known_backgrounds_and_missing_beams_stay():
