@@ -41,6 +41,29 @@ class Scope(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class CommonQuantity:
+    """What all channels of a wavelength measure alike, whatever their detection and polarisation.
+
+    Its errors are the standard error and the systematic errors that its own variables state.
+    """
+
+    variable: str
+    along: str
+    """The coordinate along its profiles."""
+    errors_of_channel: tuple[str, ...] = ()
+    """Variables of systematic errors that differ between channels."""
+    errors_of_air: tuple[str, ...] = ()
+    """Variables of systematic errors with one cause in all channels, of which only the difference
+    remains in the difference of two channels."""
+
+    @property
+    def errors(self) -> tuple[str, ...]:
+        """Variables of all errors."""
+        own = (f"{self.variable}_standard_error", *self.errors_of_channel)
+        return own + self.errors_of_air
+
+
+@dataclass(frozen=True, slots=True)
 class Kind:
     """One kind of product."""
 
@@ -58,9 +81,7 @@ class Kind:
     """Whether a scene should give usable values. False where the method is applied to any air, so
     that fog or darkness may reject all values."""
 
-    common: tuple[str, str] | None = None
-    """Variable that all channels of a wavelength measure alike, whatever their detection and
-    polarisation, and the coordinate along its profiles."""
+    common: CommonQuantity | None = None
 
     @property
     def scope(self) -> Scope:

@@ -396,11 +396,11 @@ class Disagreement:
     kind: str
     channels: tuple[str, str]
     outlier: str
-    """Channel that also disagrees with another one, which the rest agree with; else empty."""
+    """The one of the two that more of the other channels contradict at the place; else empty."""
     place: float
     """Coordinate along the profile where they disagree most, m."""
     deviation: float
-    """Standard errors of the difference there."""
+    """Difference there over its error, of all stated errors that differ between the channels."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,11 +26,17 @@ ERROR = 0.01
 LEVELS = 200
 
 
-def write(root: Path, channel: str, depth: np.ndarray) -> ProductRecord:
-    """Write a product of an optical depth (level,), and return its record."""
+def write(
+    root: Path, channel: str, depth: np.ndarray, gradient: float = 0.0, dead_time: float = 0.0
+) -> ProductRecord:
+    """Write a product of an optical depth (level,) with errors, and return its record."""
     product = multiangle(profiles=2, levels=LEVELS).isel(time=[1])
     product["vertical_optical_depth"][:] = depth
     product["vertical_optical_depth_standard_error"][:] = ERROR
+    product["vertical_optical_depth_gradient_error"][:] = gradient
+    product["vertical_optical_depth_dead_time_error"][:] = dead_time
+    if channel.startswith("analog"):
+        product = product.drop_vars("vertical_optical_depth_dead_time_error")
     origin = provenance("multiangle", channel=channel)
     of_channel = context("multiangle", channel=channel, provenance=origin)
     path = product_path(of_channel)
@@ -70,6 +76,57 @@ def test_noise_makes_one_of_1000_pairs_disagree(part: float, pairs: int, tmp_pat
     shifted[70] += part * limit * np.sqrt(2.0) * ERROR
     records = [write(tmp_path, *of) for of in zip(CHANNELS, (depth, shifted), strict=False)]
     assert len(compared(tmp_path, records)) == pairs
+
+
+SHIFT = 10.0 * ERROR
+
+
+@pytest.mark.parametrize(
+    ("gradients", "dead_time", "pairs"),
+    [
+        ((0.0, 0.0), 0.0, 1),
+        ((0.0, 0.0), SHIFT / 3, 0),
+        ((SHIFT / 3, 0.0), 0.0, 0),
+        # The same error of the air explains no difference.
+        ((SHIFT, SHIFT), 0.0, 1),
+    ],
+)
+def test_errors_explain_a_difference_if_they_differ_between_the_channels(
+    gradients: tuple[float, float], dead_time: float, pairs: int, tmp_path: Path
+) -> None:
+    depth = np.full(LEVELS, 0.3)
+    analog = write(tmp_path, "analog_532o", depth, gradients[0])
+    photon = write(tmp_path, "photon_532o", depth + SHIFT, gradients[1], dead_time)
+    assert len(compared(tmp_path, [analog, photon])) == pairs
+
+
+@pytest.mark.parametrize(
+    ("third", "named"), [(0.0, "photon_532o"), (6.0, "analog_532o"), (3.0, "")]
+)
+def test_a_third_channel_tells_which_of_two_is_wrong_at_one_place(
+    third: float, named: str, tmp_path: Path
+) -> None:
+    # A difference of 6 errors is no chance of 200 places; one of 3.5 errors is none at a place.
+    shifts = {"analog_532o": 0.0, "photon_532o": 6.0, "photon_532p": third}
+    records = []
+    for channel, shift in shifts.items():
+        depth = np.full(LEVELS, 0.3)
+        depth[70] += shift * np.sqrt(2.0) * ERROR
+        records.append(write(tmp_path, channel, depth))
+    found = {pair.channels: pair.outlier for pair in compared(tmp_path, records)}
+    assert found["analog_532o", "photon_532o"] == named
+
+
+def test_two_wrong_channels_of_four_are_named_by_the_two_others(tmp_path: Path) -> None:
+    shifts = {"analog_532o": 0.0, "photon_532o": 0.0, "analog_532p": 8.0, "photon_532p": -8.0}
+    records = []
+    for channel, shift in shifts.items():
+        records.append(write(tmp_path, channel, np.full(LEVELS, 0.3 + shift * ERROR)))
+    found = {pair.channels: pair.outlier for pair in compared(tmp_path, records)}
+    assert len(found) == 5
+    assert found.pop(("analog_532p", "photon_532p")) == ""
+    for pair, named in found.items():
+        assert {named} == {name for name in pair if shifts[name]}
 
 
 def test_the_channel_that_all_others_contradict_is_named(tmp_path: Path) -> None:

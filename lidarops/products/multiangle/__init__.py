@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.kinds import Kind
+from lidarops.kinds import CommonQuantity, Kind
 from lidarops.products.multiangle.settings import MultiAngleSettings
 
 KIND: Final = Kind(
@@ -13,5 +13,10 @@ KIND: Final = Kind(
     package=__name__,
     settings=MultiAngleSettings,
     rank=30,
-    common=("vertical_optical_depth", "altitude"),
+    common=CommonQuantity(
+        "vertical_optical_depth",
+        "altitude",
+        errors_of_channel=("vertical_optical_depth_dead_time_error",),
+        errors_of_air=("vertical_optical_depth_gradient_error",),
+    ),
 )
