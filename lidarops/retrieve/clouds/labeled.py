@@ -370,11 +370,10 @@ def _signal_beyond_clouds(
 
 
 def with_margin(mask: Mask, distance: Array) -> Mask:
-    """Return the bins of layers, and those in which their thin upper edge may be."""
+    """Return the bins of layers, (..., range), and those in which their thin edges may be."""
     bins = round(THRESHOLDS.cloud_margin / float(np.median(np.diff(distance))))
-    counts: npt.NDArray[np.int64] = np.cumsum(mask, axis=-1, dtype=np.int64)
-    counts[:, bins + 1 :] -= counts[:, : -bins - 1].copy()
-    return np.asarray(counts > 0)
+    near = np.cumsum(np.pad(mask, [(0, 0)] * (mask.ndim - 1) + [(bins + 1, bins)]), axis=-1)
+    return np.asarray(near[..., 2 * bins + 1 :] > near[..., : mask.shape[-1]])
 
 
 def _less_than_air(

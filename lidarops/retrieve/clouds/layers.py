@@ -27,6 +27,7 @@ _TOP: Final = THRESHOLDS.top
 _LEAST_FALL: Final = THRESHOLDS.least_fall
 _VISIBLE_FALL: Final = THRESHOLDS.visible_fall
 _BEYOND: Final = THRESHOLDS.windows_beyond
+_BELOW: Final = THRESHOLDS.windows_below
 _ROUNDING: Final = 1e-9
 """Relative rise that the rounding of sums can cause."""
 
@@ -81,12 +82,14 @@ def find_layers(
     of the false-alarm rate at most. Both are multiplied by the factor by which the noise of means
     over :math:`L` bins exceeds the stated one in the far half of the profile, with four standard
     errors (`lidarops.retrieve.signal.noise_correlation`).
-    The base is where the statistic peaks. The top is where the mean of the next window is again
-    within 2 standard errors of the level below the base, and from where the ratio no longer falls:
-    a layer that attenuates, or whose upper part is thin, is still brighter than the air above it
-    where it is no brighter than that below it. The ratio falls where the mean of a window exceeds
-    that of the next one, or of the next eight, by :math:`1 + (c - 1) / 10`, with :math:`u`. The
-    window is the shortest in which noise does not hide a fall by :math:`(c - 1) / 4`.
+    The layer begins where the statistic peaks, or below, from where the ratio no longer falls
+    downwards: its lower part may be thin. The top is where the mean of the next window is again
+    within 2 standard errors of the level below the steepest rise, and from where the ratio no
+    longer falls: a layer that attenuates, or whose upper part is thin, is still brighter than the
+    air above it where it is no brighter than that below it. The ratio falls where the mean of a
+    window exceeds that of the next one, or of the next eight (four below the layer), by
+    :math:`1 + (c - 1) / 10`, with :math:`u`. The window is the shortest in which noise does not
+    hide a fall by :math:`(c - 1) / 4`.
 
     A layer that begins within one window of the first bin is not detected. With a `contrast` of
     1 all layers are detected that rise significantly.
@@ -391,59 +394,77 @@ def _end(sums: Array, base: int, length: int) -> int:
 
 
 @_compiled
+def _mean_towards(sums: Array, i: int, length: int, side: int) -> tuple[float, float]:
+    """Return the mean ratio to air and its variance above (`side` 1) or below (-1) a bin's edge."""
+    first = i if side > 0 else i - length
+    return _mean(sums, first, first + length)
+
+
+@_compiled
 def _falls(
-    sums: Array, i: int, length: int, beyond: int, contrast: float, least: float, margin: float
+    sums: Array,
+    i: int,
+    length: int,
+    beyond: int,
+    side: int,
+    contrast: float,
+    least: float,
+    margin: float,
 ) -> bool:
     """Return whether the ratio to air exceeds that of the window beyond by more than `contrast`.
 
     By more than `least` standard errors, and it does not rise within the window.
     """
-    stop = i + length
-    high, high_variance = _mean(sums, i, stop)
-    low, low_variance = _mean(sums, stop, stop + beyond)
+    stop = i + side * length
+    high, high_variance = _mean_towards(sums, i, length, side)
+    low, low_variance = _mean_towards(sums, stop, beyond, side)
     # With too high a background the ratio falls for ever, below zero.
-    excess = high - contrast * max(low, 0.0) - margin / (sums[SHAPE, i] - sums[SHAPE, stop])
+    excess = high - contrast * max(low, 0.0) - margin / abs(sums[SHAPE, i] - sums[SHAPE, stop])
     error = math.sqrt(high_variance + contrast * contrast * low_variance)
     if not excess > max(least * error, _ROUNDING * high):
         return False
-    # Within a window that begins in the gap below another layer it rises.
-    middle = i + length // 2
-    near, near_variance = _mean(sums, i, middle)
-    far, far_variance = _mean(sums, middle, stop)
+    # Within a window that begins in the gap before another layer it rises.
+    half = length // 2
+    near, near_variance = _mean_towards(sums, i, half, side)
+    far, far_variance = _mean_towards(sums, i + side * half, length - half, side)
     return not far - near > _TOP * math.sqrt(near_variance + far_variance)
 
 
 @_compiled
-def _top(
+def _edge(
     sums: Array,
-    end: int,
+    start: int,
+    last: int,
+    beyond: int,
     lengths: npt.NDArray[np.int64],
     contrast: float,
     certainty: float,
     limits: Array,
     margins: Array,
 ) -> int:
-    """Return the first bin from an apparent end on from which the ratio to air no longer falls.
+    """Return the edge of a bin, from `start` to `last`, from which the ratio no longer falls.
 
     The window is the shortest in which noise does not hide such a fall: a longer one would reach
-    the top of aerosol above the layer.
+    the edge of aerosol beyond the layer.
     """
     slight = 1.0 + _LEAST_FALL * (contrast - 1.0)
-    bins = int(sums.shape[1]) - 1
-    for i in range(end, bins):
+    side = 1 if last >= start else -1
+    for i in range(start, last, side):
         falls = False
         for k, length in enumerate(lengths):
             least = certainty * limits[k]
-            for beyond in (length, _BEYOND * length):
-                falls = falls or _falls(sums, i, length, beyond, slight, least, margins[k])
-            level, variance = _mean(sums, i + length, i + 2 * length)
+            for windows in (1, beyond):
+                falls = falls or _falls(
+                    sums, i, length, windows * length, side, slight, least, margins[k]
+                )
+            level, variance = _mean_towards(sums, i + side * length, length, side)
             if falls or _VISIBLE_FALL * (contrast - 1.0) * level > least * math.sqrt(
                 2.0 * variance
             ):
                 break
         if not falls:
             return i
-    return bins
+    return last
 
 
 @_compiled
@@ -477,7 +498,8 @@ def _mark_layers(
     layers : (profile, bin) bool
         Output, False before.
     """
-    sums = np.empty((4, power.shape[1] + 1))
+    bins = int(power.shape[1])
+    sums = np.empty((4, bins + 1))
     for k in range(power.shape[0]):
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
         _accumulate(power[k], noise, air, sums)
@@ -488,6 +510,11 @@ def _mark_layers(
             )
             if base < 0:
                 break
+            first = _edge(
+                sums, base, end, _BELOW, lengths, contrast, certainty, limits[k], margins[k]
+            )
             end = _end(sums, base, length)
-            end = _top(sums, end, lengths, contrast, certainty, limits[k], margins[k])
-            layers[k, base:end] = True
+            end = _edge(
+                sums, end, bins, _BEYOND, lengths, contrast, certainty, limits[k], margins[k]
+            )
+            layers[k, first:end] = True

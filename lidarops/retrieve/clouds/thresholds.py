@@ -44,10 +44,13 @@ class Thresholds:
     windows_beyond: int = 8
     """Length of the air that a window is compared with, in windows. With 4, a third of the bins
     above the peak of a deep cirrus is missed (`test_layers.py`)."""
+    windows_below: int = 4
+    """The same, below a layer. With 2, up to 225 m of the lower part of a deep cirrus is missed;
+    with 8, every tenth altocumulus above dust begins with the dust (`test_layers.py`)."""
     cloud_margin: float = 300.0
-    """m beyond the last bin of a cloud; its thin edge extends beyond its apparent top. Values there
-    are to be used with care, and neither background nor reference window is sought there:
-    noise hides up to 260 m of the upper part of a cirrus (`test_layers.py`)."""
+    """m before the first and beyond the last bin of a cloud, whose thin edges extend beyond it.
+    Values there are to be used with care, and neither background nor reference window is sought
+    there: noise hides up to 260 m of the upper part of a cirrus (`test_layers.py`)."""
     least_share_beyond: float = 0.1
     """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
     visible_depth: float = 480.0

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from lidarops.flags import FIRST_OWN, FlagBit, Severity
+from lidarops.retrieve.clouds.thresholds import THRESHOLDS
+
+_MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
 
 
 class ElasticQuality(FlagBit):
@@ -12,8 +17,8 @@ class ElasticQuality(FlagBit):
         FIRST_OWN,
         Severity.CARE,
         (
-            "in a cloud, or behind one as seen from the start of the inversion, where the lidar"
-            " ratio of aerosol does not hold"
+            f"within {_MARGIN} of a cloud, or behind one as seen from the start of the inversion,"
+            " where the lidar ratio of aerosol does not hold"
         ),
     )
     NO_REFERENCE = (
@@ -49,7 +54,7 @@ class ElasticQuality(FlagBit):
         FIRST_OWN + 5,
         Severity.CARE,
         (
-            "some of the averaged profiles, not all, show a cloud here, or between here and the"
-            " start of the inversion: the mean is that of cloudy and clear air"
+            f"some of the averaged profiles, not all, show a cloud within {_MARGIN}, or between"
+            " here and the start of the inversion: the mean is that of cloudy and clear air"
         ),
     )

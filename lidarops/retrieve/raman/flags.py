@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from lidarops.flags import FIRST_OWN, FlagBit, Severity
+from lidarops.retrieve.clouds.thresholds import THRESHOLDS
+
+_MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
 
 
 class RamanQuality(FlagBit):
@@ -45,15 +50,16 @@ class RamanQuality(FlagBit):
         FIRST_OWN + 4,
         Severity.CARE,
         (
-            "some of the averaged profiles, not all, show a cloud here, or within the vertical"
-            " resolution: the mean is that of cloudy and clear air"
+            f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or within the"
+            " vertical resolution: the mean is that of cloudy and clear air"
         ),
     )
     CLOUD = (
         FIRST_OWN + 5,
         Severity.CARE,
         (
-            "the mean of the profiles shows a cloud here, or within the vertical resolution:"
+            f"the mean of the profiles shows a cloud within {_MARGIN} or within the vertical"
+            " resolution:"
             " multiple scattering makes extinction too small, by more than its error states"
         ),
     )

@@ -475,6 +475,7 @@ def _cloud_variables(
         (state == _clouds.CLOUDY, RamanQuality.CLOUD),
     ):
         near = touched(mask, result.vertical_resolution, cells.step)
+        near |= _clouds.with_margin(mask, cells.range)
         quality = quality | np.where(near, np.int32(bit), np.int32(0))
     return {
         "quality_flag": (both, quality),

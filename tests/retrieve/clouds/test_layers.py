@@ -286,11 +286,25 @@ def test_a_layer_holds_its_upper_part(wavelength, cloud, ratio):
 
 
 @pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
+@pytest.mark.parametrize("cloud", ["weak cirrus", "cirrus"])
+@pytest.mark.parametrize("ratio", [5.0, 30.0])
+def test_a_layer_holds_its_lower_part(wavelength, cloud, ratio):
+    """As its upper part, but for 90 m: longer windows are needed the farther the air is away."""
+    total, excess, masks = found_tops(wavelength, cloud, ratio)
+    half = 1.0 + 0.5 * (cloud_contrast(wavelength) - 1.0)
+    below = RANGE[np.argmax(total)] >= RANGE
+    true_base = RANGE[below & (total > half) & (excess > 5.0)].min()
+    bases = RANGE[masks.argmax(axis=-1)]
+    assert np.median(bases) - true_base <= 90.0
+    assert np.percentile(bases, 5) >= RANGE[below & (total > 1.02)].min() - 15.0
+
+
+@pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
 @pytest.mark.parametrize("cloud", TOPS)
 def test_the_margin_of_a_layer_holds_the_edge_that_noise_hides(wavelength, cloud):
     total, excess, masks = found_tops(wavelength, cloud, 30.0)
     half = 1.0 + 0.5 * (cloud_contrast(wavelength) - 1.0)
-    edge_bins = (total > half) & (excess > 5.0) & (np.arange(RANGE.size) >= np.argmax(total))
+    edge_bins = (total > half) & (excess > 5.0)
     assert with_margin(masks, RANGE)[:, edge_bins].mean() > 0.99
 
 

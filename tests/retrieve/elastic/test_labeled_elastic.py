@@ -297,7 +297,7 @@ def test_a_cloud_above_the_reference_flags_the_bins_beyond_it():
     flagged = has(retrieved, ElasticQuality.CLOUD)
     assert np.all(np.isfinite(retrieved["reference_bottom"]))
     assert flagged[:, distance > 8100.0].all()
-    assert not flagged[:, distance < 7700.0].any()
+    assert not flagged[:, distance < 7400.0].any()
     inside = between(300.0, 2000.0)
     true = particles(STATION + distance)[inside]
     deviation = (retrieved["aerosol_backscatter"].to_numpy()[:, inside] - true).mean(axis=0)
@@ -532,7 +532,7 @@ def test_a_cloud_over_an_overlap_that_is_not_stated_is_found():
     retrieved = solved(counted(signal, 10, exposure=100 * EXPOSURE), reference=window)
     base = retrieved["cloud_base_range"].to_numpy()
     assert np.all((base > 7700.0) & (base < 8000.0))
-    assert not has(retrieved, ElasticQuality.CLOUD)[:, distance < 7700.0].any()
+    assert not has(retrieved, ElasticQuality.CLOUD)[:, distance < 7400.0].any()
 
 
 @pytest.mark.parametrize("full", [150.0, 300.0, 1000.0])

@@ -93,7 +93,7 @@ def averages(conditioned, edges=(), contrast=None):
     return xr.concat([batch for (batch,) in average.completed()], dim="time", data_vars="minimal")
 
 
-def retrieved(means, overlap=None):
+def retrieved(means, overlap=None, highest=12_000.0):
     return invert_elastic(
         means.assign_coords(zenith_angle=0.0),
         molecules=AIR,
@@ -101,7 +101,7 @@ def retrieved(means, overlap=None):
         station_altitude=0.0,
         lidar_ratio=constant_ratio(LIDAR_RATIO, 0.0),
         molecular_relative_error=0.0,
-        reference=Reference(3000.0, 12_000.0, 1000.0, 1.0, 0.02),
+        reference=Reference(3000.0, highest, 1000.0, 1.0, 0.02),
         overlap=overlap,
         overlap_is_stated=True,
     )
@@ -138,6 +138,15 @@ def test_a_cirrus_that_ends_before_the_middle_is_stated():
     assert flagged[inside].all()
     # With a start of the inversion beyond the cloud, what lies nearer depends on its lidar ratio.
     assert flagged[between(500.0, 7900.0)].all() == (window[0] > 8600.0)
+
+
+def test_the_edges_of_a_cloud_are_to_be_used_with_care():
+    """Up to 300 m below and above it, also where the reference lies below."""
+    edges = between(7730.0, 8870.0)
+    for cloudy, bit in ((6, ElasticQuality.PARTLY_CLOUDY), (PROFILES, ElasticQuality.CLOUD)):
+        product = retrieved(averages(profiles(cirrus_of(cloudy))), highest=7000.0)
+        assert product["reference_top"][0] <= 7000.0
+        assert raised(product, bit)[0, edges].all()
 
 
 def test_a_cloud_in_all_profiles_is_no_partial_one():

@@ -117,6 +117,13 @@ def test_a_cirrus_in_some_of_the_profiles_is_stated(partly_cloudy):
     assert raised(partly_cloudy, RamanQuality.PARTLY_CLOUDY)[cloud].all()
 
 
+def test_the_edges_of_a_cloud_are_to_be_used_with_care(partly_cloudy):
+    """Up to 300 m below and above it, as in elastic products."""
+    edges = inside(partly_cloudy, 5730.0, 6570.0)
+    assert raised(partly_cloudy, RamanQuality.PARTLY_CLOUDY)[edges].all()
+    assert raised(product_of(PROFILES), RamanQuality.CLOUD)[edges].all()
+
+
 def test_values_without_the_bit_are_right(partly_cloudy):
     """In the mean of clear and cloudy air."""
     r = partly_cloudy["range"].to_numpy()
