@@ -62,9 +62,14 @@ def change_in_words(change: Change) -> str:
 def _measured(change: Change) -> str:
     """Return the largest difference with what it is measured in."""
     if change.measure is Measure.ERROR:
-        return f"{change.largest:.2g} standard errors"
+        return f"{_two_digits(change.largest)} standard errors"
     of = "standard error" if change.measure is Measure.OF_ERROR else "value"
-    return f"{100.0 * change.largest:.2g} % of the {of}"
+    return f"{_two_digits(100.0 * change.largest)} % of the {of}"
+
+
+def _two_digits(value: float) -> str:
+    """Return a number with two digits, without an exponent below a million."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def size(count: float) -> str:

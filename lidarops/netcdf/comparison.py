@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from lidarops.errors import ProductError
 from lidarops.flags import Severity
 from lidarops.netcdf.provenance import read_provenance
 from lidarops.netcdf.variables import PROVENANCE, USABLE
-from lidarops.records import Change, Grade, Measure
+from lidarops.records import Change, Grade, Measure, Plan
 
 MINOR: Final = 0.1
 """Largest difference of a minor change, in standard errors: an interval of 95 % that is off by it
@@ -37,6 +37,14 @@ _MAKING: Final = frozenset(
 _BLOCK: Final = 1 << 26
 """Bytes of a variable that are compared at a time."""
 _MOST_CAUSES: Final = 20
+_MOST_REASONS: Final = 3
+"""Changes that name why a product is to be made again; the rest is counted."""
+_EMPTY: Final = frozenset({"", "null", "{}", "[]"})
+"""Values of settings that are the same as none."""
+_LONGEST: Final = 60
+"""Characters of a value of a cause."""
+_SHARED: Final = 15
+"""Of those, characters before the first that differs."""
 _ERROR: Final = "_standard_error"
 _MEANING: Final = ("standard_name", "units")
 """Attributes of a variable without which its values mean something else."""
@@ -292,25 +300,66 @@ def _making(file: Path) -> dict[str, dict[str, str]]:
         ) from error
 
 
+def planned_changes(file: Path, settings: Mapping[str, Any], plan: Plan) -> tuple[str, ...]:
+    """Return in what a product differs from what would be made now: settings, or else steps.
+
+    Parameters
+    ----------
+    file : Path
+        The product.
+    settings : mapping
+        Those that a new product would record.
+    plan : Plan
+        Its plan.
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be read or does not say how it was made.
+    """
+    making = _making(file)
+    changes = [*_changes("setting", making["setting"], dict(_flat("", settings)))]
+    changes = changes or [*_changes("step", making["step"], _steps_of(plan.as_dict()))]
+    return tuple(_first(changes, _MOST_REASONS))
+
+
 def _causes(
     old: Mapping[str, Mapping[str, str]], new: Mapping[str, Mapping[str, str]]
 ) -> Iterator[str]:
     """Yield what differs in the making of two products."""
     causes = [cause for what in old for cause in _changes(what, old[what], new[what])]
-    yield from causes[:_MOST_CAUSES]
-    if len(causes) > _MOST_CAUSES:
-        yield f"and {len(causes) - _MOST_CAUSES} more"
+    yield from _first(causes, _MOST_CAUSES)
+
+
+def _first(causes: Sequence[str], most: int) -> Iterator[str]:
+    """Yield the first causes, and the number of the others."""
+    yield from causes[:most]
+    if len(causes) > most:
+        yield f"and {len(causes) - most} more"
 
 
 def _changes(what: str, old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:
     for name in sorted({*old, *new}):
-        before, after = old.get(name, "absent"), new.get(name, "absent")
+        before, after = (_value(part, name) for part in (old, new))
         if before != after:
-            yield f"{what} {name}: {_short(before)} -> {_short(after)}"
+            # Long texts from shortly before the first difference on.
+            pairs = enumerate(zip(before, after, strict=False))
+            shared = next((place for place, (old_one, new_one) in pairs if old_one != new_one), 0)
+            first = max(shared - _SHARED, 0)
+            yield f"{what} {name}: {_short(before, first)} -> {_short(after, first)}"
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def _value(stated: Mapping[str, str], name: str) -> str:
+    value = stated.get(name, "")
+    return "absent" if value in _EMPTY else value
+
+
+def _short(text: str, first: int) -> str:
+    """Return a text of `_LONGEST` characters at most; of longer ones the part from `first` on."""
+    if len(text) <= _LONGEST:
+        return text
+    part = text[first : first + _LONGEST]
+    return f"{'...' * (first > 0)}{part}{'...' * (first + _LONGEST < len(text))}"
 
 
 def _inputs(document: Mapping[str, Any]) -> dict[str, str]:
@@ -339,7 +388,10 @@ def _flat(key: str, value: Any) -> Iterator[tuple[str, str]]:
 
 def _steps(document: Mapping[str, Any]) -> dict[str, str]:
     """Return step, channel and setting -> value, of the plan."""
-    plan = json.loads(document["entity"]["lidarops:plan"]["lidarops:json"])
+    return _steps_of(json.loads(document["entity"]["lidarops:plan"]["lidarops:json"]))
+
+
+def _steps_of(plan: Mapping[str, Any]) -> dict[str, str]:
     stated = {}
     for step in plan["steps"]:
         name = " ".join(part for part in (step["name"], step.get("channel", "")) if part)

@@ -185,7 +185,7 @@ def assess(
         for batch in judge.batches(days):
             for judged in judge.days(batch).judgements:
                 if everything or judged.due or judged.held or judged.frozen:
-                    yield judged
+                    yield judge.explained(judged)
 
 
 def survey(

@@ -23,14 +23,16 @@ from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdic
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import AncillaryError, RawFormatError
+from lidarops.errors import AncillaryError, ProductError, RawFormatError
+from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.outlying_headers import without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.plan.surroundings import NEAR_DAYS
+from lidarops.process.context import recorded_settings
 from lidarops.process.guard import Failure, guarded
-from lidarops.process.job import Place
+from lidarops.process.job import Job, Place
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import Granule, InputRecord, Plan, Role, Scene, Stamp
@@ -486,6 +488,37 @@ class Judge:
                 [[used.path, used.sha256] for used in judged.ancillaries],
             ]
         )
+
+    def explained(self, judged: Judgement) -> Judgement:
+        """Return a judgement whose reasons name the settings or steps that changed.
+
+        Reads the products of which some did, which takes a few ms each.
+        """
+        stale, frozen = (
+            tuple(self._explained(judged, product) for product in products)
+            for products in (judged.stale, judged.frozen)
+        )
+        return replace(judged, stale=stale, frozen=frozen)
+
+    def _explained(self, judged: Judgement, stale: Stale) -> Stale:
+        scene, product, made = judged.scene, (stale.kind, stale.channel), stale.before
+        if made is None:
+            return stale
+        closure = dependence.plan_closure(judged.plan, [product])
+        known = made.depends_on
+        if (known.plan_hash, known.settings_hash) == (
+            closure.hash,
+            dependence.digest(self._settings.of(scene, closure, product)),
+        ):
+            return stale
+        job = Job(self.campaign, scene, judged.plan)
+        now = recorded_settings(job, scene, closure, product)
+        try:
+            changes = planned_changes(self.campaign.products_root / made.path, now, closure)
+        except ProductError:
+            # A file that is lost is a reason of its own.
+            return stale
+        return replace(stale, reason="; ".join([stale.reason, *changes]))
 
     def depends_on(
         self, scene: Scene, whole: Plan, product: ProductKey, files: Sequence[InputRecord]

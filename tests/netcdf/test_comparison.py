@@ -256,6 +256,16 @@ def test_another_text_is_minor(tmp_path: Path):
     assert (change.grade, change.variable, change.share) == (Grade.MINOR, "", 0.0)
 
 
+def test_causes_of_long_texts_show_where_they_differ(tmp_path: Path):
+    settings = dict(provenance().settings)
+    texts = ["a text that is the same for quite a while, " * 3 + end for end in ("old", "new")]
+    before, after = (provenance(settings={**settings, "note": text}) for text in texts)
+    old = written(tmp_path / "old.nc", homogeneous(), provenance=before)
+    new = written(tmp_path / "new.nc", homogeneous(), provenance=after)
+    (cause,) = compare_products(old, new).causes
+    assert cause == 'setting note: ...quite a while, old" -> ...quite a while, new"'
+
+
 def test_causes_name_inputs_settings_and_packages(tmp_path: Path):
     before = provenance()
     dark = InputRecord("dark/d.dat", Role.DARK, "e" * 64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -107,6 +108,23 @@ def test_a_forced_run_keeps_files_whose_content_is_the_same(source: Archive) -> 
     remade = products(brought(source, force=True))
     assert {product.change.grade for product in remade.values() if product.change} == {Grade.NONE}
     assert {path: (root / path).stat().st_mtime_ns for path in _paths(root)} == times
+
+
+def test_plan_names_what_changed_since_a_product_was_made(source: Archive) -> None:
+    set_dead_time(source, 3.7e-9)
+    source.tree.setdefault("metadata", {})["institution"] = "another one"
+    source.write()
+    call = ["plan", str(source.file), "--instrument", "poor", "--stale"]
+    scenes = json.loads(CliRunner().invoke(app, [*call, "--json"]).output)["scenes"]
+    assert len(scenes) == 2
+    for scene in scenes:
+        reasons = {product["channel"]: product["reason"] for product in scene["stale"]}
+        dead_time = "setting facts.channels.photon_532o.dead_time: "
+        assert dead_time not in reasons["analog_532o"]
+        assert f"plan changed; {dead_time}absent -> 3.7e-09" in reasons["photon_532o"]
+        assert re.search('metadata.institution: .* -> "another one"', reasons["analog_532o"])
+    text = CliRunner().invoke(app, call).output
+    assert "dead_time: absent -> 3.7e-09" in " ".join(text.split())
 
 
 @pytest.mark.parametrize("frozen", [True, False])
