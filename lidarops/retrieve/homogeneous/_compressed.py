@@ -540,6 +540,8 @@ def _settle_constant(tables: Tables, s: _Scratch, mode: Mode) -> None:
 def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> None:
     _project(block, tables, s)
     _classify(tables, s)
+    if np.all(s.state == ROUTED):
+        return
     _start(tables, s)
     _leap(tables, s)
     _settle(tables, s)

@@ -73,6 +73,8 @@ def solve_by_compression(problem: PathProblem) -> PathSolution:
     routed = np.flatnonzero((state == _compressed.ROUTED) | few)
     if routed.size == 0:
         return solution
+    if routed.size == count:
+        return solve_by_direct_fit(problem)
     return solution.updated(routed, solve_by_direct_fit(problem.select(routed)))
 
 
