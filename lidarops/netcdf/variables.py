@@ -22,6 +22,7 @@ from lidarops import __version__
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.flags import Flags, Severity
 from lidarops.kinds import flags_of, kind_of, kinds
+from lidarops.netcdf.false_shares import percent
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.reference_window import Rejection
 
@@ -711,8 +712,8 @@ BACKGROUND_METHOD: Final = _coded(
     " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
     " the far range where the fit fails. Haze that falls with height nearly as air does leaves no"
     " trace in that fit: with simulated haze of 0.6 to 3 times the backscatter of air at the ground"
-    " and a scale height of 3 km, 10 percent of the backgrounds deviated by more than 4 standard"
-    " errors.",
+    f" and a scale height of 3 km, {percent('background, known shape', 'shape of hazy air')} of the"
+    " backgrounds deviated by more than 4 standard errors.",
 )
 
 AVERAGED_PROFILES: Final = Row(

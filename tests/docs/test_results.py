@@ -16,7 +16,6 @@ from lidarops.bench.registry import Benchmark
 from lidarops.bench.stability import study
 from lidarops.bench.stability.random_scenes import BROKEN, VIOLATED, Verdict
 from lidarops.cli import app
-from lidarops.kinds import kinds
 
 FALSE_SHARE = "and not uncertain"
 """Share of false values for which the target is where the model does not hold."""
@@ -128,46 +127,6 @@ def test_published_targets_are_those_of_the_code() -> None:
                 assert (str(Verdict.MET) in target) == met, (title, case, method)
 
 
-EXTINCTION = ("homogeneous", "total_extinction_model_error")
-BACKGROUND = ("homogeneous", "background_model_error")
-STATED = {
-    ("extinction", "slope of the backscatter along the section"): (
-        *EXTINCTION,
-        "7 percent with backscatter that changes exponentially along the section",
-    ),
-    ("extinction", "plume"): (*EXTINCTION, "10 percent with a plume"),
-    ("extinction", "saturated"): (*EXTINCTION, "8 percent where the top of the signal is clipped"),
-    ("extinction", "bent backscatter"): (*EXTINCTION, "2.5 percent where backscatter is curved"),
-    ("background", "bent backscatter"): (*BACKGROUND, "5 percent where the curvature exceeds"),
-    ("background", "afterpulse"): (*BACKGROUND, "2.4 percent with an afterpulse"),
-    ("background", "plume"): (*BACKGROUND, "1.1 percent with a plume"),
-    ("background, known shape", "shape of hazy air"): (
-        *("signal", "background_method"),
-        "10 percent of the backgrounds deviated by more than 4 standard errors",
-    ),
-    ("voltage", "analog noise below half a step"): (
-        *("signal", ""),
-        "62 percent of such simulated means deviated by more than 4 of them",
-    ),
-}
-"""By quantity and class: product, variable (none: the file), and the words of its comment."""
-
-
-def test_products_state_the_classes_that_miss_their_target() -> None:
-    for title, rows in benchmark_results.read("stability")["tables"].items():
-        shares = {(row.case, row.method): row for row in rows if row.quantity == FALSE_SHARE}
-        for row in rows:
-            if Verdict.MISSED not in str(row.value) or row.method == BROKEN:
-                continue
-            kind, variable, words = STATED[row.case, row.method]
-            layout = kinds()[kind].part("variables", "LAYOUT")
-            comments = {data.name: data.comment for data in layout.data} | {"": layout.comment}
-            assert words in comments[variable], (title, row.case, row.method)
-            share = shares[row.case, row.method]
-            stated = float(words.split(" ")[0]) / 100.0
-            assert abs(share.value - stated) < 2.0 * share.error, (title, row.case, row.method)
-
-
 def _rows_before():
     groups = json.loads((benchmark_results.RESULTS / "before.json").read_text())["groups"]
     return [row for group in groups for row in group["rows"]]
@@ -180,49 +139,6 @@ def test_a_figure_that_misses_its_target_says_why(row) -> None:
     assert figure.value >= 0.0
     missed = "MISSED" in before_after.verdict(figure, row["target"])
     assert missed == bool(row.get("why"))
-
-
-STATED_BESIDE = {
-    ("near the cut", "background near the cut: false"): (
-        "homogeneous",
-        "background",
-        "0.3 percent",
-    ),
-    ("single profiles in layered air", "network, layered, blocks of 1: false"): (
-        *("visibility", ""),
-        "0.4 percent where extinction changes with height",
-    ),
-    (
-        "varying lidar ratio",
-        "network, lidar ratio varies by 10 %, 2 % declared, the default: false",
-    ): (*("visibility", ""), "4.5 percent of simulated values deviated"),
-    (
-        "varying lidar ratio",
-        "network, lidar ratio varies by 10 %, declared: false",
-    ): (*("visibility", ""), "0.4 percent with 10 percent"),
-    ("networks of single profiles", "network, plume, blocks of 1: false"): (
-        *("visibility", ""),
-        "0.3 percent with a plume",
-    ),
-}
-"""As `STATED`, for groups and figures of the study of intervals."""
-
-
-@pytest.mark.parametrize("place", STATED_BESIDE)
-def test_products_state_what_the_study_of_intervals_misses(place) -> None:
-    kind, variable, words = STATED_BESIDE[place]
-    layout = kinds()[kind].part("variables", "LAYOUT")
-    comments = {data.name: data.comment for data in layout.data} | {"": layout.comment}
-    assert words in comments[variable]
-    figure = before_after.measured(["intervals", *place])
-    assert abs(figure.value - float(words.split(" ")[0]) / 100.0) < 2.0 * figure.error
-
-
-def test_every_false_share_that_misses_in_the_study_is_stated() -> None:
-    for row in _rows_before():
-        missed = "MISSED" in before_after.verdict(before_after.measured(row["now"]), row["target"])
-        if missed and row["now"][0] == "intervals" and row["now"][-1].endswith(": false"):
-            assert tuple(row["now"][1:]) in STATED_BESIDE
 
 
 def test_the_page_shows_before_and_now_with_errors() -> None:

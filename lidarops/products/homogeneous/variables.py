@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final, get_args
 
 from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
+from lidarops.netcdf.false_shares import by_class, percent
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     SECTION,
@@ -34,6 +35,19 @@ _CURVED_SIGNAL = (
     "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
     " section, and by the opposite amount at the other"
 )
+_DEPARTURES: Final = {
+    "slope of the backscatter along the section": "with backscatter that changes exponentially"
+    " along the section with a scale of 1 to 100 km",
+    "bent backscatter": "where backscatter is curved",
+    "plume": "with a plume",
+    "overlap error": "with an error of the overlap",
+    "eddies": "with eddies",
+    "afterpulse": "with an afterpulse",
+    "saturated": "where the top of the signal is clipped",
+    "detector not linear": "with a detector that is not linear",
+    "outliers": "with outliers",
+}
+"""Words for the classes of random departures from the model."""
 _UNDETECTED = (
     "This is not an upper bound: departures from the model that its parameters absorb leave no"
     " trace in the residuals. In simulated random departures, this share of the values without a"
@@ -85,10 +99,8 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Separate from the random error in total_extinction_standard_error. Root of the"
             " sum of squares of 5 percent of (extinction + 1 / mean range), and of the extinction"
-            f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED} 7 percent with backscatter"
-            " that changes exponentially along the section with a scale of 1 to 100 km, 10 percent"
-            " with a plume, 8 percent where the top of the signal is clipped, 2.5 percent where"
-            f" backscatter is curved, at most 0.5 percent otherwise. {NO_STANDARD_NAME}",
+            f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED}"
+            f" {by_class('extinction', _DEPARTURES)}. {NO_STANDARD_NAME}",
         ),
         *visibility_rows(
             _SECTIONS, place="along the section", ancillaries=_OF_EXTINCTION, optional=True
@@ -117,8 +129,8 @@ LAYOUT: Final = Layout(
             ancillaries=("background_model_error", *_OF_FIT),
             uncertain=True,
             comment="Not calibrated. Where extinction plus 1 / mean range is known to 10 to 15"
-            " percent only, 0.3 percent of such simulated backgrounds deviated by more than 4 of"
-            f" their standard errors. {NO_STANDARD_NAME}",
+            f" percent only, {percent('background', 'near the cut')} of such simulated backgrounds"
+            f" deviated by more than 4 of their standard errors. {NO_STANDARD_NAME}",
         ),
         Row(
             name="background_model_error",
@@ -131,10 +143,7 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Separate from the random error in background_standard_error. Background error"
             f" caused by a signal {_CURVED_SIGNAL}, as with backscatter that is curved along the"
-            f" path. {_UNDETECTED} 5 percent where the curvature exceeds this allowance,"
-            " 2.4 percent with an afterpulse, 1.1 percent with a plume, at most 0.5 percent"
-            " otherwise."
-            f" {NO_STANDARD_NAME}",
+            f" path. {_UNDETECTED} {by_class('background', _DEPARTURES)}. {NO_STANDARD_NAME}",
         ),
         Row(
             name="reduced_chi2",

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from lidarops.constants import MULTIPOSITION_PAPER
+from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     PLACE,
@@ -127,13 +128,15 @@ LAYOUT: Final = Layout(
     " high, and no test detects it there: total_extinction_standard_error allows for twice the"
     " typical gradient. More profiles in a block and more beams constrain the field better. In"
     " blocks of one profile, the share of simulated values without a flag that deviated by more"
-    " than 4 standard errors was 0.3 percent with a plume, and 0.4 percent where extinction changes"
-    " with height by a factor of e in 300 to 3000 m; most are of few networks, where noise hides"
+    f" than 4 standard errors was {percent('network', 'plume, blocks of 1')} with a plume, and"
+    f" {percent('network', 'layered, blocks of 1')} where extinction changes with height by"
+    " a factor of e in 300 to 3000 m; most are of few networks, where noise hides"
     " the field. The error that the prior leaves is common to all profiles, so that a mean over"
     " time does not reduce it. total_extinction_systematic_error includes a lidar ratio that varies"
     " over the network as declared, by 2 percent if not stated: where it varied by 10 percent"
-    " (rms), 4.5 percent of simulated values deviated by more than 4 standard errors with 2 percent"
-    " declared, and 0.4 percent with 10 percent.",
+    f" (rms), {percent('network', 'lidar ratio, 2 % declared')} of simulated values deviated by"
+    " more than 4 standard errors with 2 percent declared, and"
+    f" {percent('network', 'lidar ratio, 10 % declared')} with 10 percent.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=(

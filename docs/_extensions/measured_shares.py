@@ -1,0 +1,84 @@
+"""Shares of false values that comments of products state, from the committed results.
+
+``python docs/_extensions/measured_shares.py`` writes `lidarops/netcdf/measured_shares.py`; so does
+``make golden``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import before_after
+import benchmark_results
+
+from lidarops.bench.harness.rows import share_text
+from lidarops.bench.stability.random_scenes import BROKEN, VIOLATED
+
+FILE: Final = Path(benchmark_results.__file__).parents[2] / "lidarops/netcdf/measured_shares.py"
+FALSE: Final = "and not uncertain"
+"""The column of `lidarops bench stability`."""
+TABLES: Final = ("homogeneous", "signal chain")
+"""Tables of that benchmark whose violations comments state."""
+BESIDE: Final[dict[tuple[str, str], list[Any]]] = {
+    ("background", "near the cut"): ["intervals", "near the cut", "background near the cut: false"],
+    ("network", "plume, blocks of 1"): [
+        *("intervals", "networks of single profiles", "network, plume, blocks of 1: false")
+    ],
+    ("network", "layered, blocks of 1"): [
+        *("intervals", "single profiles in layered air", "network, layered, blocks of 1: false")
+    ],
+    ("network", "lidar ratio, 2 % declared"): [
+        *("intervals", "varying lidar ratio"),
+        "network, lidar ratio varies by 10 %, 2 % declared, the default: false",
+    ],
+    ("network", "lidar ratio, 10 % declared"): [
+        *("intervals", "varying lidar ratio"),
+        "network, lidar ratio varies by 10 %, declared: false",
+    ],
+}
+"""Other shares: their names, and where they stand in the results."""
+
+_HEAD: Final = '''\
+"""Measured shares of false values, as `docs/_extensions/measured_shares.py` writes them.
+
+By quantity and class of simulated scenes: percent of the values that differ by more than 4 stated
+errors, and the standard error of that. `false_shares` puts them into words.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+SHARES: Final[dict[tuple[str, str], tuple[float, float]]] = {
+'''
+
+
+def text() -> str:
+    """Return the module of shares."""
+    shares = {}
+    for title, rows in benchmark_results.read("stability")["tables"].items():
+        if not title.endswith(tuple(f": {name}" for name in TABLES)):
+            continue
+        violated = {
+            (row.case, row.method)
+            for row in rows
+            if row.quantity == "target" and str(row.value).startswith(share_text(VIOLATED))
+        }
+        shares |= {
+            (row.case, row.method): row
+            for row in rows
+            if row.quantity == FALSE and (row.case, row.method) in violated and row.method != BROKEN
+        }
+    figures = shares | {name: before_after.measured(place) for name, place in BESIDE.items()}
+    lines = [
+        f"    ({json.dumps(quantity)}, {json.dumps(name)}):"
+        f" ({100.0 * figure.value:.3g}, {100.0 * figure.error:.2g}),\n"
+        for (quantity, name), figure in figures.items()
+    ]
+    return f"{_HEAD}{''.join(lines)}}}\n"
+
+
+if __name__ == "__main__":
+    FILE.write_text(text(), encoding="utf-8")
