@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-from compliance_checker.runner import CheckSuite, ComplianceChecker
 from support.archives.aggregate_archive import add_day, facts_of
+from support.products.compliance import findings
 from support.products.made_products import MAKERS
 
 from lidarops.aggregate.facts import Refused, groups, read_facts
@@ -30,27 +28,6 @@ from lidarops.netcdf.variables import ErrorKind, layout_of
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.labeled import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.air.visibility import WavelengthLaw
-
-
-def findings(path: Path) -> list[set[str]]:
-    """Return the messages of the compliance checker in strict mode, for CF and ACDD."""
-    checks = ["cf:1.11", "acdd:1.3"]
-    CheckSuite.load_all_available_checkers()
-    report = path.with_suffix(".json")
-    ComplianceChecker.run_checker(
-        str(path), checks, 0, "strict", output_filename=str(report), output_format="json"
-    )
-    results = json.loads(report.read_text(encoding="utf-8"))
-    assert all(results[check]["possible_points"] > 90 for check in checks)
-    return [set(_messages(results[check]["all_priorities"])) for check in checks]
-
-
-def _messages(results: list[dict[str, Any]]) -> Iterator[str]:
-    for result in results:
-        scored, possible = result["value"]
-        if scored != possible:
-            yield from (f"{result['name']} {message}" for message in result["msgs"])
-        yield from _messages(result["children"])
 
 
 def means_of(root: Path, period: Period = Period.DAY, **options) -> MeansResult:

@@ -24,8 +24,6 @@ SHAPES: dict[str, dict[str, Any]] = {
     "one_profile": {"zenith": 3.0, "profiles": 1},
     "many_profiles": {"zenith": 0.0, "profiles": 300},
 }
-# Seconds each, and the same variables as the others; a product of missing values is horizontal too.
-SLOW = {"horizontal", "one_profile", "many_profiles"}
 
 
 def missing(kind: str) -> xr.Dataset:
@@ -37,9 +35,7 @@ def missing(kind: str) -> xr.Dataset:
     return data
 
 
-@pytest.mark.parametrize(
-    "shape", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in SHAPES]
-)
+@pytest.mark.parametrize("shape", list(SHAPES))
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_products_comply(kind: str, shape: str, tmp_path: Path):
     path = tmp_path / "product.nc"
