@@ -189,10 +189,15 @@ def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]
         "geospatial_vertical_max": extents.highest,
         "geospatial_vertical_units": "m",
         "geospatial_vertical_positive": "up",
-        "geospatial_vertical_resolution": (
-            "not constant" if extents.step is None else f"{extents.step:.6g} m"
-        ),
+        "geospatial_vertical_resolution": _vertical_resolution(extents.step),
     }
+
+
+def _vertical_resolution(step: float | None) -> str:
+    if step is None:
+        return "not constant"
+    # ACDD wants the attribute in every file.
+    return f"{step:.6g} m" if step else "none: the beam is level"
 
 
 _SPREADS = {"crossing": "irregular: crossings of beams"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -69,6 +70,8 @@ class Values:
     """What the CSV file holds."""
 
 
+_DECIMALS: Final = 6
+"""Most decimals, or zeros, of a value without a power of ten."""
 NO_VALUES: Final = Values((), b"", "")
 
 
@@ -273,10 +276,23 @@ def _table(grid: _Grid, part: _Part, column: _Column) -> ValueTable:
 
 
 def _words(value: float, error: float, flagged: object) -> str:
-    words = number(float(f"{value:.3g}"))
-    if np.isfinite(error):
-        words += f" \N{PLUS-MINUS SIGN} {number(float(f'{error:.2g}'))}"
+    words = " \N{PLUS-MINUS SIGN} ".join(_rounded(value, error))
     return f"{words} *" if flagged else words
+
+
+def _rounded(value: float, error: float) -> tuple[str, ...]:
+    """Return a value and its error of two digits, to the same place; three digits without one."""
+    if not np.isfinite(error):
+        return (number(float(f"{value:.3g}")),)
+    if not error > 0.0:
+        return number(value), "0"
+    error = float(f"{error:.2g}")
+    decimals = 1 - math.floor(math.log10(error))
+    pair = [round(size, decimals) + 0.0 for size in (value, error)]
+    if abs(decimals) > _DECIMALS:
+        return tuple(number(size) for size in pair)
+    texts = (f"{size:.{max(decimals, 0)}f}" for size in pair)
+    return tuple(text.replace("-", "\N{MINUS SIGN}") for text in texts)
 
 
 def _clock(grid: _Grid, row: int) -> str:
@@ -345,7 +361,8 @@ def _csv(grid: _Grid, part: _Part) -> bytes:
         for k in part.places.tolist():
             label = grid.labels[k] if grid.labels else f"{grid.place[k]:.7g}"
             numbers = [
-                f"{values[i, k]:.6g}"
+                # The shortest text that is the same number in the precision of the file.
+                str(np.float32(values[i, k]))
                 for column in part.columns
                 for values in (column.values, column.errors)
             ]

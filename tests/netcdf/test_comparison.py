@@ -149,6 +149,7 @@ def test_without_a_stated_error_the_difference_is_a_share_of_the_value(tmp_path:
     found = compared(tmp_path, change)
     assert (found.grade, found.measure) == (Grade.MAJOR, Measure.SIZE)
     assert "up to 50 % of the value in reduced_chi2" in change_in_words(found)
+    assert "up to 100 % of the value" in change_in_words(replace(found, largest=1.0))
 
 
 @pytest.mark.parametrize(

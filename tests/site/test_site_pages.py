@@ -83,7 +83,8 @@ def test_the_csv_holds_the_values_of_the_file(output: Path, kind: str) -> None:
         assert len(rows) == expected.size
         column = next(key for key in rows[0] if key.startswith(name))
         stated = np.array([float(row[column]) for row in rows]).reshape(expected.shape)
-        np.testing.assert_allclose(stated, factor * expected, rtol=1e-5)
+        # All digits of a float32.
+        np.testing.assert_allclose(stated, factor * expected, rtol=1.2e-7)
         flags = product["quality_flag"].values.ravel()
         usable = product["usable"].values.ravel()
     for row, flag, grade in zip(rows, flags, usable, strict=True):
@@ -105,8 +106,12 @@ def test_a_value_can_be_read_from_the_page(output: Path) -> None:
     row = text[text.index("2026-03-01 10:20\u201310:30") :]
     cell = row[row.index("<td") : row.index("</td>")].partition(">")[2]
     stated, _, uncertain = cell.partition(" \u00b1 ")
-    assert float(stated) == pytest.approx(value, rel=5e-3)
-    assert float(uncertain.rstrip(" *")) == pytest.approx(error, rel=5e-2)
+    uncertain = uncertain.rstrip(" *")
+    assert float(uncertain) == pytest.approx(error, rel=5e-2)
+    # The digits that the error leaves.
+    assert len(uncertain.lstrip("0.")) == 2
+    assert len(stated.partition(".")[2]) == len(uncertain.partition(".")[2])
+    assert abs(float(stated) - value) <= 0.051 * error
 
 
 def test_long_products_are_thinned_to_round_times_and_said() -> None:
