@@ -12,6 +12,7 @@ from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 
 @pytest.mark.parametrize(
@@ -168,6 +169,14 @@ def test_labeled_profiles_take_their_exposures():
     )
     assert np.array_equal(result["quality_flag"][:, 0], fit.quality)
     assert np.array_equal(result["total_extinction"][:, 0], fit.extinction, equal_nan=True)
+
+
+def test_the_page_tells_where_errors_of_backgrounds_are_widened():
+    quantile = stats.norm.isf(THRESHOLDS.false_curved)
+    assert quantile == pytest.approx(3.19, abs=6e-3)
+    assert 1.0 / quantile - 0.25 == pytest.approx(0.063, abs=6e-4)
+    at_limit = quantile / (4.0 * (1.0 - quantile * THRESHOLDS.largest_relative_error))
+    assert at_limit == pytest.approx(1.53, abs=6e-3)
 
 
 @pytest.mark.parametrize("method", ["compressed", "direct"])

@@ -66,12 +66,13 @@ def test_intervals_of_1000_profiles_cover_the_truth(light):
     # Falsely negative: 1 of 3,000 profiles.
     negative = (found.quality & RamanQuality.NEGATIVE_EXTINCTION) != 0
     assert negative.any(axis=1).sum() == {30.0: 0, 300.0: 1, 5000.0: 0}[light]
-    extinction, backscatter = deviations(sky, found)
-    for z in (extinction, backscatter):
-        # Values of a profile share an error: those of a few profiles cover nothing.
-        if z.size > 0.01 * extinction.size:
-            assert 0.94 <= covered(z) <= 0.96
-            assert np.mean(np.abs(z) > 4.0) <= 1e-3
+    # Values of a profile share an error: those of backscatter of 2 profiles cover nothing.
+    both = deviations(sky, found)[: 1 if light == 30.0 else 2]
+    # As the page tells.
+    shares = {30.0: (0.946,), 300.0: (0.957, 0.951), 5000.0: (0.959, 0.947)}[light]
+    assert [covered(z) for z in both] == pytest.approx(shares, abs=6e-4)
+    far = max(np.mean(np.abs(z) > 4.0) for z in both)
+    assert far == pytest.approx({30.0: 2e-4, 300.0: 6e-4, 5000.0: 1e-4}[light], abs=6e-5)
 
 
 @pytest.mark.parametrize("mean", [0.3, 1.0, 3.0, 10.0, 30.0])
@@ -133,6 +134,10 @@ def test_reciprocals_of_weak_values_have_no_bias(errors):
     inverse = inverse_of_weak(values, np.full(values.size, error))
     mean = (density * inverse).sum() / density.sum()
     assert mean == pytest.approx(1.0 / (errors * error), rel=1e-5)
+    # As the page tells of another reciprocal.
+    shrunk = (density * values / (values**2 + error**2)).sum() / density.sum() * errors * error
+    known = {2.0: 0.73, 3.0: 0.93}
+    assert shrunk == pytest.approx(known.get(errors, shrunk), abs=6e-3)
 
 
 def of_lidar_ratio(light, lidar_ratio, rows, seed):
