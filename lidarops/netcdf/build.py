@@ -253,9 +253,11 @@ def _stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Valu
     if row.dtype.startswith("i"):
         return whole_numbers(row, values)
     stored = _rounded(row, values)
-    if flags is not None:
-        check_flagged(row, stored, flags)
-    stored[~np.isfinite(stored)] = rows.FILL_VALUE
+    missing = ~np.isfinite(stored)
+    if missing.any():
+        if flags is not None:
+            check_flagged(row, missing, flags)
+        stored[missing] = rows.FILL_VALUE
     return stored
 
 

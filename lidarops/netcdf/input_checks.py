@@ -130,18 +130,26 @@ def check_flags(row: Row, values: Values) -> None:
         )
 
 
-def check_flagged(row: Row, values: Values, flags: Values) -> None:
+def check_flagged(row: Row, missing: Values, flags: Values) -> None:
     """Check that every missing value carries a quality bit that states why.
+
+    Parameters
+    ----------
+    row : Row
+    missing : ndarray of bool
+        Where values are missing or not finite.
+    flags : ndarray of int32
+        Of the same shape.
 
     Raises
     ------
     ProductError
         If a missing value carries no bit.
     """
-    unflagged = int(np.count_nonzero(~np.isfinite(values) & (flags == 0)))
+    unflagged = int(np.count_nonzero(missing & (flags == 0)))
     if unflagged:
         raise ProductError(
-            f"{unflagged} of {values.size} values are missing or not finite and carry no quality"
+            f"{unflagged} of {missing.size} values are missing or not finite and carry no quality"
             " bit",
             field=row.name,
             remedy="raise a bit in quality_flag where a value is missing",

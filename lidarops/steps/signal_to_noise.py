@@ -22,8 +22,12 @@ def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: floa
     least : float
         Least ratio of a value to its standard error without the bit; 0 for no bit.
     """
-    low = xr.zeros_like(rows["quality_flag"], dtype=np.bool_)
+    dims, flags = rows["quality_flag"].dims, rows["quality_flag"].to_numpy()
+    low = np.zeros(flags.shape, dtype=np.bool_)
     for name in names:
-        low = low | (abs(rows[name]) < least * rows[f"{name}_standard_error"])
-    bit = low.astype(np.int32) * np.int32(Quality.LOW_SIGNAL_TO_NOISE)
-    return rows.assign(quality_flag=rows["quality_flag"] | bit)
+        value, error = (
+            rows[of].transpose(*dims).to_numpy() for of in (name, f"{name}_standard_error")
+        )
+        low |= np.abs(value) < least * error
+    bit = low * np.int32(Quality.LOW_SIGNAL_TO_NOISE)
+    return rows.assign(quality_flag=rows["quality_flag"].copy(data=flags | bit))
