@@ -69,13 +69,46 @@ def test_optical_depths_agree_with_an_independent_estimate(channel, products):
     assert (product["usable"] == 0).any()
 
 
+def polarisation_difference(one: xr.Dataset, other: xr.Dataset) -> float:
+    """Return the root mean square difference from 300 m on, in stated errors.
+
+    The gradient error is common to both, so that only its difference counts.
+    """
+    first, second = (product.isel(altitude=slice(4, None)) for product in (one, other))
+    name = "vertical_optical_depth"
+    independent = (f"{name}_standard_error", f"{name}_dead_time_error")
+    variance = sum(product[error] ** 2 for product in (first, second) for error in independent)
+    variance = variance + (first[f"{name}_gradient_error"] - second[f"{name}_gradient_error"]) ** 2
+    return float(np.sqrt(((first[name] - second[name]) ** 2 / variance).mean()))
+
+
 def test_parallel_and_perpendicular_see_the_same_optical_depth(products):
-    one, other = (products[channel].isel(altitude=slice(4, None)) for channel in REFERENCE)
-    difference = one["vertical_optical_depth"] - other["vertical_optical_depth"]
-    spread = np.hypot(
-        one["vertical_optical_depth_standard_error"], other["vertical_optical_depth_standard_error"]
+    # 0.97, for a dead time that is assumed to be known to 20 %.
+    assert 0.85 < polarisation_difference(*(products[channel] for channel in REFERENCE)) < 1.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("uncertainty", [0.1, 0.15, 0.2, "estimate"])
+def test_polarisations_differ_as_the_stated_error_of_the_dead_time(
+    uncertainty, data_root, tmp_path
+):
+    """By the random errors alone, 1.36 of them at 10 %; 5 % are contradicted, and rejected."""
+    tree = yaml.safe_load(CAMPAIGN.read_text())
+    lidar = tree["instruments"]["savant"]
+    for channel, dead_time in zip(REFERENCE, (6.2e-9, 6.8e-9), strict=True):
+        given = {"dead_time": dead_time, "dead_time_uncertainty": uncertainty}
+        lidar["facts"][0]["channels"][channel] = (
+            {"dead_time": "estimate"} if uncertainty == "estimate" else given
+        )
+    lidar["products"]["multiangle"]["channels"] = list(REFERENCE)
+    campaign = tmp_path / "polarisations.yaml"
+    campaign.write_text(yaml.safe_dump(tree))
+    record = reprocess(
+        load_campaign(campaign, archive=data_root / "savant", output=tmp_path / "out")
     )
-    assert np.sqrt(((difference / spread) ** 2).mean()) < 1.3
+    assert record is not None
+    pair = [xr.load_dataset(Path(record.products) / p.path) for p in record.scenes[0].products]
+    assert 0.85 < polarisation_difference(*pair) < 1.15
 
 
 @pytest.mark.parametrize("channel", ["analog_355p", "analog_355s"])
@@ -167,13 +200,22 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     (archive / ray.name).write_bytes(ray.read_bytes().replace(b"03:04:25", b"07:07:49", 2))
     tree = yaml.safe_load(CAMPAIGN.read_text())
     tree["instruments"]["savant"]["files"] = "R18*"
-    tree["instruments"]["savant"]["products"]["multiangle"]["channels"] = ["analog_355s"]
+    tree["instruments"]["savant"]["products"]["multiangle"]["channels"] = [
+        "analog_355s",
+        *REFERENCE,
+    ]
     campaign = tmp_path / "blocked.yaml"
     campaign.write_text(yaml.safe_dump(tree))
     record = reprocess(load_campaign(campaign, archive=archive, output=tmp_path / "out"))
     assert record is not None
-    (product,) = record.scenes[0].products
-    found = xr.load_dataset(Path(record.products) / product.path)
+    found, *photon_counts = (
+        xr.load_dataset(Path(record.products) / product.path)
+        for product in sorted(record.scenes[0].products, key=lambda product: product.channel)
+    )
+    for product in photon_counts:
+        ends = product["beam_obstruction"].where(product["beam_azimuth"] == 87.0, drop=True)
+        assert np.nanmax(ends) <= 300.0
+        assert np.isfinite(product["beam_obstruction"]).sum() == 1
     assert found["blocked_zenith_angle"].values.tolist() == [87.0]
     assert found["blocked_azimuth"].values.tolist() == [87.0]
     # Nearer than full overlap, and no light is used behind.
@@ -181,9 +223,9 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     assert np.nanmin(found["beam_obstruction"].values[:, beam]) == found["blocked_range"].values
     assert np.isfinite(found["beam_obstruction"]).sum() == 1
     assert not np.isfinite(found["beam_signal"].values[:, beam]).any()
-    assert record.scenes[0].notes == (
-        "blocked beams, 1 of 83: elevation 3, azimuth 87 degree from 62 m",
-    )
+    # Of all channels together.
+    (note,) = record.scenes[0].notes
+    assert note.startswith("blocked beam: elevation 3, azimuth 87 degree, from the range in")
     assert (np.abs(found["analog_baseline"]) < 0.005).all()
     assert (found["usable"] < 2).all()
     rows = [int(np.abs(found["altitude"].values - 220.0 - z).argmin()) for z in HEIGHTS[1:]]

@@ -25,7 +25,7 @@ BASELINE: Final = Datum[bool]("baseline")
 _UNKNOWN: Final = np.int32(Quality.INPUT_MISSING | Quality.SATURATED)
 """Bits of bins that show nothing; what blocks a beam may stand where the overlap is incomplete."""
 _NAMED: Final = 6
-"""Most blocked beams that a note names."""
+"""Most blocked beams that notes name."""
 _TOGETHER: Final = 8
 """Profiles that are averaged together; the result does not depend on it."""
 
@@ -100,25 +100,24 @@ def add_low_beams(beams: BlockedBeams, chunk: Chunk, profiles: Profiles) -> None
 
 
 def blocked_in_words(product: xr.Dataset) -> list[str]:
-    """Return a note on the low beams that are blocked, and from which range; none if all are free.
+    """Return a note on each low beam that is blocked.
 
-    Obstructions of steeper beams are clouds.
+    The channels of a scene have the same note, so that it is reported once: the range is that of
+    the product. Obstructions of steeper beams are clouds.
     """
-    nearest = product["beam_obstruction"].min("time").to_numpy()
+    known = product["beam_obstruction"].notnull().any("time").to_numpy()
     elevation = 90.0 - product["beam_zenith_angle"].to_numpy()
-    blocked = np.flatnonzero(np.isfinite(nearest) & (elevation < THRESHOLDS.lowest_free))
-    if not blocked.size:
-        return []
+    blocked = np.flatnonzero(known & (elevation < THRESHOLDS.lowest_free))
     sides = product["beam_azimuth"].to_numpy() if "beam_azimuth" in product.coords else None
-    words = [
-        f"elevation {elevation[beam]:.3g}"
+    notes = [
+        f"blocked beam: elevation {elevation[beam]:.3g}"
         + ("" if sides is None else f", azimuth {sides[beam]:.3g}")
-        + f" degree from {nearest[beam]:.0f} m"
+        + " degree, from the range in beam_obstruction of the product"
         for beam in blocked[:_NAMED]
     ]
     if blocked.size > _NAMED:
-        words.append(f"and {blocked.size - _NAMED} more (beam_obstruction of the product)")
-    return [f"blocked beams, {blocked.size} of {nearest.size}: {'; '.join(words)}"]
+        notes.append(f"blocked beams: {blocked.size - _NAMED} more")
+    return notes
 
 
 def with_baseline(

@@ -127,7 +127,9 @@ def read_scan_image(product: xr.Dataset, _: ProductSource) -> ScanImage | None:
 def draw_scan_images(images: Sequence[ScanImage]) -> list[Figure]:
     """Return range-height images (RHI) of the vertical planes, and a map (PPI) of a volume."""
     image = images[0]
-    planes = vertical_planes(image.zenith_angle, image.azimuth)
+    lit = np.asarray(np.isfinite(image.signal).any(axis=1))
+    every = vertical_planes(image.zenith_angle, image.azimuth)
+    planes = [beams for beams in every if lit[beams].any()]
     if not planes:
         return []
     low, high = (float(end) for end in np.percentile(finite([image.signal]), _SHOWN))
@@ -138,12 +140,15 @@ def draw_scan_images(images: Sequence[ScanImage]) -> list[Figure]:
         f"{counted(len(shown), 'vertical plane')} of {len(planes)}; each beam is shown as far as"
         " its signal is used"
     )
-    blocked = image.obstruction[np.isfinite(image.obstruction)]
+    obstruction = image.obstruction[np.concatenate(shown)]
+    blocked = obstruction[np.isfinite(obstruction)]
     if blocked.size:
         words += (
             f"; {counted(blocked.size, 'beam')} blocked, from {blocked.min():.0f} m: crosses, and"
             " lines behind"
         )
+    if len(planes) < len(every):
+        words += f"; {len(every) - len(planes)} more, blocked where the beams begin"
     figures = [Figure("Range-height scans (RHI)", words, panels)]
     beams = _of_one_elevation(image)
     if beams.size >= _FEWEST_AZIMUTHS and len(planes) >= _FEWEST_AZIMUTHS:

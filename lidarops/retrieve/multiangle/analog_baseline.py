@@ -76,9 +76,12 @@ class BlockedBeams:
 
     Behind an obstruction (`_obstructions.obstruction_range`, and a guard of 300 m for the echo of a
     strong target) there is no light, which is tested: the power in the first block is less than a
-    tenth of the median of the free beams. The power there minus that of the tail is averaged over
-    blocks of 300 m or a fifth of the range, the last of which ends where the tail begins; in the
-    middle of the tail the baseline is 0. With the variances :math:`v_{ib}` of profile :math:`i`
+    tenth of the median of the free beams. Near the lidar, a photon counter of few shots sees echo
+    and afterpulses as bright as what it sees before: a beam that is dark in all blocks from the
+    second to the first in which free beams are not saturated is blocked within the first. The power
+    behind minus that of the tail is averaged over blocks of 300 m or a fifth of the range, the last
+    of which ends where the tail begins; in the middle of the tail the baseline is 0.
+    With the variances :math:`v_{ib}` of profile :math:`i`
     in block :math:`b`, and a variance :math:`e^2` between profiles by the moments of
     `dersimonian1986`, pooled over blocks, the mean has weights :math:`1 / (v + e^2)`, and the
     variance :math:`1 / \sum w + e^2`: the baseline of a free beam differs from the mean too.
@@ -146,15 +149,22 @@ class BlockedBeams:
 
     def _blocked(self) -> list[_Profile]:
         """Return the profiles that are dark behind an obstruction; none where none is free."""
-        free = [own.mean for own in self._profiles if not np.isfinite(own.obstruction)]
-        if len(free) in {0, len(self._profiles)}:
+        unblocked = [own.mean for own in self._profiles if not np.isfinite(own.obstruction)]
+        if not unblocked:
             return []
-        light = _median(np.stack(free))
-        return [
-            own
+        means = np.stack(unblocked)
+        # Where most are saturated, the others are the dark ones.
+        light = np.where(np.isfinite(means).mean(axis=0) > 0.5, _median(means), np.nan)
+        profiles = [
+            own._replace(obstruction=float(self._edges[1])) if _never_lit(own, light) else own
             for own in self._profiles
+        ]
+        blocked = [
+            own
+            for own in profiles
             if np.isfinite(own.obstruction) and _is_dark(self._behind(own), light)
         ]
+        return blocked if len(blocked) < len(profiles) else []
 
     def _behind(self, part: _Profile) -> Array:
         """Return the means of the blocks behind the obstruction, NaN in front."""
@@ -190,6 +200,18 @@ def _is_dark(behind: Array, light: Array) -> bool:
         return False
     first = known[0]
     return bool(abs(behind[first]) < THRESHOLDS.baseline_light * light[first])
+
+
+def _never_lit(profile: _Profile, light: Array) -> bool:
+    """Return whether a profile without obstruction is dark from the second block to free beams.
+
+    That is to the first block in which they are not saturated; nearer, they have more light.
+    """
+    known = np.flatnonzero(np.isfinite(light[1:])) + 1
+    if np.isfinite(profile.obstruction) or known.size == 0:
+        return False
+    faint = THRESHOLDS.baseline_light * light[known[0]]
+    return bool((np.abs(profile.mean[1 : known[0] + 1]) < faint).all())
 
 
 def _means(

@@ -116,3 +116,21 @@ def test_far_blocks_are_longer_and_have_less_noise():
     found = baseline(*scan(np.random.default_rng(7), [200.0, np.inf, np.inf]))
     of_300_m = NOISE / np.sqrt(300.0 / 3.75)
     assert (found.standard_error[found.range > 6000.0] < 0.6 * of_300_m).all()
+
+
+def test_a_beam_that_is_dark_behind_afterpulses_is_blocked():
+    """As a photon counter sees it, where free beams are saturated up to 1 km."""
+    power, variance = scan(np.random.default_rng(6), [60.0, np.inf, np.inf])
+    power[1:, DISTANCE < 1000.0] = np.nan
+    near = DISTANCE < 300.0
+    power[0, near] = 4.8 + 2.0 * (60.0 / DISTANCE[near]) ** 2 * np.exp(-DISTANCE[near] / 60.0)
+    beams = BlockedBeams(DISTANCE, TAIL)
+    beams.add(power, variance, np.arange(3))
+    assert beams.obstructions() == {0: 300.0}
+
+
+def test_weak_beams_are_not_taken_for_blocked_ones():
+    power, variance = scan(np.random.default_rng(7), [np.inf] * 300, true=0.0, light=3e-3)
+    beams = BlockedBeams(DISTANCE, TAIL)
+    beams.add(power, variance, np.arange(300))
+    assert beams.obstructions() == {}
