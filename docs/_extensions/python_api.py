@@ -32,6 +32,8 @@ MODULES: Final = (
     "lidarops.retrieve.elastic",
     "lidarops.retrieve.elastic.labeled",
     "lidarops.retrieve.raman.retrieval",
+    "lidarops.retrieve.raman.settings",
+    "lidarops.retrieve.raman.signals",
     "lidarops.retrieve.raman.cells",
     "lidarops.retrieve.raman.scattering",
     "lidarops.retrieve.raman.extinction",

@@ -10,7 +10,7 @@ from lidarops.bench.throughput.raman_night import night, night_signals, screened
 from lidarops.products.raman.steps import bytes_held
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.retrieval import RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
 
 SETTINGS = RamanSettings(355e-9, 387e-9, 1.0, 0.5, 3000.0, 6500.0, 2000.0, 1.0, 0.02, 0.01)
 NAMES = ("355", "387")

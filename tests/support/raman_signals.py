@@ -10,7 +10,8 @@ import numpy.typing as npt
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.cells import Cells, make_cells
-from lidarops.retrieve.raman.retrieval import AirColumn, ChannelSignal, RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal
 
 Array = npt.NDArray[np.float64]
 
@@ -66,8 +67,12 @@ def make_sky(
     cell: float = 60.0,
     full_overlap: float = 300.0,
     window: tuple[float, float, float] = (7000.0, 12_000.0, 5000.0),
+    brightness: float = 3.0,
 ) -> Sky:
-    """Return a sky of bins of `step` m; `light` is the mean count of the Raman bin at 1 km."""
+    """Return a sky of bins of `step` m; `light` is the mean count of the Raman bin at 1 km.
+
+    `brightness` is that of the elastic bin over it.
+    """
     r = step * (np.arange(extinction.size) + 0.5)
     molecules = MolecularProfile.us_standard()
     ratio = (LASER / RAMAN) ** exponent
@@ -86,7 +91,7 @@ def make_sky(
         extinction,
         extinction / lidar_ratio,
         light * raman / raman[at],
-        3.0 * light * elastic / elastic[at],
+        brightness * light * elastic / elastic[at],
         AirColumn(r, backscatter, depth, raman_depth, density, known),
         make_cells(r, r[-1] + step, cell),
         RamanSettings(LASER, RAMAN, exponent, 0.0, low, high, width, 1.0, 0.0, 0.0),

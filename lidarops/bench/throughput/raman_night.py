@@ -15,7 +15,7 @@ from lidarops.bench.harness.timing import READ
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.retrieval import RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.labeled import condition
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, joined
 from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening

@@ -16,13 +16,13 @@ from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import LeftOut, PlannedStep
 from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.retrieval import RamanSettings
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
     WATER_SHIFT,
     is_raman_line,
     raman_wavelength,
 )
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
 from lidarops.retrieve.signal.labeled_screening import Screening

@@ -23,15 +23,10 @@ from lidarops.retrieve.raman.cells import Cells, make_cells
 from lidarops.retrieve.raman.cloud_cells import largest_of_cells, state_of_cells, touched
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.overlap import overlap_of
-from lidarops.retrieve.raman.retrieval import (
-    AirColumn,
-    ChannelSignal,
-    RamanResult,
-    RamanSettings,
-    cell_signals,
-    retrieve_raman,
-)
+from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.scattering import nitrogen_line_share
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal, cell_signals
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 from lidarops.retrieve.signal.labeled import (
     CORRELATION_LENGTH,

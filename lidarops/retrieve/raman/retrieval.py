@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
-from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.raman import backscatter as _backscatter
 from lidarops.retrieve.raman._negative_depth import falling
 from lidarops.retrieve.raman.backscatter import Backscatter
@@ -19,7 +18,9 @@ from lidarops.retrieve.raman.cells import Cells
 from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth, root_of_squares
 from lidarops.retrieve.raman.extinction import Extinction, extinction_of, slope
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.scattering import particle_ratio
+from lidarops.retrieve.raman.reference import choose_window
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, CellSignal, ChannelSignal, cell_signals
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -36,99 +37,6 @@ RANDOM: Final = frozenset({"noise", "resolution", "background"})
 """Causes whose errors change from profile to profile; those of all others are systematic."""
 _MOST_UNKNOWN: Final = 0.05
 """Weight of cells without backscatter in the lidar ratio of a cell."""
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelSignal:
-    """Signals of a channel, without background, not corrected for overlap or range."""
-
-    power: Array
-    """(profile, bin), any unit; NaN where missing."""
-    variance: Array
-    """(profile, bin): of a bin, times the correlation length of noise."""
-    background: Array
-    """(profile,)"""
-    background_standard_error: Array
-    """(profile,)"""
-    dead_time_error: Array
-    """(profile or 1, bin): change with one standard error of the dead time."""
-    counts_per_power: Array | None = None
-    """(profile,): for photon counting, whose variance then follows from the fitted counts."""
-
-
-@dataclass(frozen=True, slots=True)
-class AirColumn:
-    """Clean air along the beam, (bin,)."""
-
-    range: Array
-    """m."""
-    backscatter: Array
-    """m-1 sr-1, at the laser wavelength."""
-    depth: Array
-    """Molecular optical depth from the lidar, at the laser wavelength."""
-    raman_depth: Array
-    """The same at the Raman wavelength."""
-    density: Array
-    """Number density of the Raman scatterers times the share of their lines that is measured; any
-    unit."""
-    overlap: Array
-    """Common to both signals; NaN where it is not known."""
-
-    @property
-    def elastic_shape(self) -> Array:
-        """Elastic signal of air for a backscatter of 1."""
-        return np.asarray(self.known_overlap * np.exp(-2.0 * self.depth) / self.range**2)
-
-    @property
-    def raman_shape(self) -> Array:
-        """Raman signal of clean air."""
-        density = self.density / self.density.max()
-        both = np.exp(-self.depth - self.raman_depth)
-        return np.asarray(self.known_overlap * density * both / self.range**2)
-
-    @property
-    def known_overlap(self) -> Array:
-        """Overlap, 1 where it is not known."""
-        return np.where(np.isnan(self.overlap), 1.0, self.overlap)
-
-
-@dataclass(frozen=True, slots=True)
-class RamanSettings:
-    """What is assumed, with standard errors."""
-
-    wavelength: float
-    """m, of the laser."""
-    raman_wavelength: float
-    """m."""
-    angstrom_exponent: float
-    """Of particle extinction between both wavelengths."""
-    angstrom_standard_error: float
-    lowest: float
-    """m, least range of the reference window."""
-    highest: float
-    """m, largest range of the reference window."""
-    width: float
-    """m, of the reference window."""
-    scattering_ratio: float
-    """Total over molecular backscatter in the reference window."""
-    reference_relative_error: float
-    molecular_relative_error: float
-    """Of the density of air."""
-    overlap_relative_error: float = 0.0
-    """Of one minus the overlap."""
-    molecular_slope_error: float = 0.0
-    """m-1 along the beam, of the derivative of the logarithm of the density of air."""
-
-    @property
-    def ratio(self) -> float:
-        """Particle extinction at the Raman wavelength over that at the laser's."""
-        return particle_ratio(self.angstrom_exponent, self.wavelength, self.raman_wavelength)
-
-    @property
-    def ratio_error(self) -> float:
-        """Standard error of `ratio`."""
-        colour = abs(float(np.log(self.wavelength / self.raman_wavelength)))
-        return self.ratio * colour * self.angstrom_standard_error
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,60 +92,6 @@ class RamanResult:
 def total_error(budget: dict[str, Array]) -> Array:
     """Return the root of the sum of squares of the errors of all causes."""
     return np.asarray(np.sqrt(sum(error**2 for error in budget.values())))
-
-
-@dataclass(frozen=True, slots=True)
-class CellSignal:
-    """A signal over that of clean air in cells, of one profile."""
-
-    value: Array
-    """(cell,): NaN where there are no data."""
-    variance: Array
-    noise: SignalNoise
-    background: Array
-    """(cell,): change of the value with one standard error of the background."""
-    dead_time: Array
-    """(cell,): change of the value with one standard error of the dead time."""
-
-    def relative(self, change: Array, level: Array) -> Array:
-        """Return a change relative to a level, 0 where there are no data."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.nan_to_num(change / level, posinf=0.0, neginf=0.0)
-
-
-def cell_signals(signal: ChannelSignal, shape: Array, cells: Cells) -> list[CellSignal]:
-    """Return the signals of all profiles over that of clean air in cells.
-
-    Their noise is a function of their mean.
-    """
-    known = np.isfinite(signal.power) & np.isfinite(signal.variance)
-    power = np.where(known, signal.power, np.nan)
-    bins = np.maximum(cells.known(power), 1.0)
-    variance = cells.mean(np.where(known, signal.variance / shape**2, np.nan)) / bins
-    inverse = np.where(known, 1.0 / shape, np.nan)
-    level = cells.mean(inverse)
-    value = cells.mean(power / shape)
-    missing = np.isnan(value)
-    if signal.counts_per_power is None:
-        per_signal, fixed = np.zeros(value.shape), np.where(np.isnan(variance), np.inf, variance)
-    else:
-        counts = signal.counts_per_power[:, np.newaxis]
-        sky = np.maximum(signal.background, 0.0)[:, np.newaxis]
-        per_signal = level / (bins * counts)
-        fixed = sky * cells.mean(inverse**2) / (bins * counts)
-        many = np.nan_to_num(value / per_signal) > THRESHOLDS.many_counts
-        expected = np.where(many, per_signal * value + fixed, 1.0)
-        excess = np.where(many, np.maximum(variance / expected, 1.0), 1.0)
-        per_signal = np.where(missing, 0.0, per_signal * excess)
-        fixed = np.where(missing, np.inf, fixed * excess)
-    background = level * np.nan_to_num(signal.background_standard_error)[:, np.newaxis]
-    dead_time = cells.mean(signal.dead_time_error * inverse)
-    return [
-        CellSignal(v, s, SignalNoise(p, f), b, d)
-        for v, s, p, f, b, d in zip(
-            value, variance, per_signal, fixed, background, dead_time, strict=True
-        )
-    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +178,8 @@ def retrieve_raman(
         _profile(of_raman, of_elastic, cells, settings, near)
         for (of_raman, of_elastic), near in zip(pairs, partial, strict=True)
     ]
-    window = _reference(elastic, air, cells, settings, rows)
+    fitted = [None if row is None else (row.raman, row.fit) for row in rows]
+    window = choose_window(elastic, fitted, air, cells, settings)
     edges = np.stack(window.edges, axis=-1)
     in_cells = _AirCells.of(air, cells)
     solved = [
@@ -345,40 +200,6 @@ def _profile(
     if fit is None:
         return None
     return _Profile(raman, elastic, fit, extinction_of(fit, cells.step, settings.ratio))
-
-
-def _reference(
-    elastic: ChannelSignal,
-    air: AirColumn,
-    cells: Cells,
-    settings: RamanSettings,
-    rows: Sequence[_Profile | None],
-) -> reference_window.ReferenceWindow:
-    """Return the reference windows: clean air, corrected for the measured attenuation."""
-    # Of cells: the tests take noise as normal, which it is not in bins of few counts.
-    shape = np.tile(cells.mean(air.backscatter * air.elastic_shape), (len(rows), 1))
-    power, bins = cells.mean(elastic.power), np.maximum(cells.known(elastic.power), 1.0)
-    variance = cells.mean(elastic.variance) / bins
-    for number, row in enumerate(rows):
-        if row is None:
-            power[number] = np.nan
-            continue
-        depth = row.fit.depth - row.fit.depth.min()
-        shape[number] *= np.exp(-2.0 / (1.0 + settings.ratio) * depth)
-        power[number, row.fit.expected_error > THRESHOLDS.most_uncertain] = np.nan
-    highest = min(settings.highest, float(cells.range[-1]))
-    width = min(settings.width, highest - settings.lowest)
-    candidates = reference_window.candidate_windows(
-        settings.lowest, highest, width, settings.width / WINDOW_THRESHOLDS.steps_per_window
-    )
-    return reference_window.choose_reference(
-        power,
-        cells.range,
-        variance,
-        molecular_attenuated=shape,
-        candidates=candidates,
-        background_standard_error=np.nan_to_num(elastic.background_standard_error),
-    )
 
 
 @dataclass(frozen=True, slots=True)

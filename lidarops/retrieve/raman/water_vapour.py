@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.raman.backscatter import inverse_mean
-from lidarops.retrieve.raman.retrieval import CellSignal, RamanSettings
 from lidarops.retrieve.raman.scattering import particle_ratio
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import CellSignal
 
 Array = npt.NDArray[np.float64]
 

@@ -15,13 +15,14 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.labeled import Assumptions, WaterVapour, retrieve
-from lidarops.retrieve.raman.retrieval import CellSignal, RamanSettings
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
     WATER_SHIFT,
     nitrogen_line_share,
     raman_wavelength,
 )
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import CellSignal
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 
 STEP = 15.0

@@ -9,7 +9,7 @@ from support.raman_signals import make_sky
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.raman.depth_fit import SignalNoise, fit_depth
 from lidarops.retrieve.raman.extinction import extinction_of, mean_weights, sliding_line
-from lidarops.retrieve.raman.retrieval import cell_signals
+from lidarops.retrieve.raman.signals import cell_signals
 
 STEP = 30.0
 R = STEP * (np.arange(400) + 0.5)

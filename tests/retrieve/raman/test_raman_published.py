@@ -21,12 +21,8 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.cells import make_cells
 from lidarops.retrieve.raman.extinction import sliding_line
-from lidarops.retrieve.raman.retrieval import (
-    AirColumn,
-    ChannelSignal,
-    RamanSettings,
-    cell_signals,
-)
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal, cell_signals
 
 STEP = 15.0
 RAMAN = {"355": ("387", 386.7e-9), "532": ("608", 607.4e-9)}
@@ -45,12 +41,12 @@ FIGURES = {
     },
     "532": {
         "extinction": (2.4, 0.0),
-        "backscatter": (-1.5, 0.1),
+        "backscatter": (-2.1, -1.1),
         "lidar_ratio": (3.9, 2.7),
         "line": (1.1, -10.5),
     },
 }
-COVERED = {"355": (0.938, 0.967, 0.973), "532": (0.961, 0.918, 0.953)}
+COVERED = {"355": (0.938, 0.967, 0.973), "532": (0.961, 0.922, 0.953)}
 
 
 def channel(counts, variance=None):
@@ -285,7 +281,7 @@ def test_single_realisations_are_right_within_their_errors(case):
 def test_cross_sections_of_lidarops_leave_their_difference(case):
     found = deviations(case, retrieved(case, air=case.own_air))
     name, away = {
-        "355": ("extinction", (-1.7, -9.1)), "532": ("backscatter", (-3.8, -2.2)),
+        "355": ("extinction", (-1.7, -9.1)), "532": ("backscatter", (-4.4, -3.4)),
     }[case.name]  # fmt: skip
     np.testing.assert_allclose(found[name], away, atol=0.06)
 

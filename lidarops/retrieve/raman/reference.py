@@ -1,0 +1,144 @@
+r"""Reference windows: clean air by the ratio of the elastic to the Raman counts.
+
+With the elastic signal of air :math:`\phi` for the smooth transmission and the Raman signal
+:math:`y_R` over the smooth one :math:`m`, clean air has :math:`P_0 = a \phi\, y_R / m`. Compared
+is
+
+.. math:: P_0 - a \phi \left(\frac{y_R}{m} - 1\right) \quad\text{with}\quad a \phi ,
+
+so that the noise of the fit, which tilts and lifts :math:`\phi`, is left out to the first order.
+What is left is that of the counts of both signals, independent from cell to cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.air import reference_window
+from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
+from lidarops.retrieve.raman.cells import Cells
+from lidarops.retrieve.raman.depth_fit import DepthFit
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, CellSignal, ChannelSignal
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
+
+Array = npt.NDArray[np.float64]
+
+
+def choose_window(
+    elastic: ChannelSignal,
+    raman: Sequence[tuple[CellSignal, DepthFit] | None],
+    air: AirColumn,
+    cells: Cells,
+    settings: RamanSettings,
+) -> reference_window.ReferenceWindow:
+    """Return the reference windows of all profiles: of clean air, by the ratio of both signals.
+
+    Parameters
+    ----------
+    elastic : ChannelSignal
+    raman : sequence of (CellSignal, DepthFit) or None
+        Raman signal of each profile with its fit; None where there is none, and no window then.
+    air : AirColumn
+    cells : Cells
+    settings : RamanSettings
+    """
+    candidates = _candidates(cells, settings)
+    # Of cells: the tests take noise as normal, which it is not in bins of few counts.
+    of_air = cells.mean(air.backscatter * air.elastic_shape)
+    power, bins = cells.mean(elastic.power), np.maximum(cells.known(elastic.power), 1.0)
+    variance = cells.mean(elastic.variance) / bins
+    shape = np.tile(of_air, (len(raman), 1))
+    background = np.nan_to_num(elastic.background_standard_error)
+    inside = (cells.range >= candidates[:, :1]) & (cells.range <= candidates[:, 1:])
+    for number, signal in enumerate(raman):
+        if signal is None:
+            power[number] = np.nan
+            continue
+        of_raman, fit = signal
+        power[number, fit.expected_error > THRESHOLDS.most_uncertain] = np.nan
+        pair = _Pair.of(power[number], variance[number], of_raman, fit, of_air, settings.ratio)
+        level = pair.level(inside)
+        away = level * pair.per_raman * (of_raman.value - pair.mean)
+        shape[number] = pair.per_raman * pair.mean
+        power[number] -= away
+        variance[number] += (level * pair.per_raman) ** 2 * pair.raman_variance
+        # Over air, both signals have nearly the same shape, so that backgrounds are alike too.
+        shift = level * (pair.per_raman * of_raman.background)[inside.any(axis=0)].mean()
+        background[number] = np.hypot(background[number], shift)
+    return reference_window.choose_reference(
+        power,
+        cells.range,
+        variance,
+        molecular_attenuated=shape,
+        candidates=candidates,
+        background_standard_error=background,
+    )
+
+
+def _candidates(cells: Cells, settings: RamanSettings) -> Array:
+    highest = min(settings.highest, float(cells.range[-1]))
+    width = min(settings.width, highest - settings.lowest)
+    step = settings.width / WINDOW_THRESHOLDS.steps_per_window
+    return reference_window.candidate_windows(settings.lowest, highest, width, step)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Both signals of one profile, (cell,)."""
+
+    power: Array
+    variance: Array
+    raman: Array
+    mean: Array
+    """Smooth Raman signal."""
+    raman_variance: Array
+    """For the smooth signal: by the observed one, low counts would weigh more."""
+    per_raman: Array
+    """Elastic signal of air over the Raman one."""
+
+    @classmethod
+    def of(
+        cls,
+        power: Array,
+        variance: Array,
+        raman: CellSignal,
+        fit: DepthFit,
+        of_air: Array,
+        ratio: float,
+    ) -> _Pair:
+        """Return the pair; of the fit, only the small difference of both transmissions is used."""
+        mean = np.exp(-fit.depth)
+        per_raman = of_air * np.exp((1.0 - 2.0 / (1.0 + ratio)) * fit.depth)
+        return cls(power, variance, raman.value, mean, raman.noise.of(mean), per_raman)
+
+    def level(self, windows: npt.NDArray[np.bool_]) -> float:
+        """Return the ratio of the signals over that of air, of the window with the lowest bound.
+
+        The bound is the upper one, as in the choice of the window. 0 where there is no signal.
+
+        Parameters
+        ----------
+        windows : (window, cell) bool
+        """
+        known = np.isfinite(self.power) & np.isfinite(self.raman)
+        sums = [
+            windows[:, known] @ values[known]
+            for values in (
+                self.power,
+                self.per_raman * self.raman,
+                self.variance,
+                self.per_raman**2 * self.raman_variance,
+            )
+        ]
+        seen = sums[1] > 0.0
+        if not seen.any():
+            return 0.0
+        power, expected, variance, raman_variance = (values[seen] for values in sums)
+        ratio = power / expected
+        error = np.sqrt(variance + ratio**2 * raman_variance) / expected
+        return float(ratio[np.argmin(ratio + WINDOW_THRESHOLDS.most_deviation * error)])
