@@ -21,6 +21,7 @@ import xarray as xr
 from lidarops.errors import AncillaryError, RetrievalInputError
 from lidarops.records import InputRecord, Role
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.raman.flags import RamanQuality
 
 Array = npt.NDArray[np.float64]
 
@@ -41,8 +42,12 @@ _LIDAR_RATIOS: Final = (1.0, 200.0)
 """sr; as for the fact ``lidar_ratio``."""
 _MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_systematic", "usable"})
 """Variables of a product with measured lidar ratios and overlap."""
+_LIDAR_RATIO_NEEDS: Final = frozenset({"altitude", "lidar_ratio", "quality_flag", "shots"})
+"""What else a product with measured lidar ratios holds."""
 _REJECTED: Final = 2
 """``usable`` of a value that is not to be used."""
+_CLOUDS: Final = int(RamanQuality.CLOUD | RamanQuality.PARTLY_CLOUDY)
+"""Multiple scattering makes lidar ratios of clouds too small by more than their errors."""
 _POINTS: Final = 4
 """Points of half a cell of a measured overlap; with lines between them it is off by less than 1e-3.
 """
@@ -323,16 +328,25 @@ def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -
 
 
 def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:
-    """Return the mean over time of the lidar ratios of a product, where there are any.
+    """Return the mean over time of the lidar ratios of a product outside of clouds.
 
-    Values are weighted by laser shots. Their errors, and limits of values, would follow the noise
-    of backscatter: low values have small errors, and by them 60 sr become 49
-    (`tests/campaign/test_ancillary_files.py`). Systematic errors are those of all times.
+    Heights whose mean is below its standard error have none. Values are weighted by laser shots.
+    Their errors, and limits of values, would follow the noise of backscatter: low values have small
+    errors, and by them 60 sr become 49 (`tests/campaign/test_ancillary_files.py`). Systematic
+    errors are those of all times.
     """
+    missing = sorted(_LIDAR_RATIO_NEEDS - raw.keys())
+    if missing:
+        raise AncillaryError(
+            f"has measured lidar ratios without {' and '.join(missing)}",
+            file=name,
+            remedy="give the product with all its variables",
+        )
     ratio, random, systematic = (
         raw[f"lidar_ratio{error}"][1] for error in ("", "_error_random", "_error_systematic")
     )
-    known = np.isfinite(ratio) & (random > 0.0) & (raw["usable"][1] < _REJECTED)
+    cloudy = (raw["quality_flag"][1].astype(np.int32) & np.int32(_CLOUDS)) != 0
+    known = np.isfinite(ratio) & (random > 0.0) & (raw["usable"][1] < _REJECTED) & ~cloudy
     weight = np.where(known, raw["shots"][1][:, np.newaxis], 0.0)
     weight /= np.maximum(weight.sum(axis=0), 1.0)
 
@@ -341,15 +355,18 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
 
     together = mean(ratio)
     least, largest = _LIDAR_RATIOS
-    measured = (together >= least) & (together <= largest)
-    if not measured.any():
-        raise AncillaryError(
-            "holds no usable value", file=name, field="lidar_ratio", remedy="choose another night"
-        )
     # Values that noise makes too large have the relative error of the mean.
-    excess = np.maximum(np.where(known, ratio, 0.0) / np.where(measured, together, 1.0), 1.0)
+    excess = np.maximum(np.where(known, ratio, 0.0) / np.maximum(together, least), 1.0)
     by_noise = np.sqrt(((weight * np.where(known, random, 0.0) / excess) ** 2).sum(axis=0))
     error = np.hypot(by_noise, mean(systematic))
+    measured = (together >= least) & (together <= largest) & (together >= error)
+    if not measured.any():
+        raise AncillaryError(
+            "holds no usable value outside of clouds that exceeds its error",
+            file=name,
+            field="lidar_ratio",
+            remedy="choose another night",
+        )
     return LidarRatio(raw["altitude"][1][measured], together[measured], error[measured])
 
 

@@ -24,6 +24,7 @@ from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.retrieve.raman.backscatter import inverse_of_weak
+from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.steps.dependence import ancillary_files
 
 ALTITUDE = np.linspace(0.0, 20_000.0, 41)
@@ -150,7 +151,9 @@ def test_lidar_ratios_are_linear_between_their_altitudes(tmp_path: Path) -> None
     assert digest == hashlib.sha256((tmp_path / "s.csv").read_bytes()).hexdigest()
 
 
-def _product(folder: Path, ratio: object, random: object, usable: object) -> None:
+def _product(
+    folder: Path, ratio: object, random: object, usable: object, quality: object = 0
+) -> None:
     """Write the variables of a product with measured lidar ratios over times and heights."""
     plane, values = ("time", "range"), np.asarray(ratio, float)
     times, heights = values.shape
@@ -160,6 +163,7 @@ def _product(folder: Path, ratio: object, random: object, usable: object) -> Non
             "lidar_ratio_error_random": (plane, np.broadcast_to(random, values.shape)),
             "lidar_ratio_error_systematic": (plane, np.full(values.shape, 2.0)),
             "usable": (plane, np.broadcast_to(np.asarray(usable, np.int8), values.shape)),
+            "quality_flag": (plane, np.broadcast_to(np.asarray(quality, np.int32), values.shape)),
             "shots": ("time", np.where(np.arange(times) == 1, 500, 1000)),
         },
         coords={"altitude": ("range", 1000.0 * np.arange(1, heights + 1))},
@@ -179,6 +183,34 @@ def test_measured_lidar_ratios_are_averaged_by_shots(tmp_path: Path) -> None:
     _product(tmp_path, ratio, random, 2)
     with pytest.raises(AncillaryError, match="usable"):
         lidar_ratio_profile(tmp_path, "night.nc")
+
+
+def test_measured_lidar_ratios_of_clouds_are_left_out(tmp_path: Path) -> None:
+    ratio = [[70.0, 18.0, 70.0], [20.0, 18.0, 70.0]]
+    cloud, partly = RamanQuality.CLOUD, RamanQuality.PARTLY_CLOUDY
+    _product(tmp_path, ratio, 5.0, 1, [[0, cloud, 0], [partly, cloud, 0]])
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    assert profile.altitude.tolist() == [1000.0, 3000.0]
+    assert profile.ratio.tolist() == [70.0, 70.0]
+    _product(tmp_path, ratio, 5.0, 1, cloud)
+    with pytest.raises(AncillaryError, match="outside of clouds"):
+        lidar_ratio_profile(tmp_path, "night.nc")
+
+
+def test_means_of_lidar_ratios_below_their_error_are_left_out(tmp_path: Path) -> None:
+    _product(tmp_path, [[48.5, 60.0]], [[54.7, 20.0]], 0)
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    assert profile.ratio.tolist() == [60.0]
+
+
+def test_products_without_shots_are_refused_by_name(tmp_path: Path) -> None:
+    _product(tmp_path, [[60.0]], 5.0, 0)
+    with xr.open_dataset(tmp_path / "night.nc") as product:
+        product.drop_vars("shots").to_netcdf(tmp_path / "cut.nc")
+    with pytest.raises(AncillaryError, match="without shots") as caught:
+        lidar_ratio_profile(tmp_path, "cut.nc")
+    assert caught.value.file == "cut.nc"
+    assert caught.value.remedy
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,9 @@ LAYOUT: Final = Layout(
             coverage=Coverage.REFERENCE,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Set by the campaign, not measured. Its errors at all ranges are one error.",
+            comment="Set by the campaign: a number, a profile, or the mean over time of a raman"
+            " product without values in clouds, which the provenance names. Its errors at all"
+            " ranges are one error.",
         ),
         *REFERENCE_WINDOW,
         Row(
