@@ -173,6 +173,24 @@ def test_a_product_states_the_estimated_dead_time_of_its_nitrogen_channel(reposi
     assert "give dead_time in s" in note
 
 
+def test_each_value_below_its_error_has_a_bit(night):
+    campaign, _, record = night
+    product = product_of(campaign, record)
+    marked = (product["quality_flag"] & Quality.LOW_SIGNAL_TO_NOISE) != 0
+    weak = xr.zeros_like(marked)
+    for name in (
+        "aerosol_extinction",
+        "aerosol_backscatter",
+        "lidar_ratio",
+        "water_vapour_mixing_ratio",
+    ):
+        weak |= np.abs(product[name]) < product[f"{name}_standard_error"]
+    water = product["water_vapour_mixing_ratio"]
+    below = np.abs(water) < product["water_vapour_mixing_ratio_standard_error"]
+    assert below.sum() > 100
+    np.testing.assert_array_equal(marked, weak)
+
+
 def test_water_vapour_needs_no_overlap(night):
     campaign, _, record = night
     product = product_of(campaign, record)

@@ -343,9 +343,8 @@ class _Retrieval(RowProduct):
         )
         if settings.known_shape:
             retrieved = retrieved.assign_attrs(references=KNOWN_SHAPE_PAPERS)
-        flagged = with_low_signal_to_noise(
-            retrieved, LAYOUT.weighed, settings.least_signal_to_noise
-        )
+        weighed = [name for name in LAYOUT.weighed if name in retrieved]
+        flagged = with_low_signal_to_noise(retrieved, weighed, settings.least_signal_to_noise)
         return with_methods(flagged, data[MOLECULES], known_shape=settings.known_shape)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:

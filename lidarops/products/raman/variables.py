@@ -131,7 +131,12 @@ LAYOUT: Final = Layout(
     " nearly as molecules do look like aerosol-free air: only the error of the scattering ratio"
     " declared in the settings covers them.",
     sampled="range",
-    weighed=("aerosol_extinction", "aerosol_backscatter"),
+    weighed=(
+        "aerosol_extinction",
+        "aerosol_backscatter",
+        "lidar_ratio",
+        "water_vapour_mixing_ratio",
+    ),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(
