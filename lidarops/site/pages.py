@@ -23,7 +23,7 @@ from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.links import Links
 from lidarops.site.neighbours import Neighbours
 from lidarops.site.paths import day_page, href, month_list, slug, year_page
-from lidarops.site.product_contents import Origin, QualityCounts, citation, variables
+from lidarops.site.product_contents import Origin, QualityCounts, citation, contact, variables
 from lidarops.site.product_entry import UNKNOWN, Entry, Problem, ShareGrade, Shares, mean_shares
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import Values
@@ -97,6 +97,7 @@ def product(
         values_csv=href(entry.files[3], page),
         citation=citation(opened),
         license=entry.license,
+        contact=contact(opened),
         references=str(opened.attrs.get("references", "")).splitlines(),
         variables=variables(opened),
         attributes=[(str(name), str(value)) for name, value in opened.attrs.items()],

@@ -243,6 +243,15 @@ def citation(product: xr.Dataset) -> str:
     return " ".join(f"{part.rstrip('.')}." for part in parts if part)
 
 
+def contact(product: xr.Dataset) -> str:
+    """Return whom to ask about a product, by its attributes; empty without an address."""
+    for role in ("creator", "publisher"):
+        address = attribute(product, f"{role}_email", "")
+        if address:
+            return ", ".join(filter(None, (attribute(product, f"{role}_name", ""), address)))
+    return ""
+
+
 def origin(product: xr.Dataset) -> Origin:
     """Read the provenance of a product; problems are stated in the result, not raised."""
     if PROVENANCE not in product:

@@ -276,6 +276,8 @@ def test_citation_and_licence_are_those_of_the_file(output: Path) -> None:
             assert str(product.attrs[name]) in cited
         assert product.attrs["date_issued"][:4] in cited
         assert f"Licence: {product.attrs['license']}" in text
+        contact = ", ".join(product.attrs[f"creator_{part}"] for part in ("name", "email"))
+        assert f"Contact: {contact}" in text
 
 
 def test_a_citation_without_an_author_begins_with_the_title() -> None:
