@@ -133,6 +133,8 @@ class Figure:
     """What the figure shows, in words."""
     panels: tuple[Panel, ...]
     beside: bool = False
+    above: tuple[Panel, ...] = ()
+    """Panels of a figure above it over the same times: its axis begins and ends below theirs."""
 
     @property
     def text(self) -> str:

@@ -187,11 +187,12 @@ def _file(content: str, width: float, height: float, aspect: str = "") -> bytes:
 
 
 def _content(figure: Figure, width: int) -> tuple[str, float]:
-    panels, beside = figure.panels, figure.beside
+    panels, above, beside = figure.panels, figure.above, figure.beside
     if width < WIDTH:
+        above = tuple(replace(panel, right=None) for panel in above)
         beside, lower = False, _LOWER if figure.beside else 1.0
         panels = tuple(_narrowed(panel, width, lower) for panel in panels)
-    boxes = list(_beside(panels, width) if beside else _stacked(panels, width))
+    boxes = list(_beside(panels, width) if beside else _stacked(panels, width, above))
     return "".join(map(_panel, boxes)), max(box.foot + _below(box) for box in boxes)
 
 
@@ -230,8 +231,8 @@ def _most_ticks(height: float) -> int:
     return max(3, round(height / 45))
 
 
-def _stacked(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
-    left, right = _margins(panels)
+def _stacked(panels: Sequence[Panel], whole: int, above: Sequence[Panel]) -> Iterator[_Box]:
+    left, right = _margins([*panels, *above])
     width = whole - left - right
     y = 0.0
     for place, (panel, legend) in enumerate(zip(panels, _legends(panels), strict=True), 1):

@@ -236,7 +236,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             lambda: read_values(opened, kind), "its values cannot be shown"
         )
         over_time, no_quality = _guarded(
-            lambda: _quality_figures(opened), "its quality over time cannot be drawn"
+            lambda: _quality_figures(opened, figures), "its quality over time cannot be drawn"
         )
         station = product_contents.attribute(opened, "lidarops_station")
         instrument = product_contents.attribute(opened, "lidarops_instrument")
@@ -293,10 +293,15 @@ def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
         return None, f"{failure}: {error}"
 
 
-def _quality_figures(opened: xr.Dataset) -> list[Figure]:
-    """Return the figure of quality over time, if there are flags."""
+def _quality_figures(opened: xr.Dataset, figures: Sequence[Figure]) -> list[Figure]:
+    """Return the figure of quality over time, if there are flags, aligned with the first one."""
     quality = read_quality(opened)
-    return [] if quality is None else [quality_figure(quality)]
+    if quality is None:
+        return []
+    figure = quality_figure(quality)
+    first = figures[0].panels if figures else ()
+    axis = figure.panels[0].x
+    return [replace(figure, above=first if first and first[-1].x.label == axis.label else ())]
 
 
 def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:

@@ -186,6 +186,18 @@ def test_a_second_axis_stands_at_the_right():
     assert frame(document)[2] < frame(drawn(panel()))[2]
 
 
+@pytest.mark.parametrize("whole", [svg.WIDTH, svg.NARROW])
+def test_a_figure_below_another_one_has_its_horizontal_axis(whole):
+    line = Curve(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    scaled = panel(line, right=Axis("altitude (km)", 0.0, 2.0))
+    below = panel(line, height=80.0)
+    first, second = (
+        frame(svg.file(one, whole).decode())
+        for one in (figure(scaled), figure(below, above=(scaled,)))
+    )
+    assert (second[0], second[2]) == (first[0], first[2])
+
+
 def test_thumbnails_are_small_and_without_axes():
     many = np.linspace(0.0, 1.0, 5000)
     for layer in (Curve(many, many), Image(np.full((306, 780), 9, dtype=np.uint8))):
