@@ -8,12 +8,14 @@ from typing import Any, Final
 
 import benchmark_results
 import tables
+import verdicts
 
-from lidarops.bench.harness.rows import Figure, Unit, format_time, share_text, with_error
+from lidarops.bench.harness.rows import Figure, Row, Unit, format_time, with_error
+from lidarops.bench.harness.verdicts import Target, unmet
+from lidarops.bench.stability.random_scenes import TARGETS
 
-STUDY: Final = "python tests/studies/intervals.py"
-PLAIN: Final = {"order", "kernels"}
-"""Groups of the study whose figures are no shares."""
+RATIO: Final = "ratio"
+"""Beginning of a place that names two figures, of which the first is divided by the second."""
 
 
 def page() -> str:
@@ -23,26 +25,34 @@ def page() -> str:
 
 
 def _groups(groups: list[dict[str, Any]]) -> Iterator[str]:
-    columns = ("figure", "before", "now", "target", "made by", "where missed, why")
+    columns = ("figure", "before", "now", "target", "made by", "where not met, why")
     for group in groups:
         yield f"*{group['title']}*"
-        rows = []
-        for row in group["rows"]:
-            figure = measured(row["now"])
-            cells = (row["figure"], row["before"], _text(figure), verdict(figure, row["target"]))
-            rows.append((*cells, _command(row["now"][0]), row.get("why", "")))
+        rows = [
+            (
+                row["figure"],
+                row["before"],
+                _text(measured(row["now"])),
+                verdict(row),
+                f"`{command(row['now'])}`",
+                why(row),
+            )
+            for row in group["rows"]
+        ]
         yield from tables.table(columns, rows)
 
 
-def measured(place: list[str]) -> Figure:
+def measured(place: list[Any]) -> Figure:
     """Return a figure of a committed result, given the result and where it stands in it."""
-    result, *names = place
-    if result == "intervals":
-        group, name = names
-        figure = _read("intervals")[group]["figures"][name]
-        unit = Unit.NUMBER if group in PLAIN else Unit.SHARE
-        return Figure(figure["value"], figure.get("error", 0.0), unit)
-    title, case, method, quantity = names
+    if place[0] == RATIO:
+        first, second = (measured(part) for part in place[1:])
+        return Figure(first.value / second.value)
+    row = _row(place)
+    return Figure(float(row.value or 0.0), row.error, row.unit)
+
+
+def _row(place: list[Any]) -> Row:
+    result, title, case, method, quantity = place
     (row,) = (
         row
         for name, rows in benchmark_results.read(result)["tables"].items()
@@ -50,19 +60,26 @@ def measured(place: list[str]) -> Figure:
         for row in rows
         if (row.case, row.method, row.quantity) == (case, method, quantity)
     )
-    return Figure(row.value, row.error, row.unit)
+    return row
 
 
-def verdict(figure: Figure, target: dict[str, float] | None) -> str:
-    """Return the target, and whether the figure meets it, within 2 Monte Carlo errors or not."""
-    if target is None:
+def verdict(row: dict[str, Any]) -> str:
+    """Return the target of a row and whether the figure meets it, as the benchmark decides."""
+    if row["target"] is None:
         return ""
-    least, most = target.get("least", 0.0), target["most"]
-    text = share_text(most) if not least else f"{100.0 * least:g} to {share_text(most)}"
-    away = max(least - figure.value, figure.value - most)
-    if away <= 0.0:
-        return f"{text} met"
-    return f"{text} {'undecided' if away <= 2.0 * figure.error else 'MISSED'}"
+    return Target(**row["target"]).judged(measured(row["now"]))
+
+
+def why(row: dict[str, Any]) -> str:
+    """Return why a figure does not meet its target: as stated beside it, or for the benchmark."""
+    text = verdict(row)
+    if unmet(text) is None:
+        return ""
+    if "why" in row or row["now"][0] != "stability":
+        return str(row.get("why", ""))
+    _, title, case, method, quantity = row["now"]
+    target = next(name for name, shares in TARGETS.items() if quantity in (*shares, "share"))
+    return verdicts.why(verdicts.Unmet(title, case, method, target, "", text))
 
 
 def _text(figure: Figure) -> str:
@@ -79,10 +96,10 @@ def percent_text(figure: Figure) -> str:
     return with_error(whole.value, whole.error)
 
 
-def _command(result: str) -> str:
-    if result == "intervals":
-        return f"`{STUDY}`"
-    return f"`{benchmark_results.read(result)['command'].split(' --out')[0]}`"
+def command(place: list[Any]) -> str:
+    """Return the command that makes a figure."""
+    result = place[1][0] if place[0] == RATIO else place[0]
+    return str(benchmark_results.read(result)["command"]).split(" --out")[0]
 
 
 def _read(name: str) -> dict[str, Any]:

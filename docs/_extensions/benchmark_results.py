@@ -36,7 +36,8 @@ class Selection(NamedTuple):
 SELECTIONS: Final = {
     "accuracy": Selection(
         "lidarops bench accuracy --quick --out bench",
-        ("The most accurate", "Homogeneous path:", "Elastic inversion:", "Scans over zenith"),
+        ("The most accurate", "Ours beside", "Homogeneous path:", "Elastic inversion:",
+         "Scans over zenith", "Networks: Networks and scipy"),
         figures=("all-homogeneous-path", "all-elastic-inversion", "all-scans-over-zenith-angle",
                  "all-networks-of-lidars"),
     ),
@@ -51,10 +52,13 @@ SELECTIONS: Final = {
         ("Background of published files", "Backscatter of published files"),
     ),
     "stability": Selection(
-        "lidarops bench stability --quick --out bench",
+        "lidarops bench stability --out bench",
         ("",),
-        ("values", "not rejected", "within 1.96", "false, random error", "and not uncertain",
-         "of these undetectable", "without any flag", "target"),
+        ("clusters", "values", "not rejected", "within 1.96", "95 % target", "within 1",
+         "68 % target", "stated / median error", "false, random error", "and not uncertain",
+         "target", "of these undetectable", "and below 3.5", "without any flag",
+         "needlessly flagged", "needless target", "share", "largest change, in stated errors",
+         "share of the CPU time", "CPU time"),
     ),
     "throughput": Selection(
         "lidarops bench throughput --quick --out bench", ("float32, dense", "float32, 30 %"),
@@ -76,6 +80,7 @@ def take(name: str, folder: Path) -> None:
         "command": selection.command,
         "date": result["date"],
         "machine": result["machine"],
+        "cpu_seconds": result["cpu_seconds"],
         "headings": {title: result["headings"][title] for title in kept},
         "notes": _notes(result["notes"], kept),
     }
@@ -150,9 +155,11 @@ def facts(result: dict[str, Any]) -> str:
     """Return what was run, when, and on what machine."""
     machine = result["machine"]
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
+    seconds = result.get("cpu_seconds")
+    cost = f", {seconds:,.0f} s of CPU time" if seconds else ""
     return (
         f"`{result['command']}`, {result['date']}: {machine['processor']}, {machine['cores']} "
-        f"cores, Python {machine['python']}, {packages}, code {machine['code']}."
+        f"cores, Python {machine['python']}, {packages}, code {machine['code']}{cost}."
     )
 
 

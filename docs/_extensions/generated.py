@@ -14,6 +14,7 @@ import command_line
 import product_variables
 import python_api
 import stiff_cases
+import verdicts
 from sphinx.util.docutils import SphinxDirective
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
     "stability": partial(benchmark_results.page, "stability"),
     "stiff-cases": stiff_cases.page,
     "throughput": partial(benchmark_results.page, "throughput"),
+    "verdicts": verdicts.page,
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
 from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
 from lidarops.bench.harness.rows import Study
+from lidarops.bench.harness.timing import cpu_seconds
 from lidarops.bench.stability import study
 from lidarops.bench.throughput import (
     archives,
@@ -49,7 +51,7 @@ def run_benchmark(
     *,
     data: Path | None = None,
 ) -> Study:
-    """Run a benchmark.
+    """Run a benchmark, and measure its CPU time.
 
     Parameters
     ----------
@@ -70,6 +72,19 @@ def run_benchmark(
     RawFormatError
         If "reader" gets no file, or one that cannot be read.
     """
+    begin = cpu_seconds()
+    measured = _run(what, case, files, effort, data=data)
+    return replace(measured, cpu_seconds=cpu_seconds() - begin)
+
+
+def _run(
+    what: str,
+    case: str | None,
+    files: Sequence[Path],
+    effort: Effort,
+    *,
+    data: Path | None = None,
+) -> Study:
     kind = _member(BenchmarkKind, what, "benchmark")
     if kind is BenchmarkKind.STABILITY:
         for name, value in {"case": case, "files": files, "data": data}.items():

@@ -74,6 +74,23 @@ def test_of_equally_accurate_methods_the_first_table_shows_the_fastest():
     assert {row.method for row in all_retrievals.best_methods({"paths": works})} == {"fast"}
 
 
+def test_where_a_peer_is_ahead_the_table_says_so():
+    def work(method: str, error: float, nanoseconds: float, *, ours: bool = True) -> Work:
+        time = cpu_time(nanoseconds)
+        return Work("all", "depth", method, Figure(error, 0.02), None, time, ours=ours)
+
+    def beside(*works: Work) -> dict[str, object]:
+        return {row.quantity: row.value for row in all_retrievals.against_peers({"x": works})}
+
+    ours, peer = work("ours", 1.0, 50.0), work("peer", 1.02, 10.0, ours=False)
+    row = beside(ours, peer)
+    assert row["ours is"] == "equal error, slower"
+    assert row["time, ratio"] == pytest.approx(5.0)
+    assert beside(ours, work("peer", 0.8, 60.0, ours=False))["ours is"] == "less accurate, faster"
+    assert beside(ours, work("peer", 1.4, 60.0, ours=False))["ours is"] == "more accurate, faster"
+    assert beside(ours) == {}
+
+
 def test_page_and_figures_are_written_once_each(study, tmp_path):
     page = study.write(tmp_path)
     text = page.read_text(encoding="utf-8")

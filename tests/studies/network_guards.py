@@ -125,7 +125,7 @@ def _rising_noise(cluster: int) -> dict[str, float] | None:
     """Return the counts of a block in which noise rises by a factor of 5, as at dawn."""
     rng = np.random.default_rng((74, cluster))
     factor = np.where(np.arange(PROFILES) < rng.integers(10, 40), 1.0, 5.0)[:, None, None]
-    return _own_counts(rng, random_networks._layered, (3e-3, 0.1), factor=factor)
+    return _own_counts(rng, random_networks.layered, (3e-3, 0.1), factor=factor)
 
 
 def _steep_field(cluster: int) -> dict[str, float] | None:
@@ -142,14 +142,14 @@ def _steep_field(cluster: int) -> dict[str, float] | None:
 def _curved_outliers(cluster: int) -> dict[str, float] | None:
     """Return the counts of a block with 0.5 to 4 percent of outlying bins in plumes and layers."""
     rng = np.random.default_rng((76, cluster))
-    air = random_networks._plume if cluster % 2 else random_networks._thin_layer
+    air = random_networks.plume if cluster % 2 else random_networks._thin_layer
     return _own_counts(rng, air, (1e-3, 0.1), outlying=float(rng.uniform(0.005, 0.04)))
 
 
 def _own_counts(
     rng: Any, air: Any, noises: tuple[float, float], *, factor: Any = 1.0, outlying: float = 0.0
 ) -> dict[str, float] | None:
-    net = random_networks._random_network(rng).network()
+    net = random_networks.random_network(rng).network()
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return None
     clean = signals(net, air(rng))

@@ -139,7 +139,8 @@ def format_time(nanoseconds: float) -> str:
     return f"{nanoseconds:.3g} ns"
 
 
-def _cell(row: Row) -> str:
+def cell(row: Row) -> str:
+    """Return the text of a value in a table."""
     value = row.value
     if value is None or isinstance(value, str):
         return value or _NONE
@@ -184,7 +185,7 @@ def table(
     """
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for row in rows:
-        lines.setdefault((row.case, row.method), {})[row.quantity] = _cell(row)
+        lines.setdefault((row.case, row.method), {})[row.quantity] = cell(row)
     names = [number for number in (0, 1) if len({line[number] for line in lines}) > 1] or [1]
     quantities = tuple(dict.fromkeys(row.quantity for row in rows))
     return Table(
@@ -424,6 +425,8 @@ class Study:
     works: Sequence[Work] = ()
     missed: Sequence[str] = ()
     """Targets that are missed; the command fails where there is one."""
+    cpu_seconds: float = 0.0
+    """CPU time of the whole benchmark, with its child processes."""
     machine: Machine = field(default_factory=machine)
 
     def figures(self, title: str) -> dict[tuple[str, str, str], Row]:
@@ -452,6 +455,7 @@ class Study:
             "title": self.title,
             "date": self.date,
             "machine": asdict(self.machine),
+            "cpu_seconds": round(self.cpu_seconds, 1),
             "tables": {results.title: [asdict(row) for row in results.rows] for results in shown},
             "headings": {results.title: [results.case, results.method] for results in shown},
             "notes": {results.title: results.note for results in shown},

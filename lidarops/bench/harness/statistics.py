@@ -15,6 +15,8 @@ TWO_SIDED: Final = 1.959963984540054
 """Standard deviations that hold 95 percent of a normal distribution."""
 SIGMAS: Final = (1.0, TWO_SIDED)
 """Standard errors within which truths are counted."""
+_LIMIT_WITHOUT_EVENTS: Final = -math.log(0.05)
+"""Expected events of which none are seen in 5 percent of all cases."""
 
 
 def mean(values: npt.NDArray[np.generic]) -> Figure:
@@ -44,21 +46,42 @@ def over_blocks(means: Sequence[float]) -> Figure:
     return Figure(float(finite.mean()) if finite.size else math.nan, error)
 
 
-def clustered_share(events: Array, trials: Array) -> Figure:
+def clustered_share(events: Array, trials: Array, effect: float = 1.0) -> Figure:
     """Return a share of counts in independent clusters.
 
     Parameters
     ----------
     events, trials : (cluster,) float
         Counts.
+    effect : float
+        Design effect of values of the same clusters (`design_effect`). So many values count as one
+        where there are too few events to show how they scatter.
     """
     total = float(trials.sum())
     if total == 0.0:
         return share(0.0)
     value = float(events.sum()) / total
-    error = float(np.sqrt(np.sum((events - value * trials) ** 2))) / total
-    # Without any event the error would be zero; one event is assumed then.
-    return share(Figure(value, max(error, 1.0 / total)))
+    # Without events, 2 errors are the 95 percent limit of the share: 3 over the number of values.
+    least = 0.5 * _LIMIT_WITHOUT_EVENTS * effect / total
+    return share(Figure(value, max(_scatter(events, trials), min(least, 0.5))))
+
+
+def design_effect(events: Array, trials: Array) -> float:
+    """Return the number of values in clusters that tell as much as one independent value.
+
+    At least 1; it is the variance of the share over that of independent values.
+    """
+    total = float(trials.sum())
+    value = float(events.sum()) / total if total else 0.0
+    independent = value * (1.0 - value) / total if total else 0.0
+    return max(_scatter(events, trials) ** 2 / independent, 1.0) if independent else 1.0
+
+
+def _scatter(events: Array, trials: Array) -> float:
+    """Return the error of a share from the scatter of its clusters."""
+    total = float(trials.sum())
+    value = float(events.sum()) / total
+    return float(np.sqrt(np.sum((events - value * trials) ** 2))) / total
 
 
 def mean_by_block(values: npt.NDArray[np.generic], kept: Mask, block: int) -> Figure | None:

@@ -83,6 +83,12 @@ def least_times(
     return least
 
 
+def cpu_seconds() -> float:
+    """Return the CPU time of this process so far, with that of its children that have ended."""
+    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
 def in_threads(function: Callable[[int], object], threads: int) -> None:
     """Call ``function(0)`` to ``function(threads - 1)``, each in its own thread."""
     with ThreadPoolExecutor(threads) as pool:

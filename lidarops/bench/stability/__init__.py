@@ -1,5 +1,6 @@
 """The stability benchmark: false values without a flag in random scenes.
 
-`random_scenes` counts them; the scenes of each retrieval are in ``random_*``. `study` runs all.
-Stiff cases are tests.
+`random_scenes` counts them; the scenes of each retrieval are in ``random_*``. `flag_rates` counts
+flags that are needless or decide alone, `reproducibility` how far order and machine change values.
+`study` runs all, with targets. Stiff cases are tests.
 """

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.harness.rows import Array, Mask
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
+from lidarops.bench.harness.rows import Array
+from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import ErrorKind
 from lidarops.products.elastic.variables import sources
@@ -317,13 +317,13 @@ def score_elastic(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
         if sky.outlying:
             counts = counts + np.sqrt(noise) * _deviations(rng, counts.shape, sky.outlying)
         processed = _process(counts, noise, base)
-        hidden = None
+        misfit = None
         if not failure.satisfied:
-            hidden = visible_misfit_of_sky(mean / _SHOTS, noise[0], base, processed) < VISIBLE
+            misfit = visible_misfit_of_sky(mean / _SHOTS, noise[0], base, processed)
         if sky.outlying:
             # The misfit of noise-free signals does not include outlying bins.
-            hidden = np.zeros(profiles, dtype=np.bool_)
-        yield _scored(failure, sky, processed, base, hidden), profiles
+            misfit = np.full(profiles, np.inf)
+        yield _scored(failure, sky, processed, base, misfit), profiles
 
 
 def _deviations(rng: Random, shape: tuple[int, ...], share: float) -> Array:
@@ -337,7 +337,7 @@ def _scored(
     sky: RandomSky,
     processed: _Processed,
     base: elastic_cases.SimulatedSky,
-    hidden: Mask | None,
+    misfit: Array | None,
 ) -> ScoredValues:
     r = base.range
     window, clouds, solved = processed.window, processed.clouds, processed.solved
@@ -362,7 +362,7 @@ def _scored(
         failure, "backscatter", error, random[:, inside], systematic[:, inside],
         bits[:, inside], ElasticQuality,
         uncertain=(bits[:, inside] & int(ElasticQuality.CLOUD)) != 0,
-        hidden=None if hidden is None else np.broadcast_to(hidden[:, np.newaxis], error.shape),
+        misfit=None if misfit is None else np.broadcast_to(misfit[:, np.newaxis], error.shape),
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from lidarops.bench.accuracy.multiangle_cases import correlated
 from lidarops.bench.harness.rows import Array, Mask
-from lidarops.bench.stability.random_scenes import COVERED, FALSE, VISIBLE, Failure, ScoredValues
+from lidarops.bench.stability.random_scenes import COVERED, Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -255,10 +255,8 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValue
         noise = None if "not stated" in failure.name else 1.0
         wider = _widening(paths.range.size) if noise is None else 1.0
         solvable: Mask = within & (wider * least <= _SOLVABLE)
-        hidden = (
-            None if violate is _none else visible_misfit(paths.range, violated.signal) < VISIBLE
-        )
-        yield from _solved(failure, paths, violated, power, (noise, solvable, hidden))
+        misfit = None if violate is _none else visible_misfit(paths.range, violated.signal)
+        yield from _solved(failure, paths, violated, power, (noise, solvable, misfit))
 
 
 def _widening(bins: int) -> float:
@@ -267,8 +265,7 @@ def _widening(bins: int) -> float:
     Calculated apart from the retrieval, whose errors must not decide which flags are needless.
     """
     freedom = 18.0 / 35.0 * (bins - 2)
-    far = stats.t.isf(0.5 * THRESHOLDS.false_estimated, freedom) / FALSE
-    return float(max(far, stats.t.isf(stats.norm.sf(COVERED), freedom) / COVERED))
+    return float(stats.t.isf(stats.norm.sf(COVERED), freedom) / COVERED)
 
 
 def _solved(
@@ -276,9 +273,9 @@ def _solved(
     paths: Paths,
     violated: ViolatedPaths,
     power: Array,
-    known: tuple[float | None, Mask, Mask | None],
+    known: tuple[float | None, Mask, Array | None],
 ) -> Iterator[tuple[ScoredValues, int]]:
-    noise, solvable, hidden = known
+    noise, solvable, misfit = known
     fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
     bits = np.asarray(fit.quality)
     # Missing bins lose information.
@@ -288,7 +285,7 @@ def _solved(
         ScoredValues(
             failure, "extinction", fit.extinction - violated.extinction,
             fit.extinction_standard_error, fit.extinction_model_error, bits,
-            HomogeneousQuality, solvable=expected, hidden=hidden,
+            HomogeneousQuality, solvable=expected, misfit=misfit,
         ),
         count,
     )  # fmt: skip
@@ -296,7 +293,7 @@ def _solved(
         ScoredValues(
             failure, "background", fit.background - paths.background[:, 0],
             fit.background_standard_error, fit.background_model_error, bits,
-            HomogeneousQuality, solvable=expected, hidden=hidden,
+            HomogeneousQuality, solvable=expected, misfit=misfit,
         ),
         count,
     )  # fmt: skip

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals
 from lidarops.bench.harness.rows import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.errors import LidarOpsError
-from lidarops.retrieve.network import extinction_field
+from lidarops.retrieve.network import extinction_field, labeled
 from lidarops.retrieve.network.flags import NetworkQuality
 
 Random = np.random.Generator
@@ -31,7 +32,7 @@ class _Measurement:
     exponent: float = 1.0
 
 
-def _random_network(rng: Random) -> LidarLine:
+def random_network(rng: Random) -> LidarLine:
     """Return 3 or 4 lidars on a line with 1 or 2 beams each that meet above it."""
     lidar_count = int(rng.integers(3, 5))
     east = np.linspace(-600.0, 600.0, lidar_count) + rng.uniform(-150.0, 150.0, lidar_count)
@@ -47,18 +48,21 @@ def _random_network(rng: Random) -> LidarLine:
     return LidarLine("random", tuple(float(x) for x in east), elevations, farthest=2500.0)
 
 
-def _homogeneous(rng: Random) -> Air:
+def homogeneous(rng: Random) -> Air:
+    """Return air of one random extinction."""
     value = float(np.exp(rng.uniform(np.log(1e-5), np.log(6e-2))))
     return Air("homogeneous", lambda _: lambda __, up: np.full_like(up, value))
 
 
-def _layered(rng: Random) -> Air:
+def layered(rng: Random) -> Air:
+    """Return air whose extinction falls or grows with height."""
     value = float(np.exp(rng.uniform(np.log(1e-5), np.log(1e-2))))
     scale = float(rng.uniform(300.0, 3000.0) * rng.choice([-1.0, 1.0]))
     return Air("layered", lambda _: lambda __, up: value * np.exp(-up / scale))
 
 
-def _plume(rng: Random, *, drift: float = 0.0) -> Air:
+def plume(rng: Random, *, drift: float = 0.0) -> Air:
+    """Return air with a plume, which drifts by `drift` m in a block."""
     value = float(np.exp(rng.uniform(np.log(1e-4), np.log(5e-3))))
     excess, width = rng.uniform(0.3, 3.0), rng.uniform(50.0, 300.0)
     centre = rng.uniform([-300.0, 300.0], [300.0, 900.0])
@@ -88,7 +92,7 @@ def _thin_layer(rng: Random) -> Air:
 
 
 def _drifting_plume(rng: Random) -> Air:
-    return _plume(rng, drift=300.0)
+    return plume(rng, drift=300.0)
 
 
 def _undamaged(measurement: _Measurement, _: Signals, __: Random) -> _Measurement:
@@ -138,15 +142,15 @@ def _with_offset(measurement: _Measurement, _: Signals, rng: Random) -> _Measure
 _UNKNOWN_EXPONENT: Final = "the signals do not determine the exponent: the user declares it"
 _NOT_CANCELLED: Final = "overlap errors do not cancel, and beams that agree may share them"
 FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
-    (Failure("none, homogeneous", satisfied=True), _homogeneous, _undamaged),
-    (Failure("none, layered", satisfied=True), _layered, _undamaged),
-    (Failure("none, plume", satisfied=True), _plume, _undamaged),
+    (Failure("none, homogeneous", satisfied=True), homogeneous, _undamaged),
+    (Failure("none, layered", satisfied=True), layered, _undamaged),
+    (Failure("none, plume", satisfied=True), plume, _undamaged),
     (Failure("plume that drifts within a block"), _drifting_plume, _undamaged),
-    (Failure("gaps"), _layered, _with_gaps),
-    (Failure("outliers"), _layered, _with_outliers),
-    (Failure("overlap error", unseen=_NOT_CANCELLED), _layered, _with_overlap),
-    (Failure("wrong exponent", unseen=_UNKNOWN_EXPONENT), _layered, _with_exponent),
-    (Failure("background left in the signals"), _layered, _with_offset),
+    (Failure("gaps"), layered, _with_gaps),
+    (Failure("outliers"), layered, _with_outliers),
+    (Failure("overlap error", unseen=_NOT_CANCELLED), layered, _with_overlap),
+    (Failure("wrong exponent", unseen=_UNKNOWN_EXPONENT), layered, _with_exponent),
+    (Failure("background left in the signals"), layered, _with_offset),
     (Failure("layer of a few bins"), _thin_layer, _with_little_noise),
 )
 
@@ -181,7 +185,7 @@ def _solve_damaged(
 ) -> tuple[extinction_field.NetworkResult, Array] | None:
     """Return the result and the truth; None where the beams do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
-    net = _random_network(rng).network()
+    net = random_network(rng).network()
     if net.crossings < 2 or not np.all(np.diff(np.bincount(net.passages.beam)) == 0):
         return None
     clean = signals(net, draw_air(rng))
@@ -197,3 +201,90 @@ def _solve_damaged(
         # Beams without two crossings in range raise an error.
         return None
     return result, clean.truth(profiles)
+
+
+# Short blocks, and lidar ratios -------------------------------------------------------------------
+
+_LONG_WAVES: Final = (300.0, 3000.0)
+"""m; lengths of the waves of the lidar ratio."""
+_VARIED: Final = 0.1
+"""Rms variation of the lidar ratio within a network."""
+_DECLARED: Final = (("2 %, the default, declared", 0.02), ("10 % declared", _VARIED))
+_NOT_SHOWN: Final = "the signals do not show how the lidar ratio varies: the user declares it"
+
+
+def _drawn(rng: Random, draw_air: Any) -> tuple[Signals, float] | None:
+    """Return clean signals of a random network, and the noise; None where beams do not meet."""
+    noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
+    net = random_network(rng).network()
+    if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
+        return None
+    return signals(net, draw_air(rng)), noise
+
+
+def score_short_blocks(
+    cluster: int, profiles: int, *, draw_air: Any, length: int
+) -> Iterator[tuple[ScoredValues, int]]:
+    """Yield results of networks that are solved in blocks of a few profiles."""
+    rng = np.random.default_rng((81, cluster))
+    drawn = _drawn(rng, draw_air)
+    if drawn is None:
+        return
+    clean, noise = drawn
+    power, variance = clean.draw(noise, profiles, int(rng.integers(2**31)))
+    result = extinction_field.retrieve_network(
+        power, clean.range, clean.network, variance=variance, full_overlap_range=_FULL_OVERLAP,
+        blocks=np.arange(profiles) // length,
+    )  # fmt: skip
+    name = f"{draw_air.__name__}, blocks of {length}"
+    yield _scored(Failure(name, satisfied=True), result, clean.truth(profiles), 0.0), profiles
+
+
+def _scored(
+    failure: Failure, result: extinction_field.NetworkResult, truth: Array, systematic: Any
+) -> ScoredValues:
+    bits = np.where(result.flags.flagged, _DOUBTED, np.int32(0))
+    error = np.where(result.near_crossing, result.extinction - truth, np.nan)
+    return ScoredValues(
+        failure, "extinction", error, result.extinction_standard_error, systematic, bits,
+        NetworkQuality,
+    )  # fmt: skip
+
+
+def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+    """Yield results of networks whose lidar ratio varies along a wave of random direction."""
+    rng = np.random.default_rng((86, cluster))
+    drawn = _drawn(rng, plume)
+    if drawn is None:
+        return
+    clean, noise = drawn
+    net = clean.network
+    wave = 2.0 * np.pi / np.exp(rng.uniform(np.log(_LONG_WAVES[0]), np.log(_LONG_WAVES[1]), 2))
+    at = net.origin[:, :, np.newaxis] + net.direction[:, :, np.newaxis] * clean.range
+    phase = wave[0] * at[:, 0] + wave[1] * at[:, 2] + rng.uniform(0.0, 2.0 * np.pi)
+    ratio = np.exp(_VARIED * np.sqrt(2.0) * np.sin(phase))
+    power, variance = replace(clean, power=clean.power / ratio).draw(
+        noise, profiles, int(rng.integers(2**31))
+    )
+    solver = _solver(clean, power, variance)
+    result = solver.solve(power)
+    of_ratio = labeled._lidar_ratio_error(solver, result, 1.0)  # noqa: SLF001 - as products state it
+    for words, declared in _DECLARED:
+        failure = Failure(f"lidar ratio varies by 10 %, {words}", unseen=_NOT_SHOWN)
+        yield _scored(failure, result, clean.truth(profiles), declared * of_ratio), profiles
+
+
+def _solver(clean: Signals, power: Array, variance: Array) -> Any:
+    """Return the solver of products, which states their systematic errors."""
+    net = clean.network
+    of_beams: Any = SimpleNamespace(
+        power=power, variance=variance, overlap=None,
+        range=np.broadcast_to(clean.range, (net.beams, clean.range.size)),
+    )  # fmt: skip
+    beams: Any = [
+        SimpleNamespace(exponent=1.0, instrument=beam, nearest=_FULL_OVERLAP)
+        for beam in range(net.beams)
+    ]
+    settings: Any = SimpleNamespace(prior="block", multiplier=None, block_intervals=len(power))
+    intervals = np.arange(len(power))
+    return labeled._Solver(beams, net, settings, of_beams, intervals)  # noqa: SLF001 - as above

@@ -9,6 +9,7 @@ from itertools import product
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scan, Scene
@@ -126,15 +127,21 @@ def score_scan_methods(cluster: int, profiles: int) -> Iterator[tuple[ScoredValu
         yield from _score_quantities(failure, scene, result, profiles)
 
 
+def _bits(result: optical_depth.MultiAngleResult) -> npt.NDArray[np.int32]:
+    """Return the quality bits of a result, with those of its flags."""
+    bits = np.asarray(result.quality).copy()
+    for name, bit in QUALITY_OF_FLAG.items():
+        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
+    return bits
+
+
 def _score_quantities(
     failure: Failure,
     scene: Scene,
     result: optical_depth.MultiAngleResult,
     profiles: int,
 ) -> Iterator[tuple[ScoredValues, int]]:
-    bits = np.asarray(result.quality).copy()
-    for name, bit in QUALITY_OF_FLAG.items():
-        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
+    bits = _bits(result)
     truth: dict[str, Array] = {
         "optical depth": scene.optical_depth,
         "extinction": np.asarray(scene.extinction),
@@ -150,3 +157,66 @@ def _score_quantities(
             ),
             profiles,
         )  # fmt: skip
+
+
+# Other scans ------------------------------------------------------------------------------------
+
+
+def score_short_scans(
+    cluster: int, profiles: int, *, length: int
+) -> Iterator[tuple[ScoredValues, int]]:
+    """Solve random scans where the model holds, in blocks of `length` profiles."""
+    rng = np.random.default_rng((72, cluster, 0))
+    scene = _level(multiangle_cases.random_scene(cluster, profiles), rng)
+    scan = scene.draw(profiles, cluster, 0, 87)
+    for first in range(0, profiles, length):
+        some = slice(first, first + length)
+        part = replace(
+            scene, extinction=scene.extinction[some], backscatter=scene.backscatter[some]
+        )
+        block = Scan(part, scan.signal[some], scan.variance[some])
+        result = multiangle_cases.retrieve(block, multiangle_cases.AUTO)
+        failure = Failure(f"blocks of {length}", satisfied=True)
+        yield from _score_quantities(failure, part, result, length)
+
+
+def score_counted_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+    """Solve scans of photon counts, whose variance is stated in two ways."""
+    rng = np.random.default_rng((84, cluster))
+    angles = np.degrees(np.arccos(1.0 / np.linspace(1.0, 3.0, 9)))
+    altitude = 150.0 + 30.0 * np.arange(60, dtype=np.float64)
+    extinction = np.full(altitude.size, float(rng.uniform(2e-5, 2e-4)))
+    depth = 30.0 * np.cumsum(extinction) + 120.0 * extinction
+    distance = altitude / np.cos(np.radians(angles))[:, np.newaxis]
+    bright = float(np.exp(rng.uniform(np.log(3e6), np.log(3e8))))
+    air = 0.02 * rng.standard_normal((profiles, *distance.shape))
+    mean = bright / distance**2 * np.exp(-2.0 * distance / altitude * depth + air)
+    counts = rng.poisson(mean).astype(float)
+    # Rates smoothed over 10 % of range, as `photon_signal` has them.
+    smooth = _smoothed(counts, altitude)
+    for name, holds, variance in (
+        ("variance from single counts", False, counts),
+        ("variance from smoothed counts, as in products", True, smooth),
+    ):
+        result = optical_depth.retrieve_optical_depth(
+            counts * distance**2, angles, altitude, variance=variance * distance**4
+        )
+        yield _score_depth(Failure(name, satisfied=holds), depth, result), profiles
+
+
+def _score_depth(
+    failure: Failure, depth: Array, result: optical_depth.MultiAngleResult
+) -> ScoredValues:
+    return ScoredValues(
+        failure, "optical depth", result.optical_depth - depth,
+        result.optical_depth_standard_error, result.optical_depth_gradient_error, _bits(result),
+        MultiAngleQuality, uncertain=result.flags.doubtful(),
+    )  # fmt: skip
+
+
+def _smoothed(counts: Array, altitude: Array) -> Array:
+    low = np.searchsorted(altitude, 0.9 * altitude)
+    high = np.searchsorted(altitude, 1.1 * altitude, side="right")
+    sums = np.cumsum(counts, axis=-1)
+    sums = np.concatenate([np.zeros_like(sums[..., :1]), sums], axis=-1)
+    return np.asarray(np.maximum(sums[..., high] - sums[..., low], 1.0) / (high - low))

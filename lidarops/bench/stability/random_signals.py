@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.harness.rows import Array
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, ScoredValues
+from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -45,8 +45,8 @@ class Errors:
     bits: Any
     systematic: Any = 0.0
     """Stated systematic error."""
-    hidden: Any = None
-    """Where the violation is hidden; None: unknown."""
+    misfit: Any = None
+    """Of the violation, in standard deviations of the noise; None: unknown."""
 
 
 def _logarithmic(rng: Random, low: float, high: float) -> float:
@@ -145,17 +145,17 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Errors:
     bits = fit.quality | np.where(
         fit.singular, np.int32(HomogeneousQuality.POORLY_DETERMINED), np.int32(0)
     )
-    hidden = None
+    misfit = None
     if haze:
         # Misfit of the wrong shape in the chosen window, without noise.
         rows = np.broadcast_to(clean, counts.shape)
         noise_free_fit = known_shape.fit_known_shape(
             rows, sky.range, shape, variance=variance, start=fit.start, stop=fit.stop
         )
-        hidden = np.sqrt(noise_free_fit.chi2) < VISIBLE
+        misfit = np.sqrt(noise_free_fit.chi2)
     error = fit.background - level
     return Errors(
-        "background, known shape", error, fit.background_standard_error, bits, hidden=hidden
+        "background, known shape", error, fit.background_standard_error, bits, misfit=misfit
     )
 
 
@@ -224,8 +224,44 @@ def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
             ScoredValues(
                 failure, errors.quantity, errors.error, errors.random, errors.systematic,
                 np.asarray(errors.bits), HomogeneousQuality,
-                solvable=np.isfinite(errors.error) if clean else None, hidden=errors.hidden,
+                solvable=np.isfinite(errors.error) if clean else None, misfit=errors.misfit,
                 uncertain=(errors.bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
             ),
             profiles,
         )  # fmt: skip
+
+
+_ROUNDED: Final = (0.05, 0.1, 0.2)
+"""Noise in steps of the digitizer."""
+
+
+def score_digitizers(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+    """Yield single bins of a signal that falls steeply, with noise of a fraction of a step."""
+    for noise in _ROUNDED:
+        rng = np.random.default_rng((83, cluster))
+        shots = int(_logarithmic(rng, 20.0, 300.0))
+        distance = _RANGE[:_BINS]
+        fall = (300.0 / np.maximum(distance, 300.0)) ** 2
+        level = float(rng.uniform(20.0, 60.0)) + float(rng.uniform(500.0, 3500.0)) * fall
+        total = np.zeros((profiles, _BINS))
+        for _ in range(shots):
+            total += np.rint(level + noise * rng.standard_normal(total.shape, dtype=np.float32))
+        signal = counts_to_signal.analog_signal(
+            total.astype(np.int32), np.full(profiles, shots), distance, adc_bits=_BITS,
+            input_range=np.full(profiles, 0.5),
+        )  # fmt: skip
+        error = np.asarray(signal.power - level * _STEP, dtype=np.float64)
+        stated = np.sqrt(np.asarray(signal.variance, dtype=np.float64))
+        places = {
+            "steep": (distance > 320.0) & (distance < 1200.0),
+            "flat": distance > 1500.0,
+        }
+        for place, bins in places.items():
+            failure = Failure(f"noise of {noise:g} steps, {place} bins", satisfied=True)
+            yield (
+                ScoredValues(
+                    failure, "voltage of a bin", error[:, bins], stated[:, bins], 0.0,
+                    np.asarray(signal.quality)[:, bins], HomogeneousQuality,
+                ),
+                profiles,
+            )  # fmt: skip

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from lidarops.netcdf.cloud_rows import CLOUDS
+from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -129,7 +130,9 @@ LAYOUT: Final = Layout(
     " independent measurement. Profiles are means over time; range is along the beam. Particles in"
     " the reference window that decrease with height nearly as molecules do look like aerosol-free"
     " air, and no test of the signal detects them: only the error of the scattering ratio declared"
-    " in the settings covers them. Declare a larger error where the air is hazy at all heights. An"
+    " in the settings covers them. Declare a larger error where the air is hazy at all heights:"
+    f" where simulated haze exceeded it, {percent('backscatter', 'more haze than stated')} of the"
+    " values without a flag deviated by more than 4 of their standard errors. An"
     " elastic signal does not determine the lidar ratio either; its declared error has to cover"
     " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
     " bin deviates from theirs by more than noise explains.",

@@ -316,14 +316,18 @@ def test_a_contrast_changes_values_and_errors_alike(accuracy):
 
 
 def test_the_network_agrees_with_a_plain_fit(accuracy):
-    rows = accuracy.figures("Network without prior and scipy, the same profiles")
+    rows = accuracy.figures("Networks and scipy, the same profiles and crossings")
     pairs = list(dict.fromkeys((place, air) for place, air, _ in rows))
     assert len(pairs) == 8
     for pair in pairs:
         assert rows[*pair, "profiles"].value == 10
         assert rows[*pair, "difference / stated"].value < 1.0
-        ours = rows[*pair, "lidarops, RMSE"].value
-        assert rows[*pair, "scipy, RMSE"].value == pytest.approx(ours, rel=0.5)
+        ours, plain, peer = (
+            rows[*pair, f"{method}, RMSE"].value
+            for method in ("network", "network, no prior", "scipy least_squares")
+        )
+        assert peer == pytest.approx(plain, rel=0.5)
+        assert rows[*pair, "network / scipy"].value == pytest.approx(ours / peer)
 
 
 def test_times_are_multiples_of_the_read(throughput_result):
