@@ -27,10 +27,14 @@ class Cells:
     step: float
     """m."""
 
+    @property
+    def stop(self) -> int:
+        """First bin beyond the last cell."""
+        return self.first + self.bins * self.range.size
+
     def split(self, values: npt.NDArray[T]) -> npt.NDArray[T]:
         """Return (..., bin) values as (..., cell, bin of the cell)."""
-        stop = self.first + self.bins * self.range.size
-        inside = values[..., self.first : stop]
+        inside = values[..., self.first : self.stop]
         return inside.reshape(*inside.shape[:-1], self.range.size, self.bins)
 
     def mean(self, values: Array) -> Array:

@@ -476,8 +476,21 @@ def _cloud_variables(
         "quality_flag": (both, quality),
         "cloud_mask": (both, state),
         "cloud_fraction": (both, fraction),
-        **_clouds.cloud_heights(clouds, distance, sky.station_altitude, sky.climb),
+        **_heights_in(cells, clouds, distance, sky),
     }
+
+
+def _heights_in(
+    cells: Cells, clouds: _clouds.Clouds, distance: Array, sky: _Sky
+) -> dict[str, tuple[str, Array]]:
+    """Return base and top of clouds up to the last cell, beyond which no value has their bit."""
+    inside = slice(0, cells.stop)
+    mask, fraction, unknown = (
+        of_bins[:, inside] for of_bins in (clouds.mask, clouds.fraction, clouds.unknown)
+    )
+    return _clouds.cloud_heights(
+        _clouds.Clouds(mask, fraction, unknown), distance[inside], sky.station_altitude, sky.climb
+    )
 
 
 def _overlap(

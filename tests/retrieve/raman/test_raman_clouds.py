@@ -65,12 +65,12 @@ def averages(profiles):
     return elastic, raman
 
 
-def product_of(cloudy):
+def product_of(cloudy, cirrus=CIRRUS):
     """Return the product of half an hour, `cloudy` of whose profiles have a cirrus."""
-    clear, seen = (make_sky(HAZE + cirrus, STEP, 3e5, window=WINDOW) for cirrus in (0.0, CIRRUS))
+    clear, seen = (make_sky(HAZE + cloud, STEP, 3e5, window=WINDOW) for cloud in (0.0, cirrus))
     # The cirrus has another lidar ratio than the haze.
-    total = clear.air.backscatter + (HAZE + CIRRUS) / 50.0
-    bright = seen.elastic * (1.0 + CIRRUS * (1.0 / CLOUD_RATIO - 1.0 / 50.0) / total)
+    total = clear.air.backscatter + (HAZE + cirrus) / 50.0
+    bright = seen.elastic * (1.0 + cirrus * (1.0 / CLOUD_RATIO - 1.0 / 50.0) / total)
     first = int(np.searchsorted(R, 1000.0))
     assert clear.elastic[first] == pytest.approx(bright[first])
     rng = np.random.default_rng(3)
@@ -115,6 +115,14 @@ def test_a_cirrus_in_some_of_the_profiles_is_stated(partly_cloudy):
     assert partly_cloudy["cloud_base_altitude"][0] == pytest.approx(6000.0, abs=60.0)
     assert partly_cloudy["cloud_top_altitude"][0] == pytest.approx(6300.0, abs=120.0)
     assert raised(partly_cloudy, RamanQuality.PARTLY_CLOUDY)[cloud].all()
+
+
+def test_clouds_beyond_the_product_have_no_heights():
+    product = product_of(PROFILES, cirrus=np.where((R > 13_000.0) & (R < 13_300.0), 3e-4, 0.0))
+    assert product["range"][-1] < 10_000.0
+    assert np.isnan(product["cloud_top_altitude"]).all()
+    assert np.isnan(product["cloud_base_altitude"]).all()
+    assert not raised(product, RamanQuality.CLOUD).any()
 
 
 def test_the_edges_of_a_cloud_are_to_be_used_with_care(partly_cloudy):
