@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -399,6 +400,10 @@ def test_the_slope_of_the_standard_atmosphere_is_off_by_its_stated_error(data_ro
     slopes = [np.gradient(np.log(density), z) for density in densities]
     away = np.sqrt(np.mean((slopes[0] - slopes[1]) ** 2))
     assert away == pytest.approx(STANDARD_SLOPE_ERROR, rel=0.02)
+    edges = np.array([100.0, 1000.0, 2000.0, 4000.0, 8000.0, 12_000.0])
+    parts = [(z > low) & (z < high) for low, high in itertools.pairwise(edges)]
+    of_parts = [np.sqrt(np.mean((slopes[0] - slopes[1])[part] ** 2)) for part in parts]
+    np.testing.assert_allclose(np.multiply(of_parts, 1e6), [4.3, 5.9, 7.0, 10.2, 24.8], atol=0.3)
 
 
 def test_the_night_of_manaus_has_the_extinction_of_the_page(manaus):

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.raman.cells import Cells
@@ -46,6 +47,11 @@ def choose_window(
     air : AirColumn
     cells : Cells
     settings : RamanSettings
+
+    Raises
+    ------
+    RetrievalInputError
+        Where all cells lie below the least range of the window.
     """
     candidates = _candidates(cells, settings)
     # Of cells: the tests take noise as normal, which it is not in bins of few counts.
@@ -82,6 +88,13 @@ def choose_window(
 
 def _candidates(cells: Cells, settings: RamanSettings) -> Array:
     highest = min(settings.highest, float(cells.range[-1]))
+    if not highest > settings.lowest:
+        raise RetrievalInputError(
+            f"the last cell at {highest:g} m is nearer than the reference window, which begins at"
+            f" {settings.lowest:g} m or beyond",
+            field="highest",
+            remedy="give a farther range, smaller cells or a nearer window",
+        )
     width = min(settings.width, highest - settings.lowest)
     step = settings.width / WINDOW_THRESHOLDS.steps_per_window
     return reference_window.candidate_windows(settings.lowest, highest, width, step)

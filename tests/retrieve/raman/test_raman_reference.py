@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.raman_signals import make_sky
 
+from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.raman import retrieve_raman
 
 STEP = 30.0
@@ -57,3 +58,9 @@ def test_windows_with_particles_are_rejected():
     layer = HAZE + np.where((R > 5900.0) & (R < 8200.0), 60.0 * 0.5 * molecular, 0.0)
     _, found = retrieved(20_000.0, 150.0, SEVERAL, rows=20, seed=3, extinction=layer)
     assert np.all(found.reference_bottom >= 8000.0)
+
+
+def test_cells_below_the_window_are_refused_in_clear_words():
+    with pytest.raises(RetrievalInputError, match=r"highest: the last cell at 13470 m") as caught:
+        retrieved(1000.0, 16.0, (14_000.0, 15_000.0, 1000.0), rows=1, seed=1)
+    assert caught.value.remedy
