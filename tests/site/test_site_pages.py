@@ -364,7 +364,7 @@ def test_days_have_a_calendar_and_filters(output: Path) -> None:
 def test_human_names_stand_beside_identifiers(output: Path) -> None:
     text = page_of(output, "signal").read_text("utf-8")
     assert "<h1>Range-corrected signals, 532 nm, photon counting</h1>" in text
-    assert "Одеса, hill; Lidar One; 2026-03-01, 10:00 to 10:50 UTC" in text
+    assert "Одеса, hill; Lidar One; 2026-03-01, 10:00 to 10:50\u00a0UTC" in text
     assert "532 nm, photon counting (photon_532o)" in text
 
 
