@@ -21,7 +21,7 @@ from lidarops.netcdf.variables import (
     units,
 )
 from lidarops.records import DetectionMode
-from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
+from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 
 ROWS = [
     pytest.param(kind, row, id=f"{kind}-{row.name}")

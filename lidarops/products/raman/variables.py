@@ -31,7 +31,7 @@ from lidarops.netcdf.variables import (
     shots,
 )
 from lidarops.products.raman.flags import FLAGS
-from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
+from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12

@@ -221,37 +221,25 @@ def retrieve(
     quality[uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
     stated = seen if overlap_is_stated or overlap is not None else np.full_like(seen, np.nan)
-    variables = _variables(result, cells, air, of_raman, settings, stated)
     sky = _Sky(molecules, station_altitude, climb, seen, overlap_is_stated)
-    variables |= _cloud_variables(channels[0].averages, assumptions, cells, result, sky)
+    variables = {
+        **_variables(result, cells, air, of_raman, settings, stated),
+        **_reference_variables(result, settings, sky),
+        **_cloud_variables(channels[0].averages, assumptions, cells, result, sky),
+        "background": ("time", of_elastic.background),
+        "background_standard_error": ("time", of_elastic.background_standard_error),
+        "profiles": elastic["profiles"],
+        "profiles_left_out": elastic.get("profiles_left_out", 0 * elastic["profiles"]),
+        "shots": elastic["shots"],
+    }
     if water is not None:
         pair = _Pair((of_raman, air), channels[2], water)
-        of_water, doubtful = _water(pair, cells, result, (molecules, heights), assumptions)
-        variables |= of_water
+        of_water, doubtful = _water(pair, cells, result, sky, assumptions)
         dims, bits = variables["quality_flag"]
         doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
-        variables["quality_flag"] = (dims, bits | doubt)
+        variables |= {**of_water, "quality_flag": (dims, bits | doubt)}
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
-    return xr.Dataset(
-        {
-            **variables,
-            "reference_bottom_altitude": (
-                "time",
-                station_altitude + climb * result.reference_bottom,
-            ),
-            "reference_top_altitude": ("time", station_altitude + climb * result.reference_top),
-            "reference_scattering_ratio": settings.scattering_ratio,
-            "reference_scattering_ratio_standard_error": (
-                settings.scattering_ratio * settings.reference_relative_error
-            ),
-            "background": ("time", of_elastic.background),
-            "background_standard_error": ("time", of_elastic.background_standard_error),
-            "profiles": elastic["profiles"],
-            "profiles_left_out": elastic.get("profiles_left_out", 0 * elastic["profiles"]),
-            "shots": elastic["shots"],
-        },
-        coords={**coords, "range": ("range", cells.range)},
-    )
+    return xr.Dataset(variables, coords={**coords, "range": ("range", cells.range)})
 
 
 def without_signal(
@@ -415,9 +403,6 @@ def _variables(
         **{name: (both, values) for name, values in profiles.items()},
         "quality_flag": (both, result.quality),
         "molecular_backscatter": ("range", cells.mean(air.backscatter)),
-        "reference_bottom": ("time", result.reference_bottom),
-        "reference_top": ("time", result.reference_top),
-        "reference_rejections": ("time", result.reference_rejections),
     }
 
 
@@ -435,6 +420,24 @@ class _Sky:
     overlap: Array
     overlap_is_stated: bool
 
+    def altitude(self, distance: Array) -> Array:
+        """Return altitudes of ranges, m."""
+        return np.asarray(self.station_altitude + self.climb * distance)
+
+
+def _reference_variables(result: RamanResult, settings: RamanSettings, sky: _Sky) -> dict[str, Any]:
+    """Return the reference windows, and what is assumed in them."""
+    ratio = settings.scattering_ratio
+    return {
+        "reference_bottom": ("time", result.reference_bottom),
+        "reference_top": ("time", result.reference_top),
+        "reference_rejections": ("time", result.reference_rejections),
+        "reference_bottom_altitude": ("time", sky.altitude(result.reference_bottom)),
+        "reference_top_altitude": ("time", sky.altitude(result.reference_top)),
+        "reference_scattering_ratio": ratio,
+        "reference_scattering_ratio_standard_error": ratio * settings.reference_relative_error,
+    }
+
 
 def _cloud_variables(
     averages: xr.Dataset, assumptions: Assumptions, cells: Cells, result: RamanResult, sky: _Sky
@@ -442,8 +445,7 @@ def _cloud_variables(
     """Return the clouds of the elastic signal, and the quality with their bits."""
     both, settings = ("time", "range"), assumptions.settings
     distance = averages["range"].to_numpy()
-    heights = sky.station_altitude + sky.climb * distance
-    air = _clouds.air_along(sky.molecules, heights, distance, settings.wavelength)
+    air = _clouds.air_along(sky.molecules, sky.altitude(distance), distance, settings.wavelength)
     contrast = cloud_contrast(settings.wavelength)
     means = _clouds.MeanProfiles(averages, distance, air, sky.overlap, contrast)
     reference = _clouds.Reference(
@@ -484,13 +486,9 @@ def _heights_in(
     cells: Cells, clouds: _clouds.Clouds, distance: Array, sky: _Sky
 ) -> dict[str, tuple[str, Array]]:
     """Return base and top of clouds up to the last cell, beyond which no value has their bit."""
-    inside = slice(0, cells.stop)
-    mask, fraction, unknown = (
-        of_bins[:, inside] for of_bins in (clouds.mask, clouds.fraction, clouds.unknown)
-    )
-    return _clouds.cloud_heights(
-        _clouds.Clouds(mask, fraction, unknown), distance[inside], sky.station_altitude, sky.climb
-    )
+    n = cells.stop
+    of_cells = _clouds.Clouds(clouds.mask[:, :n], clouds.fraction[:, :n], clouds.unknown[:, :n])
+    return _clouds.cloud_heights(of_cells, distance[:n], sky.station_altitude, sky.climb)
 
 
 def _overlap(
@@ -540,14 +538,14 @@ def _water(
     pair: _Pair,
     cells: Cells,
     result: RamanResult,
-    sources: tuple[MolecularProfile, Array],
+    sky: _Sky,
     assumptions: Assumptions,
 ) -> tuple[dict[str, Any], Booleans]:
     """Return the mixing ratio of water vapour with its errors, and the cells that are doubtful."""
     (nitrogen, air), water = pair.nitrogen, pair.water
-    (molecules, heights), settings = sources, assumptions.settings
-    density = molecules.number_density(heights)
-    depth = _depth(molecules, heights, air.range, water.wavelength)
+    settings, heights = assumptions.settings, sky.altitude(air.range)
+    density = sky.molecules.number_density(heights)
+    depth = _depth(sky.molecules, heights, air.range, water.wavelength)
     # The share of the lines of nitrogen that the filter passes is not that of water vapour.
     shape = replace(air, raman_depth=depth, density=density)
     vapour, uncertain = pair.channel.signal(shape.raman_shape, known_shape=assumptions.known_shape)

@@ -24,8 +24,8 @@ from lidarops.records import (
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.network.flags import NetworkQuality
+from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.retrieval import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
 SCENE = "lidar-1_20260301T000000"
