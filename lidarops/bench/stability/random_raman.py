@@ -14,13 +14,9 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.cells import Cells, make_cells
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.retrieval import (
-    AirColumn,
-    ChannelSignal,
-    RamanResult,
-    RamanSettings,
-    retrieve_raman,
-)
+from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal
 
 Random = np.random.Generator
 
