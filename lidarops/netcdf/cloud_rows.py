@@ -40,8 +40,8 @@ CLOUDS: Final = (
         comment="The profiles of a mean are divided into up to"
         f" {THRESHOLDS.most_parts} parts, and clouds are sought in each, in cells of"
         f" about {THRESHOLDS.cell_length:g} m; only those with data there count. Missing"
-        " where no part has any, or where only the mean shows a cloud, so that cloud_mask is"
-        f" cloudy. {NO_STANDARD_NAME}",
+        " where no part has any, where cloud_mask is unknown, or where only the mean shows a"
+        f" cloud, so that cloud_mask is cloudy. {NO_STANDARD_NAME}",
     ),
     Row(
         name="cloud_base_range",

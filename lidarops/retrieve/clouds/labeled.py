@@ -6,7 +6,7 @@ rise may be that of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -91,7 +91,8 @@ class Clouds:
     mask: Mask
     """Clouds of the mean, or of all profiles in it."""
     fraction: Array
-    """Share of the profiles with a cloud; NaN where only the mean shows it, or is examined."""
+    """Share of the profiles with a cloud; NaN where only the mean shows it, or is examined, and
+    where noise would hide one."""
     unknown: Mask
     """Bins in which neither the mean nor a part of it can show a cloud, or noise would hide it."""
 
@@ -247,9 +248,11 @@ def signal_and_clouds(
         signal, layers = _signal_beyond_clouds(means, known_shape=known_shape)
     mask = (layers.mask | (fraction == 1.0)) & ~doubtful
     unknown = (doubtful | ~np.isfinite(signal.power)) & ~mask & np.isnan(fraction)
-    clouds = Clouds(mask, np.where(mask & (fraction == 0.0), np.nan, fraction), unknown)
+    clouds = Clouds(mask, fraction, unknown)
     hidden = np.isfinite(signal.power) & ~means.visible_air(signal.power, clouds.any)
-    return signal, replace(clouds, unknown=unknown | hidden & ~clouds.any)
+    unknown |= hidden & ~clouds.any
+    fraction = np.where((mask | unknown) & (fraction == 0.0), np.nan, fraction)
+    return signal, Clouds(mask, fraction, unknown)
 
 
 def _cloud_fraction(averages: xr.Dataset, means: MeanProfiles) -> Array:

@@ -383,14 +383,21 @@ def _next_base(
 
 @_compiled
 def _end(sums: Array, base: int, length: int) -> int:
-    """Return the first bin from which the ratio to air is back at its level below the base."""
+    """Return the first bin from which the ratio to air is back at its level below the base.
+
+    Bins without data, as saturated ones, do not end a layer; where none follows with data, it ends
+    before them.
+    """
     level, level_variance = _mean(sums, base - length, base)
     bins = int(sums.shape[1]) - 1
+    end = base + 1
     for i in range(base + 1, bins):
         ratio, variance = _mean(sums, i, min(i + length, bins))
-        if not ratio > level + _TOP * math.sqrt(variance + level_variance):
+        if ratio > level + _TOP * math.sqrt(variance + level_variance):
+            end = i + 1
+        elif not math.isnan(ratio):
             return i
-    return bins
+    return end
 
 
 @_compiled

@@ -462,6 +462,21 @@ def test_missing_data_hide_layers_and_make_none():
     assert layers.cloud_base_range[1] == pytest.approx(9000.0, abs=16.0)
 
 
+@pytest.mark.parametrize("hole", [(5050.0, 5150.0), (5050.0, 5350.0)])
+def test_a_layer_goes_on_beyond_its_saturated_bins(hole):
+    power = np.where(between(*hole), np.nan, 1e18 * attenuated(0.0, (5000.0, 500.0, 1.5e-3)))
+    layers = detect(power, np.abs(power) + 1.0)
+    assert layers.mask[between(5000.0, 5450.0)].all()
+    assert not layers.mask[between(5600.0, 1e5)].any()
+
+
+def test_a_layer_ends_where_the_data_end():
+    power = np.where(RANGE > 5200.0, np.nan, 1e18 * attenuated(0.0, (5000.0, 500.0, 1.5e-3)))
+    layers = detect(power, np.abs(power) + 1.0)
+    assert layers.mask[between(5000.0, 5150.0)].all()
+    assert not layers.mask[between(5500.0, 1e5)].any()
+
+
 def test_profiles_are_tested_independently_in_any_layout():
     rng = np.random.default_rng(8)
     true = attenuated(aerosol(12, rng), CLOUDS["cumulus"])
