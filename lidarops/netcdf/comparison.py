@@ -24,8 +24,8 @@ MINOR: Final = 0.1
 covers 94.9 %."""
 
 MOST_STATES: Final = 0.01
-"""Largest share of the values whose state (good, care or reject; cloud or none) differs in a minor
-change, but for a single one: whoever keeps good values only then keeps 99 % of them."""
+"""Largest share of the values whose state (cloud or none) differs in a minor change, but for a
+single one. Of `usable` it is a share of the good ones: whoever keeps these only then keeps 99 %."""
 
 _MAKING: Final = frozenset(
     {
@@ -83,8 +83,8 @@ def compare_products(old: Path, new: Path) -> Change:
         product was made; minor where all values are within `MINOR` standard errors of `old`, or
         within that share of their size where no error is stated, at the same coordinates and in
         the same units, the same values are missing and rejected, and at most `MOST_STATES` of the
-        values are in another state. Values that are rejected in both are not measured, and other
-        flags of a value are counted only.
+        values, of `usable` of the good ones, are in another state. Values that are rejected in
+        both are not measured, and other flags of a value are counted only.
 
     Raises
     ------
@@ -172,7 +172,8 @@ def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
             yield _Difference(name, size, lost=size)
             continue
         count = sum(int(_differs(before, after, part).sum()) for part in _parts(before))
-        allowed = max(MOST_STATES * before.size, 1)
+        good = int((before.to_numpy() == 0).sum()) if name == USABLE else 0
+        allowed = max(MOST_STATES * (good or before.size), 1)
         many = f"other states of {name}" if count > allowed else ""
         if any(before.attrs.get(key) != after.attrs.get(key) for key in _MEANING):
             yield _Difference(name, before.size, moved=f"another meaning of {name}")

@@ -201,6 +201,18 @@ def test_many_values_of_another_state_are_major(
     assert (f"other states of {name}" in change_in_words(change)) == (grade is Grade.MAJOR)
 
 
+def test_few_good_values_that_are_lost_are_major(tmp_path: Path):
+    """Two of twenty good values are to be used with care: at most 1 % of all."""
+    files = [written(tmp_path / file, elastic(), kind="elastic") for file in ("old.nc", "new.nc")]
+    for file, good in zip(files, (20, 18), strict=True):
+        with netCDF4.Dataset(file, "a") as product:
+            size = product["usable"].size
+            states = np.where(np.arange(size) < good, 0, 1).astype(np.int8)
+            product["usable"][...] = states.reshape(product["usable"].shape)
+    assert size >= 200
+    assert compare_products(*files).grade is Grade.MAJOR
+
+
 @pytest.mark.parametrize(
     ("changes", "field"),
     [

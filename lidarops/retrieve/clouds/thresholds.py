@@ -29,8 +29,9 @@ class Thresholds:
     which the signal may change across a bin. Assumed."""
 
     # Clouds
-    window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0, 960.0)
-    """m; in which signals are averaged below and above a base. Assumed."""
+    window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0, 960.0, 1920.0)
+    """m; in which signals are averaged below and above a base: the longest finds cirrus that rises
+    within 2 km."""
     cloud_false_alarm: float = 0.001
     """Probability of a false cloud in a profile. Required of the product."""
     top: float = 2.0

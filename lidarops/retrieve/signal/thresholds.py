@@ -36,7 +36,7 @@ class Thresholds:
     found."""
     cloud_contrast: float = 3.0
     """Factor of the rise at a cloud, at 532 nm. The scattering ratio of aerosol rarely rises by
-    this factor within 1 km, that of thin cirrus does. Assumed."""
+    this factor within 2 km, that of thin cirrus does. Assumed."""
     screening_false_alarm: float = 0.001
     """Probability that noise makes a part of a mean outlying. Required of the product."""
 

@@ -174,7 +174,7 @@ def test_noise_of_analog_channels_makes_no_layers(data_root):
 def test_power_of_the_test_is_what_gaussian_noise_allows():
     """A step beyond the factor is detected with the probability of the Gaussian tail."""
     rng = np.random.default_rng(4)
-    bins, contrast, noise = 64, 2.0, 0.7
+    bins, contrast, noise = round(THRESHOLDS.window_lengths[-1] / 15.0), 2.0, 1.0
     ratio = np.where(RANGE > 5000.0, 2.6, 1.0)
     spread = noise * SHAPE
     power = SHAPE * ratio + spread * rng.standard_normal((2000, RANGE.size))
@@ -306,6 +306,17 @@ def test_the_margin_of_a_layer_holds_the_edge_that_noise_hides(wavelength, cloud
     half = 1.0 + 0.5 * (cloud_contrast(wavelength) - 1.0)
     edge_bins = (total > half) & (excess > 5.0)
     assert with_margin(masks, RANGE)[:, edge_bins].mean() > 0.99
+
+
+@pytest.mark.parametrize(("ratio", "found"), [(3.0, False), (8.0, True)])
+@pytest.mark.parametrize("depth", [300.0, 500.0, 800.0, 1200.0])
+def test_a_cirrus_that_rises_slowly_is_found(depth, ratio, found):
+    excess = (ratio - 1.0) * np.exp(-0.5 * ((RANGE - 9500.0) / depth) ** 2)
+    counts = 1e20 * attenuated(excess * BACKSCATTER, lidar_ratio=20.0)
+    layers = detect(counts, counts + 1.0, contrast=cloud_contrast(532e-9))
+    bright = excess > 1.0
+    assert layers.mask[bright].any() == found
+    assert np.mean(layers.mask[bright]) >= (0.9 if found else 0.0)
 
 
 def test_aerosol_above_a_cloud_is_outside_of_it():
