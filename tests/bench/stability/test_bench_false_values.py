@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from itertools import takewhile
 
 import numpy as np
@@ -24,8 +23,8 @@ FOUND = 0.95
 """Probability that twice the target is found."""
 CONFINED = 0.3
 """Share of the values that are false in a network that has false ones: as large as in the random
-networks of `test_bench_random_networks.py`. Values of one network, scan or sky share geometry, air
-and errors."""
+networks of `test_bench_random_networks.py`. Of other retrievals, values beyond 1.96 errors show how
+those of one geometry depend on each other."""
 
 
 def most_false(values):
@@ -34,21 +33,24 @@ def most_false(values):
     return int(np.sum(stats.binom.cdf(counts, int(values), 2.0 * SATISFIED) <= 1.0 - FOUND)) - 1
 
 
-def effective_size(outside, values):
+def effective_size(outside, values, confined):
     """Return as how many independent values those of clusters count, (cluster,) counts given.
 
     By the scatter of those beyond 1.96 errors, or of false ones that are confined to few clusters.
     """
     total = values.sum()
-    return min(total / design_effect(outside, values), total**2 / np.sum(values**2) / CONFINED)
+    clusters = total**2 / np.sum(values**2)
+    confining = clusters / confined if confined else total
+    return min(total / design_effect(outside, values), confining)
 
 
-def is_found(false, outside, values):
+def is_found(false, outside, values, confined):
     """Return whether there are too many false values for the target, (cluster,) counts given."""
-    size = effective_size(outside, values)
+    size = effective_size(outside, values, confined)
     limit = most_false(size)
     assert limit >= 0, size
-    return false.sum() / values.sum() * size > limit
+    # One event is a false value that counts alone, or a cluster that holds many.
+    return round(false.sum() / values.sum() * size) > limit
 
 
 def test_twice_the_target_is_found_and_a_third_of_it_is_not():
@@ -73,7 +75,7 @@ def test_twice_the_target_is_found_where_few_clusters_hold_all_false_values(prof
             bad = rng.random(1000) < share / CONFINED
             false = rng.binomial(profiles, CONFINED * bad).astype(float)
             outside = false + rng.binomial(profiles, 0.05, 1000)
-            found += is_found(false, outside, values)
+            found += is_found(false, outside, values, CONFINED)
         return found / 400
 
     assert share_found(2.0 * SATISFIED) > FOUND - 0.02
@@ -82,7 +84,7 @@ def test_twice_the_target_is_found_where_few_clusters_hold_all_false_values(prof
 
 def test_few_networks_are_too_few_whatever_their_number_of_values():
     values = np.full(70, 200.0)
-    assert most_false(effective_size(np.full(70, 10.0), values)) < 0
+    assert most_false(effective_size(np.full(70, 10.0), values, CONFINED)) < 0
 
 
 def deviations(values):
@@ -96,23 +98,17 @@ def deviations(values):
 
 
 @pytest.mark.parametrize(
-    ("score", "clusters", "profiles"),
+    ("score", "clusters", "profiles", "confined"),
     [
-        pytest.param(random_homogeneous.score_homogeneous, 1000, 30, id="homogeneous"),
-        pytest.param(random_elastic.score_elastic, 1000, 4, id="elastic"),
-        pytest.param(random_scans.score_scans, 1000, 4, id="multi-angle"),
-        pytest.param(random_raman.score_raman, 1000, 4, id="Raman"),
-        pytest.param(random_networks.score_networks, 1300, 50, id="network"),
-        pytest.param(
-            partial(random_networks.score_short_blocks, draw_air=random_networks.plume, length=3),
-            1300,
-            6,
-            id="networks in blocks of 3",
-        ),
+        pytest.param(random_homogeneous.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
+        pytest.param(random_elastic.score_elastic, 400, 20, 0.0, id="elastic"),
+        pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
+        pytest.param(random_raman.score_raman, 1000, 4, 0.0, id="Raman"),
+        pytest.param(random_networks.score_networks, 1300, 50, CONFINED, id="network"),
     ],
 )
 @pytest.mark.slow
-def test_where_the_model_holds_few_values_are_false(score, clusters, profiles):
+def test_where_the_model_holds_few_values_are_false(score, clusters, profiles, confined):
     counts = {}
     for cluster in range(clusters):
         # The first classes are those where the model holds.
@@ -129,4 +125,4 @@ def test_where_the_model_holds_few_values_are_false(score, clusters, profiles):
             counts.setdefault(quantity, []).append(total)
     assert counts
     for quantity, rows in counts.items():
-        assert not is_found(*np.array(rows, dtype=float).T), quantity
+        assert not is_found(*np.array(rows, dtype=float).T, confined), quantity
