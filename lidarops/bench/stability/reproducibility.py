@@ -1,34 +1,26 @@
-"""How far values depend on the order of profiles and on the machine, and a share of work."""
+"""How far values depend on the order of profiles and on the machine."""
 
 from __future__ import annotations
 
-import importlib
 import io
 import os
 import subprocess
 import sys
-import time
-import types
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, Final
-from unittest import mock
+from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.network_cases import signals
-from lidarops.bench.harness.rows import Array, Scores, share
+from lidarops.bench.harness.rows import Array, Scores
 from lidarops.bench.stability import random_networks
-from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.network import extinction_field
 
 CHANGE: Final = "largest change, in stated errors"
-TIME_SHARE: Final = "share of the CPU time"
 _KERNELS: Final = ("Haswell", "Prescott")
 _PROFILES: Final = 8
 _NETWORK_PROFILES: Final = 4
-SECOND_LOOK: Final = "    _take_residuals(block, s, not mode.known_variance)\n"
 
 
 def profile_order(cluster: int) -> Iterator[tuple[str, float]]:
@@ -88,40 +80,11 @@ def kernel_change(clusters: int) -> float:
     return _largest(np.abs(results[0][0] - results[1][0]) / results[0][1])
 
 
-def second_pass(repeats: int) -> float:
-    """Return the share of the time of the compressed solver for its residuals."""
-    # No public function has the parts of the solver.
-    solver = importlib.import_module(f"{path_fit.__package__}._compressed")
-    source = Path(str(solver.__file__)).read_text(encoding="utf-8")
-    module = types.ModuleType("compressed_variant")
-    sys.modules[module.__name__] = module
-    variant = source.replace(SECOND_LOOK, "").replace("cache=True", "cache=False")
-    exec(compile(variant, "<variant>", "exec"), module.__dict__)  # noqa: S102 - our own source
-    distance = 2500.0 + 37.5 * np.arange(225)
-    fall = 1e9 / distance**2 * np.exp(-6e-5 * distance)
-    rng = np.random.default_rng(0)
-    power = (300.0 + fall + rng.standard_normal((4000, 225))).astype(np.float32)
-    solvers: dict[str, Callable[..., Any]] = {
-        "all": solver.solve_compressed, "without": module.solve_compressed
-    }  # fmt: skip
-    times: dict[str, list[float]] = {name: [] for name in solvers}
-    for _ in range(repeats + 1):
-        for name, solve in solvers.items():
-            with mock.patch.object(solver, "solve_compressed", solve):
-                begin = time.process_time()
-                path_fit.fit_homogeneous_path(power, distance, variance=1.0)
-                times[name].append(time.process_time() - begin)
-    # The first call compiles.
-    return 1.0 - min(times["without"][1:]) / min(times["all"][1:])
-
-
-def measure_reproducibility(clusters: int, networks: int, repeats: int) -> Scores:
-    """Return the largest changes by the order of profiles and by the machine, and work."""
+def measure_reproducibility(clusters: int, networks: int) -> Scores:
+    """Return the largest changes by the order of profiles and by the machine."""
     changes: dict[str, float] = {}
     for cluster in range(clusters):
         for name, change in profile_order(cluster):
             changes[name] = max(change, changes.get(name, 0.0))
     changes["network, kernel of linear algebra"] = kernel_change(networks)
-    scores: Scores = {("", name): {CHANGE: change} for name, change in changes.items()}
-    scores["", "second pass of the compressed solver"] = {TIME_SHARE: share(second_pass(repeats))}
-    return scores
+    return {("", name): {CHANGE: change} for name, change in changes.items()}

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -328,12 +327,6 @@ def test_missed_targets_are_those_of_the_tables():
     missed = [f"paths: {name} (x), target 0.5 % MISSED" for name in ("hidden", BROKEN)]
     assert study.missed_targets("paths", scores) == missed
     assert study.targets(scores) == f"Missed: hidden (x), {BROKEN} (x)."
-
-
-def test_the_second_look_at_the_bins_is_one_call_of_the_solver():
-    """Its share of the time is measured without this call."""
-    source = Path(path_fit.__file__).with_name("_compressed.py").read_text()
-    assert source.count(reproducibility.SECOND_LOOK) == 1
 
 
 def test_networks_have_the_same_values_each_time():
