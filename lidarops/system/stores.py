@@ -24,6 +24,8 @@ from lidarops.errors import CatalogError, LidarOpsError, ProductError
 from lidarops.system.files import sha256_of
 
 _READ_ONLY: Final = frozenset({"http", "https"})
+_ABSENT: Final = frozenset({404, 410})
+"""Answers of a web server that lacks a file."""
 # Schemes by which an object appears only when its upload is complete.
 _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 # A secret may hold slashes, so it is matched up to the last @. In Azure URLs the @ separates
@@ -182,7 +184,10 @@ class RemoteStore:
                 continue
             try:
                 yield name, self._fs.info(name)
-            except FileNotFoundError:
+            except FileNotFoundError as error:
+                if not _is_absent(error):
+                    problem = f"the size of {self._path(name)} is not given: {error.__cause__!r}"
+                    raise OSError(errno.EIO, problem) from error
                 _LOG.warning("%s lists %r, which it does not have", self.url, self._path(name))
 
     def _path(self, name: str) -> str:
@@ -191,7 +196,14 @@ class RemoteStore:
     def _find(self) -> dict[str, Any]:
         # By default, drivers that walk through folders skip what they cannot list.
         strict = {} if self._scheme in _ATOMIC else {"on_error": "raise"}
-        listing: dict[str, Any] = self._fs.find(self._prefix, detail=True, **strict)
+        try:
+            listing: dict[str, Any] = self._fs.find(self._prefix, detail=True, **strict)
+        except RecursionError as error:
+            raise CatalogError(
+                "cannot be listed: the index of a folder lists the folder itself",
+                file=self.url,
+                remedy="take the link out of the index",
+            ) from error
         if not listing:
             # Raises an error if the place does not exist.
             self._fs.ls(self._prefix, detail=False)
@@ -409,6 +421,12 @@ def _failures() -> tuple[type[Exception], ...]:
         EOFError,
         *(getattr(module, name) for module, name in loaded if module is not None),
     )
+
+
+def _is_absent(error: FileNotFoundError) -> bool:
+    """Return whether a store says that it lacks a file: drivers of the web raise this always."""
+    status = getattr(error.__cause__, "status", None)
+    return error.__cause__ is None or status in _ABSENT
 
 
 def _stamp(info: dict[str, Any]) -> int:

@@ -166,6 +166,37 @@ def test_a_dead_link_costs_no_other_file(
     assert "lists 'coast/gone', which it does not have" in caplog.text
 
 
+@pytest.mark.parametrize("status", [403, 500, 503])
+def test_a_server_that_answers_for_no_file_ends_the_scan(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    """Otherwise a file that is there for the next run would be taken out of its scene."""
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        before = store.granules()
+        send_head = _Quiet.send_head
+
+        def failing(self: _Quiet) -> Any:
+            if self.path.endswith("h1"):
+                return self.send_error(status)
+            return send_head(self)
+
+        monkeypatch.setattr(_Quiet, "send_head", failing)
+        with pytest.raises(CatalogError, match=f"coast/h1.*{status}"):
+            scan_archive(campaign, store)
+        assert store.granules() == before
+
+
+def test_an_index_that_lists_its_own_folder_is_refused(campaign: Campaign, tmp_path: Path) -> None:
+    (tmp_path / "raw" / "index.html").write_text('<a href="./">x</a><a href="coast/h0">y</a>')
+    everything = _campaign_of_everything(campaign, campaign.archive)
+    with (
+        Store(campaign.catalog_url, campaign.name) as store,
+        pytest.raises(CatalogError, match="lists the folder itself"),
+    ):
+        scan_archive(everything, store)
+
+
 @pytest.fixture(params=["http", "s3", "memory", "file"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> RemoteStore:
     """A store of each kind with the raw file ``coast/h0``."""
