@@ -101,21 +101,25 @@ def _check_full_scale(counts: NDArray[np.int32], channel: RawChannel, path: str)
 
 
 def _check_blocks(counts: NDArray[np.int32], channel: RawChannel, path: str) -> None:
-    """Refuse a block of zeros between counts that are nowhere else zero, as of a lost sector.
+    """Refuse a block of zeros between as many counts without a zero, as of a lost sector.
 
     A recorder that is off gives zeros only, one that stops early zeros at the end, and few
     photons zeros among other counts.
     """
-    zeros = np.flatnonzero(counts == 0)
-    if zeros.size < _SECTOR or zeros[-1] - zeros[0] != zeros.size - 1:
+    zero = counts == 0
+    if np.count_nonzero(zero) < _SECTOR:
         return
-    if zeros[0] > 0 and zeros[-1] < counts.size - 1:
-        raise RawFormatError(
-            f"bins {zeros[0]} to {zeros[-1]} hold zeros, and no other does: their counts are lost",
-            file=path,
-            field=f"counts of {channel.name}",
-            remedy="copy the file again from the instrument, or leave it out",
-        )
+    edges = np.flatnonzero(np.diff(zero, prepend=False, append=False))
+    for first, stop in edges.reshape(-1, 2)[np.diff(edges)[::2] >= _SECTOR]:
+        inside = first > 0 and stop < counts.size
+        if inside and zero[max(first - _SECTOR, 0) : stop + _SECTOR].sum() == stop - first:
+            raise RawFormatError(
+                f"bins {first} to {stop - 1} hold zeros, and those beside them none: their counts"
+                " are lost",
+                file=path,
+                field=f"counts of {channel.name}",
+                remedy="copy the file again from the instrument, or leave it out",
+            )
 
 
 @lru_cache(maxsize=128)

@@ -57,6 +57,8 @@ _DASK: Final = {
     # that is not served.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
+    # Pages that any user of the machine could read.
+    "distributed.scheduler.http.routes": [],
     # For the same dashboard, each process would read a dozen system files twice a second.
     "distributed.admin.system-monitor.interval": "10s",
     # With it, small scenes spend much of their time on mapping and returning every array.

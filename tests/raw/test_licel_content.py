@@ -59,11 +59,14 @@ def test_a_block_of_zeros_among_counts_is_refused(channel: str) -> None:
     counts[channel][500:628] = 0
     with pytest.raises(RawFormatError, match=f"counts of {channel}: bins 500 to 627"):
         _parsed(*counts.values())
-    # Fewer than a disk loses, or with zeros elsewhere.
+    counts[channel][1400:] = 0
+    with pytest.raises(RawFormatError, match=f"counts of {channel}: bins 500 to 627"):
+        _parsed(*counts.values())
+    # Fewer than a disk loses, or with zeros beside them.
     counts[channel][500] = 1
     _parsed(*counts.values())
     counts[channel][499:628] = 0
-    counts[channel][1400] = 0
+    counts[channel][640] = 0
     _parsed(*counts.values())
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from distributed import Client, Nanny
 from distributed.core import Status
@@ -55,6 +56,12 @@ def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client:
     together = reprocess(campaign, client=client)
     assert made(alone) == made(together)
     assert archive.contents("alone/products") == archive.contents("out/products")
+
+
+@pytest.mark.parametrize("page", ["json/identity.json", "info/main/workers.html"])
+def test_a_scheduler_has_no_pages_for_other_users(client: Client, page: str) -> None:
+    address = f"http://127.0.0.1:{client.cluster.scheduler.http_server.port}/{page}"
+    assert httpx.get(address).status_code == 404
 
 
 def test_a_signal_while_workers_start_leaves_no_cluster_behind(
