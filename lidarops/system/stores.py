@@ -32,7 +32,7 @@ _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 # container and account.
 _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
 # Signatures and tokens stand there.
-_QUERY: Final = re.compile(r"""(https?://[^\s?'"]*)\?[^\s'")]*""")
+_QUERY: Final = re.compile(r"""((?:https?|s3a?|gc?s|abfss?|az)://[^\s?'"]*)\?[^\s'")]*""")
 WITHOUT_KEYS: Final = rf"^(?!.*(?:{_KEYS.pattern}|{_QUERY.pattern}))"
 """Regular expression of texts that `without_keys` leaves as they are, for JSON schemas."""
 _BATCH: Final = 100

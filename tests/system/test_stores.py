@@ -219,6 +219,8 @@ def test_keys_are_left_out_of_messages(url: str, shown: str) -> None:
         "s3://key:sword/swordfish@bucket/a",
         "https://swordfish@host/a",
         "https://host/a?sig=swordfish",
+        "s3://bucket/a?secret=swordfish",
+        "abfs://container@account/a?sig=swordfish",
         "simplecache::s3://key:swordfish@bucket",
     ],
 )
