@@ -28,6 +28,7 @@ BESIDE: Final[dict[tuple[str, str], list[Any]]] = {
     ("backscatter", "more haze than stated"): [
         *("stability", "elastic", "backscatter", "more haze than stated", FALSE_PLAIN)
     ],
+    ("lidar ratio", "model holds"): ["stability", "Raman", "lidar ratio", "none", FALSE_RANDOM],
     ("network", "plume, blocks of 1"): [
         *("stability", "networks, plume, blocks of 1", "extinction", "plume, blocks of 1"),
         FALSE_RANDOM,

@@ -36,6 +36,7 @@ SHARES: Final[dict[tuple[str, str], tuple[float, float]]] = {
     ("voltage of a bin", "analog noise below half a step, a single bin"): (0.012, 0.015),
     ("background", "near the cut"): (0.256, 0.054),
     ("backscatter", "more haze than stated"): (9.15, 1.4),
+    ("lidar ratio", "model holds"): (0.966, 0.34),
     ("network", "plume, blocks of 1"): (0.471, 0.16),
     ("network", "layered, blocks of 1"): (0.288, 0.17),
     ("network", "lidar ratio, 2 % declared"): (3.9, 1.3),

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from lidarops.netcdf.cloud_rows import CLOUDS
+from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -210,7 +211,10 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.BOTH,
             budget=_of_two_parts("lidar_ratio"),
             comment="Measured: extinction over backscatter, which is smoothed as extinction is."
-            " Missing where backscatter exceeds zero by too few standard errors.",
+            " Missing where backscatter exceeds zero by too few standard errors. The error is in"
+            " proportion to the value: where noise made a ratio too small, so is its error."
+            f" Simulated: {percent('lidar ratio', 'model holds')} of the values without a flag"
+            " differ by more than 4 errors.",
         ),
         _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.RANDOM),
         _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.SYSTEMATIC),
