@@ -47,7 +47,7 @@ def inspect(
     from lidarops.reports import inspection
 
     if provenance:
-        typer.echo(inspection.provenance(file))
+        say(inspection.provenance(file))
         return
     if as_json:
         typer.echo(json.dumps(inspection.describe(file), indent=2, ensure_ascii=False))
@@ -110,7 +110,7 @@ def reproduce(
     from lidarops.run.reproduction import explain_difference, reproduce_product
 
     result = reproduce_product(product, archive=archive, ancillary=ancillary, catalog=catalog)
-    typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
+    say(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
     exit_with_status(failed=not result.identical)
 
 
@@ -135,7 +135,7 @@ def compare(
     if as_json:
         typer.echo(json.dumps(change.as_dict(), indent=2))
     else:
-        typer.echo(f"{change.grade.value}: {change_in_words(change)}")
+        say(f"{change.grade.value}: {change_in_words(change)}")
         for cause in change.causes:
-            typer.echo(f"  {cause}")
+            say(f"  {cause}")
     exit_with_status(failed=change.grade is not Grade.NONE)

@@ -173,7 +173,7 @@ class Recipe:
 def stays_inside(path: str) -> bool:
     """Return whether a path stays in the folder that it is relative to."""
     pure = PurePosixPath(path)
-    return not (pure.is_absolute() or ".." in pure.parts)
+    return not (pure.is_absolute() or ".." in pure.parts or "\0" in path)
 
 
 def _insufficient(file: Path, problem: str) -> ProductError:

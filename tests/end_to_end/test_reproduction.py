@@ -363,7 +363,7 @@ def _forge(monkeypatch: pytest.MonkeyPatch, product: Path, renamed: dict[str, st
     monkeypatch.setattr("lidarops.run.recipe.read_origin", lambda _: (document, attributes))
 
 
-@pytest.mark.parametrize("escape", ["{outside}", "../outside"])
+@pytest.mark.parametrize("escape", ["{outside}", "../outside", "coast/h\0"])
 @pytest.mark.parametrize("name", ["raw", "overlap.csv", "air.csv"])
 def test_a_product_that_names_inputs_elsewhere_is_refused(
     escape: str, name: str, campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -378,6 +378,18 @@ def test_a_product_that_names_inputs_elsewhere_is_refused(
     with pytest.raises(ProductError, match="outside its archive"):
         reproduce_product(product, archive=campaign.archive, catalog=campaign.catalog_url)
     assert outside.read_bytes() == b"of somebody else"
+
+
+def test_control_characters_of_names_are_shown_as_escapes(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    product = of_kind(campaign, "homogeneous")
+    entities = read_provenance(product)["entity"].values()
+    paths = [entity["lidarops:path"] for entity in entities if "lidarops:path" in entity]
+    _forge(monkeypatch, product, {next(path for path in paths if "/h" in path): "coast/h\x1b]0;x"})
+    result = CliRunner().invoke(app, ["reproduce", str(product), "--archive", str(tmp_path)])
+    assert "h\\x1b]0;x" in result.output
+    assert "\x1b" not in result.output
 
 
 def test_a_product_cannot_name_a_file_that_every_machine_has(
