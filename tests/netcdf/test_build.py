@@ -418,7 +418,7 @@ def test_every_missing_variable_is_named(kind: str):
             "range",
         ),
         (put("reduced_chi2", -0.1, (1, 1)), "reduced_chi2", "valid range"),
-        (put("quality_flag", 1 << 21 | 1 << 16, (0, 0)), "quality_flag", "not have: 16, 21"),
+        (put("quality_flag", 1 << 23 | 1 << 16, (0, 0)), "quality_flag", "not have: 16, 23"),
         (put("quality_flag", -1, (0, 0)), "quality_flag", "29, 30, 31"),
         (put("quality_flag", 0.5, (0, 0)), "quality_flag", "whole numbers"),
         (put("valid_bins", math.nan, (0, 0)), "valid_bins", "whole numbers"),

@@ -203,11 +203,13 @@ def test_errors_come_from_independent_blocks():
     square = statistics.root(Figure(4.0, 0.4))
     assert (square.value, square.error) == pytest.approx((2.0, 0.1))
     assert statistics.root(Figure(0.0, 0.0)) == Figure(0.0, 0.0)
-    part = statistics.clustered_share(np.array([1.0, 0.0, 3.0]), np.array([10.0, 10.0, 20.0]))
+    part = statistics.clustered_share(np.array([10.0, 0.0, 30.0]), np.array([100.0, 100.0, 200.0]))
     assert part.value == pytest.approx(0.1)
-    assert part.error == pytest.approx(math.sqrt(0 + 1 + 1) / 40)
-    none = statistics.clustered_share(np.zeros(2), np.full(2, 5.0))
-    assert (none.value, none.error) == (0.0, 0.1)
+    assert part.error == pytest.approx(math.sqrt(0 + 100 + 100) / 400)
+    none = statistics.clustered_share(np.zeros(2), np.full(2, 50.0))
+    assert none.value == 0.0
+    # Of a share at the limit, no event is seen in 5 percent of the cases.
+    assert (1.0 - 2.0 * none.error) ** 100 == pytest.approx(0.05, rel=0.1)
     empty = statistics.clustered_share(np.zeros(2), np.zeros(2))
     assert (empty.value, empty.error) == (0.0, 0.0)
 
