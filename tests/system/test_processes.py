@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import _ExecutorManagerThread
 from itertools import count, islice
@@ -48,6 +48,17 @@ def failing(kept: int, item: int) -> int:
 
 def doubled(items: range) -> list[tuple[int, int]]:
     return [(item, 2 * item) for item in items]
+
+
+def left_alive(others: Collection[BaseProcess], seconds: float) -> list[BaseProcess]:
+    """Return the children besides others that do not end in time, and kill them."""
+    left = [child for child in multiprocessing.active_children() if child not in others]
+    for child in left:
+        child.join(seconds)
+    alive = [child for child in left if child.is_alive()]
+    for child in alive:
+        child.kill()
+    return alive
 
 
 @pytest.fixture
@@ -109,13 +120,7 @@ class TestEach:
         others = multiprocessing.active_children()
         with Processes(2, 2) as pool:
             assert list(pool.map_items(deadly, range(40), at_a_time=2)) == doubled(range(40))
-        left = [child for child in multiprocessing.active_children() if child not in others]
-        for child in left:
-            child.join(60)
-        alive = [child for child in left if child.is_alive()]
-        for child in alive:
-            child.kill()
-        assert not alive
+        assert not left_alive(others, 60.0)
 
     def test_ends_a_process_that_starts_while_another_is_lost(self, monkeypatch) -> None:
         """The executor neither terminates it nor sends it an end: it does not know it yet."""
@@ -139,13 +144,7 @@ class TestEach:
         with Processes(2, 2) as pool:
             assert list(pool.map_items(deadly, range(40), at_a_time=6)) == doubled(range(40))
         assert begun.is_set()
-        started = [child for child in multiprocessing.active_children() if child not in others]
-        for child in started:
-            child.join(5)
-        alive = [child for child in started if child.is_alive()]
-        for child in alive:
-            child.kill()
-        assert not alive
+        assert not left_alive(others, 5.0)
 
     @pytest.mark.parametrize(
         "error", [BlockingIOError("no more processes"), EOFError("unexpected EOF")]
