@@ -27,6 +27,8 @@ from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, Generic, Self, TypeVar
 
+from lidarops.system.threads import ONE_THREAD
+
 _BATCHES_AHEAD: Final = 8
 """Batches of items submitted per process."""
 _MMAP_THRESHOLD: Final = (-3, 32 << 20)
@@ -34,15 +36,11 @@ _MMAP_THRESHOLD: Final = (-3, 32 << 20)
 _TRIM_THRESHOLD: Final = (-1, 256 << 20)
 """M_TRIM_THRESHOLD of glibc, and its value in bytes: more than a scene leaves, which the next scene
 needs again."""
-_ONE_THREAD: Final = dict.fromkeys(
-    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
-)
-"""Variables that libraries read when they are loaded; dask sets the same for its workers."""
 _ENDS_WITH_PARENT: Final = "lidarops.system.ends_with_parent"
 PARENT: Final = "__LIDAROPS_PARENT_PID"
 """Variable with the id of this process, for that module, which removes it."""
 _LIBRARY_VARIABLES: Final = frozenset(
-    {*_ONE_THREAD, PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
+    {*ONE_THREAD, PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
 )
 """Variables that dask, when it starts workers, netCDF4 and `preload_modules` set here, too."""
 
@@ -65,7 +63,7 @@ def preload_modules(modules: Collection[str]) -> None:
     # The kernel takes the thread that starts a process for its parent; only the main one stays.
     in_main = threading.current_thread() is threading.main_thread()
     multiprocessing.set_forkserver_preload([*([_ENDS_WITH_PARENT] if in_main else []), *modules])
-    unset = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
+    unset = {name: value for name, value in ONE_THREAD.items() if name not in os.environ}
     if in_main:
         unset[PARENT] = str(os.getpid())
     os.environ.update(unset)

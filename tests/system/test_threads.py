@@ -1,0 +1,34 @@
+"""Numerical libraries use one thread, because more of them wait for each other."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lidarops.system.threads import ONE_THREAD
+
+THREADS = """
+import os, lidarops.cli, numpy
+numpy.linalg.inv(numpy.eye(500))
+print(len(os.listdir("/proc/self/task")))
+"""
+
+
+def threads(**variables: str) -> int:
+    """Return the number of threads of a process that loads the command line and solves."""
+    others = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
+    command = [sys.executable, "-c", THREADS]
+    return int(subprocess.check_output(command, env=others | variables, text=True))
+
+
+@pytest.mark.skipif(
+    (os.cpu_count() or 1) < 2 or not Path("/proc/self/task").exists(),
+    reason="needs two processors and the files of Linux on threads",
+)
+def test_the_command_line_solves_in_one_thread_unless_the_environment_says_more() -> None:
+    assert threads() == 1
+    assert threads(OPENBLAS_NUM_THREADS="2") == 2
