@@ -39,12 +39,18 @@ def obstruction_range(power: Array, variance: Array, distance: Array) -> Array:
     blocked = np.full(len(power), np.inf)
     if count < _BEHIND + 2:
         return blocked
-    shape = (len(power), count, bins)
+    shape = (count, bins)
     known = np.isfinite(power) & np.isfinite(variance)
-    square = distance**2
-    inside, values, spread = (
-        np.where(known, array, 0.0)[:, : count * bins].reshape(shape).sum(axis=2)
-        for array in (np.ones_like(power), power * square, variance * square**2)
+    square = distance[: count * bins].reshape(shape) ** 2
+
+    def blocks(array: Array) -> Array:
+        return array[:, : count * bins].reshape(-1, *shape)
+
+    inside = np.count_nonzero(blocks(known), axis=2)
+    # Summed as they are multiplied.
+    values, spread = (
+        np.einsum("pcb,cb->pc", blocks(np.where(known, array, 0.0)), factor)
+        for array, factor in ((power, square), (variance, square**2))
     )
     samples = np.maximum(inside, 1.0)
     level, error = values / samples, np.sqrt(spread) / samples

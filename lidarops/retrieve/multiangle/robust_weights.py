@@ -113,7 +113,15 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
                     residuals[t, a, k] = y[t, a, k] - level - slope * x[a, k]
 
 
-@_compiled
+# Reassociated into sums side by side, always the same: a fifth of the time. Inlined by force, as
+# such a sum has other bits fresh than cached.
+@numba.njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"reassoc", "contract", "nsz"},
+)
 def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float) -> float:
     """Return the sum of (1 - square)^3 of Tukey's bounded squares about a line."""
     total = 0.0
