@@ -12,6 +12,7 @@ import typer
 from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
+from flows.child_processes import keep_main_module_out
 from flows.reprocess import Seconds, Workers
 from flows.temporary_server import tie_to_this_process
 from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
@@ -52,6 +53,7 @@ def catalog(
     ScanSummary
     """
     tie_to_this_process()
+    keep_main_module_out()
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:

@@ -39,6 +39,7 @@ from prefect.utilities.annotations import quote
 from pydantic import AfterValidator, Field
 
 from flows import WITH_FAILURES
+from flows.child_processes import keep_main_module_out
 from flows.temporary_server import tie_to_this_process
 from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
 from lidarops.campaign.model import Campaign, load_campaign
@@ -266,6 +267,7 @@ def reprocess(
     results are the data of this state; callers of the flow get the data.
     """
     tie_to_this_process()
+    keep_main_module_out()
     chosen = clusters.choose_cluster(
         workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
+import multiprocessing
 import os
 import re
 import select
@@ -11,9 +13,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -40,6 +44,7 @@ import flows.catalog
 import flows.reprocess
 from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
+from flows.child_processes import keep_main_module_out
 from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
 from flows.temporary_server import tie_to_this_process
@@ -142,6 +147,28 @@ def _read(file: Path) -> str:
         return file.read_text()
     except OSError:
         return ""
+
+
+@pytest.mark.parametrize("name", ["flows.reprocess", "prefect.engine"])
+def test_processes_of_a_flow_do_not_load_prefect(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a command, and in a deployment."""
+    main = ModuleType("__main__")
+    main.__spec__ = importlib.util.find_spec(name)
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    keep_main_module_out()
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        assert pool.submit(eval, "'prefect' in __import__('sys').modules").result() is False
+
+
+def test_the_main_module_of_other_programs_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own processes may need it."""
+    main = ModuleType("__main__")
+    main.__spec__ = spec = importlib.util.find_spec("support.factories")
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    keep_main_module_out()
+    assert main.__spec__ is spec
 
 
 def test_a_prefect_that_starts_servers_otherwise_runs_flows(
