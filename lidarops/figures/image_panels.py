@@ -77,7 +77,9 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     x = time_panel_axis(axis)
     full = max(float(raster.edges[-1]) for raster in rasters)
     reach = max(raster.reach for raster in rasters)
-    far = min(full, BEYOND * reach) if reach > 0 else full
+    # Of a quantity that noise hides, such as particles of clean air, all usable bins are shown.
+    last = reach or max(raster.usable_to for raster in rasters)
+    far = min(full, BEYOND * last) if last > 0 else full
     shown = [raster.shown_to(far) for raster in rasters]
     near = min(float(raster.edges[0]) for raster in shown)
     far = max(float(raster.edges[-1]) for raster in shown)

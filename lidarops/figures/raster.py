@@ -106,10 +106,20 @@ class Raster:
 
     @property
     def reach(self) -> float:
-        """Range up to which the signal exceeds its noise, m; 0 if it never does."""
+        """Range up to which the signal exceeds its noise, m; 0 if it never does.
+
+        Columns without any usable bin do not count.
+        """
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.where(self.used > 0, self.total / np.sqrt(self.variance), 0.0)
-        return signal_reach(ratio, self.edges[1:])
+        measured = self.used.any(axis=1)
+        return signal_reach(ratio[measured], self.edges[1:]) if measured.any() else 0.0
+
+    @property
+    def usable_to(self) -> float:
+        """Range of the last usable bin, m; 0 without any."""
+        usable = np.flatnonzero(self.used.any(axis=0))
+        return float(self.edges[usable[-1] + 1]) if usable.size else 0.0
 
     def shown_to(self, far: float) -> Raster:
         """Return the rows up to `far` (m), merged to at most `ROWS` rows."""

@@ -120,6 +120,15 @@ def test_far_noise_is_left_out_with_a_note():
     assert "noise dominates beyond" in figure.words
 
 
+def test_a_quantity_that_noise_hides_is_shown_as_far_as_it_is_usable():
+    """As particles of clean air below a reference window, with rejected bins far above."""
+    product = signal(times(START, 60, 60.0), bins=4000, bin_width=15.0)
+    product["signal"].values[:] = 0.0
+    product["quality_flag"].values[:] = 0
+    product["quality_flag"].values[:, 400:] = flags_of("signal").rejecting
+    assert drawn(product).panels[0].y.high == pytest.approx(7.2, rel=0.02)
+
+
 def test_triangles_mark_the_lowest_cloud_bases():
     product = signal(times(START, 8, 60.0), bins=100)
     assert not labelled(drawn(product).panels[0], "base of the lowest cloud")

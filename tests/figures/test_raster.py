@@ -140,6 +140,14 @@ def test_reach_ends_where_noise_dominates():
     assert read(product).reach == 0.0
 
 
+def test_rejected_profiles_do_not_shorten_the_reach():
+    """As of four lone beams beside two scans."""
+    product = signal(times(START, 6, 60.0), bins=400)
+    product["signal"].values[:] = 2.0 * product["signal_standard_error"].values
+    product["quality_flag"].values[:4] = BAD
+    assert read(product).reach == pytest.approx(product["range"].values[-1], rel=0.05)
+
+
 def test_altitude_is_a_line_in_range():
     image = read(signal(times(START, 3, 60.0)))
     np.testing.assert_allclose(image.altitude, (120.0, 0.94))

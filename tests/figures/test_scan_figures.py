@@ -284,6 +284,20 @@ class TestProfileFigure:
             (band,) = labelled(panel, words)
             assert (band.high - band.low)[20] / 2 == pytest.approx(expected)
 
+    def test_the_error_of_the_dead_time_is_part_of_the_standard_error(self):
+        product = multiangle()
+        for number, quantity in enumerate(figure_data.QUANTITIES):
+            error = product[f"{quantity}_standard_error"]
+            product[f"{quantity}_dead_time_error"] = 3.0 * error
+            scale = (1.0, 1e3)[number]
+            panel = drawn(product).panels[number]
+            (band,) = labelled(panel, "standard error, with the dead time")
+            expected = scale * np.sqrt(10.0) * error.values[0, 20]
+            assert (band.high - band.low)[20] / 2 == pytest.approx(expected)
+            (band,) = labelled(panel, "largest gradient")
+            expected += scale * product[f"{quantity}_gradient_error"].values[0, 20]
+            assert (band.high - band.low)[20] / 2 == pytest.approx(expected)
+
     def test_flagged_values_and_missing_ones_are_marked_at_their_altitude(self):
         for panel in drawn(multiangle()).panels:
             (marks,) = labelled(panel, "do not use")
@@ -485,6 +499,12 @@ class TestResiduals:
 
     def test_one_cycle_has_no_mean_apart(self):
         assert len(residual_figure(multiangle(cycles=1)).panels[1].layers) == 1
+        # As of two vertical planes, each of which was scanned once.
+        product = multiangle(cycles=2)
+        product["residual"][0, :3] = np.nan
+        product["residual"][1, 3:] = np.nan
+        (single,) = residual_figure(product).panels[1].layers
+        assert single.label == "one cycle of each beam"
 
     def test_residuals_that_are_all_zero_can_be_drawn(self):
         product = multiangle()

@@ -28,9 +28,13 @@ _ALONG_BOTH: Final = (
     *(f"{name}{error}" for name in QUANTITIES for error in _ERRORS),
     "quality_flag",
 )
+_OF_DEAD_TIME: Final = tuple(f"{name}_dead_time_error" for name in QUANTITIES)
+"""Optional variables."""
 _PROFILES: Final = ("time", "altitude", "reach", *_ALONG_BOTH)
-CYCLE_VARIABLES: Final = (*_PROFILES, "time_bnds", "station_altitude", "wavelength")
-"""Variables that `clearest_cycle` needs."""
+CYCLE_VARIABLES: Final = (
+    *_PROFILES, *_OF_DEAD_TIME, "time_bnds", "station_altitude", "wavelength"
+)  # fmt: skip
+"""Variables that `clearest_cycle` reads."""
 EXTINCTION_VARIABLES: Final = (*_PROFILES, TIME_BOUNDS)
 """Variables that `read_extinction` needs."""
 RESIDUAL_VARIABLES: Final = (
@@ -70,6 +74,9 @@ class ProfileEstimate:
     rejected: Floats
     """Rejected values; NaN elsewhere."""
     standard_error: Floats
+    """Of noise and smoothing."""
+    dead_time_error: Floats
+    """Standard error from the dead time; NaN where the product has none."""
     gradient_error: Floats
     """Largest systematic error from a horizontal gradient."""
 
@@ -200,12 +207,16 @@ def _estimate(cycle: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileE
     rejected = (bits & _REJECTED) != 0
 
     def kept(suffix: str) -> Floats:
-        return np.where(rejected, np.nan, cycle[f"{name}_{suffix}"].values.astype(np.float64))
+        variable = f"{name}_{suffix}"
+        if variable in _OF_DEAD_TIME and variable not in cycle.variables:
+            return np.full(value.shape, np.nan)
+        return np.where(rejected, np.nan, cycle[variable].values.astype(np.float64))
 
     return ProfileEstimate(
         value=np.where(rejected, np.nan, value),
         rejected=np.where(rejected, value, np.nan),
         standard_error=kept("standard_error"),
+        dead_time_error=kept("dead_time_error"),
         gradient_error=kept("gradient_error"),
     )
 

@@ -104,7 +104,10 @@ def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
     """Return a quantity of one cycle with its errors, flags, reach and truth."""
     scale, label = _SCALES[quantity]
     estimate, z = profile.estimates[quantity], profile.altitude / 1e3
-    value, error = scale * estimate.value, scale * estimate.standard_error
+    of_dead_time = np.nan_to_num(estimate.dead_time_error)
+    value = scale * estimate.value
+    error = scale * np.hypot(estimate.standard_error, of_dead_time)
+    words = "standard error, with the dead time" if of_dead_time.any() else "standard error"
     whole = error + scale * np.nan_to_num(estimate.gradient_error)
     truth = _truth(profile, quantity, scale)
     # A truth beyond the reach, such as a cloud, does not set the axis.
@@ -118,7 +121,7 @@ def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
         Band(
             z, value - whole, value + whole, "c0 wide", upright=True, label="largest gradient error"
         ),
-        Band(z, value - error, value + error, upright=True, label="standard error"),
+        Band(z, value - error, value + error, upright=True, label=words),
         Curve(value, z, label="retrieved"),
         truth,
         *_flagged(profile, quantity, scale, x),
@@ -228,8 +231,9 @@ def _top(residuals: ScanResiduals) -> float:
 
 def _rms(residuals: ScanResiduals, beams: Floats) -> tuple[Layer, ...]:
     """Return the rms residual of every beam, and the part that does not average out."""
-    many = residuals.cycles > 1
-    label = "single cycles" if many else "one cycle"
+    # Of a volume, each cycle may hold other beams.
+    many = not np.allclose(residuals.rms, residuals.rms_of_mean, equal_nan=True)
+    label = "single cycles" if many else "one cycle of each beam"
     single = Curve(beams, residuals.rms, mark=Mark.DISC, joined=False, label=label)
     if not many:
         return (single,)
