@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Final
+from typing import Final, NamedTuple
+
+import numpy as np
 
 from lidarops.catalog.sources import RawFile, Source, path_pattern, printable
-from lidarops.errors import RawFormatError
+from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 
 _HEADER_BYTES: Final = 16384
 _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
+
+
+class Beam(NamedTuple):
+    """Interval and pointing of one raw file."""
+
+    start: datetime
+    stop: datetime
+    zenith_angle: float
+    """degree; NaN where the header states none, or a doubtful one."""
+    azimuth: float
+    """degree; NaN where the header states none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +67,8 @@ class FileGroup:
     """Why pointings are doubtful, in words."""
     notes: tuple[str, ...]
     """Oddities of the headers, in words."""
+    beams: tuple[Beam, ...]
+    """By file."""
 
     @property
     def pattern(self) -> str:
@@ -282,21 +299,58 @@ def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
         without_zenith=len(headers) - len(angles),
         doubts=tuple(sorted({header.doubt for header in headers if header.doubt})),
         notes=tuple(sorted({note for header in headers for note in header.notes})),
+        beams=tuple(
+            Beam(
+                header.start,
+                header.stop,
+                math.nan if header.doubt or header.zenith_angle is None else header.zenith_angle,
+                math.nan if header.azimuth is None else header.azimuth,
+            )
+            for header in headers
+        ),
     )
 
 
-def instruments_of(groups: Iterable[FileGroup]) -> tuple[InstrumentHeaders, ...]:
+def lone_beams(headers: InstrumentHeaders) -> tuple[FileGroup, ...]:
+    """Return the groups of a scanning instrument whose cycles have one beam each; none if all do.
+
+    Of cycles of one beam, a scan has no value.
+    """
+    beams = sorted(
+        (beam, number) for number, group in enumerate(headers.signal) for beam in group.beams
+    )
+    bounds = [(beam.start.timestamp(), beam.stop.timestamp()) for beam, _ in beams]
+    pointing = np.array([(beam.zenith_angle, beam.azimuth) for beam, _ in beams]).T
+    try:
+        cycle = scan_cycles.cycles(*pointing, bounds)
+        direction = scan_cycles.directions(*pointing).index
+    except RetrievalInputError:
+        # Without times that rise, nothing is known of cycles; the plan says it.
+        return ()
+    known = direction >= 0
+    counts = np.bincount(np.unique([cycle[known], direction[known]], axis=1)[0])
+    group = np.array([number for _, number in beams])[known]
+    scanned = set(group[counts[cycle[known]] > 1].tolist())
+    lone = set(group.tolist()) - scanned
+    return tuple(headers.signal[number] for number in sorted(lone)) if scanned else ()
+
+
+def instruments_of(
+    groups: Iterable[FileGroup], left_out: Collection[FileGroup] = ()
+) -> tuple[InstrumentHeaders, ...]:
     """Return the instruments of groups of files: one for each site, position and set of channels.
 
     Groups with one pattern are of one instrument, because its files could not be told apart.
+    Patterns match no file of groups that are left out.
     """
     groups = tuple(groups)
+    everything = [path for group in groups for path in group.files]
+    groups = tuple(group for group in groups if group not in left_out)
     sets: list[list[FileGroup]] = []
     for group in groups:
         alike = [own for own in sets if any(_one_instrument(group, other) for other in own)]
         sets = [own for own in sets if own not in alike]
         sets.append([member for own in alike for member in own] + [group])
-    everything = [path for group in groups for path in group.files]
     return tuple(
         InstrumentHeaders(
             tuple(own),

@@ -16,11 +16,13 @@ from lidarops.catalog.folder import (
     FolderContents,
     InstrumentHeaders,
     instruments_of,
+    lone_beams,
 )
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import HeaderOrder
 from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.steps.channels import file_channels
 from lidarops.steps.pointing import LEAST_SPREAD
 
@@ -102,6 +104,11 @@ def draft_campaign(
             remedy="give the folder of the raw files",
         )
     instruments = tuple(instrument for instrument in instruments if instrument.files)
+    scanning = [instrument for instrument in instruments if _scans(instrument)]
+    lone = [group for instrument in scanning for group in lone_beams(instrument) if _is_free(group)]
+    if lone:
+        instruments = instruments_of(contents.groups, lone)
+        instruments = tuple(instrument for instrument in instruments if instrument.files)
     sites = _sites(instruments)
     keys = _keys(f"{site.key}-lidar" for site in sites)
     lines = [
@@ -119,10 +126,12 @@ def draft_campaign(
         "instruments:",
     ]
     for key, instrument, site in zip(keys, instruments, sites, strict=True):
-        lines += [*_instrument(key, instrument, site), ""]
+        # Instruments of one archive with equal channels have equal detectors.
+        estimates = any(_channel_names(own) == _channel_names(instrument) for own in scanning)
+        lines += [*_instrument(key, instrument, site, estimates=estimates), ""]
     lines += _networks(dict(zip(keys, zip(instruments, sites, strict=True), strict=True)))
     lines.append("scenes: {window: day}  # products of one file each: day, 6h, 30min")
-    return "\n".join([*lines, *_left_out(contents, archive), ""])
+    return "\n".join([*lines, *_left_out(contents, archive, lone), ""])
 
 
 def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
@@ -158,7 +167,25 @@ def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
     return coordinates, known, "latitude_first" if second > 90.0 else "longitude_first"
 
 
-def _instrument(key: str, headers: InstrumentHeaders, site: _Site) -> Iterator[str]:
+def _scans(headers: InstrumentHeaders) -> bool:
+    return headers.zenith_span >= LEAST_SPREAD
+
+
+def _is_free(group: FileGroup) -> bool:
+    """Return whether no beam is so low that it may be blocked, which shows the analog baseline.
+
+    Without the blocked beam of SAVANT, all analog values of its scans are rejected.
+    """
+    return max(map(abs, group.zenith_angles)) <= 90.0 - THRESHOLDS.lowest_free
+
+
+def _channel_names(headers: InstrumentHeaders) -> set[str]:
+    return {channel.name for channel in headers.layout}
+
+
+def _instrument(
+    key: str, headers: InstrumentHeaders, site: _Site, *, estimates: bool
+) -> Iterator[str]:
     groups = headers.signal
     count = sum(len(group.files) for group in groups)
     start, stop = min(g.start for g in groups), max(g.stop for g in groups)
@@ -175,11 +202,11 @@ def _instrument(key: str, headers: InstrumentHeaders, site: _Site) -> Iterator[s
         yield "    header_position: ignore  # headers state no position on Earth"
     else:
         yield f"    header_position: {site.order}  # ? order of {_pair(site.coordinates)}"
-    yield from _facts(headers)
+    yield from _facts(headers, estimates=estimates)
     yield from _products(headers)
 
 
-def _facts(headers: InstrumentHeaders) -> Iterator[str]:
+def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield "    facts:"
     yield "      - clock_offset: 0  # ? s, clock of the files minus UTC; -18000 for UTC-5"
     yield from (f"        {line}" for line in _pointing(headers))
@@ -190,8 +217,7 @@ def _facts(headers: InstrumentHeaders) -> Iterator[str]:
         yield "        # ? Other files have other bins: each set of bins makes scenes of its own."
     yield "        channels:"
     # Without dead times, all values of a scan are rejected where rates are high (SAVANT).
-    scans = headers.zenith_span >= LEAST_SPREAD
-    estimated = {name for pair in headers.pairs if scans for name in file_channels(pair)}
+    estimated = {name for pair in headers.pairs if estimates for name in file_channels(pair)}
     for channel in headers.layout:
         photon = channel.mode is DetectionMode.PHOTON
         facts = "{dead_time: estimate}" if photon and channel.name in estimated else "{}"
@@ -264,7 +290,7 @@ def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[
             yield ""
 
 
-def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
+def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup]) -> Iterator[str]:
     """Yield comments on the files that no instrument has."""
     tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
     rest = [path for path in contents.other if path not in tables]
@@ -274,6 +300,10 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
         named += "; copy them below the folder of this file first"
     for title, paths in (
         ("copies of the last record of the acquisition, left out", contents.copies),
+        (
+            "of cycles of one beam, whose values a scan rejects, left out of `files`",
+            [path for group in lone for path in group.files],
+        ),
         # As seen from the campaign file.
         (named, [f"{archive}/{path}" for path in tables]),
         ("of no raw format", rest),

@@ -122,6 +122,41 @@ def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
     assert [granule.zenith_angle for granule in granules(campaign)] == [0.0, 30.0, 60.0]
 
 
+def test_files_of_single_beams_beside_a_scan_are_left_out(tmp_path: Path) -> None:
+    """A low beam stays, because it may be blocked, and then shows the analog baseline."""
+    scan = {f"scan/h{number}": (number, 30.0 * (number % 3)) for number in range(6)}
+    beams = {**scan, "up/h6": (600.0, 0.0), "low/h7": (1200.0, 85.0)}
+    for path, (minutes, angle) in beams.items():
+        write(tmp_path / "raw" / path, content(minutes, zenith_angle=angle))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert {granule.path for granule in granules(campaign)} == set(beams) - {"up/h6"}
+    assert "1 file, of cycles of one beam, whose values a scan rejects, left out of `files`" in text
+    shown = CliRunner().invoke(app, ["plan", str(tmp_path / "campaign.yaml")])
+    assert "leave their files out" not in " ".join(shown.output.split())
+
+
+def test_a_scan_with_a_folder_for_each_beam_keeps_all(tmp_path: Path) -> None:
+    for number in range(6):
+        data = content(number, zenith_angle=(0.0, 30.0, 60.0)[number % 3])
+        write(tmp_path / f"raw/beam{number % 3}/h{number}", data)
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert len(granules(campaign)) == 6
+    assert "of one beam" not in text
+
+
+def test_an_instrument_with_the_channels_of_a_scanning_one_gets_its_dead_times(
+    tmp_path: Path,
+) -> None:
+    """As the same lidar, of which some files state another site."""
+    for number, angle in enumerate((0.0, 30.0, 60.0)):
+        write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle))
+    write(tmp_path / "raw/v26", content(90.0, site="Hill", zenith_angle=0.0))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert set(campaign.instruments["hill-lidar"].products.requested()) == {"signal", "elastic"}
+    for lidar in campaign.instruments.values():
+        assert lidar.facts[0].channels["photon_532o"].dead_time == "estimate"
+
+
 def test_lidars_of_near_stations_are_shown_as_a_network(tmp_path: Path) -> None:
     places = {"west": (47.2, 11.3), "east": (47.2, 11.4), "far": (52.0, 11.3), "up": (47.2, 11.4)}
     for site, position in places.items():
@@ -237,5 +272,7 @@ def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path:
     qualities = json.loads(shown.stdout)["quality"]
     (quality,) = (own for name, own in qualities.items() if "photon_355p" in name)
     assert quality["good"] + quality["care"] == 100
-    # Of four lone records.
+    # Of four lone records of low beams; one is blocked, so that analog values are usable.
     assert quality["reject"] == 200
+    (quality,) = (own for name, own in qualities.items() if "analog_355s" in name)
+    assert quality["good"] + quality["care"] == 100

@@ -203,10 +203,17 @@ def _single_beams(case: Case, directions: Beams) -> str:
     """Return the warning of cycles of one beam; empty where there are none."""
     if not directions.single:
         return ""
-    first = case.scene.granules[directions.single[0]].path
+    granules = [case.scene.granules[row] for row in directions.single]
+    limit = 90.0 - THRESHOLDS.lowest_free
+    steep = [granule.path for granule in granules if abs(granule.zenith_angle or 0.0) <= limit]
+    advice = (
+        f": leave their files out of `files` (first: {steep[0]})"
+        if steep
+        else "; where the beam is blocked, it shows the analog baseline of other cycles"
+    )
     return (
-        f"cycles of one beam only: {len(directions.single)} of {directions.cycles}. All their"
-        f" values are rejected: leave their files out of `files` (first: {first})"
+        f"cycles of one beam only: {len(granules)} of {directions.cycles}. All their values are"
+        f" rejected{advice}"
     )
 
 
