@@ -320,10 +320,10 @@ def lone_beams(headers: InstrumentHeaders) -> tuple[FileGroup, ...]:
         (beam, number) for number, group in enumerate(headers.signal) for beam in group.beams
     )
     bounds = [(beam.start.timestamp(), beam.stop.timestamp()) for beam, _ in beams]
-    pointing = np.array([(beam.zenith_angle, beam.azimuth) for beam, _ in beams]).T
+    zenith_angle, azimuth = np.array([(beam.zenith_angle, beam.azimuth) for beam, _ in beams]).T
     try:
-        cycle = scan_cycles.cycles(*pointing, bounds)
-        direction = scan_cycles.directions(*pointing).index
+        cycle = scan_cycles.cycles(zenith_angle, azimuth, bounds)
+        direction = scan_cycles.directions(zenith_angle, azimuth).index
     except RetrievalInputError:
         # Without times that rise, nothing is known of cycles; the plan says it.
         return ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +43,7 @@ def obstruction_range(power: Array, variance: Array, distance: Array) -> Array:
     known = np.isfinite(power) & np.isfinite(variance)
     square = distance[: count * bins].reshape(shape) ** 2
 
-    def blocks(array: Array) -> Array:
+    def blocks(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return array[:, : count * bins].reshape(-1, *shape)
 
     inside = np.count_nonzero(blocks(known), axis=2)
