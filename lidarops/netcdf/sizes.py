@@ -23,6 +23,7 @@ _UNWRITTEN: Final = 64 * 2**20
 _MEMORY_SHARE: Final = 0.5
 """Share of the memory of this machine that one variable may take; assumed."""
 _GIGABYTE: Final = 1e9
+_DISTRUST: Final = "lidarops does not write such files: do not trust this one"
 _NO_VARIABLE: Final = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -103,7 +104,7 @@ def _refuse_more(stated: int, most: float, file: Path, field: str, able: str) ->
             f" bytes can {able} at most {most / _GIGABYTE:.3g} GB",
             file=file,
             field=field,
-            remedy="lidarops does not write such files: do not trust this one",
+            remedy=_DISTRUST,
         )
 
 
@@ -122,7 +123,14 @@ def _stated_bytes(opened: h5py.File, name: str, file: Path) -> int:
             "takes its values from elsewhere, which could be any file of this machine",
             file=file,
             field=name,
-            remedy="lidarops does not write such files: do not trust this one",
+            remedy=_DISTRUST,
+        )
+    if stored.get_type().get_class() == h5py.h5t.VLEN:
+        raise ProductError(
+            "has values of variable length, of which the file does not state how large they are",
+            file=file,
+            field=name,
+            remedy=_DISTRUST,
         )
     chunk = math.prod(layout.get_chunk()) if layout.get_layout() == h5py.h5d.CHUNKED else 0
     # A dimension without variable holds no values.

@@ -61,8 +61,14 @@ def _virtual(file: Path) -> None:
         product.create_virtual_dataset("bomb", layout)
 
 
+def _variable_length(file: Path) -> None:
+    with h5py.File(file, "a") as product:
+        product.create_dataset("bomb", (2,), dtype=h5py.vlen_dtype("i4"))[0] = np.arange(3)
+
+
 CRAFTED: list[Callable[[Path], None]] = [
     _unwritten, _coordinate, _large_chunk, _other_file, _link, _virtual,
+    _variable_length,
 ]  # fmt: skip
 
 
@@ -79,13 +85,16 @@ def test_a_crafted_product_is_refused_before_it_is_read(
 
 
 @pytest.mark.parametrize("craft", CRAFTED)
-@pytest.mark.parametrize("command", ["inspect", "inspect --provenance", "reproduce", "plot"])
+@pytest.mark.parametrize(
+    "command", ["inspect", "inspect --provenance", "reproduce", "plot", "compare"]
+)
 def test_a_crafted_product_costs_one_line(
     tmp_path: Path, craft: Callable[[Path], None], command: str
 ) -> None:
     product = tmp_path / add_day(tmp_path, 0)
     craft(product)
-    result = CliRunner().invoke(app, [*command.split(), str(product)])
+    files = [str(product)] * (2 if command == "compare" else 1)
+    result = CliRunner().invoke(app, [*command.split(), *files])
     assert result.exit_code == 1
     assert isinstance(result.exception, SystemExit)
     assert len(result.output.splitlines()) == 1
