@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Final, Protocol, TypeVar
 
 from lidarops.errors import LidarOpsError
@@ -41,19 +41,26 @@ def registered(group: str, of: type[_Part], noun: str) -> dict[str, _Part]:
     for point in entry_points(group=group):
         try:
             part = point.load()
-        except (ImportError, AttributeError) as error:
+        except Exception as error:
+            # The code of a package may raise anything; the cause is chained.
             raise LidarOpsError(
-                f"{noun} {point.name!r} cannot be loaded from {point.value}: {error}",
-                remedy="repair or remove the package that registers it",
+                f"{noun} {point.name!r} cannot be loaded from {point.value}: {error!r}",
+                remedy=f"repair or remove the package {_package(point)}; python -c 'import"
+                f" {point.module}' shows where it fails",
             ) from error
         if not isinstance(part, of) or part.name != point.name or part.name in parts:
             raise LidarOpsError(
                 f"{noun} {point.name!r} of {point.value} is no {of.__name__} of that name, or the"
                 " name is taken",
-                remedy="repair or remove the package that registers it",
+                remedy=f"repair or remove the package {_package(point)}",
             )
         parts[part.name] = part
     return parts
+
+
+def _package(point: EntryPoint) -> str:
+    """Return the distribution that registers an entry point, or else its package."""
+    return point.dist.name if point.dist else point.module.partition(".")[0]
 
 
 def by_name(
