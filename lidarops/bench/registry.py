@@ -72,25 +72,12 @@ def run_benchmark(
     RawFormatError
         If "reader" gets no file, or one that cannot be read.
     """
-    begin = cpu_seconds()
-    measured = _run(what, case, files, effort, data=data)
-    return replace(measured, cpu_seconds=cpu_seconds() - begin)
-
-
-def _run(
-    what: str,
-    case: str | None,
-    files: Sequence[Path],
-    effort: Effort,
-    *,
-    data: Path | None = None,
-) -> Study:
     kind = _member(BenchmarkKind, what, "benchmark")
     if kind is BenchmarkKind.STABILITY:
         for name, value in {"case": case, "files": files, "data": data}.items():
             _refuse(name, value, "is no option of the benchmark 'stability'")
         _refuse("repeats", effort.repeats, "is no option of the benchmark 'stability'")
-        return study.measure_stability(effort)
+        return _timed(study.measure_stability, effort)
     default = Benchmark.ALL if kind is BenchmarkKind.ACCURACY else Benchmark.HOMOGENEOUS
     benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
     if benchmark is not Benchmark.READER:
@@ -103,7 +90,12 @@ def _run(
             f"the case {benchmark.value!r} has no {kind.value}",
             remedy=f"choose: {' or '.join(studies)}",
         )
-    return studies[benchmark](effort)
+    return _timed(studies[benchmark], effort)
+
+
+def _timed(measure: Callable[[Effort], Study], effort: Effort) -> Study:
+    begin = cpu_seconds()
+    return replace(measure(effort), cpu_seconds=cpu_seconds() - begin)
 
 
 _Studies = Mapping[Benchmark, Callable[[Effort], Study]]
