@@ -79,6 +79,8 @@ _MODES = {
     DatasetKind.ANALOG: DetectionMode.ANALOG,
     DatasetKind.PHOTON: DetectionMode.PHOTON,
 }
+_SIGNAL_DEVICES = ("BT", "BC")
+"""Begins of the device of analog and of photon datasets (`licel2023`)."""
 _ANALOG = frozenset({DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED})
 _PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
 
@@ -778,8 +780,12 @@ def _bin_shift(whole: str, decimals: str) -> float:
 
 
 def _dataset_notes(datasets: tuple[Dataset, ...]) -> tuple[str, ...]:
-    return tuple(
-        f"{d.name} has no shots: its values are undefined"
-        for d in datasets
-        if d.shots == 0 and d.active
+    active = [dataset for dataset in datasets if dataset.active]
+    return (
+        *(f"{d.name} has no shots: its values are undefined" for d in active if d.shots == 0),
+        *(
+            f"{d.name} is no signal by its type, and one by its device {d.device}"
+            for d in active
+            if d.kind not in _MODES and d.device.startswith(_SIGNAL_DEVICES)
+        ),
     )

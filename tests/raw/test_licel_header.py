@@ -509,3 +509,13 @@ def test_a_file_of_no_known_format_is_called_text_only_if_it_is(data, text):
     with pytest.raises(RawFormatError, match="no known raw format") as caught:
         parse_raw_header(data, file="x", size=len(data))
     assert ("it is text" in str(caught.value)) is text
+
+
+def test_a_signal_that_is_none_by_its_type_is_noted():
+    """A damaged type would lose one of two memories in silence."""
+    damaged = PHOTON.replace(" 1 1 1 ", " 1 4 1 ")
+    assert parse(datasets=(ANALOG, damaged)).notes == (
+        "power_meter_532p is no signal by its type, and one by its device BC0",
+    )
+    meter = damaged.replace("BC0", "PD0")
+    assert parse(datasets=(ANALOG, meter)).notes == ()

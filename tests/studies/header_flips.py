@@ -100,7 +100,8 @@ class Flips:
             return "noted"
         original = (self.root / path).read_bytes()
         whole = parse_raw_header(original, file=path, size=len(original))
-        return "without effect" if _used(whole) == _used(header) else "used"
+        same = _used(whole, due.role) == _used(header, due.role)
+        return "without effect" if same else "used"
 
     def _header(self, granule: Granule) -> RawHeader | None:
         try:
@@ -110,8 +111,11 @@ class Flips:
             return None
 
 
-def _used(header: RawHeader) -> RawHeader:
+def _used(header: RawHeader, role: Role) -> RawHeader:
     """Return what products and scenes follow from."""
+    # Dark signal is the same wherever the beam points.
+    if role is Role.DARK:
+        header = header._replace(zenith_angle=None, azimuth=None)
     # The position of a product is that of its station.
     return header._replace(
         digest="", notes=(), record=None, coordinates=None, altitude=None, site=""
