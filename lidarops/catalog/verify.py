@@ -18,7 +18,7 @@ from lidarops.system.output_files import product_paths
 _UNLISTED: Final = (
     "is not in the ledger: a run makes it again if it is requested; else move it away"
 )
-LEFT_OVER: Final = "left by a killed process; the next run that makes a product removes it"
+LEFT_OVER: Final = "left by a killed process; the next run removes it"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ The command line and the Prefect flows call these functions and add no logic of 
 from __future__ import annotations
 
 import logging
+import os
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
@@ -557,13 +558,18 @@ class _Pass:
 
     def _clear_up(self) -> None:
         """Remove what a killed run left, if this one has not; another run may be at work."""
-        if self.session is None and self.store.has_dead_run():
+        if self.session is None and (self.store.has_dead_run() or self._is_littered()):
             _acquire(self.lock)
             paths, complete = versions.sweep(Path(self.campaign.output))
             for path in paths:
                 _LOG.warning("removed %s, left by a killed process", path)
             if complete:
                 self.store.close_runs(self.lock.token)
+
+    def _is_littered(self) -> bool:
+        """Return whether there are temporary files that no run writes and this one may remove."""
+        files = versions.temporary_files(Path(self.campaign.output))
+        return not self.store.in_use() and any(os.access(file.parent, os.W_OK) for file in files)
 
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:

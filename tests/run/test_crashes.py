@@ -99,8 +99,14 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     product = next((tmp_path / "out/products").rglob("*.nc"))
     left = product.with_name(f".{product.name}.123-abcd.tmp")
     left.write_bytes(b"half of a product")
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        with pytest.raises(CatalogError, match="held by"):
+            reprocess(campaign)
+        assert left.exists(), "another run may write it"
     assert reprocess(campaign) is None
-    assert left.exists(), "a run with nothing to do touches nothing"
+    assert not left.exists(), "a run with nothing to do removes it"
+    left.write_bytes(b"half of a product")
     product.unlink()
     reprocess(campaign)
     assert not left.exists()
