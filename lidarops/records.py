@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 from lidarops.kinds import kinds
 
@@ -71,6 +71,12 @@ class ChannelLayout:
         return hash((self.name, self.bins))
 
 
+UNREADABLE: Final = "cannot be read"
+"""Start of the reason if a disk or a network did not give a file."""
+LONGEST_REASON: Final = 300
+"""Characters of a reason that products state; a damaged header may be quoted in it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Granule:
     """One raw file as catalogued."""
@@ -122,6 +128,29 @@ class Holding:
     files: int
 
 
+class UnusedFile(NamedTuple):
+    """A raw file that belongs to a scene, and from which no product is made."""
+
+    path: str
+    """Relative to the archive root."""
+    role: Role
+    reason: str
+
+    @classmethod
+    def of(cls, refused: Granule) -> Self:
+        """Return what products state of a refused file, each on one line.
+
+        Not what a disk or network said: that may differ from try to try, and name other places.
+        """
+        reason = UNREADABLE if refused.reason.startswith(UNREADABLE) else refused.reason
+        return cls(_one_line(refused.path), refused.role, _one_line(reason)[:LONGEST_REASON])
+
+
+def _one_line(text: str) -> str:
+    """Return a text with escapes for what is no printable character."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 @dataclass(frozen=True, slots=True)
 class Scene:
     """The granules that are processed together."""
@@ -142,6 +171,8 @@ class Scene:
     `station` and `instrument` are the key of the network. Empty for a single instrument."""
     notes: tuple[str, ...] = ()
     """Notes and contradictions of its signal granules, each with the number of granules."""
+    unused: tuple[UnusedFile, ...] = ()
+    """Files of its time that are refused, by path."""
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:

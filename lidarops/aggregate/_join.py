@@ -12,7 +12,8 @@ from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 
 _PER_PRODUCT: Final = (
     "date_", "history", "id", "lidarops_input_count", "lidarops_plan", "lidarops_scene",
-    "lidarops_steps", "lidarops_window_", "measurement_ID", "time_coverage_",
+    "lidarops_steps", "lidarops_unused_inputs", "lidarops_window_", "measurement_ID",
+    "time_coverage_",
 )  # fmt: skip
 """Prefixes of global attributes that apply to one product only."""
 

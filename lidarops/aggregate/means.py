@@ -29,6 +29,7 @@ from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
+from lidarops.netcdf.global_attributes import UNUSED_INPUTS
 from lidarops.netcdf.variables import layout_of
 from lidarops.netcdf.write import write_product
 
@@ -239,6 +240,8 @@ class _Year:
     """``date_modified`` of the newest product so far; such times in UTC sort as texts."""
     version: int = 0
     """Sum of the versions of the products so far."""
+    partial: int = 0
+    """Number of products so far that lack raw files of their scenes."""
 
     def note(self, profiles: Profiles) -> None:
         path = profiles.facts.path
@@ -247,6 +250,7 @@ class _Year:
             so_far = profiles.attributes if self.shared is None else self.shared
             self.shared = shared_attributes([so_far, profiles.attributes])
             self.version += int(profiles.attributes["product_version"])
+            self.partial += UNUSED_INPUTS in profiles.attributes
             self.modified = max(self.modified, str(profiles.attributes.get("date_modified", "")))
 
     def close(self, key: np.datetime64, sums: _PeriodSums) -> None:
@@ -322,6 +326,7 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
             first,
             last,
             len(year.inputs),
+            year.partial,
             year.modified,
             year.version,
             means_version(group.kind),

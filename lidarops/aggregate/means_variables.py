@@ -16,6 +16,7 @@ import numpy as np
 
 from lidarops import __version__
 from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
+from lidarops.netcdf.global_attributes import UNUSED_INPUTS
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
     TIME,
@@ -350,6 +351,15 @@ def global_attributes(
         "lidarops_weights": about.weights.value,
         "lidarops_code_version": about.code_version,
         "lidarops_input_count": np.int32(about.inputs),
+        **_partial(about),
+    }
+
+
+def _partial(about: MeansDescription) -> dict[str, str]:
+    if not about.partial:
+        return {}
+    return {
+        UNUSED_INPUTS: f"{about.partial} of {about.inputs} products lack raw files, and name them"
     }
 
 
@@ -373,6 +383,8 @@ class MeansDescription:
     """Middle of the last period."""
     inputs: int
     """Number of products."""
+    partial: int
+    """Number of products that lack raw files of their scenes."""
     modified: str
     """``date_modified`` of the newest product."""
     version: int

@@ -43,6 +43,15 @@ class Fingerprint(NamedTuple):
     """UTC, without a zone."""
 
 
+class DatedFile(NamedTuple):
+    """A good file, and when it starts."""
+
+    path: str
+    instrument: str
+    role: Role
+    start: datetime
+
+
 @dataclass(frozen=True, slots=True)
 class DaySum:
     """Sums over the granules of one role on one day; unchanged if no row changed."""
@@ -151,6 +160,23 @@ class Granules(Database):
     def refused(self) -> list[Granule]:
         """Return the granules that the catalog refuses."""
         return self.granules(status=Status.REFUSED)
+
+    def files_in(self, folder: str) -> list[DatedFile]:
+        """Return the good files that lie in a folder itself; of the archive where it is empty."""
+        columns = (_C.path, _C.instrument, _C.role, _C.start)
+        query = sa.select(*columns).where(
+            _C.campaign == self.campaign, _C.status == Status.GOOD.value
+        )
+        begin = f"{folder}/" if folder else ""
+        if folder:
+            # All paths that begin so: "0" follows "/".
+            query = query.where(_C.path > begin, _C.path < f"{folder}0")
+        with self.stream(query) as rows:
+            return [
+                DatedFile(path, instrument, _ROLES[role], start.replace(tzinfo=UTC))
+                for path, instrument, role, start in self.decoded(rows)
+                if "/" not in path[len(begin) :]
+            ]
 
     def count(self, *, status: Status | None = None) -> int:
         """Return the number of granules."""

@@ -16,13 +16,12 @@ from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
 from lidarops.raw.header import HeaderOrder, RawHeader
-from lidarops.records import Granule, Role, Status
+from lidarops.records import UNREADABLE, Granule, Role, Status
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign, Instrument, Station
 
-_UNREADABLE: Final = "cannot be read"
-_TRY_AGAIN: Final = (_UNREADABLE, UNKNOWN_FORMAT)
+_TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
 
 HEADER_BYTES: Final = 16384
@@ -135,7 +134,7 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
     except RawFormatError as error:
         return _refused(due, str(error).removeprefix(f"{file.path}: "))
     except OSError as error:
-        return _refused(due, f"{_UNREADABLE}: {error.strerror or error}")
+        return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
 
 
 def _refused(due: UnreadFile, reason: str) -> Granule:

@@ -10,7 +10,7 @@ from typing import cast
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import writing_time
-from lidarops.records import DetectionMode, Provenance, Stamp
+from lidarops.records import DetectionMode, Provenance, Stamp, UnusedFile
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -41,6 +41,8 @@ class Context:
     provenance: Provenance
     raw_format: str
     """Raw format of its files, in words."""
+    unused: tuple[UnusedFile, ...] = ()
+    """Raw files of its scene from which it is not made."""
     stamp: Stamp = field(default_factory=Stamp)
     """Version of its content, and when it is written; now, where it has no time."""
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,7 +14,11 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import GLUED, DetectionMode, LeftOut, PlannedStep, is_glued
+from lidarops.records import GLUED, DetectionMode, LeftOut, PlannedStep, Role, is_glued
+
+UNUSED_INPUTS: Final = "lidarops_unused_inputs"
+MOST_UNUSED: Final = 20
+"""Unused files that a product names; its provenance names all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,8 +244,18 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_plan_sha256": provenance.plan.hash,
         "lidarops_code_version": provenance.code_version,
         "lidarops_input_count": np.int32(len(provenance.inputs)),
-        **({"lidarops_input_notes": "\n".join(context.notes)} if context.notes else {}),
+        "lidarops_input_notes": "\n".join(context.notes),
+        UNUSED_INPUTS: "\n".join(_unused(context)),
     }
+
+
+def _unused(context: Context) -> Iterator[str]:
+    files = context.unused
+    for path, role, reason in files[:MOST_UNUSED]:
+        dark = "dark file " if role is Role.DARK else ""
+        yield f"{dark}{path}: {reason}"
+    if len(files) > MOST_UNUSED:
+        yield f"{len(files) - MOST_UNUSED} other raw files"
 
 
 def _mode(context: Context) -> str:

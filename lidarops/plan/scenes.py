@@ -150,7 +150,7 @@ def scene_stop(scene: str, campaign: Campaign) -> datetime:
     """Return when a scene with this id would end with the present campaign file."""
     key, start = parse_scene_id(scene)
     members = campaign.networks[key].instruments if key in campaign.networks else [key]
-    return _window(campaign, [name for name in members if name in campaign.instruments], start)[1]
+    return window_at(campaign, [name for name in members if name in campaign.instruments], start)[1]
 
 
 def select_scenes(
@@ -211,7 +211,7 @@ def _in_windows(
     opens = closes = datetime.min.replace(tzinfo=UTC)
     for granule in granules:
         if not opens <= _start(granule) < closes:
-            opens, closes = _window(campaign, instruments, _start(granule))
+            opens, closes = window_at(campaign, instruments, _start(granule))
         yield granule, (opens, closes)
 
 
@@ -251,7 +251,7 @@ def _cycles(granules: Sequence[Granule]) -> list[int]:
         return list(range(len(granules)))
 
 
-def _window(
+def window_at(
     campaign: Campaign, instruments: Sequence[str], start: datetime
 ) -> tuple[datetime, datetime]:
     """Return the window that holds `start`, narrowed so that no fact changes within it."""

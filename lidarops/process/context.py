@@ -66,6 +66,7 @@ def product_context(
         start=scene.start,
         stop=scene.stop,
         notes=notes,
+        unused=dependence.product_unused(scene, closure),
         provenance=Provenance(
             campaign=campaign.name,
             scene=scene.id,
@@ -107,6 +108,7 @@ def recorded_settings(
         "campaign": {"title": campaign.title, "summary": campaign.summary},
         "window": [scene.start.isoformat(), scene.stop.isoformat()],
         "notes": list(dependence.product_notes(scene, plan, product[1])),
+        **dependence.unused_settings(scene, plan),
     }
 
 

@@ -18,7 +18,7 @@ from lidarops.errors import CatalogError, LidarOpsError, SceneError
 from lidarops.raw.archive import open_archive
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import Stretches
-from lidarops.records import Granule, InputRecord, Scene, Status
+from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
 from lidarops.steps.dependence import scene_facts
 from lidarops.system.stores import RemoteStore
 
@@ -89,7 +89,10 @@ def check_files(
                 sha256 = _read_digest(granule, root)
         except FileNotFoundError:
             refused.append(replace(granule, status=Status.REFUSED, reason=_VANISHED))
-        except (LidarOpsError, OSError) as error:
+        except OSError as error:
+            reason = f"{UNREADABLE}: {error.strerror or error}"
+            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
+        except LidarOpsError as error:
             reason = str(error).removeprefix(f"{granule.path}: ")
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))
         else:

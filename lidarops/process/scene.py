@@ -45,7 +45,13 @@ from lidarops.steps.channels import (
 )
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.data import Chunk, Data, ProductStream, Source, WholeProduct, in_one_batch
-from lidarops.steps.dependence import ancillary_files, is_product, plan_closure, scene_facts
+from lidarops.steps.dependence import (
+    ancillary_files,
+    is_product,
+    plan_closure,
+    scene_facts,
+    with_unused,
+)
 from lidarops.steps.network import Member
 from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
 from lidarops.steps.registry import gives, network_step
@@ -100,6 +106,7 @@ def _process(job: Job, root: Path) -> tuple[SceneOutcome, bool]:
     clock.lap("digest")
     failure = Failure("").outcome(job.scene, job.plan)
     failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
+    usable = with_unused(usable, refused)
     if not usable.granules:
         return replace(failure, error="no granule of the scene can be read"), True
     # Of a scheduler by its name, dask loads `distributed`, which takes 0.3 s.

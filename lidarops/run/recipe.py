@@ -26,7 +26,9 @@ from lidarops.records import (
     Scene,
     Stamp,
     Status,
+    UnusedFile,
 )
+from lidarops.steps.dependence import UNUSED
 
 RAW: Final = (Role.SIGNAL, Role.DARK)
 """Roles of files in the archive; paths of other inputs start from the campaign folder."""
@@ -165,9 +167,17 @@ class Recipe:
             start=start,
             stop=stop,
             notes=tuple(self.settings["notes"]),
+            unused=_unused(self.settings),
             granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
             dark=tuple(granule for granule in granules if granule.role is Role.DARK),
         )
+
+
+def _unused(settings: Mapping[str, Any]) -> tuple[UnusedFile, ...]:
+    return tuple(
+        UnusedFile(str(file["path"]), Role(file["role"]), str(file["reason"]))
+        for file in settings.get(UNUSED, ())
+    )
 
 
 def stays_inside(path: str) -> bool:

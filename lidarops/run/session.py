@@ -30,7 +30,7 @@ from lidarops.records import (
 from lidarops.reports.run_journal import Journal
 from lidarops.reports.run_record import save_run_record
 from lidarops.run.staleness import Judge, Judgement
-from lidarops.steps.dependence import ProductKey
+from lidarops.steps.dependence import ProductKey, with_unused
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.stores import without_keys
 
@@ -253,15 +253,14 @@ class Session:
         self, judged: Judgement, outcome: SceneOutcome
     ) -> tuple[list[NewProduct], SceneOutcome]:
         new = []
+        scene = with_unused(judged.scene, outcome.refused)
         for record in outcome.products:
             mtime_ns = self._written(record)
             if mtime_ns is None:
                 error = f"{record.path}: vanished or changed after it was written"
                 return [], replace(outcome, products=(), error=error)
             product: ProductKey = (record.kind, record.channel)
-            depends_on, used = self._judge.depends_on(
-                judged.scene, judged.plan, product, outcome.inputs
-            )
+            depends_on, used = self._judge.depends_on(scene, judged.plan, product, outcome.inputs)
             new.append(
                 NewProduct(record, mtime_ns, depends_on, used, self._kept.get(record.path, ""))
             )

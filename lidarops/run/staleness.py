@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from math import ceil
 from typing import Any, Final, NamedTuple
 
@@ -30,12 +31,13 @@ from lidarops.plan.outlying_headers import without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.plan.surroundings import NEAR_DAYS
+from lidarops.plan.unused_files import Refused, dated, name_unused
 from lidarops.process.context import recorded_settings
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.job import Job, Place
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
-from lidarops.records import Granule, InputRecord, Plan, Role, Scene, Stamp
+from lidarops.records import Granule, InputRecord, Plan, Role, Scene, Stamp, UnusedFile
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection, requested_kinds
@@ -53,6 +55,7 @@ _PLANNING: Final = (
     "lidarops.plan.outlying_headers",
     "lidarops.plan.scene_plan",
     "lidarops.plan.scenes",
+    "lidarops.plan.unused_files",
 )
 """Modules that decide which scenes and plans a day has. A product records its own scene and plan,
 so that a change of these modules makes it stale only if they changed."""
@@ -205,11 +208,10 @@ class Judge:
         sums: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
         for day_sum in self._store.day_sums():
             fingerprint = (day_sum.role.value, day_sum.good, day_sum.low, day_sum.high)
-            sums[day_sum.day].append(fingerprint)
-            reach = NEAR_DAYS + (DARK_DAYS if day_sum.role is Role.DARK else 0)
-            for near in range(1, reach + 1):
-                sums[day_sum.day - near].append((near, *fingerprint))
-                sums[day_sum.day + near].append((-near, *fingerprint))
+            _add_around(sums, day_sum.day, day_sum.role, fingerprint)
+        for file in self._refused:
+            unused = UnusedFile.of(file.granule)
+            _add_around(sums, day_of(file.time), unused.role, unused)
         products, broken = self._product_days()
         base = self._base()
         signatures = {}
@@ -344,6 +346,7 @@ class Judge:
         granules = self._store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
         kept, refused = without_outlying(granules, used, self._header)
+        aside = [granule for granule in refused if day_of(_moment(granule)) in days]
         cut = cut_scenes(
             self.campaign,
             [
@@ -352,8 +355,14 @@ class Judge:
                 if granule.role is Role.DARK or day_of(_moment(granule)) in days
             ],
         )
-        aside = [granule for granule in refused if day_of(_moment(granule)) in days]
-        return replace(cut, set_aside=(*cut.set_aside, *aside))
+        unused = [*self._refused, *(Refused(granule, _moment(granule)) for granule in refused)]
+        scenes = name_unused(cut.scenes, unused)
+        return replace(cut, scenes=scenes, set_aside=(*cut.set_aside, *aside))
+
+    @cached_property
+    def _refused(self) -> tuple[Refused, ...]:
+        """Files that the catalog refuses, with times to which they belong."""
+        return tuple(dated(self.campaign, self._store.refused(), self._store.files_in))
 
     def _header(self, granule: Granule) -> RawHeader | None:
         """Return the header of a file; None where this file cannot be read now."""
@@ -647,6 +656,17 @@ class Judge:
         return self._ancillaries[name]
 
 
+def _add_around(
+    sums: dict[int, list[tuple[Any, ...]]], day: int, role: Role, fingerprint: tuple[Any, ...]
+) -> None:
+    """Add what is known of files of a day to the sums of all days whose products may use them."""
+    sums[day].append(fingerprint)
+    reach = NEAR_DAYS + (DARK_DAYS if role is Role.DARK else 0)
+    for near in range(1, reach + 1):
+        sums[day - near].append((near, *fingerprint))
+        sums[day + near].append((-near, *fingerprint))
+
+
 def _files(judged: Judgement, content: Callable[[Granule], str]) -> tuple[InputRecord, ...]:
     """Return the present inputs of a scene."""
     scene = judged.scene
@@ -682,7 +702,7 @@ def _changed(recorded: Dependence, plan_hash: str, code: str) -> str:
         return f"the code changed, from {recorded.code_version} to {code}"
     if recorded.plan_hash != plan_hash:
         return "its plan changed"
-    return "its settings in the campaign changed"
+    return "its settings in the campaign, or the files that are unused, changed"
 
 
 def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> str:

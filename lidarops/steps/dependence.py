@@ -15,7 +15,16 @@ from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
 from lidarops.kinds import Scope, kinds_of
-from lidarops.records import InputRecord, LeftOut, Plan, PlannedStep, Role, Scene
+from lidarops.records import (
+    Granule,
+    InputRecord,
+    LeftOut,
+    Plan,
+    PlannedStep,
+    Role,
+    Scene,
+    UnusedFile,
+)
 from lidarops.steps.channels import READ_STEP
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.reading import ARCHIVE, required_by
@@ -25,6 +34,9 @@ from lidarops.steps.workload import Workload
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
+
+UNUSED: Final = "unused"
+"""Key of the unused files in the settings of a product."""
 
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
@@ -219,6 +231,7 @@ class Settings:
             ),
             "scene": [scene.id, scene.start.isoformat(), scene.stop.isoformat()],
             "notes": product_notes(scene, plan, channel),
+            **unused_settings(scene, plan),
             "members": [
                 {
                     "station": self._stations[member.station],
@@ -244,6 +257,34 @@ def product_notes(scene: Scene, plan: Plan, channel: str) -> tuple[str, ...]:
     others = {held.name for member in scene.members or (scene,) for held in member.layout}
     others -= {step.channel for step in plan.steps} | {channel}
     return tuple(note for note in scene.notes if others.isdisjoint(note.split(": ")))
+
+
+def with_unused(scene: Scene, refused: Iterable[Granule]) -> Scene:
+    """Return a scene that names refused files, too, as unused."""
+    unused = {*scene.unused, *map(UnusedFile.of, refused)}
+    return replace(scene, unused=tuple(sorted(unused))) if unused else scene
+
+
+def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
+    """Return the unused files of a scene that a product would be made from.
+
+    Parameters
+    ----------
+    scene : Scene
+    plan : Plan
+        Plan of the product, from `plan_closure`.
+    """
+    dark = _reads_dark(plan)
+    return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
+
+
+def unused_settings(scene: Scene, plan: Plan) -> dict[str, Any]:
+    """Return the unused files of a product as plain JSON types; no key where there are none.
+
+    Parameters as `product_unused`.
+    """
+    unused = [file._asdict() for file in product_unused(scene, plan)]
+    return {UNUSED: unused} if unused else {}
 
 
 def scene_facts(campaign: Campaign, scene: Scene) -> InstrumentFacts:
@@ -316,13 +357,17 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     files : iterable of InputRecord
         Files of the scene.
     """
-    dark = any(gives(step, DARK) for step in plan.steps)
+    dark = _reads_dark(plan)
     named = ancillary_files(plan.steps)
     return tuple(
         file
         for file in files
         if file.role is Role.SIGNAL or (file.role is Role.DARK and dark) or file.path in named
     )
+
+
+def _reads_dark(plan: Plan) -> bool:
+    return any(gives(step, DARK) for step in plan.steps)
 
 
 def digest(value: Any) -> str:

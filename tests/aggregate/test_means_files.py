@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -24,6 +25,7 @@ from lidarops.aggregate.means_variables import (
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of, kinds
+from lidarops.netcdf.global_attributes import UNUSED_INPUTS
 from lidarops.netcdf.variables import ErrorKind, layout_of
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.labeled import VisibilityDefinition, visibility_of_extinction
@@ -49,6 +51,16 @@ def test_means_have_the_date_of_their_newest_product(tmp_path: Path):
     means = only(tmp_path, means_of(tmp_path)).attrs
     assert means["date_modified"] == means["date_created"] == max(dates)
     assert means["history"].startswith(max(dates))
+
+
+def test_means_state_how_many_products_lack_raw_files(tmp_path: Path):
+    days = [add_day(tmp_path, day) for day in range(3)]
+    assert UNUSED_INPUTS not in only(tmp_path, means_of(tmp_path)).attrs
+    with netCDF4.Dataset(tmp_path / days[1], "a") as product:
+        product.setncattr(UNUSED_INPUTS, "coast/h1: cannot be read")
+    means = only(tmp_path, means_of(tmp_path))
+    assert means.attrs[UNUSED_INPUTS] == "1 of 3 products lack raw files, and name them"
+    assert UNUSED_INPUTS not in open_products(tmp_path).attrs
 
 
 def test_daily_means_of_the_usable_values(tmp_path: Path):

@@ -1,0 +1,258 @@
+"""A product that is made of a part of its scene states which raw files are not in it, and why."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+import xarray as xr
+from support.archives.small_archive import Archive
+
+from lidarops.campaign.model import Campaign
+from lidarops.catalog.granules import DatedFile
+from lidarops.errors import CatalogError
+from lidarops.netcdf.comparison import compare_products
+from lidarops.netcdf.global_attributes import MOST_UNUSED, UNUSED_INPUTS
+from lidarops.plan.unused_files import dated
+from lidarops.records import Grade, Granule, Role, Status
+from lidarops.reports.inspection import describe
+from lidarops.run.archive import bring_up_to_date, reprocess
+from lidarops.run.reproduction import reproduce_product
+from lidarops.system.stores import RemoteStore
+
+Fault = Callable[[Path, pytest.MonkeyPatch], None]
+"""Makes raw/poor/h01 below a folder unusable."""
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """An archive of one instrument, two days and three raw files a day."""
+    archive = Archive(tmp_path, days=2)
+    del archive.tree["instruments"]["rich"]
+    return archive
+
+
+def _unused(campaign: Campaign) -> dict[str, str]:
+    """Return the unused files that products state, by name of product and day."""
+    stated = {}
+    for path in sorted(campaign.products_root.rglob("*.nc")):
+        with xr.open_dataset(path) as product:
+            stated[path.stem.partition("T")[0]] = product.attrs.get(UNUSED_INPUTS, "")
+    return stated
+
+
+def _is_undisturbed(campaign: Campaign, tmp_path: Path) -> bool:
+    other = campaign.model_copy(update={"output": str(tmp_path / "undisturbed")})
+    assert reprocess(other) is not None
+    names = [
+        sorted(path.relative_to(root) for path in root.rglob("*.nc"))
+        for root in (other.products_root, campaign.products_root)
+    ]
+    return names[0] == names[1] and all(
+        compare_products(other.products_root / name, campaign.products_root / name).grade
+        is Grade.NONE
+        for name in names[0]
+    )
+
+
+def _denied(_: Path, patch: pytest.MonkeyPatch) -> None:
+    opened = os.open
+
+    def failing(path: Any, *arguments: Any, **options: Any) -> int:
+        if str(path).endswith("poor/h01"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, *arguments, **options)
+
+    patch.setattr(os, "open", failing)
+
+
+def _failing_read(error: OSError) -> Fault:
+    def fault(_: Path, patch: pytest.MonkeyPatch) -> None:
+        read = Path.read_bytes
+
+        def failing(path: Path) -> bytes:
+            if path.match("poor/h01"):
+                raise error
+            return read(path)
+
+        patch.setattr(Path, "read_bytes", failing)
+
+    return fault
+
+
+def _truncated(folder: Path, _: pytest.MonkeyPatch) -> None:
+    file = folder / "raw/poor/h01"
+    file.write_bytes(file.read_bytes()[:-100])
+
+
+def _refused_by_a_store(_: Path, patch: pytest.MonkeyPatch) -> None:
+    head = RemoteStore.head
+
+    def failing(store: RemoteStore, path: str, size: int) -> bytes:
+        if path == "poor/h01":
+            cause = PermissionError(f"https://user:secret@host/{path}?key=secret")
+            raise CatalogError("cannot be read", file=path) from cause
+        return head(store, path, size)
+
+    patch.setattr(RemoteStore, "head", failing)
+
+
+def _gone_from_a_store(_: Path, patch: pytest.MonkeyPatch) -> None:
+    fetch = RemoteStore.fetch
+
+    def without(store: RemoteStore, paths: list[str], folder: Path) -> None:
+        fetch(store, [path for path in paths if path != "poor/h01"], folder)
+
+    patch.setattr(RemoteStore, "fetch", without)
+
+
+@contextmanager
+def _disturbed(folder: Path, fault: Fault) -> Iterator[None]:
+    file = folder / "raw/poor/h01"
+    content = file.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        fault(folder, patch)
+        yield
+    file.write_bytes(content)
+
+
+UNREADABLE = "poor/h01: cannot be read"
+VANISHED = "poor/h01: vanished after it was catalogued (run lidarops catalog again)"
+
+
+@pytest.mark.parametrize(
+    ("fault", "remote", "words"),
+    [
+        (_denied, False, UNREADABLE),
+        (_failing_read(OSError(errno.EIO, "Input/output error", "/secret/h01")), False, UNREADABLE),
+        (_failing_read(FileNotFoundError(errno.ENOENT, "No such file")), False, VANISHED),
+        (_truncated, False, "poor/h01: "),
+        (_refused_by_a_store, True, UNREADABLE),
+        (_gone_from_a_store, True, VANISHED),
+    ],
+    ids=[
+        "denied",
+        "unreadable",
+        "vanished",
+        "truncated",
+        "refused by a store",
+        "gone from a store",
+    ],
+)
+def test_a_product_states_the_files_of_its_scene_that_are_not_in_it(
+    archive: Archive, tmp_path: Path, fault: Fault, remote: bool, words: str
+) -> None:
+    if remote:
+        archive.tree["archive"] = f"file://{tmp_path}/raw"
+    campaign = archive.write()
+    with _disturbed(tmp_path, fault):
+        assert bring_up_to_date(campaign).has_failures
+        stated = _unused(campaign)
+        second_day = [text for name, text in stated.items() if name.endswith("02")]
+        first_day = [text for name, text in stated.items() if name.endswith("01")]
+        assert second_day == ["", ""]
+        assert len(first_day) == 2
+        assert len(set(first_day)) == 1
+        [text] = set(first_day)
+        assert text == words if words[-1] != " " else text.startswith(words)
+        assert "secret" not in text
+        assert str(tmp_path) not in text
+        product = next(campaign.products_root.rglob("*_20260301*.nc"))
+        assert describe(product)["attributes"][UNUSED_INPUTS] == text
+    assert reproduce_product(product, archive=tmp_path / "raw").identical
+    # The file is back.
+    assert not bring_up_to_date(campaign).has_failures
+    assert set(_unused(campaign).values()) == {""}
+    assert _is_undisturbed(campaign, tmp_path)
+    assert reprocess(campaign) is None
+
+
+def test_products_state_files_that_are_refused_later_and_forget_those_that_are_gone(
+    archive: Archive, tmp_path: Path
+) -> None:
+    """Though nothing else of their days changes."""
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    assert set(_unused(campaign).values()) == {""}
+    damaged = archive.folder / "raw/poor/h015\x1b]0;x\n"
+    damaged.write_bytes(b"\0" * 1000)
+    assert reprocess(campaign) is not None
+    stated = {text for name, text in _unused(campaign).items() if name.endswith("01")}
+    assert len(stated) == 1
+    [text] = stated
+    assert text.startswith("poor/h015\\x1b]0;x\\n: ")
+    assert "\x1b" not in text
+    assert "\n" not in text
+    assert reprocess(campaign) is None
+    damaged.unlink()
+    assert reprocess(campaign) is not None
+    assert set(_unused(campaign).values()) == {""}
+    assert _is_undisturbed(campaign, tmp_path)
+
+
+def test_a_product_names_some_unused_files_and_counts_the_others(archive: Archive) -> None:
+    for number in range(MOST_UNUSED + 3):
+        (archive.folder / f"raw/poor/h01{number:02}").write_bytes(b"")
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    text = next(text for text in _unused(campaign).values() if text)
+    assert len(text.splitlines()) == MOST_UNUSED + 1
+    assert text.endswith("\n3 other raw files")
+
+
+def test_a_product_states_dark_files_only_if_it_subtracts_some(tmp_path: Path) -> None:
+    archive = Archive(tmp_path, days=1)
+    archive.raw("rich/d2", 701, seed=98)
+    (archive.folder / "raw/rich/d1").write_bytes(b"")
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    stated = _unused(campaign)
+    assert {name for name, text in stated.items() if text.startswith("dark file rich/d1: ")}
+    assert not any(text for name, text in stated.items() if "_poor_" in name)
+
+
+@pytest.mark.parametrize(
+    ("path", "days"),
+    [
+        # Between files of one day, and the last one of a day, whose names have the hour in common.
+        ("raw/RM16A0222.1", [2, 2]),
+        ("raw/RM16A0223.9", [2]),
+        ("raw/RM16A0100.0", [1]),
+        # Of the day between two: it may be that none of its files can be read.
+        ("raw/RM16A0312.0", []),
+        ("raw/RM16A0500.0", []),
+        # The names of days need not differ where a folder holds one.
+        ("night/last", [7]),
+        ("night/a", [7]),
+        # No file of this folder, or of this instrument, is good.
+        ("elsewhere/RM16A0222.1", []),
+        ("other/a01", []),
+    ],
+)
+def test_a_refused_file_belongs_beside_the_files_of_like_names(
+    archive: Archive, path: str, days: list[int]
+) -> None:
+    names = ["0100.1", "0123.5", "0200.1", "0223.5", "0400.1", "0423.5"]
+    start = datetime(2026, 3, 1, tzinfo=UTC)
+    signals = [
+        DatedFile(f"raw/RM16A{name}", "poor", Role.SIGNAL, start.replace(day=int(name[:2])))
+        for name in reversed(names)
+    ]
+    files = {
+        "raw": [
+            *signals,
+            DatedFile("raw/RM16A0222.0", "other", Role.SIGNAL, start.replace(day=9)),
+            DatedFile("raw/RM16A0222.2", "poor", Role.DARK, start.replace(day=9)),
+        ],
+        "night": [DatedFile("night/h0", "poor", Role.SIGNAL, start.replace(day=7))],
+        "other": [DatedFile("other/a01", "other", Role.SIGNAL, start)],
+    }
+    refused = Granule(path, 0, 0, "poor", Role.SIGNAL, Status.REFUSED, "cannot be read: Stale")
+    beside = dated(archive.write(), [refused], lambda folder: files.get(folder, []))
+    assert [file.time.day for file in beside] == days
