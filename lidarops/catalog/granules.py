@@ -321,8 +321,9 @@ class Granules(Database):
                 for texts, contradicts in zip(stored, (False, True), strict=True):
                     for text in texts:
                         files[contradicts, instrument, text] += count
-        by_wording = _by_wording(files).items()
-        ordered = sorted(by_wording, key=lambda item: (not item[0][0], -item[1], item[0]))
+        ordered = sorted(
+            by_wording(files).items(), key=lambda item: (not item[0][0], -item[1], item[0])
+        )
         notes = [
             FileNote(instrument, text, contradicts, count)
             for (contradicts, instrument, text), count in ordered
@@ -363,7 +364,7 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
     )
 
 
-def _by_wording(files: Counter[tuple[bool, str, str]]) -> Counter[tuple[bool, str, str]]:
+def by_wording(files: Counter[tuple[bool, str, str]]) -> Counter[tuple[bool, str, str]]:
     """Return counts of notes, with one note for many that differ by numbers only."""
     groups: dict[tuple[bool, str, str], list[tuple[int, str]]] = defaultdict(list)
     for (contradicts, instrument, text), count in files.items():

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Final, NamedTuple
 
+from lidarops.catalog.granules import by_wording
+from lidarops.catalog.rows import day_of
 from lidarops.plan.outlying_intervals import lone_intervals
 from lidarops.plan.outlying_pointings import lone_pointings
 from lidarops.plan.surroundings import FEWEST_ALIKE, Outlying, ReadHeader, granules_around
 from lidarops.raw.header import RawChannel, RawHeader
-from lidarops.records import Granule, Role, Status
+from lidarops.records import FileNote, Granule, Role, Status
 
 _OF_VALUES: Final = frozenset({"wavelength_label", "bins", "bin_width", "adc_bits", "input_range"})
 """Properties of a channel by which its values or their ranges would be wrong."""
@@ -51,6 +53,34 @@ def without_outlying(
             note = f"the header states {stated.note}"
             kept.append(replace(granule, notes=(*granule.notes, note)))
     return kept, refused
+
+
+def new_notes(
+    before: Sequence[Granule], after: Sequence[Granule], days: Collection[int]
+) -> Iterator[FileNote]:
+    """Yield a note for each one that `without_outlying` added to a file of some days.
+
+    Parameters
+    ----------
+    before, after : sequence of Granule
+        What it was given, and the granules that it kept.
+    days : collection of int
+        Days since 1970-01-01.
+    """
+    known = {granule.path: len(granule.notes) for granule in before}
+    for granule in after:
+        for text in granule.notes[known[granule.path] :]:
+            if granule.start and day_of(granule.start) in days:
+                yield FileNote(granule.instrument, text, contradicts=False, files=1)
+
+
+def joined_notes(notes: Iterable[FileNote]) -> Iterator[FileNote]:
+    """Yield notes on files of equal wording as one, with their number of files."""
+    files: Counter[tuple[bool, str, str]] = Counter()
+    for note in notes:
+        files[note.contradicts, note.instrument, note.text] += note.files
+    for (contradicts, instrument, text), number in sorted(by_wording(files).items()):
+        yield FileNote(instrument, text, contradicts, number)
 
 
 def outlying_headers(

@@ -22,7 +22,7 @@ from functools import lru_cache
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.errors import RetrievalInputError, SceneError
-from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
+from lidarops.records import ChannelLayout, FileNote, Granule, Role, Scene, Status
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.steps.pointing import LEAST_SPREAD
 
@@ -43,6 +43,8 @@ class Cut:
     scenes: tuple[Scene, ...]
     set_aside: tuple[Granule, ...]
     """Granules that start at the time of another one of the instrument; refused for that reason."""
+    file_notes: tuple[FileNote, ...] = ()
+    """Notes on its granules that only the files around them show."""
 
 
 def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:

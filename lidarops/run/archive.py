@@ -23,8 +23,9 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.plan.outlying_headers import joined_notes
 from lidarops.process.job import Job
-from lidarops.records import Findings, Granule, RunRecord
+from lidarops.records import FileNote, Findings, Granule, RunRecord
 from lidarops.reports import run_record
 from lidarops.run.executor import (
     EndedScene,
@@ -269,6 +270,8 @@ class _Gathered:
 
     orphans: list[Orphan] = field(default_factory=list)
     set_aside: list[Granule] = field(default_factory=list)
+    file_notes: list[FileNote] = field(default_factory=list)
+    """Notes on files of the days that were judged, which the catalog does not know."""
     held: list[Judgement] = field(default_factory=list)
     frozen: dict[str, str] = field(default_factory=dict)
     """Product of a frozen period that would be replaced -> why."""
@@ -329,8 +332,10 @@ class _Pass:
         self._clear_up()
         orphans = {orphan.path for orphan in self.gathered.orphans}
         findings = find(self.judge, self.store, self.selection, summary.idle_patterns, orphans)
-        record = self._conclude(status, findings)
         gathered = self.gathered
+        file_notes = (*findings.file_notes, *joined_notes(gathered.file_notes))
+        findings = replace(findings, file_notes=file_notes)
+        record = self._conclude(status, findings)
         self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])
         return Result(
             record=record,
@@ -484,6 +489,7 @@ class _Pass:
         gathered = self.gathered
         gathered.orphans += judged.orphans
         gathered.set_aside += judged.set_aside
+        gathered.file_notes += judged.file_notes
         gathered.verdicts.update(judged.verdicts)
         gathered.empty_scenes += _empty_scenes(judged)
         gathered.held += [scene for scene in judged.judgements if scene.held]

@@ -27,7 +27,7 @@ from lidarops.catalog.store import Store
 from lidarops.errors import AncillaryError, ProductError, RawFormatError
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
-from lidarops.plan.outlying_headers import without_outlying
+from lidarops.plan.outlying_headers import new_notes, without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
 from lidarops.plan.surroundings import NEAR_DAYS
@@ -37,7 +37,16 @@ from lidarops.process.guard import Failure, guarded
 from lidarops.process.job import Job, Place
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
-from lidarops.records import Granule, InputRecord, Plan, Role, Scene, Stamp, UnusedFile
+from lidarops.records import (
+    FileNote,
+    Granule,
+    InputRecord,
+    Plan,
+    Role,
+    Scene,
+    Stamp,
+    UnusedFile,
+)
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.selection import Selection, requested_kinds
@@ -149,6 +158,8 @@ class DaysJudged:
     judgements: tuple[Judgement, ...]
     orphans: tuple[Orphan, ...]
     set_aside: tuple[Granule, ...]
+    file_notes: tuple[FileNote, ...]
+    """Notes on files that only the files around them show."""
     verdicts: Mapping[int, Verdict]
     """Of days that may be settled, without signature."""
     open: frozenset[int]
@@ -293,7 +304,8 @@ class Judge:
             else judged
             for judged in judgements
         ]
-        selected = {scene.id for scene in self._selection.scenes(cut.scenes)}
+        selected_scenes = self._selection.scenes(cut.scenes)
+        selected = {scene.id for scene in selected_scenes}
         fates = leftovers.Fates(cut, self._store.refused, self._signals)
         orphans = leftovers.orphaned_products(
             planned, made.values(), self.campaign, self._other_files, fates.of
@@ -325,6 +337,11 @@ class Judge:
                 if self._selection.product(product, self.campaign)
             ),
             set_aside=cut.set_aside,
+            file_notes=tuple(
+                note
+                for note in cut.file_notes
+                if any(note.instrument in _instruments(scene) for scene in selected_scenes)
+            ),
             verdicts=_unsigned(
                 [day for day in days if day not in unsettled], judgements, cut.set_aside
             )
@@ -357,7 +374,12 @@ class Judge:
         )
         unused = [*self._refused, *(Refused(granule, _moment(granule)) for granule in refused)]
         scenes = name_unused(cut.scenes, unused)
-        return replace(cut, scenes=scenes, set_aside=(*cut.set_aside, *aside))
+        return replace(
+            cut,
+            scenes=scenes,
+            set_aside=(*cut.set_aside, *aside),
+            file_notes=tuple(new_notes(granules, kept, days)),
+        )
 
     @cached_property
     def _refused(self) -> tuple[Refused, ...]:
@@ -654,6 +676,10 @@ class Judge:
                 # The processing of the scene reports the problem.
                 self._ancillaries[name] = "unreadable"
         return self._ancillaries[name]
+
+
+def _instruments(scene: Scene) -> set[str]:
+    return {member.instrument for member in scene.members or (scene,)}
 
 
 def _add_around(

@@ -18,6 +18,7 @@ from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import Granule, RunRecord, Status
+from lidarops.reports.findings import finding_rows
 from lidarops.run import staleness
 from lidarops.run.archive import Result, bring_up_to_date
 from lidarops.run.reproduction import reproduce_product
@@ -99,6 +100,10 @@ def test_what_changes_no_value_is_noted(
     _damage(archive, 2, line, line.replace(old, new, 1))
     result, products = _run(archive)
     assert not result.has_failures
+    assert result.record is not None
+    for findings in (result.findings, result.record.findings):
+        [row] = [row for row in finding_rows(findings) if said in row.problem]
+        assert row.subject == "1 file"
     product = archive.folder / "out/products" / min(products)
     with xr.open_dataset(product) as opened:
         assert said in opened.attrs["lidarops_input_notes"]
