@@ -257,6 +257,13 @@ class TestTruth:
         product["time_bnds"] = (("time", "nv"), np.stack([middle - half, middle + half], axis=1))
         assert figure_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
 
+    def test_half_a_minute_before_is_no_minus_zero(self):
+        product = multiangle(cycles=1)
+        truth = truth_of(product, zenith=(30.0,))
+        truth["time"] = truth["time"] - np.timedelta64(20, "s")
+        (line,) = labelled(drawn(product, truth).panels[0], "truth")
+        assert line.label.endswith(", +0 min")
+
     def test_a_wavelength_in_metres_is_understood(self):
         product = multiangle(cycles=2)
         product = product.assign_coords(wavelength=((), 532e-9, {"units": "m"}))

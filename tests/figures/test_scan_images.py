@@ -94,6 +94,14 @@ def test_the_map_of_a_volume_has_each_signal_toward_its_azimuth():
     assert pixel(panel, -2.0, 0.0) == pixels.BLANK
 
 
+def test_the_map_holds_the_whole_sector_of_each_beam():
+    """The first one is 25 degree wide, so that it goes on beyond the tip of its beam."""
+    _, figure = drawn(scan([37.0, 62.0, 87.0, 112.0, 137.0, 162.0]))
+    (panel,) = figure.panels
+    far = 3.0 / np.tan(np.radians(10.0))
+    assert panel.y.high == pytest.approx(far * np.cos(np.radians(37.0 - 12.5)), rel=0.02)
+
+
 def test_a_blocked_beam_is_marked_where_it_ends():
     """One beam of a plane; another plane consists of a blocked beam only, and has no panel."""
     product = scan([20.0, 80.0])

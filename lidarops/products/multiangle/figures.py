@@ -148,8 +148,8 @@ def _truth(profile: ScanProfile, quantity: str, scale: float) -> Curve:
     truth = profile.truth
     if truth is None:
         return Curve(np.array([]), np.array([]))
-    late = float((truth.time - profile.time) / np.timedelta64(1, "m"))
-    label = f"truth at zenith angle {truth.zenith_angle:.3g}°, {late:+.0f} min"
+    late = round((truth.time - profile.time) / np.timedelta64(1, "m"))
+    label = f"truth at zenith angle {truth.zenith_angle:.3g}°, {late:+d} min"
     if quantity == "vertical_optical_depth":
         return Curve(scale * truth.optical_depth, truth.edges / 1e3, "ink d1", label=label)
     edges = np.repeat(truth.edges / 1e3, 2)[1:-1]

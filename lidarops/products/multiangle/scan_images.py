@@ -189,7 +189,9 @@ def _plan_position(image: ScanImage, beams: Indices, ends: tuple[float, float]) 
     known = np.isfinite(image.signal[beams])
     far = np.where(known, image.distance[beams], 0.0).max(axis=1) / 1e3
     turned = np.radians(image.azimuth[beams])
-    spans = [np.append(far * side, 0.0) for side in (np.sin(turned), np.cos(turned))]
+    half_sector = np.radians(_BESIDE * _usual_step(image.azimuth[beams]))
+    sides = turned[:, np.newaxis] + half_sector * np.array([-1.0, 0.0, 1.0])
+    spans = [np.append(far[:, np.newaxis] * side, 0.0) for side in (np.sin(sides), np.cos(sides))]
     half = 0.5 * max(float(np.ptp(spans[0])) / _ASPECT, float(np.ptp(spans[1])), 1e-3)
     x, y = (
         Axis(f"to the {side} (km)", middle - extent, middle + extent)
@@ -271,14 +273,17 @@ def _pixels(axis: Axis, count: int) -> Floats:
 
 def _nearest(angle: Floats, angles: Floats, period: float = np.inf) -> Indices:
     """Return the nearest of the angles to each pixel; -1 where none is near."""
-    order = np.argsort(angles)
-    step = float(np.median(np.diff(angles[order]))) if angles.size > 1 else 1.0
-    best, least = np.full(angle.shape, -1), np.full(angle.shape, _BESIDE * step)
+    best, least = np.full(angle.shape, -1), np.full(angle.shape, _BESIDE * _usual_step(angles))
     for number, own in enumerate(angles):
         off = np.abs(angle - own)
         off = np.minimum(off, period - off) if np.isfinite(period) else off
         best, least = np.where(off <= least, number, best), np.minimum(off, least)
     return np.asarray(best, dtype=np.int64)
+
+
+def _usual_step(angles: Floats) -> float:
+    """Return the median step between neighbours, degree; 1 for a single angle."""
+    return float(np.median(np.diff(np.sort(angles)))) if angles.size > 1 else 1.0
 
 
 def _of_one_elevation(image: ScanImage) -> Indices:
