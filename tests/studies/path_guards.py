@@ -14,7 +14,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from studies.ablation import Guard, cluster_count, measure, table
+from studies.ablation import Guard, cluster_count, measure, table, write_table
 
 from lidarops.bench.stability import random_homogeneous
 from lidarops.flags import Quality
@@ -22,6 +22,7 @@ from lidarops.retrieve.homogeneous import _fit_quality, _methods, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
+PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/homogeneous.md"
 CLUSTERS: Final = 150
 PROFILES: Final = 60
 
@@ -81,18 +82,23 @@ GUARDS: Final = (
     Guard("NOT_HOMOGENEOUS, square", off=_off(square=np.inf)),
     Guard("NOT_HOMOGENEOUS, curvature", off=_off(curvature=np.inf)),
     Guard("OUTLIER", int(Quality.OUTLIER)),
-    Guard("TOO_FEW_BINS", int(Quality.TOO_FEW_BINS)),
     Guard("widening of estimated noise", off=_off(widening=1.0)),
     Guard("bend in the model error", off=without_bend),
 )
 
-BINS: Final = {"sections of 8 to 800 bins": (8, 800), "8 to 24 bins": (8, 24), "4 to 7": (4, 7)}
+SHORT: Final = (Guard("TOO_FEW_BINS", int(Quality.TOO_FEW_BINS)),)
+"""Guard of sections of fewer than 8 bins, all of which it withholds."""
+TABLES: Final = {
+    "guards": ((8, 800), GUARDS),
+    "guards of 4 to 7 bins": ((4, 7), SHORT),
+}
+"""Mark of the table in the page -> numbers of bins and guards."""
 
 if __name__ == "__main__":
     clusters = cluster_count(__doc__, CLUSTERS)
-    for title, bins in BINS.items():
+    for mark, (bins, guards) in TABLES.items():
         with mock.patch.object(random_homogeneous, "_BINS", bins):
             counts = measure(
-                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), range(clusters), GUARDS
+                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), range(clusters), guards
             )
-        sys.stdout.write("\n".join([f"\n## {title}\n", *table(counts), ""]))
+        write_table(PAGE, mark, table(counts))

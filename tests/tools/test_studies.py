@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from studies import path_guards
+from studies.ablation import BASE
 
 STUDIES = sorted(
     path
@@ -27,3 +29,12 @@ def test_a_study_states_its_arguments(path: Path, repository: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "usage" in done.stdout
+
+
+@pytest.mark.parametrize("mark", path_guards.TABLES)
+def test_the_page_of_the_homogeneous_path_holds_the_tables_of_its_study(mark: str) -> None:
+    text = path_guards.PAGE.read_text(encoding="utf-8")
+    table = text.partition(f"<!-- {mark} -->\n")[2].partition(f"<!-- end of {mark} -->")[0]
+    names = {line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()[2:]}
+    _, guards = path_guards.TABLES[mark]
+    assert names - {BASE} == {guard.name for guard in guards}
