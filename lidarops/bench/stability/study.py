@@ -98,7 +98,7 @@ DRAWS: Final = (
     Draws("multi-angle", random_scans.score_scans, 8, 400, 6, 0.13, pooled=True),
     Draws("scans of any and of calm air", random_scans.score_scan_methods, 8, 400, 6, pooled=True),
     Draws("network", random_networks.score_networks, 50, 300, 4, 0.05, pooled=True),
-    Draws("Raman", random_raman.score_raman, 8, 300, 6, pooled=True),
+    Draws("Raman", random_raman.score_raman, 8, 1000, 6, pooled=True),
     Draws("short sections", random_sections.score_short_sections, 300, 600, 6),
     Draws("correlated noise", random_sections.score_correlated_noise, 60, 400, 6),
     Draws("near the cut", random_sections.score_near_the_cut, 1000, 400, 6),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Final
 
@@ -33,10 +34,13 @@ from lidarops.netcdf.variables import (
 )
 from lidarops.products.raman.flags import FLAGS
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 _BINS: Final = ("time", "range")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
+_FACTOR: Final = math.exp(THRESHOLDS.lidar_ratio_spread)
+"""Of the typical lidar ratio, within which are 68 percent of them."""
 _WORDS: Final = {
     "noise": "the signal noise",
     "resolution": "the difference between the weights of the value and a mean over"
@@ -211,8 +215,9 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.BOTH,
             budget=_of_two_parts("lidar_ratio"),
             comment="Measured: extinction over backscatter, which is smoothed as extinction is."
-            " Missing where backscatter exceeds zero by too few standard errors. The error is in"
-            " proportion to the value: where noise made a ratio too small, so is its error."
+            " Missing where backscatter exceeds zero by too few standard errors. The error allows"
+            " for noise that made the value too small; of uncertain values, it expects most lidar"
+            f" ratios within a factor of {_FACTOR:.1f} of {THRESHOLDS.typical_lidar_ratio:g} sr."
             f" Simulated: {percent('lidar ratio', 'model holds')} of the values without a flag"
             " differ by more than 4 errors.",
         ),

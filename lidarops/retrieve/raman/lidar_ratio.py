@@ -20,6 +20,8 @@ Mask = npt.NDArray[np.bool_]
 
 _MOST_UNKNOWN: Final = 0.05
 """Weight of cells without backscatter in the lidar ratio of a cell."""
+_NODES: Final = np.linspace(-6.0, 6.0, 49)
+"""Standard deviations at which chances of lidar ratios are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,8 @@ def lidar_ratio_of(
     r"""Return the lidar ratio, from equally smoothed extinction and backscatter.
 
     Its change is :math:`\delta S = (\delta\alpha - S\,\delta b) / b`, of noise and of each cause.
+    The error is not that at the value, which noise that makes the value small makes small as well:
+    see `_chances`.
 
     Parameters
     ----------
@@ -72,24 +76,63 @@ def lidar_ratio_of(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         inverse = inverse_of_weak(smooth, error)
         ratio = extinction.value * inverse
-        by_noise = extinction.noise - ratio[:, np.newaxis] * of_noise
-        random = root_of_squares(by_noise) ** 2 + own * ratio**2
+        of_both = np.einsum("ij,ij->i", extinction.noise, of_noise)
+        random = np.stack([extinction.noise_error**2, of_both, error**2])
         systematic = np.zeros(value.size)
         for cause in causes:
-            change = cause.extinction - ratio * (weights @ cause.backscatter[known])
+            change = weights @ cause.backscatter[known]
             if cause.name in RANDOM:
-                random += change**2
+                both = np.stack([cause.extinction, change])
+                random += both[[0, 0, 1]] * both[[0, 1, 1]]
             else:
-                systematic += change**2
-        # The variance of a reciprocal to the second order.
-        random *= inverse**2 * (1.0 + 8.0 * (error / smooth) ** 2)
+                systematic += (cause.extinction - ratio * change) ** 2
         systematic *= inverse**2
+        true, chance = _chances(extinction.value, smooth, random)
+        # The expected deviation from the value, in place of an error of the first order.
+        scatter = (chance * (true - ratio) ** 2).sum(axis=0)
         likely = _likely(extinction, smooth, error, complete & usable)
         # The error is in proportion to total backscatter: this is that of the likely one.
         least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
     certain = complete & (smooth > 0.0) & (likely > least)
-    parts = (ratio, np.sqrt(random), np.sqrt(systematic))
+    parts = (ratio, np.sqrt(scatter), np.sqrt(systematic))
     return LidarRatio(*(np.where(certain, part, np.nan) for part in parts))
+
+
+def _chances(extinction: Array, backscatter: Array, random: Array) -> tuple[Array, Array]:
+    r"""Return lidar ratios that may be true, (node, cell), and the chance of each.
+
+    For a true lidar ratio :math:`S`, the noise of :math:`\alpha - S b` is normal, with a variance
+    :math:`v(S)` (`fieller1954`). That is the likelihood of :math:`S` with the extinction that is
+    most likely for it. Beforehand, lidar ratios are distributed log-normally about the typical one
+    :math:`S_0`:
+
+    .. math:: p(S) \propto \exp\left(
+        -\frac{(\alpha - S b)^2}{2 v} - \frac{\ln^2 (S / S_0)}{2 s^2}\right)
+
+    per :math:`\mathrm{d} \ln S`.
+
+    Parameters
+    ----------
+    extinction, backscatter : (cell,) float
+        Equally smoothed.
+    random : (3, cell) float
+        Variance of extinction, covariance, and variance of backscatter.
+    """
+
+    def variance(ratio: Array) -> Array:
+        return np.asarray(random[0] - 2.0 * ratio * random[1] + ratio**2 * random[2])
+
+    middle, spread = np.log(THRESHOLDS.typical_lidar_ratio), THRESHOLDS.lidar_ratio_spread
+    # Nodes around the mean of both logarithms, weighted by errors of the first order.
+    value = np.maximum(extinction / backscatter, np.finfo(float).tiny)
+    known = 1.0 / (1.0 + variance(value) / (spread * value * backscatter) ** 2)
+    centre = middle + known * (np.log(value) - middle)
+    logarithm = centre + spread * np.sqrt(1.0 - known) * _NODES[:, np.newaxis]
+    ratio = np.exp(logarithm)
+    score = (extinction - ratio * backscatter) ** 2 / variance(ratio)
+    score += ((logarithm - middle) / spread) ** 2
+    chance = np.exp(-0.5 * (score - score.min(axis=0)))
+    return ratio, chance / chance.sum(axis=0)
 
 
 def _likely(extinction: Extinction, backscatter: Array, error: Array, known: Mask) -> Array:

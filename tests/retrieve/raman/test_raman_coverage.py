@@ -9,6 +9,7 @@ from support.raman_signals import make_sky, mean_over
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.backscatter import (
+    Backscatter,
     Ratio,
     calibrated,
     inverse_mean,
@@ -16,7 +17,9 @@ from lidarops.retrieve.raman.backscatter import (
     ratio_of_counts,
 )
 from lidarops.retrieve.raman.depth_fit import SignalNoise
+from lidarops.retrieve.raman.extinction import Extinction
 from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.lidar_ratio import lidar_ratio_of
 
 STEP = 30.0
 R = STEP * (np.arange(400) + 0.5)
@@ -140,6 +143,29 @@ def test_reciprocals_of_weak_values_have_no_bias(errors):
     assert shrunk == pytest.approx(known.get(errors, shrunk), abs=6e-3)
 
 
+def test_errors_of_lidar_ratios_do_not_follow_their_noise():
+    # Errors of the first order are too small where the value is: 0.18 % of it are beyond 4.
+    rng = np.random.default_rng(12)
+    cells, extinction, error = 1000, 1e-4, 1e-5
+    none, unit = np.zeros(cells), np.ones(cells)
+    z = []
+    for _ in range(20):
+        true = rng.uniform(25.0, 90.0, cells)
+        scatter = extinction / true / np.exp(rng.uniform(np.log(3.0), np.log(20.0), cells))
+        noisy = extinction / true + scatter * rng.normal(size=cells)
+        alpha = extinction + error * rng.normal(size=cells)
+        response = np.full((cells, 1), error)
+        of_extinction = Extinction(alpha, np.eye(cells), unit, response, none, none)
+        total = Backscatter(noisy + 5e-6, scatter, 0.0, none, none)
+        found = lidar_ratio_of(of_extinction, total, noisy, 0.0 * response, [], unit > 0.0)
+        z.append(((found.value - true) / found.random)[np.isfinite(found.value)])
+    z = np.concatenate(z)
+    assert z.size > 18_000
+    assert np.mean(np.abs(z) > 4.0) < 1e-3
+    assert 0.94 < covered(z) < 0.96
+    assert 0.67 < np.mean(np.abs(z) < 1.0) < 0.72
+
+
 def of_lidar_ratio(light, lidar_ratio, rows, seed):
     """Return the mean relative deviation of lidar ratios, and the share that 95 % intervals hold.
 
@@ -158,15 +184,16 @@ def test_lidar_ratios_of_few_counts_have_little_bias(lidar_ratio):
     assert values > 250
     # One error of the mean is 4 %.
     assert abs(away) < 0.1
-    assert held > 0.9
+    # Errors expect fewer lidar ratios of 90 sr.
+    assert held > (0.8 if lidar_ratio > 80.0 else 0.9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "lidar_ratio", "away", "held"),
     [
-        (1000.0, 25.0, -0.017, 0.950), (1000.0, 50.0, -0.017, 0.910), (1000.0, 90.0, -0.081, 0.886),
-        (5000.0, 25.0, 0.009, 0.963), (5000.0, 50.0, 0.003, 0.937), (5000.0, 90.0, 0.014, 0.933),
+        (1000.0, 25.0, -0.017, 0.999), (1000.0, 50.0, -0.017, 0.991), (1000.0, 90.0, -0.081, 0.850),
+        (5000.0, 25.0, 0.009, 0.991), (5000.0, 50.0, 0.006, 0.968), (5000.0, 90.0, 0.014, 0.903),
     ],
 )  # fmt: skip
 def test_high_lidar_ratios_of_few_counts_are_too_small_as_the_page_tells(
