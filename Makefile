@@ -47,6 +47,7 @@ bench: .venv/.runtime
 .venv/.dev: .venv/.runtime requirements-dev.lock tests/plugin/pyproject.toml
 	$(INSTALL) --require-hashes -r requirements-dev.lock
 	$(INSTALL) --no-build-isolation -e tests/plugin
+	PYTHONPATH=tests $(BIN)/python -m support.compilation
 	touch $@
 
 COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
