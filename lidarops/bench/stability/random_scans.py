@@ -14,16 +14,44 @@ import numpy.typing as npt
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scan, Scene
 from lidarops.bench.harness.rows import Array
-from lidarops.bench.stability.random_scenes import Failure, ScoredValues
+from lidarops.bench.stability.random_scenes import Failure, ScoredValues, held_first, joined
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled import QUALITY_OF_FLAG
 
 Random = np.random.Generator
 
+_CALM: Final = (5e-3, 0.4)
+"""Scatter of calm air, drawn uniformly in its logarithm."""
+_LAYER_WIDTH: Final = (2.0, 4.0)
+"""Standard deviation of a layer in altitude steps: 5 to 9 of them are its width at half maximum."""
+
 
 def _level(scene: Scene, _: Random) -> Scene:
     return replace(scene, outliers=0.0, gradient=0.0, variation=0.0)
+
+
+def _calm(scene: Scene, rng: Random) -> Scene:
+    """Return level air with little scatter, which makes stated errors small."""
+    return replace(_level(scene, rng), inhomogeneity=_logarithmic(rng, _CALM))
+
+
+def _layer(scene: Scene, rng: Random) -> Scene:
+    """Return calm clear air with a layer that several altitudes resolve."""
+    height = 150.0 + 60.0 * np.arange(60, dtype=np.float64)
+    air, haze = 1e-5 * np.exp(-height / 8000.0), np.exp(-height / rng.uniform(600.0, 3000.0))
+    width = 60.0 * rng.uniform(*_LAYER_WIDTH)
+    centre = rng.uniform(height[3], height[-4], (len(scene.extinction), 1))
+    excess = rng.uniform(0.3, 3.0) * np.exp(-0.5 * ((height - centre) / width) ** 2)
+    particles = _logarithmic(rng, (2e-5, 4e-4)) * (haze + excess)
+    return replace(
+        _calm(scene, rng), altitude=height, extinction=air + particles,
+        backscatter=air / 8.4 + particles / 50.0,
+    )  # fmt: skip
+
+
+def _logarithmic(rng: Random, limits: tuple[float, float]) -> float:
+    return float(np.exp(rng.uniform(*np.log(limits))))
 
 
 def _outliers(scene: Scene, rng: Random) -> Scene:
@@ -101,12 +129,14 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
     ),
     (Failure("background error of each beam"), _level, _with_background),
     (Failure("everything at once"), _as_drawn, _plain),
+    (Failure("calm air", satisfied=True), _calm, _plain),
+    (Failure("layer of a few altitudes", satisfied=True), _layer, _plain),
 )
 
 
 def score_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
     """Solve random scans of one geometry, class by class."""
-    for number, (failure, change, damage) in enumerate(FAILURES):
+    for number, (failure, change, damage) in held_first(FAILURES):
         rng = np.random.default_rng((72, cluster, number))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
@@ -166,18 +196,29 @@ def score_short_scans(
     cluster: int, profiles: int, *, length: int
 ) -> Iterator[tuple[ScoredValues, int]]:
     """Solve random scans where the model holds, in blocks of `length` profiles."""
-    rng = np.random.default_rng((72, cluster, 0))
-    scene = _level(multiangle_cases.random_scene(cluster, profiles), rng)
-    scan = scene.draw(profiles, cluster, 0, 87)
-    for first in range(0, profiles, length):
-        some = slice(first, first + length)
-        part = replace(
-            scene, extinction=scene.extinction[some], backscatter=scene.backscatter[some]
-        )
-        block = Scan(part, scan.signal[some], scan.variance[some])
-        result = multiangle_cases.retrieve(block, multiangle_cases.AUTO)
-        failure = Failure(f"blocks of {length}", satisfied=True)
-        yield from _score_quantities(failure, part, result, length)
+    for words, change in (
+        ("", _level),
+        ("calm air, ", _calm),
+        ("layer of a few altitudes, ", _layer),
+    ):
+        rng = np.random.default_rng((72, cluster, 0))
+        scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
+        scan = scene.draw(profiles, cluster, 0, 87)
+        failure = Failure(f"{words}blocks of {length}", satisfied=True)
+        blocks = []
+        for first in range(0, profiles, length):
+            some = slice(first, first + length)
+            part = replace(
+                scene, extinction=scene.extinction[some], backscatter=scene.backscatter[some]
+            )
+            block = Scan(part, scan.signal[some], scan.variance[some])
+            result = multiangle_cases.retrieve(block, multiangle_cases.AUTO)
+            blocks.append(
+                [values for values, _ in _score_quantities(failure, part, result, length)]
+            )
+        # Blocks of one geometry are one cluster.
+        for of_blocks in zip(*blocks, strict=True):
+            yield joined(of_blocks), profiles
 
 
 def score_counted_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:

@@ -6,9 +6,9 @@ it differs from the truth by more than 4 stated standard errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -71,6 +71,23 @@ class Failure:
     """Reason why the data cannot reveal the violation; empty where they can."""
 
 
+_Class = TypeVar("_Class", bound=tuple[Any, ...])
+
+
+def held_first(classes: Sequence[_Class]) -> list[tuple[int, _Class]]:
+    """Return classes with their numbers, those where the model holds first.
+
+    The number is part of the seed of a class, and `test_bench_false_values.py` stops behind those
+    where the model holds.
+
+    Parameters
+    ----------
+    classes : sequence of tuple
+        Each begins with its `Failure`.
+    """
+    return sorted(enumerate(classes), key=lambda numbered: not numbered[1][0].satisfied)
+
+
 @dataclass(frozen=True, slots=True)
 class ScoredValues:
     """Values of a chunk of scenes of one class, with truth and flags; arrays of equal shape."""
@@ -92,6 +109,21 @@ class ScoredValues:
     """Where a flag is needless; None where unknown."""
     misfit: Array | None = None
     """Misfit of the violation, in standard deviations of the noise; None where unknown."""
+
+
+def joined(blocks: Sequence[ScoredValues]) -> ScoredValues:
+    """Return the values of several blocks of profiles of one class as one chunk."""
+
+    def stacked(name: str) -> Any:
+        parts = [np.broadcast_to(getattr(block, name), block.error.shape) for block in blocks]
+        return np.concatenate(parts)
+
+    names = [
+        name
+        for name in ("error", "random", "systematic", "bits", "uncertain", "solvable", "misfit")
+        if getattr(blocks[0], name) is not None
+    ]
+    return replace(blocks[0], **{name: stacked(name) for name in names})
 
 
 @dataclass(slots=True)

@@ -22,6 +22,8 @@ from lidarops.bench.harness.verdicts import Verdict
 from lidarops.bench.stability import (
     random_elastic,
     random_homogeneous,
+    random_networks,
+    random_scans,
     random_signals,
     reproducibility,
     study,
@@ -35,6 +37,7 @@ from lidarops.bench.stability.random_scenes import (
     ScoredValues,
     Tally,
     collect,
+    held_first,
 )
 from lidarops.cli import app
 from lidarops.flags import Quality
@@ -262,6 +265,27 @@ def test_the_same_numbers_give_the_same_scenes(draws, repository):
     published = json.loads((repository / "docs/results/stability.json").read_text())["tables"]
     rows = published[study.results_title(draws.retrieval)]
     assert {(quantity, failure) for quantity, failure, *_ in rows} == set(first)
+
+
+def test_scans_where_the_model_holds_are_of_calm_air_and_of_a_layer_too():
+    scored = [values for values, _ in random_scans.score_short_scans(0, 4, length=2)]
+    assert [(values.failure.name, values.quantity) for values in scored] == [
+        (f"{words}blocks of 2", quantity)
+        for words in ("", "calm air, ", "layer of a few altitudes, ")
+        for quantity in ("optical depth", "extinction")
+    ]
+    # The blocks of one geometry are one cluster.
+    assert all(len(values.error) == len(values.bits) == 4 for values in scored)
+
+
+@pytest.mark.parametrize("retrieval", ["multi-angle", "network"])
+def test_classes_where_the_model_holds_come_first(retrieval):
+    """Their numbers, of which the seeds are made, stay."""
+    classes = {"multi-angle": random_scans.FAILURES, "network": random_networks.FAILURES}
+    numbered = held_first(classes[retrieval])
+    holds = [failure.satisfied for _, (failure, *_) in numbered]
+    assert holds == sorted(holds, reverse=True)
+    assert all(classes[retrieval][number] is drawn for number, drawn in numbered)
 
 
 def test_where_the_model_holds_homogeneous_paths_are_not_false():
