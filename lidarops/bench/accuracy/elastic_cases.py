@@ -285,14 +285,15 @@ def choose_window(
     exclude: Mask | None = None,
     *,
     background_error: npt.ArrayLike = 0.0,
+    candidates: Array = CANDIDATES,
 ) -> reference_window.ReferenceWindow:
-    """Return the reference windows chosen from `CANDIDATES`."""
+    """Return the reference windows chosen from the candidates."""
     return reference_window.choose_reference(
         power,
         sky.range,
         noise,
         molecular_attenuated=sky.shape,
-        candidates=CANDIDATES,
+        candidates=candidates,
         background_standard_error=np.nan_to_num(background_error),
         exclude=exclude,
     )

@@ -15,6 +15,7 @@ from lidarops.flags import Quality
 from lidarops.netcdf.variables import ErrorKind
 from lidarops.products.elastic.variables import sources
 from lidarops.retrieve.air import MolecularProfile, reference_window
+from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.background import known_shape
 from lidarops.retrieve.clouds import layers, outlying_bins
 from lidarops.retrieve.elastic import inversion
@@ -27,8 +28,12 @@ _RATIO_ERROR: Final = 0.2
 """Stated relative standard error of the lidar ratio."""
 _AIR_ERROR: Final = 0.02
 """Stated relative standard error of the air density."""
-_REFERENCE_ERROR: Final = ReferenceSettings().relative_error
-"""Stated relative error of the scattering ratio of the reference window, as in products."""
+_REFERENCE: Final = ReferenceSettings()
+"""That of products."""
+_WINDOWS: Final = reference_window.candidate_windows(
+    _REFERENCE.lowest, _REFERENCE.highest, _REFERENCE.width,
+    _REFERENCE.width / WINDOW_THRESHOLDS.steps_per_window,
+)  # fmt: skip
 _CLEAN_FROM: Final = 6000.0
 """m; no particles above."""
 _COMPARED: Final = (500.0, 6000.0)
@@ -100,7 +105,7 @@ def _hazy(least: float) -> _Change:
 
 def _clean(sky: RandomSky, _: Random) -> RandomSky:
     """Return the sky without particles at the heights of possible reference windows."""
-    z, lowest = elastic_cases.RANGE, min(bottom for bottom, _ in elastic_cases.CANDIDATES)
+    z, lowest = elastic_cases.RANGE, _REFERENCE.lowest
     # Smoothly, as in air: 1e-7 of them are left there.
     left = 1.0 / (1.0 + np.exp((z - lowest + 1000.0) / 60.0))
     return replace(sky, particles=np.where(z < lowest, left * sky.particles, 0.0))
@@ -189,8 +194,9 @@ def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _
     power = np.where(base.inverted, counts - fit.background[:, np.newaxis], np.nan)
     clouds = elastic_cases.find_clouds(power, noise, base)
     window = elastic_cases.choose_window(
-        power, noise, base, clouds.mask, background_error=fit.background_standard_error
-    )
+        power, noise, base, clouds.mask, background_error=fit.background_standard_error,
+        candidates=_WINDOWS,
+    )  # fmt: skip
     solved = _solve(power, noise, base, window.edges, _input_errors(fit, window))
     return _Processed(fit, clouds, window, solved)
 
@@ -201,7 +207,7 @@ def _input_errors(
     """Return standard errors of the background and relative ones of the reference."""
     undetected = np.nan_to_num(window.undetected_particles)
     background = np.nan_to_num(fit.background_standard_error)
-    return np.stack([background, np.hypot(_REFERENCE_ERROR, undetected)])
+    return np.stack([background, np.hypot(_REFERENCE.relative_error, undetected)])
 
 
 def _solve(

@@ -11,6 +11,7 @@ import numpy as np
 from lidarops.bench.harness.rows import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
+from lidarops.products.raman.settings import RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.cells import Cells, make_cells
 from lidarops.retrieve.raman.flags import RamanQuality
@@ -26,8 +27,8 @@ _STEP: Final = 30.0
 _RANGE: Final = _STEP * (np.arange(400, dtype=np.float64) + 0.5)
 _CELL: Final = 60.0
 _FULL_OVERLAP: Final = 300.0
-_WINDOW: Final = (7000.0, 12_000.0, 5000.0)
-"""m: least and largest range, and width."""
+_WINDOW: Final = RamanReferenceSettings()
+"""That of products."""
 _COMPARED: Final = 6000.0
 """m; values below are compared with the truth."""
 _EXPONENT: Final = 1.2
@@ -135,7 +136,16 @@ def score_raman(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int
             for mean in (raman, elastic)
         ]
         settings = RamanSettings(
-            _LASER, _RAMAN, _EXPONENT, sky.assumed_error, *_WINDOW, 1.0, sky.reference_error, 0.0
+            _LASER,
+            _RAMAN,
+            _EXPONENT,
+            sky.assumed_error,
+            _WINDOW.lowest,
+            _WINDOW.highest,
+            _WINDOW.width,
+            1.0,
+            sky.reference_error,
+            0.0,
         )
         bits = np.repeat(quality[np.newaxis], profiles, axis=0)
         result = retrieve_raman(signals[0], signals[1], air, cells, settings, quality=bits)
