@@ -7,7 +7,7 @@
 
 Importing this package sets the environment variables that a temporary Prefect server needs and that
 `maintenance` relies on; variables that are already set are kept. Where no server is configured, it
-also gives the temporary one a password.
+also gives the temporary one a password. Numerical libraries use one thread, as in the command line.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ import importlib.util
 import os
 import secrets
 from typing import Final
+
+from lidarops.system.threads import use_one_thread
 
 if importlib.util.find_spec("prefect") is None:
     raise ImportError(
@@ -28,6 +30,7 @@ WITH_FAILURES: Final = "Completed with failures"
 Its event is ``prefect.flow-run.Completed with failures``: Prefect names events after states.
 """
 
+use_one_thread()
 # By default Prefect waits 20 s for its server to start, too short on a busy machine.
 os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "120")
 # A station may have no network, and usage data should not leave it.

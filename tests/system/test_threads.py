@@ -12,16 +12,16 @@ import pytest
 from lidarops.system.threads import ONE_THREAD
 
 THREADS = """
-import os, lidarops.cli, numpy
+import os, {package}, numpy
 numpy.linalg.inv(numpy.eye(500))
 print(len(os.listdir("/proc/self/task")))
 """
 
 
-def threads(**variables: str) -> int:
-    """Return the number of threads of a process that loads the command line and solves."""
+def threads(package: str, **variables: str) -> int:
+    """Return the number of threads of a process that loads a package and solves."""
     others = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
-    command = [sys.executable, "-c", THREADS]
+    command = [sys.executable, "-c", THREADS.format(package=package)]
     return int(subprocess.check_output(command, env=others | variables, text=True))
 
 
@@ -29,6 +29,11 @@ def threads(**variables: str) -> int:
     (os.cpu_count() or 1) < 2 or not Path("/proc/self/task").exists(),
     reason="needs two processors and the files of Linux on threads",
 )
-def test_the_command_line_solves_in_one_thread_unless_the_environment_says_more() -> None:
-    assert threads() == 1
-    assert threads(OPENBLAS_NUM_THREADS="2") == 2
+@pytest.mark.parametrize("package", ["lidarops.cli", "flows"])
+def test_commands_and_flows_solve_in_one_thread_unless_the_environment_says_more(
+    package: str,
+) -> None:
+    if package == "flows":
+        pytest.importorskip("prefect")
+    assert threads(package) == 1
+    assert threads(package, OPENBLAS_NUM_THREADS="2") == 2
