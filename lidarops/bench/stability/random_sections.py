@@ -49,6 +49,14 @@ def _extinction(failure: Failure, paths: Paths, fit: Any) -> ScoredValues:
     )  # fmt: skip
 
 
+def _background(failure: Failure, paths: Paths, fit: Any) -> ScoredValues:
+    error = fit.background - paths.background[:, 0]
+    return ScoredValues(
+        failure, "background", error, fit.background_standard_error, fit.background_model_error,
+        np.asarray(fit.quality), HomogeneousQuality,
+    )  # fmt: skip
+
+
 def score_correlated_noise(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
     """Yield extinctions with noise that is correlated between bins."""
     for correlation in _CORRELATIONS:
@@ -76,19 +84,12 @@ def score_near_the_cut(cluster: int, profiles: int) -> Iterator[tuple[ScoredValu
     scale = fit.extinction + 1.0 / float(paths.range.mean())
     with np.errstate(invalid="ignore", divide="ignore"):
         near = fit.extinction_standard_error / scale > _NEAR_THE_CUT
-    error = np.where(near, fit.background - paths.background[:, 0], np.nan)
-    yield (
-        ScoredValues(
-            Failure("near the limit of POORLY_DETERMINED", satisfied=True), "background", error,
-            fit.background_standard_error, fit.background_model_error, np.asarray(fit.quality),
-            HomogeneousQuality,
-        ),
-        profiles,
-    )  # fmt: skip
+    values = _background(Failure("near the limit of POORLY_DETERMINED", satisfied=True), paths, fit)
+    yield replace(values, error=np.where(near, values.error, np.nan)), profiles
 
 
 def score_short_sections(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
-    """Yield extinctions of sections of 8 to 32 bins."""
+    """Yield extinctions and backgrounds of sections of 8 to 32 bins."""
     for least, most in _BINS:
         paths, rng = random_paths(cluster, profiles)
         bins = int(rng.integers(least, most + 1))
@@ -96,7 +97,9 @@ def score_short_sections(cluster: int, profiles: int) -> Iterator[tuple[ScoredVa
         noise = rng.standard_normal((profiles, bins))
         for words, variance in (("stated", 1.0), ("estimated", None)):
             failure = Failure(f"{least} to {most} bins, noise {words}", satisfied=True)
-            yield _extinction(failure, paths, _fitted(paths, noise, variance=variance)), profiles
+            fit = _fitted(paths, noise, variance=variance)
+            yield _extinction(failure, paths, fit), profiles
+            yield _background(failure, paths, fit), profiles
 
 
 def score_dying_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
