@@ -21,7 +21,7 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     methods,
     scenarios,
 )
-from lidarops.bench.accuracy.peers import iterative_peers
+from lidarops.bench.accuracy.peers import SLOW, iterative_peers
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.rows import (
     CPU_TIME,
@@ -45,8 +45,6 @@ from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
 PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
-_SLOW: Final = "scipy"
-"""Prefix of the names of solvers that are too slow for all profiles."""
 _SLOW_SHARE: Final = 20
 _WARM: Final = 64
 _INFORMED: Final = frozenset(
@@ -110,7 +108,7 @@ def score_path(
     converged : Estimates
         Solution of the direct method.
     """
-    if name.startswith(_SLOW):
+    if name in SLOW:
         power = power[: max(len(power) // _SLOW_SHARE, 16)]
     solver(power[:_WARM], scenario)
     begin = time.process_time()
@@ -197,6 +195,13 @@ def _summary(scores: Scores) -> Scores:
     return summary
 
 
+def _solves_all(scores: Scores, method: str) -> bool:
+    """Return whether a method has an error of any unknown on all paths."""
+    own = [score for (_, name), score in scores.items() if name == method]
+    names = (f"{quantity.replace('_', ' ')}: RMSE" for quantity in QUANTITIES)
+    return any(all(score[name] is not None for score in own) for name in names)
+
+
 def _works(scores: Scores) -> list[Work]:
     peers = {*iterative_peers(), TAIL_MEAN}
     works = []
@@ -223,8 +228,7 @@ def _works(scores: Scores) -> list[Work]:
 def _overview(scores: Scores) -> Chapter:
     summary, paths = rows_of_scores(_summary(scores)), rows_of_scores(scores)
     methods_of = list(dict.fromkeys(method for _, method in scores))
-    complete = {row.method for row in summary if row.quantity == "solved" and row.value == "all"}
-    hollow = {method for method in methods_of if method not in complete} | _INFORMED
+    hollow = {method for method in methods_of if not _solves_all(scores, method)} | _INFORMED
     drawn = [row for row in paths if row.method in {"compressed", "direct", "cubic"}]
     profiles = next(row.value for row in paths if row.quantity == "profiles")
     return Chapter(
@@ -234,8 +238,9 @@ def _overview(scores: Scores) -> Chapter:
         f"noise, background 370; {profiles:,} profiles each, fewer for scipy. The bound is the "
         "inverse Fisher matrix of background, amplitude and extinction. The amplitude is the "
         "signal extrapolated to range zero; its logarithm is compared. Profiles that a method "
-        "rejects do not count for its error. The iterative peers start from the true background "
-        "and amplitude and 0.8 of the true extinction. Distance: largest difference from the "
+        "rejects do not count for its error. The iterative peers start from the fit of the mean of "
+        "64 profiles, and test no residuals. Variable projection stops at steps of 0.05 standard "
+        "errors. Distance: largest difference from the "
         "solution of the direct method. Difficulty: least standard error of extinction over "
         "extinction + 1 / mean range.",
         [
@@ -306,12 +311,16 @@ def published_offsets(count: int) -> Scores:
     signals = {2500.0: _PAPER_SIGNAL, 10500.0: float(_PAPER_SIGNAL * fade)}
     sections = [(start, length) for start, lengths in _PAPER_LENGTHS for length in lengths]
     return {
-        (f"{start / 1e3:g} + {length / 1e3:g} km", f"{averaged}"): _offset(
+        (_section(start, length), f"{averaged}"): _offset(
             start, length, signals[start], averaged, (count, seed)
         )
         for averaged in (1, _AVERAGED)
         for seed, (start, length) in enumerate(sections)
     }
+
+
+def _section(start: float, length: float) -> str:
+    return f"{start / 1e3:g} + {length / 1e3:g} km"
 
 
 def _offset(
@@ -345,7 +354,9 @@ def _offset(
 
 def _offsets(scores: Scores) -> Chapter:
     rows = rows_of_scores(scores)
-    near = [row for row in rows if row.case.startswith("2.5 ")]
+    start, lengths = _PAPER_LENGTHS[0]
+    sections = {_section(start, length) for length in lengths}
+    near = [row for row in rows if row.case in sections]
     return Chapter(
         "Background of the published cubic",
         "Tables 1 and 2 of bobrovsky2024 give a background that decreases with the length of "

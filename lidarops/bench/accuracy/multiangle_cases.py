@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import lsq_linear
 
@@ -31,6 +30,8 @@ _LAYER: Final = 50.0
 _OUTLIERS: Final = (0.3, 1.0)
 """Smallest and largest deviation of an outlier in the logarithm."""
 _STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
+_SPLINE_STRENGTHS: Final = np.geomspace(1e-4, 1e9, 60)
+"""In the weights of the data, for altitudes one apart."""
 _LEAST_SNR: Final = 3.0
 _FEWEST_BEAMS: Final = 3
 _FEWEST_KNOTS: Final = 5
@@ -407,23 +408,34 @@ def _fit_lines(scan: Scan, level: Array) -> ScanEstimates:
 
 
 def spline(scan: Scan) -> ScanEstimates:
-    """Smooth optical depths by a cubic spline, its strength by generalised cross validation.
+    """Smooth optical depths by a discrete spline, its strength by generalised cross validation.
 
-    A running mean of the signal selects samples, so that noise does not: bright samples alone would
-    bias the lines.
+    All profiles share one singular value decomposition and one strength, for the altitudes that all
+    of them reach and the medians of their errors. A running mean of the signal selects samples, so
+    that noise does not: bright samples alone would bias the lines.
     """
     level = uniform_filter1d(scan.signal, _RUN, axis=-1, mode="nearest")
     unsmoothed = _fit_lines(scan, level)
-    error = np.asarray(unsmoothed.standard_error)
     smooth = np.full(unsmoothed.optical_depth.shape, np.nan)
-    for t, depth in enumerate(unsmoothed.optical_depth):
-        known = np.isfinite(depth)
-        if known.sum() >= _FEWEST_KNOTS:
-            # Scipy finds no strength for metres, or weights far from 1.
-            height, weight = 1e-3 * scan.scene.altitude[known], 1.0 / error[t, known] ** 2
-            curve = make_smoothing_spline(height, depth[known], w=weight / weight.mean())
-            smooth[t, known] = curve(height)
+    known = np.isfinite(unsmoothed.optical_depth).all(axis=0)
+    if known.sum() >= _FEWEST_KNOTS:
+        error = np.median(np.asarray(unsmoothed.standard_error)[:, known], axis=0)
+        smooth[:, known] = _cross_validated(unsmoothed.optical_depth[:, known], error)
     return ScanEstimates(smooth)
+
+
+def _cross_validated(depth: Array, error: Array) -> Array:
+    """Return profiles at even altitudes, smoothed by second differences weighted by the errors."""
+    count = error.size
+    error = error / error.mean()
+    roughness = np.diff(np.eye(count), 2, axis=0) * error
+    _, singular, modes = np.linalg.svd(roughness, full_matrices=True)
+    penalty = np.append(singular**2, np.zeros(count - singular.size))
+    kept = 1.0 / (1.0 + _SPLINE_STRENGTHS[:, np.newaxis] * penalty)
+    data = (depth / error) @ modes.T
+    misfit = (1.0 - kept) ** 2 @ np.sum(data**2, axis=0)
+    best = np.argmin(misfit / (count - kept.sum(axis=1)) ** 2)
+    return np.asarray((data * kept[best]) @ modes * error)
 
 
 def bounded(scan: Scan) -> ScanEstimates:

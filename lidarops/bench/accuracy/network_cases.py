@@ -118,13 +118,14 @@ def _plume(east: float) -> Extinction:
     return plume
 
 
-THIN: Final = "homogeneous, 0.2 per km"
+THIN: Final = Air("homogeneous, 0.2 per km", lambda _: _homogeneous(2e-4))
+"""Air of which noise hides the attenuation."""
 AIRS: Final = (
     Air("homogeneous", lambda _: _homogeneous(2e-3)),
     Air("gradient", lambda _: _gradient),
     Air("plume", lambda _: _plume(-40.0)),
     Air("drifting plume", lambda profile: _plume(-200.0 + 300.0 * profile / BLOCK), moving=True),
-    Air(THIN, lambda _: _homogeneous(2e-4)),
+    THIN,
 )
 """The gradient is 2 per km at 600 m with a scale height of 1 km. The plume has 3.5 per km in air
 of 1.5 per km, and drifts by 300 m in a block."""
@@ -299,6 +300,16 @@ def network_by_scipy(power: Array, variance: Array, signals: Signals) -> Array:
             for profile, noise in zip(power, variance, strict=True)
         ]
     )
+
+
+def network_by_scipy_of_means(power: Array, variance: Array, signals: Signals) -> Array:
+    """Return (profile, crossing) extinction of the mean of each block, for all its profiles."""
+    first = np.arange(0, len(power), BLOCK)
+    counts = np.diff(first, append=len(power))
+    number = counts[:, np.newaxis, np.newaxis]
+    mean = np.add.reduceat(power, first) / number
+    variance_of_mean = np.add.reduceat(variance, first) / number**2
+    return np.repeat(network_by_scipy(mean, variance_of_mean, signals), counts, axis=0)
 
 
 def _point_values(power: Array, variance: Array, signals: Signals) -> tuple[Array, Array, Array]:

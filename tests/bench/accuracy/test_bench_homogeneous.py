@@ -143,7 +143,16 @@ def test_the_compiled_fit_rejects_profiles_that_cannot_converge():
     solved = iterative_peers()[JIT](power, PATH)
     alone = iterative_peers()[JIT](power[:1], PATH)
     assert solved.rejected.tolist() == [False, True, False]
-    assert solved.values["extinction"][0] == alone.values["extinction"][0]
+    # They start from the mean of other profiles.
+    assert solved.values["extinction"][0] == pytest.approx(alone.values["extinction"][0], rel=1e-6)
+
+
+def test_peers_start_from_the_data_alone():
+    power = PATH.powers(20)
+    elsewhere = replace(PATH, extinction=1e-3, background=0.0, signal=1.0)
+    for name, solver in iterative_peers().items():
+        known, unknown = (solver(power, path).values for path in (PATH, elsewhere))
+        assert np.array_equal(known["extinction"], unknown["extinction"]), name
 
 
 def test_scores_of_known_errors():

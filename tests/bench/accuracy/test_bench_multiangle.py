@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.interpolate import make_smoothing_spline
 
 from lidarops.bench.accuracy import multiangle, multiangle_cases
 from lidarops.bench.accuracy.multiangle import StudySize
@@ -191,6 +192,34 @@ def test_peers_leave_out_samples_in_noise():
     solvable = (scan.signal > 3.0 * np.sqrt(scan.variance)).sum(axis=1) >= 3
     assert np.array_equal(np.isfinite(line.optical_depth), solvable)
     assert 0 < solvable.sum() < solvable.size
+
+
+def test_the_common_spline_is_as_good_as_a_spline_for_each_profile():
+    scene = multiangle_cases.clear(3000.0, bins=101)
+    scan = scene.draw(30, 8)
+    line = multiangle_cases.lines(scan)
+    kilometres, weight = 1e-3 * scene.altitude, 1.0 / line.standard_error**2
+    alone = [
+        make_smoothing_spline(kilometres, depth, w=of_depth / of_depth.mean())(kilometres)
+        for depth, of_depth in zip(line.optical_depth, weight, strict=True)
+    ]
+    together = multiangle_cases.spline(scan).optical_depth
+    rmse, rmse_alone = (
+        np.sqrt(np.mean((depth - scene.optical_depth) ** 2)) for depth in (together, alone)
+    )
+    assert rmse < rmse_alone
+
+
+def test_methods_are_compared_where_all_have_a_value():
+    scene = multiangle_cases.clear(300.0, bins=150)
+    scores = multiangle._compare(scene, replace(SMALL, blocks=2, profiles=12), 1)
+    joint, spline = (
+        scores[scene.label, name] for name in (multiangle_cases.JOINT, multiangle_cases.SPLINE)
+    )
+    assert spline["solved"].value < joint["solved"].value
+    common = "RMSE where all have a value"
+    assert joint[common].value < joint[DEPTH].value
+    assert spline[common].value == pytest.approx(spline[DEPTH].value, rel=0.1)
 
 
 # Statistics -----------------------------------------------------------------------------------

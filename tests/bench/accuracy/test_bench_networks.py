@@ -97,7 +97,7 @@ def test_fields_of_extinction_are_as_described():
         for air in network_cases.AIRS
     }
     assert np.all(signals_of["homogeneous"].extinction == 2e-3)
-    assert np.all(signals_of[network_cases.THIN].extinction == 2e-4)
+    assert np.all(signals_of[network_cases.THIN.name].extinction == 2e-4)
     gradient = signals_of["gradient"].extinction[0]
     height = signals_of["gradient"].network.crossing[:, 2]
     np.testing.assert_allclose(np.diff(np.log(gradient)), -np.diff(height) / 1010.0)
@@ -204,6 +204,21 @@ def test_a_plain_fit_finds_the_same_network(place):
         :, near
     ]
     assert np.abs(difference / ours.extinction_standard_error[:, near]).max() < 2.0
+
+
+def test_a_plain_fit_of_means_has_one_value_for_the_profiles_of_a_block():
+    signals = network_cases.signals(network_cases.TRIANGLE.network(), network_cases.AIRS[0])
+    profiles = network_cases.BLOCK + 7
+    power, variance = signals.draw(0.05, profiles, 2)
+    fitted = network_cases.network_by_scipy_of_means(power, variance, signals)
+    for block in (slice(network_cases.BLOCK), slice(network_cases.BLOCK, None)):
+        count = len(power[block])
+        mean, of_mean = power[block].mean(axis=0), variance[block].sum(axis=0) / count**2
+        expected = network_cases.network_by_scipy(mean[np.newaxis], of_mean[np.newaxis], signals)
+        np.testing.assert_allclose(fitted[block], np.repeat(expected, count, axis=0), rtol=1e-6)
+    near = signals.network.near_crossing
+    error = np.abs(fitted / signals.truth(profiles) - 1.0)[0, near]
+    assert error.max() < 0.1
 
 
 # Scores ---------------------------------------------------------------------------------------
@@ -328,6 +343,10 @@ def test_the_network_agrees_with_a_plain_fit(accuracy):
         )
         assert peer == pytest.approx(plain, rel=0.5)
         assert rows[*pair, "network / scipy"].value == pytest.approx(ours / peer)
+        # 10 profiles are one block.
+        mean = rows[*pair, "scipy least_squares, mean of 50 profiles, RMSE"].value
+        ratio = rows[*pair, "network / scipy of means of 50"].value
+        assert ratio == pytest.approx(ours / mean)
 
 
 def test_times_are_multiples_of_the_read(throughput_result):
