@@ -25,7 +25,7 @@ def page() -> str:
 
 
 def _groups(groups: list[dict[str, Any]]) -> Iterator[str]:
-    columns = ("figure", "before", "now", "target", "made by", "where not met, why")
+    columns = ("figure", "before", "now", "target", "made by", "remark")
     for group in groups:
         yield f"*{group['title']}*"
         rows = [
@@ -35,7 +35,7 @@ def _groups(groups: list[dict[str, Any]]) -> Iterator[str]:
                 _text(measured(row["now"])),
                 verdict(row),
                 f"`{command(row['now'])}`",
-                why(row),
+                remark(row),
             )
             for row in group["rows"]
         ]
@@ -68,6 +68,11 @@ def verdict(row: dict[str, Any]) -> str:
     if row["target"] is None:
         return ""
     return Target(**row["target"]).judged(measured(row["now"]))
+
+
+def remark(row: dict[str, Any]) -> str:
+    """Return why a figure does not meet its target, and how its draws differ from the study's."""
+    return "; ".join(text for text in (why(row), row.get("note", "")) if text)
 
 
 def why(row: dict[str, Any]) -> str:

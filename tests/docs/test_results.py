@@ -189,6 +189,7 @@ def test_the_page_shows_before_and_now_with_errors() -> None:
     text = before_after.page()
     for row in _rows_before():
         assert f"| {row['figure']} | {row['before']} |" in text
+        assert row.get("note", "") in text
     assert "`lidarops bench stability`" in text
 
 

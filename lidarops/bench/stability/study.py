@@ -47,6 +47,7 @@ from lidarops.bench.stability.random_scenes import (
     collect,
 )
 from lidarops.bench.stability.reproducibility import measure_reproducibility
+from lidarops.bench.stability.second_look import measure_second_look
 from lidarops.figures.wording import counted
 
 LONGEST: Final = 1200.0
@@ -148,6 +149,7 @@ def _others(effort: Effort, costs: dict[str, float]) -> tuple[list[Chapter], Sco
     begin = cpu_seconds()
     sizes = (2, 1) if effort.quick else (60, 6)
     changes = measure_reproducibility(*sizes)
+    changes |= measure_second_look(3 if effort.quick else 30)
     costs["order and machine"] = cpu_seconds() - begin
     return [
         Chapter(
@@ -159,7 +161,7 @@ def _others(effort: Effort, costs: dict[str, float]) -> tuple[list[Chapter], Sco
         Chapter(
             REPRODUCIBLE,
             "How far values change with the order of the profiles of a block, and with the kernel"
-            " of linear algebra.",
+            " of linear algebra; how much of the solver's time its second look at the bins takes.",
             [Results(REPRODUCIBLE, rows_of_scores(changes), method="figure")],
         ),
         Chapter(

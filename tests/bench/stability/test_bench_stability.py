@@ -26,6 +26,7 @@ from lidarops.bench.stability import (
     random_scans,
     random_signals,
     reproducibility,
+    second_look,
     study,
 )
 from lidarops.bench.stability.random_scenes import (
@@ -357,6 +358,11 @@ def test_networks_have_the_same_values_each_time():
     first, second = (reproducibility.network_values(1) for _ in range(2))
     assert first.shape[0] == 2
     assert np.array_equal(first, second, equal_nan=True)
+
+
+def test_the_second_look_takes_a_part_of_the_time_of_the_solver(stability):
+    row = stability.figures(study.REPRODUCIBLE)["", second_look.NAME, second_look.SHARE]
+    assert 0.02 < row.value < 0.6
 
 
 def test_the_cost_of_all_parts_is_a_target():
