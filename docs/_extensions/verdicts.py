@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from fnmatch import fnmatchcase
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import benchmark_results
 import tables
 
 from lidarops.bench.harness.rows import Row, cell
 from lidarops.bench.harness.verdicts import unmet
+from lidarops.bench.stability import reasons
 from lidarops.bench.stability.random_scenes import TARGETS
-
-PARTS: Final = ("part", "quantity", "class", "target")
-"""What a reason is for, as patterns; a part that is left out stands for all."""
-
 
 _WORDS: Final = {"target": "false", "needless target": "needless"}
 
@@ -95,21 +90,15 @@ def _rows() -> Iterator[Row]:
         yield from rows
 
 
-def reasons() -> list[dict[str, str]]:
+def stated_reasons() -> list[reasons.Reason]:
     """Return the reasons for targets that are not met, the most special ones first."""
-    path = benchmark_results.RESULTS / "reasons.json"
-    content: list[dict[str, str]] = json.loads(path.read_text(encoding="utf-8"))
-    return content
+    return reasons.read_reasons(benchmark_results.RESULTS / reasons.FILE.name)
 
 
 def why(one: Unmet) -> str:
     """Return the reason of a target that is not met; empty if none is stated."""
-    return next((reason["why"] for reason in reasons() if matches(reason, one)), "")
-
-
-def matches(reason: dict[str, Any], one: Unmet) -> bool:
-    """Return whether a reason is for this target."""
-    values = dict(zip(PARTS, one, strict=False)) | {"verdict": one.verdict.rpartition(" ")[2]}
-    return all(
-        fnmatchcase(values[name], pattern) for name, pattern in reason.items() if name != "why"
-    )
+    verdict = unmet(one.verdict)
+    if verdict is None:
+        return ""
+    missed = reasons.Unmet(one.part, one.quantity, one.name, one.target, verdict)
+    return reasons.why(missed, stated_reasons())

@@ -58,7 +58,7 @@ def run_benchmark(
     what : {"accuracy", "throughput", "stability"}
     case : Benchmark or str, optional
         None means "reader" if files are given, else "all" for the accuracy and "homogeneous" for
-        the throughput. The stability has no cases.
+        the throughput. The stability has its own cases, and None means all.
     files : sequence of Path
         Raw files of one layout, only for "reader".
     effort : Effort
@@ -74,10 +74,10 @@ def run_benchmark(
     """
     kind = _member(BenchmarkKind, what, "benchmark")
     if kind is BenchmarkKind.STABILITY:
-        for name, value in {"case": case, "files": files, "data": data}.items():
+        for name, value in {"files": files, "data": data}.items():
             _refuse(name, value, "is no option of the benchmark 'stability'")
         _refuse("repeats", effort.repeats, "is no option of the benchmark 'stability'")
-        return _timed(study.measure_stability, effort)
+        return _timed(partial(study.measure_stability, case=case), effort)
     default = Benchmark.ALL if kind is BenchmarkKind.ACCURACY else Benchmark.HOMOGENEOUS
     benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
     if benchmark is not Benchmark.READER:

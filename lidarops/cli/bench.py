@@ -41,7 +41,8 @@ def bench(
 
     Accuracy compares errors with the least possible errors; throughput compares times with a floor
     measured in the same run; stability shows how often a wrong value
-    has no flag, and fails with 1 where a target is missed.
+    has no flag, and fails with 1 where a target is missed. Its cases are homogeneous, signal,
+    elastic, multiangle, network, raman, flags and order, or the name of a table.
 
     Example: lidarops bench accuracy --case homogeneous --quick --out bench
 
@@ -50,6 +51,8 @@ def bench(
     Example: lidarops bench throughput demo/raw/coast/h*.*0
 
     Example: lidarops bench stability --quick --out bench
+
+    Example: lidarops bench stability --case raman
     """
     from lidarops.bench.harness.benchmark import Effort
     from lidarops.bench.registry import run_benchmark
@@ -69,5 +72,7 @@ def bench(
             typer.echo(f"report: {page}")
     for target in study.missed:
         typer.echo(f"missed: {target}", err=True)
+    for target in study.unnamed:
+        typer.echo(f"missed, and not named in reasons.json: {target}", err=True)
     if study.missed:
         raise typer.Exit(1)

@@ -13,10 +13,11 @@ import verdicts
 
 from lidarops.bench.harness.benchmark import BenchmarkKind
 from lidarops.bench.harness.rows import Figure, Unit
-from lidarops.bench.harness.verdicts import Target, unmet
+from lidarops.bench.harness.verdicts import Target, Verdict, unmet
 from lidarops.bench.registry import Benchmark
 from lidarops.bench.stability import study
 from lidarops.bench.stability.random_scenes import TARGETS
+from lidarops.bench.stability.reasons import Unmet
 from lidarops.cli import app
 
 
@@ -158,10 +159,9 @@ def test_every_reason_is_for_a_class_of_the_benchmark() -> None:
         for row in rows
         if row.quantity in TARGETS and row.value is not None
     ]
-    for reason in verdicts.reasons():
-        words = reason.get("verdict", "MISSED")
-        unmet = [verdicts.Unmet(*row, "", words) for row in rows]
-        assert any(verdicts.matches(reason, one) for one in unmet), reason
+    for reason in verdicts.stated_reasons():
+        verdict = Verdict.UNDECIDED if reason.verdict == Verdict.UNDECIDED else Verdict.MISSED
+        assert any(reason.matches(Unmet(*row, verdict)) for row in rows), reason
 
 
 def test_the_page_of_targets_counts_those_that_are_not_met() -> None:

@@ -425,6 +425,8 @@ class Study:
     works: Sequence[Work] = ()
     missed: Sequence[str] = ()
     """Targets that are missed; the command fails where there is one."""
+    unnamed: Sequence[str] = ()
+    """Those of them for which no reason is stated."""
     cpu_seconds: float = 0.0
     """CPU time of the whole benchmark, with its child processes."""
     machine: Machine = field(default_factory=machine)

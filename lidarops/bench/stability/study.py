@@ -46,8 +46,10 @@ from lidarops.bench.stability.random_scenes import (
     ScoredValues,
     collect,
 )
+from lidarops.bench.stability.reasons import Unmet, read_reasons, why
 from lidarops.bench.stability.reproducibility import measure_reproducibility
 from lidarops.bench.stability.second_look import measure_second_look
+from lidarops.errors import CampaignError
 from lidarops.figures.wording import counted
 
 LONGEST: Final = 1200.0
@@ -63,6 +65,8 @@ class Draws:
     """Random scenes of one retrieval."""
 
     retrieval: str
+    case: str
+    """Name by which the command runs this part with others."""
     score: Callable[[int, int], Iterator[tuple[ScoredValues, int]]]
     """Returns the values of a cluster, given its number and the number of profiles."""
     profiles: int
@@ -84,96 +88,169 @@ class Draws:
 def _blocks(draw_air: object, length: int, clusters: int) -> Draws:
     name = getattr(draw_air, "__name__", "")
     score = partial(random_networks.score_short_blocks, draw_air=draw_air, length=length)
-    return Draws(f"networks, {name}, blocks of {length}", score, 6, clusters, 4)
+    return Draws(f"networks, {name}, blocks of {length}", "network", score, 6, clusters, 4)
 
 
 def _scans(length: int) -> Draws:
     score = partial(random_scans.score_short_scans, length=length)
-    return Draws(f"scans, blocks of {length}", score, 8, 400, 4)
+    return Draws(f"scans, blocks of {length}", "multiangle", score, 8, 400, 4)
 
 
 DRAWS: Final = (
-    Draws("homogeneous", random_homogeneous.score_homogeneous, 1000, 400, 4, 1e-3, pooled=True),
-    Draws("signal chain", random_signals.score_signals, 50, 500, 20, 0.05, pooled=True),
-    Draws("elastic", random_elastic.score_elastic, 20, 400, 6, 0.05, pooled=True),
-    Draws("multi-angle", random_scans.score_scans, 8, 400, 6, 0.13, pooled=True),
-    Draws("scans of any and of calm air", random_scans.score_scan_methods, 8, 400, 6, pooled=True),
-    Draws("network", random_networks.score_networks, 50, 300, 4, 0.05, pooled=True),
-    Draws("Raman", random_raman.score_raman, 8, 1000, 6, pooled=True),
-    Draws("short sections", random_sections.score_short_sections, 300, 600, 6),
-    Draws("correlated noise", random_sections.score_correlated_noise, 60, 400, 6),
-    Draws("near the cut", random_sections.score_near_the_cut, 1000, 400, 6),
-    Draws("dying signals", random_sections.score_dying_signals, 300, 2500, 6),
-    Draws("quiet digitizers", random_signals.score_digitizers, 5, 60, 6),
+    Draws(
+        "homogeneous",
+        "homogeneous",
+        random_homogeneous.score_homogeneous,
+        1000,
+        400,
+        4,
+        1e-3,
+        pooled=True,
+    ),
+    Draws("signal chain", "signal", random_signals.score_signals, 50, 500, 20, 0.05, pooled=True),
+    Draws("elastic", "elastic", random_elastic.score_elastic, 20, 400, 6, 0.05, pooled=True),
+    Draws("multi-angle", "multiangle", random_scans.score_scans, 8, 400, 6, 0.13, pooled=True),
+    Draws(
+        "scans of any and of calm air",
+        "multiangle",
+        random_scans.score_scan_methods,
+        8,
+        400,
+        6,
+        pooled=True,
+    ),
+    Draws("network", "network", random_networks.score_networks, 50, 300, 4, 0.05, pooled=True),
+    Draws("Raman", "raman", random_raman.score_raman, 8, 1000, 6, pooled=True),
+    Draws("short sections", "homogeneous", random_sections.score_short_sections, 300, 600, 6),
+    Draws("correlated noise", "homogeneous", random_sections.score_correlated_noise, 60, 400, 6),
+    Draws("near the cut", "homogeneous", random_sections.score_near_the_cut, 1000, 400, 6),
+    Draws("dying signals", "homogeneous", random_sections.score_dying_signals, 300, 2500, 6),
+    Draws("quiet digitizers", "signal", random_signals.score_digitizers, 5, 60, 6),
     _scans(1),
     _scans(2),
-    Draws("scans of photon counts", random_scans.score_counted_scans, 8, 250, 6),
+    Draws("scans of photon counts", "multiangle", random_scans.score_counted_scans, 8, 250, 6),
     _blocks(random_networks.plume, 1, 2000),
     _blocks(random_networks.plume, 2, 1500),
     _blocks(random_networks.plume, 3, 1500),
     _blocks(random_networks.homogeneous, 1, 700),
     _blocks(random_networks.layered, 1, 1000),
-    Draws("networks, varying lidar ratio", random_networks.score_lidar_ratios, 6, 200, 4),
+    Draws(
+        "networks, varying lidar ratio", "network", random_networks.score_lidar_ratios, 6, 200, 4
+    ),
 )
 
 
-def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Study:
+def measure_stability(
+    effort: Effort, draws: tuple[Draws, ...] = DRAWS, case: str | None = None
+) -> Study:
     """Return the rates of false values in random scenes, and what each part costs.
 
     Parameters
     ----------
     effort : Effort
     draws : tuple of Draws
+    case : str, optional
+        Only parts of this case, or the part of this name; None for all.
+
+    Raises
+    ------
+    CampaignError
+        If no part has this case or name.
     """
-    chapters, missed, costs = [], [], {}
-    for draw in draws:
+    selected = [draw for draw in draws if case in {None, draw.case, draw.retrieval}]
+    others = [other for other in OTHERS if case in {None, other.case}]
+    if not selected and not others:
+        names = dict.fromkeys(part.case for part in (*draws, *OTHERS))
+        raise CampaignError(
+            f"no case {case!r}",
+            remedy=f"choose: {' or '.join(names)}, or a part such as {draws[-1].retrieval!r}",
+        )
+    chapters: list[Chapter] = []
+    targets_unmet: list[Unmet] = []
+    costs: dict[str, float] = {}
+    for draw in selected:
         begin = cpu_seconds()
         clusters = draw.quick if effort.quick else draw.clusters
         tally = collect(draw.score_cluster, clusters, effort.progress)
         scores = tally.rates(draw.needless, pooled=draw.pooled)
         chapters.append(_chapter(draw.retrieval, scores))
-        missed += missed_targets(draw.retrieval, scores)
+        targets_unmet += unmet_targets(draw.retrieval, scores)
         costs[draw.retrieval] = cpu_seconds() - begin
-    others, of_flags = _others(effort, costs)
-    chapters += others
-    missed += missed_targets("flags", of_flags)
-    missed += missed_targets("cost", cost_scores(costs))
-    return Study("Stability: false values without a flag", effort.date, chapters, missed=missed)
-
-
-def _others(effort: Effort, costs: dict[str, float]) -> tuple[list[Chapter], Scores]:
-    """Return the chapters without random scenes, and the scores of flags; add their costs."""
-    begin = cpu_seconds()
-    flags = flag_rates.flag_rates(2 if effort.quick else 60)
-    costs["flags"] = cpu_seconds() - begin
-    begin = cpu_seconds()
-    sizes = (2, 1) if effort.quick else (60, 6)
-    changes = measure_reproducibility(*sizes)
-    changes |= measure_second_look(3 if effort.quick else 30)
-    costs["order and machine"] = cpu_seconds() - begin
-    return [
-        Chapter(
-            FLAGS,
-            "How many profiles of few photon counts are flagged although the model holds, and how"
-            " many values of homogeneous paths a single bit rejects.",
-            [Results(FLAGS, rows_of_scores(flags), case="flag", method="condition")],
-        ),
-        Chapter(
-            REPRODUCIBLE,
-            "How far values change with the order of the profiles of a block, and with the kernel"
-            " of linear algebra; how much of the solver's time its second look at the bins takes.",
-            [Results(REPRODUCIBLE, rows_of_scores(changes), method="figure")],
-        ),
+    for other in others:
+        begin = cpu_seconds()
+        scores = other.measure(effort)
+        chapters.append(other.chapter(scores))
+        targets_unmet += unmet_targets(other.title, scores)
+        costs[other.name] = cpu_seconds() - begin
+    of_cost = cost_scores(costs, whole=case is None)
+    chapters.append(
         Chapter(
             COST,
             "CPU time with child processes and compilation.",
-            [Results(COST, rows_of_scores(cost_scores(costs)), method="part")],
-        ),
-    ], flags
+            [Results(COST, rows_of_scores(of_cost), method="part")],
+        )
+    )
+    targets_unmet += unmet_targets(COST, of_cost)
+    missed = [one for one in targets_unmet if one.verdict is Verdict.MISSED]
+    reasons = read_reasons()
+    return Study(
+        "Stability: false values without a flag", effort.date, chapters,
+        missed=[str(one) for one in missed],
+        unnamed=[str(one) for one in missed if reasons and not why(one, reasons)],
+    )  # fmt: skip
 
 
-def cost_scores(costs: dict[str, float]) -> Scores:
-    """Return the CPU times of the parts, s, and whether their sum is short enough."""
+@dataclass(frozen=True, slots=True)
+class _Other:
+    """A part without random scenes."""
+
+    case: str
+    name: str
+    title: str
+    text: str
+    measure: Callable[[Effort], Scores]
+    headings: dict[str, str]
+
+    def chapter(self, scores: Scores) -> Chapter:
+        """Return the table of the part."""
+        return Chapter(
+            self.title, self.text, [Results(self.title, rows_of_scores(scores), **self.headings)]
+        )
+
+
+def _flag_scores(effort: Effort) -> Scores:
+    return flag_rates.flag_rates(2 if effort.quick else 60)
+
+
+def _order_scores(effort: Effort) -> Scores:
+    sizes, repeats = ((2, 1), 3) if effort.quick else ((60, 6), 30)
+    return measure_reproducibility(*sizes) | measure_second_look(repeats)
+
+
+OTHERS: Final = (
+    _Other(
+        "flags",
+        "flags",
+        FLAGS,
+        "How many profiles of few photon counts are flagged although the model holds, and how"
+        " many values of homogeneous paths a single bit rejects.",
+        _flag_scores,
+        {"case": "flag", "method": "condition"},
+    ),
+    _Other(
+        "order",
+        "order and machine",
+        REPRODUCIBLE,
+        "How far values change with the order of the profiles of a block, and with the kernel"
+        " of linear algebra; how much of the solver's time its second look at the bins takes.",
+        _order_scores,
+        {"method": "figure"},
+    ),
+)
+
+
+def cost_scores(costs: dict[str, float], *, whole: bool = True) -> Scores:
+    """Return the CPU times of the parts, s, and whether the sum of all parts is short enough."""
     total = sum(costs.values())
     verdict = Verdict.MET if total <= LONGEST else Verdict.MISSED
     scores: Scores = {
@@ -181,7 +258,8 @@ def cost_scores(costs: dict[str, float]) -> Scores:
         for name, seconds in costs.items()
     }
     target = f"{LONGEST / 60.0:g} min {verdict}"
-    scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), FALSE_TARGET: target}
+    if whole:
+        scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), FALSE_TARGET: target}
     return scores
 
 
@@ -238,25 +316,20 @@ def results_title(retrieval: str) -> str:
 
 def targets(scores: Scores) -> str:
     """Return which classes miss their targets, and for which that is undecided."""
+    targets_unmet = unmet_targets("", scores)
     sentences = []
     for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNDECIDED, "Undecided")):
-        names = [name for name, _ in _with_verdict(scores, verdict)]
+        names = [one.place for one in targets_unmet if one.verdict is verdict]
         if names:
             sentences.append(f"{words}: {', '.join(names)}.")
     return " ".join(sentences) or "All targets are met."
 
 
-def missed_targets(retrieval: str, scores: Scores) -> list[str]:
-    """Return the classes with a share outside a target."""
+def unmet_targets(part: str, scores: Scores) -> list[Unmet]:
+    """Return the targets of a part that are missed or undecided."""
     return [
-        f"{retrieval}: {name}, {target}" for name, target in _with_verdict(scores, Verdict.MISSED)
+        Unmet(part, quantity, name, target, verdict, str(score[target]))
+        for (quantity, name), score in scores.items()
+        for target in TARGETS
+        if (verdict := unmet(score.get(target))) is not None
     ]
-
-
-def _with_verdict(scores: Scores, verdict: Verdict) -> Iterator[tuple[str, str]]:
-    """Yield class and target where the verdict on a target is this one."""
-    for (quantity, failure), score in scores.items():
-        for target in TARGETS:
-            if unmet(score.get(target)) is verdict:
-                place = f" ({quantity})" if quantity else ""
-                yield f"{failure}{place}", f"{target} {score[target]}"
