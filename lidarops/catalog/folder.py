@@ -26,7 +26,7 @@ _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
 
 
-class Beam(NamedTuple):
+class FileBeam(NamedTuple):
     """Interval and pointing of one raw file."""
 
     start: datetime
@@ -67,7 +67,7 @@ class FileGroup:
     """Why pointings are doubtful, in words."""
     notes: tuple[str, ...]
     """Oddities of the headers, in words."""
-    beams: tuple[Beam, ...]
+    beams: tuple[FileBeam, ...]
     """By file."""
 
     @property
@@ -300,7 +300,7 @@ def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
         doubts=tuple(sorted({header.doubt for header in headers if header.doubt})),
         notes=tuple(sorted({note for header in headers for note in header.notes})),
         beams=tuple(
-            Beam(
+            FileBeam(
                 header.start,
                 header.stop,
                 math.nan if header.doubt or header.zenith_angle is None else header.zenith_angle,

@@ -210,8 +210,10 @@ def test_container_file(repository: Path) -> None:
     instructions = [line.split(maxsplit=1) for line in lines]
     assert all(word.isupper() for word, _ in instructions)
     bases = [rest for word, rest in instructions if word == "FROM"]
-    assert all(re.match(r"\S+:[\w.]+[\w.-]*( AS \w+)?$", base) for base in bases)
-    assert not any(":latest" in base for base in bases)
+    # A tag moves to other content.
+    (pinned,) = (rest for word, rest in instructions if word == "ARG")
+    assert re.fullmatch(r"PYTHON=python:3\.\d+-[\w.-]+@sha256:[0-9a-f]{64}", pinned)
+    assert all(base.split()[0] == "${PYTHON}" for base in bases)
     user = [rest for word, rest in instructions if word == "USER"][-1]
     assert int(user.partition(":")[0]) >= 1000
     installs = [rest for word, rest in instructions if word == "RUN" and "pip install" in rest]
