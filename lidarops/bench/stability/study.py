@@ -48,7 +48,6 @@ from lidarops.bench.stability.random_scenes import (
 )
 from lidarops.bench.stability.reasons import Unmet, read_reasons, why
 from lidarops.bench.stability.reproducibility import measure_reproducibility
-from lidarops.bench.stability.second_look import measure_second_look
 from lidarops.errors import CampaignError
 from lidarops.figures.wording import counted
 
@@ -223,8 +222,7 @@ def _flag_scores(effort: Effort) -> Scores:
 
 
 def _order_scores(effort: Effort) -> Scores:
-    sizes, repeats = ((2, 1), 3) if effort.quick else ((60, 6), 30)
-    return measure_reproducibility(*sizes) | measure_second_look(repeats)
+    return measure_reproducibility(*((2, 1) if effort.quick else (60, 6)))
 
 
 OTHERS: Final = (

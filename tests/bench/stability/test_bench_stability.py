@@ -27,7 +27,6 @@ from lidarops.bench.stability import (
     random_signals,
     reasons,
     reproducibility,
-    second_look,
     study,
 )
 from lidarops.bench.stability.random_scenes import (
@@ -401,13 +400,6 @@ def test_networks_have_the_same_values_each_time():
 
 
 @pytest.mark.slow
-def test_the_second_look_takes_a_part_of_the_time_of_the_solver():
-    """Slow to compile."""
-    ((place, score),) = second_look.measure_second_look(5).items()
-    assert place == ("", second_look.NAME)
-    assert 0.02 < score[second_look.SHARE].value < 0.6
-
-
 def test_the_cost_of_all_parts_is_a_target():
     assert study.cost_scores({"a": 400.0, "b": 800.0})["", study.WHOLE]["target"] == "20 min met"
     scores = study.cost_scores({"a": 400.0, "b": 900.0})
