@@ -239,8 +239,8 @@ OTHERS: Final = (
         "order",
         "order and machine",
         REPRODUCIBLE,
-        "How far values change with the order of the profiles of a block, and with the kernel"
-        " of linear algebra; how much of the solver's time its second look at the bins takes.",
+        "How far values change with the order of the profiles of a block, and with the kernel of "
+        "linear algebra.",
         _order_scores,
         {"method": "figure"},
     ),

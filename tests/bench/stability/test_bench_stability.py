@@ -311,9 +311,8 @@ def stability():
     steps = []
     effort = Effort(quick=True, date="2024-01-01", progress=steps.append)
     with pytest.MonkeyPatch.context() as patch:
-        # It starts processes, and compiles a solver.
+        # It starts processes.
         patch.setattr(study, "measure_reproducibility", lambda *_: {("", "order"): {"x": 0.0}})
-        patch.setattr(study, "measure_second_look", lambda _: {})
         measured = study.measure_stability(effort, draws)
     assert steps == [1] * len(draws)
     return measured
