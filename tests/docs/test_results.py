@@ -206,3 +206,29 @@ def test_the_scoreboard_shows_ours_beside_all_others() -> None:
     # Zero has no sign.
     assert "-0.0 " not in text
     assert "+0.0 " not in text
+
+
+@pytest.mark.parametrize(
+    ("case", "accuracy", "speed"),
+    [
+        ("homogeneous path,", {"equal error"}, "slower"),
+        ("elastic inversion, background", {"equal error", "less accurate"}, "slower"),
+        ("scans over", {"equal error", "more accurate"}, "slower"),
+        (
+            "networks of lidars,.*(homogeneous|gradient|beams, plume|triangle, plume),",
+            {"less accurate"},
+            "slower",
+        ),
+        ("networks of lidars,.* drifting plume,", {"more accurate"}, None),
+    ],
+)
+def test_the_page_says_how_ours_stand_beside_peers(case, accuracy, speed) -> None:
+    tables = benchmark_results.read("accuracy")["tables"]
+    verdicts_of_case = {
+        tuple(str(row.value).split(", "))
+        for row in tables["Ours beside the strongest peer"]
+        if row.quantity == "ours is" and re.match(case, row.case)
+    }
+    assert verdicts_of_case
+    assert {accurate for accurate, _ in verdicts_of_case} <= accuracy
+    assert speed is None or {fast for _, fast in verdicts_of_case} == {speed}

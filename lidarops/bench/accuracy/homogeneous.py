@@ -47,6 +47,8 @@ PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
 _SLOW_SHARE: Final = 20
 _WARM: Final = 64
+_ROUNDS: Final = 3
+"""Timed calls, of which the least counts: others share the processor."""
 _INFORMED: Final = frozenset(
     {
         HomogeneousMethod.LINEARIZED,
@@ -111,9 +113,11 @@ def score_path(
     if name in SLOW:
         power = power[: max(len(power) // _SLOW_SHARE, 16)]
     solver(power[:_WARM], scenario)
-    begin = time.process_time()
-    solution = solver(power, scenario)
-    spent = time.process_time() - begin
+    seconds = []
+    for _ in range(1 if name in SLOW else _ROUNDS):
+        begin = time.process_time()
+        solution = solver(power, scenario)
+        seconds.append(time.process_time() - begin)
     least = least_errors(scenario)
     score: Score = {}
     for quantity in QUANTITIES:
@@ -125,7 +129,7 @@ def score_path(
         "profiles": len(power),
         "flagged": share(float(solution.flagged.mean())),
         "rejected": share(float(solution.rejected.mean())),
-        CPU_TIME: cpu_time(1e9 * spent / len(power)),
+        CPU_TIME: cpu_time(1e9 * min(seconds) / len(power)),
     }
 
 
