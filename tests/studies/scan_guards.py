@@ -1,6 +1,7 @@
 """Ablation of the guards of scans over zenith angle: ``python tests/studies/scan_guards.py``.
 
-With ``--thresholds``, every threshold is halved and doubled instead.
+It writes the table into the page of scans. With ``--only``, it prints these rows; with
+``--thresholds``, those of every threshold halved and doubled.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from numba.core.dispatcher import Dispatcher
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from studies.ablation import Guard, measure, table
+from studies.ablation import Guard, measure, table, write_table
 
 import lidarops.retrieve.multiangle as retrieval
 from lidarops.bench.stability import random_scans
@@ -49,6 +50,7 @@ from lidarops.retrieve.multiangle.vertical import correlation as air_correlation
 
 CLUSTERS: Final = 50
 PROFILES: Final = 8
+PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/multiangle.md"
 
 Patch = tuple[Any, str, Any]
 
@@ -181,7 +183,7 @@ def _thresholds() -> Iterator[Guard]:
 
 
 def main() -> None:
-    """Print the table of the guards, or of the thresholds."""
+    """Write the table of the guards, or print a part of it or the table of the thresholds."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("clusters", nargs="?", type=int, default=CLUSTERS)
     arguments.add_argument("--thresholds", action="store_true", help="halve and double each")
@@ -192,7 +194,10 @@ def main() -> None:
         guards = [guard for guard in guards if any(word in guard.name for word in given.only)]
     clusters = range(given.clusters)
     counts = measure(lambda k: random_scans.score_scans(k, PROFILES), clusters, guards)
-    sys.stdout.write("\n".join(table(counts)) + "\n")
+    if given.thresholds or given.only:
+        sys.stdout.write("\n".join(table(counts)) + "\n")
+    else:
+        write_table(PAGE, "guards", table(counts))
 
 
 if __name__ == "__main__":
