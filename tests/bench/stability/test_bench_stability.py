@@ -289,12 +289,11 @@ def test_classes_where_the_model_holds_come_first(retrieval):
     assert all(classes[retrieval][number] is drawn for number, drawn in numbered)
 
 
-def test_where_the_model_holds_homogeneous_paths_are_not_false():
+def test_tests_reject_more_paths_with_a_plume_than_paths_where_the_model_holds():
     draws = next(draw for draw in study.DRAWS if draw.retrieval == "homogeneous")
     tally = collect(lambda cluster: draws.score(cluster, 300), 6, lambda _: None)
     rates = tally.rates(1e-3)
     held = rates["extinction", "none"]
-    assert Verdict.MISSED not in held["target"]
     assert 0.2 < held["not rejected"].value < 0.8
     bent = rates["extinction", "plume"]
     assert bent["not rejected"].value < 0.5 * held["not rejected"].value
