@@ -118,7 +118,7 @@ def scan_archive(
         store.fingerprints() as known,
         Processes(processes, Headers.of(campaign, work.source, store.campaign)) as readers,
     ):
-        due = work.due(_joined(work.source.files(), known))
+        due = work.due(_joined(work.source.files(work.is_claimed), known))
         rows = readers.map_items(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
         for _, row in rows:
             work.enter(row)
@@ -204,6 +204,10 @@ class _Scan:
             ):
                 self._judged.append(before)
                 yield _due(file, owners, key)
+
+    def is_claimed(self, path: str) -> bool:
+        """Return whether an instrument claims a path."""
+        return bool(self._owners(path))
 
     def _owners(self, path: str) -> list[_Claim]:
         folder, slash, name = path.rpartition("/")

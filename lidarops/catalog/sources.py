@@ -6,7 +6,7 @@ import errno
 import hashlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -61,8 +61,11 @@ class Source:
         """Return the source of an archive, given its folder or URL."""
         return RemoteSource(archive) if "://" in archive else Source(Path(archive))
 
-    def files(self) -> Iterator[RawFile]:
-        """List files, sorted by path."""
+    def files(
+        self,
+        is_used: Callable[[str], bool] = lambda _: True,  # noqa: ARG002 - sizes cost nothing here
+    ) -> Iterator[RawFile]:
+        """List files, sorted by path; those that are not used may have no size."""
         self.refuse_absent()
         yield from self._walk(str(self._root), "")
 
@@ -122,9 +125,9 @@ class RemoteSource(Source):
     def __init__(self, url: str) -> None:
         self._store = RemoteStore(url)
 
-    def files(self) -> Iterator[RawFile]:
-        """List files, sorted by path."""
-        for stored in self._store.files():
+    def files(self, is_used: Callable[[str], bool] = lambda _: True) -> Iterator[RawFile]:
+        """List files, sorted by path; those that are not used may have no size."""
+        for stored in self._store.files(is_used):
             yield RawFile(stored.path, stored.size, stored.stamp)
 
     def refuse_absent(self) -> None:

@@ -13,7 +13,7 @@ import logging
 import re
 import secrets
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -26,6 +26,8 @@ from lidarops.system.files import sha256_of
 _READ_ONLY: Final = frozenset({"http", "https"})
 _ABSENT: Final = frozenset({404, 410})
 """Answers of a web server that lacks a file."""
+_DENIED: Final = frozenset({401, 403, 451})
+"""Answers of a web server that does not give a file away; it may have others."""
 # Schemes by which an object appears only when its upload is complete.
 _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 # A secret may hold slashes, so it is matched up to the last @. In Azure URLs the @ separates
@@ -148,11 +150,16 @@ class RemoteStore:
             ) from error
         self._prefix = prefix.rstrip("/")
 
-    def files(self) -> Iterator[Stored]:
+    def files(self, is_used: Callable[[str], bool] = lambda _: True) -> Iterator[Stored]:
         """List all objects below the URL, sorted by path.
 
         Names that lead out of the URL are listed too, and a warning tells of them. None of them can
-        be read.
+        be read. An object that the store denies has the size 0.
+
+        Parameters
+        ----------
+        is_used : callable, optional
+            Whether the size of a path is used. A web server is requested for no other.
 
         Raises
         ------
@@ -162,7 +169,7 @@ class RemoteStore:
         with self._errors_as(CatalogError, "cannot be listed"):
             # Another process may have written since the last listing.
             self._fs.invalidate_cache()
-            listing = dict(self._sized(self._find()))
+            listing = dict(self._sized(self._find(), is_used))
         outside = sorted(path for path in map(self._path, listing) if not is_confined(path))
         if outside:
             named = ", ".join(map(repr, outside[:_NAMES_SHOWN]))
@@ -174,21 +181,30 @@ class RemoteStore:
             )
         for name in sorted(listing):
             info = listing[name]
-            yield Stored(self._path(name), int(info["size"] or 0), _stamp(info))
+            yield Stored(self._path(name), int(info.get("size") or 0), _stamp(info))
 
-    def _sized(self, listing: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    def _sized(
+        self, listing: dict[str, Any], is_used: Callable[[str], bool]
+    ) -> Iterator[tuple[str, Any]]:
         """Yield names with their sizes, which the index of a web server lacks."""
         for name, info in listing.items():
-            if info.get("size") is not None or not is_confined(self._path(name)):
+            path = self._path(name)
+            if info.get("size") is not None or not is_confined(path) or not is_used(path):
                 yield name, info
                 continue
             try:
                 yield name, self._fs.info(name)
             except FileNotFoundError as error:
-                if not _is_absent(error):
-                    problem = f"the size of {self._path(name)} is not given: {error.__cause__!r}"
+                # Drivers of the web raise this whatever the server answers.
+                status = _status(error)
+                if status in _DENIED:
+                    # Whoever reads the file learns of it.
+                    yield name, info
+                elif error.__cause__ is None or status in _ABSENT:
+                    _LOG.warning("%s lists %r, which it does not have", self.url, path)
+                else:
+                    problem = f"the size of {path} is not given: {error.__cause__!r}"
                     raise OSError(errno.EIO, problem) from error
-                _LOG.warning("%s lists %r, which it does not have", self.url, self._path(name))
 
     def _path(self, name: str) -> str:
         return name.removeprefix(self._prefix).removeprefix("/")
@@ -366,11 +382,13 @@ class RemoteStore:
         except LidarOpsError:
             raise
         except _failures() as error:
+            status = _status(error)
+            denied = PermissionError(errno.EACCES, f"the server answers {status}")
             raise kind(
                 f"{problem}: {without_keys(repr(error))}",
                 file=self.url,
                 remedy="check address, network and keys",
-            ) from error
+            ) from (denied if status in _DENIED else error)
 
 
 @contextmanager
@@ -423,10 +441,10 @@ def _failures() -> tuple[type[Exception], ...]:
     )
 
 
-def _is_absent(error: FileNotFoundError) -> bool:
-    """Return whether a store says that it lacks a file: drivers of the web raise this always."""
-    status = getattr(error.__cause__, "status", None)
-    return error.__cause__ is None or status in _ABSENT
+def _status(error: Exception) -> int | None:
+    """Return what a web server answered, where this made an error."""
+    status: int | None = getattr(error, "status", getattr(error.__cause__, "status", None))
+    return status
 
 
 def _stamp(info: dict[str, Any]) -> int:

@@ -166,7 +166,17 @@ def test_a_dead_link_costs_no_other_file(
     assert "lists 'coast/gone', which it does not have" in caplog.text
 
 
-@pytest.mark.parametrize("status", [403, 500, 503])
+def _failing_on(name: str, status: int, patch: pytest.MonkeyPatch) -> None:
+    """Let the server answer with a status for one file."""
+    send_head = _Quiet.send_head
+
+    def failing(self: _Quiet) -> Any:
+        return self.send_error(status) if self.path.endswith(name) else send_head(self)
+
+    patch.setattr(_Quiet, "send_head", failing)
+
+
+@pytest.mark.parametrize("status", [429, 500, 503])
 def test_a_server_that_answers_for_no_file_ends_the_scan(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch, status: int
 ) -> None:
@@ -174,17 +184,38 @@ def test_a_server_that_answers_for_no_file_ends_the_scan(
     with Store(campaign.catalog_url, campaign.name) as store:
         scan_archive(campaign, store)
         before = store.granules()
-        send_head = _Quiet.send_head
-
-        def failing(self: _Quiet) -> Any:
-            if self.path.endswith("h1"):
-                return self.send_error(status)
-            return send_head(self)
-
-        monkeypatch.setattr(_Quiet, "send_head", failing)
+        _failing_on("h1", status, monkeypatch)
         with pytest.raises(CatalogError, match=f"coast/h1.*{status}"):
             scan_archive(campaign, store)
         assert store.granules() == before
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_a_file_that_a_server_denies_is_refused_until_it_gives_it(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        before = store.granules()
+        with monkeypatch.context() as patch:
+            _failing_on("h1", status, patch)
+            for _ in range(2):
+                assert scan_archive(campaign, store).refused == 1
+            assert store.granules(status=Status.GOOD) == before[:1]
+            (refused,) = store.refused()
+            assert refused.reason == f"cannot be read: the server answers {status}"
+        assert scan_archive(campaign, store).refused == 0
+        assert store.granules() == before
+
+
+@pytest.mark.parametrize("status", [403, 503])
+def test_a_file_that_no_instrument_claims_may_fail(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    (tmp_path / "raw" / "notes.txt").write_text("x")
+    _failing_on("notes.txt", status, monkeypatch)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert scan_archive(campaign, store).files == 2
 
 
 def test_an_index_that_lists_its_own_folder_is_refused(campaign: Campaign, tmp_path: Path) -> None:
