@@ -56,7 +56,7 @@ class Holder:
         if self.process == os.getpid() and self.token not in _held:
             # A lock of this process that it could not release, because the disk was full.
             return True
-        return _start_of(self.process) != self.process_started
+        return process_start(self.process) != self.process_started
 
 
 class Lock:
@@ -160,16 +160,19 @@ class Lock:
 
     def holder(self) -> Holder | None:
         """Return the present holder of the lock."""
+        return next(iter(self._holders(_L.campaign == self._database.campaign)), None)
+
+    def others_at_work(self) -> bool:
+        """Return whether a living process holds the lock of another campaign of the database."""
+        others = self._holders(_L.campaign != self._database.campaign)
+        return not all(holder.dead for holder in others)
+
+    def _holders(self, condition: sa.ColumnElement[bool]) -> list[Holder]:
         clock = self._database.clock()
-        query = sa.select(LOCK, (clock - _L.heartbeat).label("silent")).where(
-            _L.campaign == self._database.campaign
-        )
+        query = sa.select(LOCK, (clock - _L.heartbeat).label("silent")).where(condition)
         with self._database.transaction() as connection:
-            row = connection.execute(query).one_or_none()
-        if row is None:
-            return None
-        _campaign, *known, _heartbeat, silent = row
-        return Holder(*(*known, silent))
+            rows = connection.execute(query).all()
+        return [Holder(*(*known, silent)) for _campaign, *known, _heartbeat, silent in rows]
 
     def _own_row(self) -> tuple[sa.ColumnElement[bool], ...]:
         return _L.campaign == self._database.campaign, _L.token == self.token
@@ -186,7 +189,7 @@ class Lock:
             "holder": self.holder_name(),
             "machine": _machine(),
             "process": os.getpid(),
-            "process_started": _start_of(os.getpid()),
+            "process_started": process_start(os.getpid()),
         }
         statement = database.insert(LOCK).values(**values, acquired=clock, heartbeat=clock)
         if current is None:
@@ -246,7 +249,7 @@ def _namespace() -> str:
         return ""
 
 
-def _start_of(process: int) -> str:
+def process_start(process: int) -> str:
     """Return the start time of a process in units of its system; empty if it does not run."""
     # The program name, in brackets, may hold blanks.
     fields = _read(f"/proc/{process}/stat").rpartition(")")[2].split()

@@ -42,6 +42,10 @@ class Store(Ledger):
         holder = Lock(self).holder()
         return holder is not None and not holder.dead
 
+    def others_at_work(self) -> bool:
+        """Return whether a living process holds the lock of another campaign of the catalog."""
+        return Lock(self).others_at_work()
+
     def has_dead_run(self) -> bool:
         """Return whether the process of a run that did not end has died."""
         return self.has_open_run() and not self.in_use()

@@ -47,8 +47,9 @@ def verify_archive(
     inputs : bool
         Whether to read also the inputs: raw, dark, molecular and overlap files.
     """
-    if not store.in_use():
-        for path in versions.temporary_files(Path(campaign.output)):
+    temporary = list(versions.temporary_files(Path(campaign.output)))
+    if not _is_written(store):
+        for path in temporary:
             name = path.relative_to(campaign.output).as_posix()
             yield CheckedFile("temporary", name, LEFT_OVER)
     # Listed first: what a run writes from now on may be in the ledger only later.
@@ -69,9 +70,14 @@ def verify_archive(
 
 def _check_unlisted(store: Store, unlisted: set[str]) -> Iterator[CheckedFile]:
     """Yield files that no campaign of the database has made."""
-    if unlisted and not store.in_use():
+    if unlisted and not _is_written(store):
         for path in sorted(unlisted - store.made_by_any_campaign(unlisted)):
             yield CheckedFile("unlisted", path, _UNLISTED)
+
+
+def _is_written(store: Store) -> bool:
+    """Return whether a run may write products: campaigns of a catalog may share a folder."""
+    return store.in_use() or store.others_at_work()
 
 
 def _check_inputs(campaign: Campaign, store: Store) -> Iterator[CheckedFile]:

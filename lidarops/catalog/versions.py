@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from lidarops.catalog.lock import process_start
 from lidarops.errors import CatalogError
 
 FOLDER: Final = "superseded"
@@ -18,6 +20,9 @@ FOLDER: Final = "superseded"
 LONGEST_WRITE: Final = 3600.0
 """s for which a temporary file of a report is left alone, because reports are built outside the
 lock. What it holds is in memory before it is made: its writer only writes and syncs it."""
+_WRITER: Final = re.compile(r"\.(\d+)-[0-9a-f]+\.tmp$")
+"""The number of the process that writes a temporary file, in its name."""
+_LOADED: Final = time.time()
 
 _NO_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.EXDEV, errno.EMLINK, errno.ENOSYS})
 
@@ -69,7 +74,7 @@ def _link(source: Path, target: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        temporary = target.with_name(f".{target.name}.tmp")
+        temporary = target.with_name(f".{target.name}.{os.getpid()}-0.tmp")
         shutil.copy2(source, temporary)
         temporary.replace(target)
 
@@ -81,8 +86,16 @@ def drop(output: Path, kept: str) -> None:
             (output / kept).unlink(missing_ok=True)
 
 
-def sweep(output: Path) -> tuple[list[str], bool]:
+def sweep(output: Path, is_written: Callable[[], bool]) -> tuple[list[str], bool]:
     """Remove hidden temporary files that killed processes left among products and reports.
+
+    Parameters
+    ----------
+    output : Path
+        The output folder.
+    is_written : callable
+        Whether another run may write into it. Called once the files are listed: those of a run that
+        begins later are not among them.
 
     Returns
     -------
@@ -93,7 +106,10 @@ def sweep(output: Path) -> tuple[list[str], bool]:
     """
     swept: list[str] = []
     failures: list[OSError] = []
-    for path in temporary_files(output, failures):
+    paths = list(temporary_files(output, failures))
+    if is_written():
+        return [], False
+    for path in paths:
         try:
             path.unlink(missing_ok=True)
             swept.append(str(path))
@@ -103,10 +119,10 @@ def sweep(output: Path) -> tuple[list[str], bool]:
 
 
 def temporary_files(output: Path, failures: list[OSError] | None = None) -> Iterator[Path]:
-    """Yield the hidden temporary files among products and reports that no living process writes.
+    """Yield the hidden temporary files among products and reports that no process here writes.
 
-    A run must not be at work, but somebody may build a report. Folders that exist and cannot be
-    read are appended to the failures.
+    Processes of other machines may write them, if a run is at work. Folders that exist and cannot
+    be read are appended to the failures.
     """
 
     def note(error: OSError) -> None:
@@ -116,14 +132,28 @@ def temporary_files(output: Path, failures: list[OSError] | None = None) -> Iter
     for kept in ("products", FOLDER, "report"):
         for folder, _, names in os.walk(output / kept, onerror=note):
             for name in names:
+                if not (name.startswith(".") and name.endswith(".tmp")):
+                    continue
                 path = Path(folder, name)
-                temporary = name.startswith(".") and name.endswith(".tmp")
-                if temporary and (kept != "report" or _is_old(path)):
+                old = kept != "report" or _age(path) > LONGEST_WRITE
+                if old and not _has_writer(path):
                     yield path
 
 
-def _is_old(path: Path) -> bool:
-    try:
-        return time.time() - path.stat().st_mtime > LONGEST_WRITE
-    except OSError:
+def _has_writer(path: Path) -> bool:
+    """Return whether the process that a name states runs on this machine."""
+    writer = _WRITER.search(path.name)
+    if writer is None:
         return False
+    if int(writer[1]) == os.getpid():
+        # In containers, another process had the same number before.
+        return _age(path) <= time.time() - _LOADED
+    return bool(process_start(int(writer[1])))
+
+
+def _age(path: Path) -> float:
+    """Return the time since a file was last written, s; 0 where it is gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except OSError:
+        return 0.0

@@ -39,7 +39,7 @@ from lidarops.run.findings import find
 from lidarops.run.leftovers import Orphan
 from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
-from lidarops.run.session import Session
+from lidarops.run.session import Session, sweep
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
 from lidarops.steps.dependence import planned_products
 from lidarops.system.files import only_one
@@ -566,16 +566,15 @@ class _Pass:
         """Remove what a killed run left, if this one has not; another run may be at work."""
         if self.session is None and (self.store.has_dead_run() or self._is_littered()):
             _acquire(self.lock)
-            paths, complete = versions.sweep(Path(self.campaign.output))
-            for path in paths:
-                _LOG.warning("removed %s, left by a killed process", path)
-            if complete:
+            if sweep(self.store, Path(self.campaign.output)):
                 self.store.close_runs(self.lock.token)
 
     def _is_littered(self) -> bool:
         """Return whether there are temporary files that no run writes and this one may remove."""
         files = versions.temporary_files(Path(self.campaign.output))
-        return not self.store.in_use() and any(os.access(file.parent, os.W_OK) for file in files)
+        if self.store.in_use() or self.store.others_at_work():
+            return False
+        return any(os.access(file.parent, os.W_OK) for file in files)
 
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:

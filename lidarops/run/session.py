@@ -58,6 +58,18 @@ def new_run(campaign: Campaign) -> Run:
     )
 
 
+def sweep(store: Store, output: Path) -> bool:
+    """Remove temporary files of killed runs; return whether all are removed.
+
+    The lock must be held. None is removed while a run of another campaign is at work, which may
+    write into the same folder.
+    """
+    paths, complete = versions.sweep(output, store.others_at_work)
+    for path in paths:
+        _LOG.warning("removed %s, left by a killed process", path)
+    return complete
+
+
 class Session:
     """A run that enters each scene in the ledger as it ends.
 
@@ -98,17 +110,10 @@ class Session:
 
     def begin(self) -> None:
         """Enter the run in the ledger, and remove temporary files of killed runs."""
-        swept = self._sweep()
+        swept = sweep(self._store, self._output)
         self._store.begin_run(self._run, self._lock.token, swept=swept)
         if self._journal:
             self._journal.begin(self._record((), Findings()))
-
-    def _sweep(self) -> bool:
-        """Return whether all temporary files of killed runs could be removed."""
-        paths, complete = versions.sweep(self._output)
-        for path in paths:
-            _LOG.warning("removed %s, left by a killed process", path)
-        return complete
 
     def take(self, judged: Judgement, *, note: bool) -> None:
         """Prepare for a scene that is about to start: keep replaced versions.
@@ -202,7 +207,7 @@ class Session:
             Whether a worker may have left half a file.
         """
         if lost_worker:
-            self._sweep()
+            sweep(self._store, self._output)
         refused = (*self._store.refused(), *set_aside)
         listed = dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES))
         record = replace(

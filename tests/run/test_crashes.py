@@ -19,9 +19,12 @@ from support.archives import crash_archive, crash_runs
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
+from lidarops.catalog.verify import verify_archive
 from lidarops.errors import CatalogError
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 
+NO_PROCESS = 2**22 + 1
+"""Larger than the number of any process."""
 KILLS = int(os.environ.get("LIDAROPS_TEST_KILLS", "30"))
 
 
@@ -97,7 +100,7 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     campaign = crash_archive.make(tmp_path, scenes=2)
     reprocess(campaign)
     product = next((tmp_path / "out/products").rglob("*.nc"))
-    left = product.with_name(f".{product.name}.123-abcd.tmp")
+    left = product.with_name(f".{product.name}.{NO_PROCESS}-abcd.tmp")
     left.write_bytes(b"half of a product")
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
@@ -111,6 +114,46 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     reprocess(campaign)
     assert not left.exists()
     assert product.exists()
+
+
+def test_temporary_files_that_another_campaign_may_write_stay(tmp_path: Path) -> None:
+    campaign = crash_archive.make(tmp_path, scenes=2)
+    reprocess(campaign)
+    product = next((tmp_path / "out/products").rglob("*.nc"))
+    left = product.with_name(f".{product.name}.{NO_PROCESS}-abcd.tmp")
+    left.write_bytes(b"half of a product")
+    with Store(campaign.catalog_url, "other") as store, Lock(store) as lock:
+        lock.acquire()
+        assert reprocess(campaign) is None
+        product.unlink()
+        assert reprocess(campaign) is not None
+        assert left.exists(), "a run of another machine may write it"
+        with Store(campaign.catalog_url, campaign.name) as own:
+            assert not [file for file in verify_archive(campaign, own) if file.problem]
+    assert reprocess(campaign) is None
+    assert not left.exists()
+
+
+def test_temporary_files_of_living_processes_stay(tmp_path: Path) -> None:
+    """They may be of a campaign with another catalog."""
+    campaign = crash_archive.make(tmp_path, scenes=2)
+    reprocess(campaign)
+    product = next((tmp_path / "out/products").rglob("*.nc"))
+    with subprocess.Popen(["sleep", "60"]) as writer:
+        files = [
+            product.with_name(f".{product.name}.{number}-abcd.tmp")
+            for number in (writer.pid, os.getpid())
+        ]
+        for file in files:
+            file.write_bytes(b"half of a product")
+        assert reprocess(campaign) is None
+        product.unlink()
+        assert reprocess(campaign) is not None
+        assert all(file.exists() for file in files)
+        writer.kill()
+    os.utime(files[1], (0, 0))
+    assert reprocess(campaign) is None
+    assert not any(file.exists() for file in files), "also of an earlier process of this number"
 
 
 @pytest.fixture(scope="module")
