@@ -73,6 +73,8 @@ class ChannelLayout:
 
 UNREADABLE: Final = "cannot be read"
 """Start of the reason if a disk or a network did not give a file."""
+UNKNOWN_FORMAT: Final = "is of no known raw format"
+"""Start of the reason if no installed format recognises a file."""
 LONGEST_REASON: Final = 300
 """Characters of a reason that products state; a damaged header may be quoted in it."""
 
@@ -141,8 +143,13 @@ class UnusedFile(NamedTuple):
         """Return what products state of a refused file, each on one line.
 
         Not what a disk or network said: that may differ from try to try, and name other places.
+        Nor which formats are installed: products do not depend on it.
         """
-        reason = UNREADABLE if refused.reason.startswith(UNREADABLE) else refused.reason
+        reason = refused.reason
+        if reason.startswith(UNREADABLE):
+            reason = UNREADABLE
+        elif reason.startswith(UNKNOWN_FORMAT):
+            reason = reason.partition(" (")[0]
         return cls(_one_line(refused.path), refused.role, _one_line(reason)[:LONGEST_REASON])
 
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from lidarops.catalog.sources import RawFile, Source, path_pattern, printable
 from lidarops.errors import RawFormatError, RetrievalInputError
-from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
+from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
-from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
-from lidarops.raw.formats import UNKNOWN_FORMAT, parse_raw_header
+from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import HeaderOrder, RawHeader
-from lidarops.records import UNREADABLE, Granule, Role, Status
+from lidarops.records import UNKNOWN_FORMAT, UNREADABLE, Granule, Role, Status
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign, Instrument, Station

@@ -21,11 +21,8 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.header import RawHeader, Stretches, holds_text
+from lidarops.records import UNKNOWN_FORMAT
 from lidarops.registry import RAW_FORMATS, by_name, registered
-
-UNKNOWN_FORMAT: Final = "is of no known raw format"
-"""What is wrong with a file that no format recognises."""
-
 
 _INT32: Final = np.iinfo(np.int32)
 

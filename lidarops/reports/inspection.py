@@ -27,8 +27,8 @@ from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
 from lidarops.raw.file import RawFile
-from lidarops.raw.formats import UNKNOWN_FORMAT, raw_formats, read_raw_header
-from lidarops.records import Role
+from lidarops.raw.formats import raw_formats, read_raw_header
+from lidarops.records import UNKNOWN_FORMAT, Role
 
 _LONG: Final = {"comment", "history", "references"}
 """Attributes too long for a table; the JSON output has them."""

@@ -33,8 +33,10 @@ _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 # A secret may hold slashes, so it is matched up to the last @. In Azure URLs the @ separates
 # container and account.
 _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
-# Signatures and tokens stand there.
-_QUERY: Final = re.compile(r"""((?:https?|s3a?|gc?s|abfss?|az)://[^\s?'"]*)\?[^\s'")]*""")
+# Signatures and tokens stand in queries and fragments. Names of local files may hold their marks.
+_QUERY: Final = re.compile(
+    r"""(\b(?!file:)[A-Za-z][\w+.-]{0,30}://[^\s?#]*)[?#]\S*?(?=['")\]>,.;:]*(?:\s|$))"""
+)
 WITHOUT_KEYS: Final = rf"^(?!.*(?:{_KEYS.pattern}|{_QUERY.pattern}))"
 """Regular expression of texts that `without_keys` leaves as they are, for JSON schemas."""
 _BATCH: Final = 100
@@ -85,7 +87,7 @@ def is_url(location: str) -> bool:
 
 
 def without_keys(text: str) -> str:
-    """Return a text without the credentials in its URLs: what stands before the @, and queries."""
+    """Return a text without the credentials in its URLs: before the @, in queries, fragments."""
     return _QUERY.sub(r"\1", _KEYS.sub("", text))
 
 

@@ -196,6 +196,13 @@ def test_products_state_files_that_are_refused_later_and_forget_those_that_are_g
     assert _is_undisturbed(campaign, tmp_path)
 
 
+def test_products_do_not_depend_on_installed_formats(archive: Archive) -> None:
+    (archive.folder / "raw/poor/h015").write_text("x = 1\n" * 100)
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    assert "poor/h015: is of no known raw format: it is text" in _unused(campaign).values()
+
+
 def test_a_product_names_some_unused_files_and_counts_the_others(archive: Archive) -> None:
     for number in range(MOST_UNUSED + 3):
         (archive.folder / f"raw/poor/h01{number:02}").write_bytes(b"")

@@ -201,6 +201,11 @@ def test_a_store_that_does_not_answer_is_reported(
             "get https://host/a and 'https://host/b'",
         ),
         ("simplecache::s3://key:secret@bucket", "simplecache::s3://bucket"),
+        ("HTTPS://host/a?sig=x", "HTTPS://host/a"),
+        ("webhdfs://host/a?delegation=x", "webhdfs://host/a"),
+        ("https://host/a'b?sig=x'y", "https://host/a'b"),
+        ("(https://host/a#token=x).", "(https://host/a)."),
+        ("simplecache::file:///folder/a?b#c", "simplecache::file:///folder/a?b#c"),
         ("s3://bucket/a@b", "s3://bucket/a@b"),
         ("file:///folder/a@b", "file:///folder/a@b"),
         ("file:///folder/a?b", "file:///folder/a?b"),
@@ -222,6 +227,10 @@ def test_keys_are_left_out_of_messages(url: str, shown: str) -> None:
         "s3://bucket/a?secret=swordfish",
         "abfs://container@account/a?sig=swordfish",
         "simplecache::s3://key:swordfish@bucket",
+        "S3://bucket/a?secret=swordfish",
+        "oss://bucket/a?secret=swordfish",
+        "https://host/a'b?sig=swordfish",
+        "https://host/a#token=swordfish",
     ],
 )
 def test_a_url_with_keys_is_refused_with_the_way_to_give_them(url: str) -> None:
