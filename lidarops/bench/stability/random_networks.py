@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -155,11 +156,26 @@ FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
 )
 
 
-def score_networks(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
-    """Yield results of blocks of profiles of random networks, class by class."""
+_DECIDABLE: Final = (homogeneous, layered)
+"""Air of which some hundred networks decide the target where the model holds."""
+
+
+def score_networks(
+    cluster: int, profiles: int, *, of_all: float = math.inf
+) -> Iterator[tuple[ScoredValues, int]]:
+    """Yield results of blocks of profiles of random networks, class by class.
+
+    Parameters
+    ----------
+    cluster, profiles : int
+    of_all : float
+        Number of the cluster from which only undamaged homogeneous and layered air is drawn.
+    """
     for index, (failure, draw_air, damage) in held_first(FAILURES):
         # Curvature has a similar effect in every layer: half of the clusters are enough.
         if draw_air is _thin_layer and cluster % 2 == 1:
+            continue
+        if cluster >= of_all and not (damage is _undamaged and draw_air in _DECIDABLE):
             continue
         rng = np.random.default_rng((73, cluster, index))
         solved = _solve_damaged(rng, draw_air, damage, profiles)

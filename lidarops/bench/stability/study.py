@@ -84,10 +84,10 @@ class Draws:
         return self.score(cluster, self.profiles)
 
 
-def _blocks(draw_air: object, length: int, clusters: int) -> Draws:
+def _blocks(draw_air: object, length: int, clusters: int, profiles: int = 6) -> Draws:
     name = getattr(draw_air, "__name__", "")
     score = partial(random_networks.score_short_blocks, draw_air=draw_air, length=length)
-    return Draws(f"networks, {name}, blocks of {length}", "network", score, 6, clusters, 4)
+    return Draws(f"networks, {name}, blocks of {length}", "network", score, profiles, clusters, 4)
 
 
 def _scans(length: int) -> Draws:
@@ -118,7 +118,16 @@ DRAWS: Final = (
         6,
         pooled=True,
     ),
-    Draws("network", "network", random_networks.score_networks, 50, 300, 4, 0.05, pooled=True),
+    Draws(
+        "network",
+        "network",
+        partial(random_networks.score_networks, of_all=300),
+        50,
+        700,
+        4,
+        0.05,
+        pooled=True,
+    ),
     Draws("Raman", "raman", random_raman.score_raman, 8, 1000, 6, pooled=True),
     Draws("short sections", "homogeneous", random_sections.score_short_sections, 300, 600, 6),
     Draws("correlated noise", "homogeneous", random_sections.score_correlated_noise, 60, 400, 6),
@@ -131,8 +140,8 @@ DRAWS: Final = (
     _blocks(random_networks.plume, 1, 2000),
     _blocks(random_networks.plume, 2, 1500),
     _blocks(random_networks.plume, 3, 1500),
-    _blocks(random_networks.homogeneous, 1, 700),
-    _blocks(random_networks.layered, 1, 1000),
+    _blocks(random_networks.homogeneous, 1, 2000, 3),
+    _blocks(random_networks.layered, 1, 2500, 3),
     Draws(
         "networks, varying lidar ratio", "network", random_networks.score_lidar_ratios, 6, 200, 4
     ),
@@ -159,7 +168,7 @@ def measure_stability(
     selected = [draw for draw in draws if case in {None, draw.case, draw.retrieval}]
     others = [other for other in OTHERS if case in {None, other.case}]
     if not selected and not others:
-        names = dict.fromkeys(part.case for part in (*draws, *OTHERS))
+        names = dict.fromkeys([draw.case for draw in draws] + [other.case for other in OTHERS])
         raise CampaignError(
             f"no case {case!r}",
             remedy=f"choose: {' or '.join(names)}, or a part such as {draws[-1].retrieval!r}",
@@ -208,13 +217,16 @@ class _Other:
     title: str
     text: str
     measure: Callable[[Effort], Scores]
-    headings: dict[str, str]
+    line: str
+    """Heading of the column of cases."""
+    method: str
+    """Heading of the column of methods."""
 
     def chapter(self, scores: Scores) -> Chapter:
         """Return the table of the part."""
-        return Chapter(
-            self.title, self.text, [Results(self.title, rows_of_scores(scores), **self.headings)]
-        )
+        rows = rows_of_scores(scores)
+        results = Results(self.title, rows, case=self.line, method=self.method)
+        return Chapter(self.title, self.text, [results])
 
 
 def _flag_scores(effort: Effort) -> Scores:
@@ -233,7 +245,8 @@ OTHERS: Final = (
         "How many profiles of few photon counts are flagged although the model holds, and how"
         " many values of homogeneous paths a single bit rejects.",
         _flag_scores,
-        {"case": "flag", "method": "condition"},
+        "flag",
+        "condition",
     ),
     _Other(
         "order",
@@ -242,7 +255,8 @@ OTHERS: Final = (
         "How far values change with the order of the profiles of a block, and with the kernel of "
         "linear algebra.",
         _order_scores,
-        {"method": "figure"},
+        "case",
+        "figure",
     ),
 )
 

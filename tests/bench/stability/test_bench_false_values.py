@@ -132,6 +132,12 @@ def test_twice_the_target_in_one_class_of_homogeneous_paths_is_found():
         assert np.mean(found) > FOUND - 0.03, name
 
 
+def networks(cluster, profiles):
+    """Yield networks without missing bins, with which one of seven is accepted: too few to tell."""
+    chunks = random_networks.score_networks(cluster, profiles)
+    yield from takewhile(lambda chunk: chunk[0].failure.name != "gaps", chunks)
+
+
 KNOWN = {
     ("calm air", "extinction"), ("layer of a few altitudes", "extinction"),
     ("calm air, blocks of 1", "extinction"),
@@ -152,18 +158,18 @@ KNOWN = {
     ("score", "clusters", "profiles", "confined"),
     [
         pytest.param(random_homogeneous.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
-        pytest.param(random_sections.score_short_sections, 100, 150, 0.0, id="short sections"),
+        pytest.param(random_sections.score_short_sections, 600, 300, 0.0, id="short sections"),
         pytest.param(random_signals.score_signals, 200, 50, 0.0, id="signal chain"),
         pytest.param(random_elastic.score_elastic, 400, 20, 0.0, id="elastic"),
         pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
         pytest.param(
-            partial(random_scans.score_short_scans, length=1), 150, 4, 0.0, id="scans, blocks of 1"
+            partial(random_scans.score_short_scans, length=1), 400, 4, 0.0, id="scans, blocks of 1"
         ),
         pytest.param(
-            partial(random_scans.score_short_scans, length=2), 150, 4, 0.0, id="scans, blocks of 2"
+            partial(random_scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
         ),
         pytest.param(random_raman.score_raman, 1000, 4, 0.0, id="Raman"),
-        pytest.param(random_networks.score_networks, 1200, 50, CONFINED, id="network"),
+        pytest.param(networks, 1200, 50, CONFINED, id="network"),
     ],
 )
 @pytest.mark.slow
