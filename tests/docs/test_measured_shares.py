@@ -23,6 +23,7 @@ SINGLE = {
     ("background, known shape", "shape of hazy air"): ("signal", "background_method"),
     ("voltage", "analog noise below half a step"): ("signal", ""),
     ("backscatter", "more haze than stated"): ("elastic", ""),
+    ("lidar ratio", "model holds"): ("raman", "lidar_ratio"),
     ("network", "plume, blocks of 1"): ("visibility", ""),
     ("network", "layered, blocks of 1"): ("visibility", ""),
     ("network", "lidar ratio, 2 % declared"): ("visibility", ""),
