@@ -164,19 +164,35 @@ class Granules(Database):
     def files_in(self, folder: str) -> list[DatedFile]:
         """Return the good files that lie in a folder itself; of the archive where it is empty."""
         columns = (_C.path, _C.instrument, _C.role, _C.start)
-        query = sa.select(*columns).where(
-            _C.campaign == self.campaign, _C.status == Status.GOOD.value
-        )
+        query = sa.select(*columns).where(*self._good_below(folder))
         begin = f"{folder}/" if folder else ""
-        if folder:
-            # All paths that begin so: "0" follows "/".
-            query = query.where(_C.path > begin, _C.path < f"{folder}0")
         with self.stream(query) as rows:
             return [
                 DatedFile(path, instrument, _ROLES[role], start.replace(tzinfo=UTC))
                 for path, instrument, role, start in self.decoded(rows)
                 if "/" not in path[len(begin) :]
             ]
+
+    def days_below(self, folder: str, instrument: str) -> list[datetime]:
+        """Return when the first good signal file of each day starts, of those below a folder."""
+        query = (
+            sa.select(sa.func.min(_C.start))
+            .where(
+                *self._good_below(folder),
+                _C.instrument == instrument,
+                _C.role == Role.SIGNAL.value,
+            )
+            .group_by(_C.day)
+        )
+        with self.transaction() as connection:
+            return sorted(start.replace(tzinfo=UTC) for start in connection.scalars(query))
+
+    def _good_below(self, folder: str) -> list[sa.ColumnElement[bool]]:
+        conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
+        if folder:
+            # All paths that begin so: "0" follows "/".
+            conditions += [_C.path > f"{folder}/", _C.path < f"{folder}0"]
+        return conditions
 
     def count(self, *, status: Status | None = None) -> int:
         """Return the number of granules."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from operator import attrgetter
-from typing import NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
@@ -21,25 +21,34 @@ from lidarops.plan.scenes import DARK_REACH, window_at
 from lidarops.records import Granule, Role, Scene
 from lidarops.steps.dependence import with_unused
 
+MOST_IN_DOUBT: Final = 10
+"""Dark files of unknown time that a scene names; all those of an archive may be refused."""
+_ALWAYS: Final = (datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
+
 
 class Refused(NamedTuple):
     """A refused file, and a time to which it belongs."""
 
     granule: Granule
     time: datetime
+    in_doubt: bool = False
+    """Whether it belongs only to scenes without dark files, of which it may be the one."""
 
 
 def dated(
     campaign: Campaign,
     refused: Iterable[Granule],
     files_in: Callable[[str], Iterable[DatedFile]],
+    days_below: Callable[[str, str], Sequence[datetime]],
 ) -> Iterator[Refused]:
     """Yield refused files with the times of the good files beside which they belong.
 
     These are the ones before and after in the order of names, of the same folder, instrument and
     role. Where both are of one window, the file is of this window too. Elsewhere its name must have
     more in common with theirs than names of different windows have. A file for which this holds for
-    neither is not yielded: the files of a whole day may be unreadable.
+    neither is not yielded: the files of a whole day may be unreadable. But a dark file may be the
+    only one of its time, so it is yielded, in doubt, with all days of the nearest signal files from
+    the dark file before to the one after.
 
     Parameters
     ----------
@@ -47,6 +56,8 @@ def dated(
     refused : iterable of Granule
     files_in : callable
         Returns the good files of a folder.
+    days_below : callable
+        Returns times of the good signal files of an instrument below a folder, one for each day.
     """
     folders: dict[str, list[Granule]] = defaultdict(list)
     for granule in refused:
@@ -57,10 +68,33 @@ def dated(
             if file.instrument in campaign.instruments:
                 rows[file.instrument, file.role].append(file)
         series = {key: _Series.of(campaign, files) for key, files in rows.items()}
+        undated: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
         for granule in granules:
             beside = series.get((granule.instrument, granule.role))
-            for time in beside.times_beside(granule.path) if beside else ():
-                yield Refused(granule, time)
+            times = beside.times_beside(granule.path) if beside else []
+            yield from (Refused(granule, time) for time in times)
+            # Where good dark files are of one window, their names do not show how those of others
+            # differ.
+            sure = beside and times and beside.in_common >= 0
+            if granule.role is Role.DARK and not sure:
+                since, until = beside.times_around(granule.path) if beside else _ALWAYS
+                undated[granule.instrument, since, until].append(granule)
+        for (instrument, since, until), dark in undated.items():
+            days = _nearest(folder, instrument, days_below)
+            within = [day for day in days if since <= day <= until]
+            for granule in dark[:MOST_IN_DOUBT]:
+                yield from (Refused(granule, day, in_doubt=True) for day in within)
+
+
+def _nearest(
+    folder: str, instrument: str, days_below: Callable[[str, str], Sequence[datetime]]
+) -> Sequence[datetime]:
+    """Return the days of an instrument in a folder, or in the first above it that holds some."""
+    days = days_below(folder, instrument)
+    while folder and not days:
+        folder = folder.rpartition("/")[0]
+        days = days_below(folder, instrument)
+    return days
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +124,17 @@ class _Series:
             for index in near
             if between or _alike(self.files[index].path, path) > self.in_common
         ]
+
+    def times_around(self, path: str) -> tuple[datetime, datetime]:
+        """Return the times of the files before and after a path; of no file, all times."""
+        place = bisect(self.files, path, key=attrgetter("path"))
+        before, after = _ALWAYS
+        if place:
+            before = self.files[place - 1].start
+        if place < len(self.files):
+            after = self.files[place].start
+        # The order of names need not be that of times.
+        return min(before, after), max(before, after)
 
 
 def _windows(campaign: Campaign, files: Iterable[DatedFile]) -> Iterator[datetime]:
@@ -130,5 +175,7 @@ def _named(scene: Scene, refused: dict[str, list[Refused]]) -> Scene:
 def _belongs(file: Refused, scene: Scene) -> bool:
     if file.granule.role is Role.SIGNAL:
         return scene.start <= file.time < scene.stop
+    if file.in_doubt and scene.dark:
+        return False
     starts = [granule.start for granule in scene.granules if granule.start]
     return starts[0] - DARK_REACH <= file.time <= starts[-1] + DARK_REACH

@@ -384,7 +384,8 @@ class Judge:
     @cached_property
     def _refused(self) -> tuple[Refused, ...]:
         """Files that the catalog refuses, with times to which they belong."""
-        return tuple(dated(self.campaign, self._store.refused(), self._store.files_in))
+        store = self._store
+        return tuple(dated(self.campaign, store.refused(), store.files_in, store.days_below))
 
     def _header(self, granule: Granule) -> RawHeader | None:
         """Return the header of a file; None where this file cannot be read now."""

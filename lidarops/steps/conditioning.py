@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
-from lidarops.records import DetectionMode, Granule, Role
+from lidarops.records import DetectionMode, Granule, LeftOut, Role
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
@@ -140,7 +140,9 @@ class Dark(Step[ChannelCase, DarkSettings]):
             return
         count = len(case.scene.dark)
         if not count:
-            yield Leave("no dark files within 24 h of the scene", number=0.0)
+            refused = any(file.role is Role.DARK for file in case.scene.unused)
+            which = "dark files that can be used" if refused else "dark files"
+            yield Leave(f"no {which} within 24 h of the scene", number=0.0)
             return
         times = sorted(granule.start for granule in case.scene.dark if granule.start)
         profiles = [granule.start for granule in case.scene.granules if granule.start]
@@ -171,6 +173,11 @@ class Dark(Step[ChannelCase, DarkSettings]):
     def held(self, settings: DarkSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the signals of dark files, and of their mean at the peak."""
         return _BYTES_OF_A_DARK_BIN * len(work.scene.dark) * work.bins
+
+
+def lacks_dark(entry: LeftOut) -> bool:
+    """Return whether an entry of a plan says that dark files are wanting."""
+    return entry.name == Dark.name and entry.number == 0.0
 
 
 _BYTES_OF_A_DARK_BIN: Final = 24.0

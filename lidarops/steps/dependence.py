@@ -26,7 +26,7 @@ from lidarops.records import (
     UnusedFile,
 )
 from lidarops.steps.channels import READ_STEP
-from lidarops.steps.conditioning import DARK
+from lidarops.steps.conditioning import DARK, lacks_dark
 from lidarops.steps.reading import ARCHIVE, required_by
 from lidarops.steps.registry import definition, gives
 from lidarops.steps.step import Definition
@@ -268,13 +268,15 @@ def with_unused(scene: Scene, refused: Iterable[Granule]) -> Scene:
 def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     """Return the unused files of a scene that a product would be made from.
 
+    Dark files also where the plan subtracts none for want of them.
+
     Parameters
     ----------
     scene : Scene
     plan : Plan
         Plan of the product, from `plan_closure`.
     """
-    dark = _reads_dark(plan)
+    dark = _reads_dark(plan) or any(map(lacks_dark, plan.left_out))
     return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
 
 

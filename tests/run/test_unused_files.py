@@ -6,7 +6,7 @@ import errno
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from lidarops.catalog.granules import DatedFile
 from lidarops.errors import CatalogError
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.global_attributes import MOST_UNUSED, UNUSED_INPUTS
-from lidarops.plan.unused_files import dated
+from lidarops.plan.unused_files import MOST_IN_DOUBT, dated
 from lidarops.records import Grade, Granule, Role, Status
 from lidarops.reports.inspection import describe
 from lidarops.run.archive import bring_up_to_date, reprocess
@@ -224,6 +224,61 @@ def test_a_product_states_dark_files_only_if_it_subtracts_some(tmp_path: Path) -
     assert not any(text for name, text in stated.items() if "_poor_" in name)
 
 
+def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
+    refused = [
+        Granule(f"dark/{n:04}", 0, 0, "poor", Role.DARK, Status.REFUSED, "x") for n in range(1000)
+    ]
+    start = datetime(2026, 3, 1, tzinfo=UTC)
+    days = [start + timedelta(days=day) for day in range(3650)]
+    named = dated(archive.write(), refused, lambda _: [], lambda folder, _: [] if folder else days)
+    assert sum(1 for _ in named) == MOST_IN_DOUBT * len(days)
+
+
+@pytest.mark.parametrize(
+    ("good", "cut", "days"),
+    [
+        ([], "rich/d0", {1, 2, 3, 4}),
+        # Beside the other dark file as well.
+        (["rich/d0"], "rich/d3", {1, 2, 3, 4}),
+        # Days 1, 2 and 4 are within 24 h of the others.
+        (["rich/d0", "rich/d3"], "rich/d1", {3}),
+        ([], "rich/dark/d0", {1, 2, 3, 4}),
+    ],
+    ids=["the only one", "the last one", "others serve", "a folder of its own"],
+)
+def test_products_without_dark_subtraction_state_the_dark_file_that_may_be_theirs(
+    tmp_path: Path, good: list[str], cut: str, days: set[int]
+) -> None:
+    archive = Archive(tmp_path, days=4)
+    del archive.tree["instruments"]["poor"]
+    rich = archive.tree["instruments"]["rich"]
+    rich |= {"dark_files": ["rich/d*", "rich/dark/d*"], "products": {"signal": {}}}
+    (archive.folder / "raw/rich/d0").unlink()
+    for name in good:
+        archive.raw(name, 700 + 1440 * int(name[-1]), seed=99)
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    whole = _unused(campaign)
+    assert set(whole.values()) == {""}
+    file = archive.raw(cut, 700 + 1440 * int(cut[-1]), seed=98)
+    content = file.read_bytes()
+    file.write_bytes(content[:-100])
+    reprocess(campaign)
+    stated = {
+        name for name, text in _unused(campaign).items() if text.startswith(f"dark file {cut}: ")
+    }
+    assert {int(name[-2:]) for name in stated} == days
+    assert all("analog" in name for name in stated)
+    for product in campaign.products_root.rglob("*.nc"):
+        if product.stem.partition("T")[0] in stated and not good:
+            assert reproduce_product(product, archive=tmp_path / "raw").identical
+            assert "no dark files that can be used within 24 h" in str(describe(product))
+    assert reprocess(campaign) is None
+    file.unlink()
+    reprocess(campaign)
+    assert _unused(campaign) == whole
+
+
 @pytest.mark.parametrize(
     ("path", "days"),
     [
@@ -261,5 +316,7 @@ def test_a_refused_file_belongs_beside_the_files_of_like_names(
         "other": [DatedFile("other/a01", "other", Role.SIGNAL, start)],
     }
     refused = Granule(path, 0, 0, "poor", Role.SIGNAL, Status.REFUSED, "cannot be read: Stale")
-    beside = dated(archive.write(), [refused], lambda folder: files.get(folder, []))
+    beside = dated(
+        archive.write(), [refused], lambda folder: files.get(folder, []), lambda *_: [start]
+    )
     assert [file.time.day for file in beside] == days
