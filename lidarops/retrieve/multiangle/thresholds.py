@@ -211,11 +211,6 @@ class Thresholds:
     least_scale: float = 0.7
     """Least scale of the smoothing error of a profile, because a thin haze may still have a sharp
     layer. With 1, errors would be too large where profiles differ by noise alone; simulations."""
-    hidden_layer: float = 0.2
-    """Least smoothing error over the extinction, if the model has as much: noise may hide a layer.
-    With 0.15, 1.2 of 1000 values of 8 scans were false in random scenes by random errors, with 0.2
-    1.0, with 0.25 more than 97 percent were covered by 95; without, every 34th in the test
-    `test_a_layer_that_noise_hides_is_covered`."""
     most_freedom: float = 10.0
     """Degrees of freedom from which a profile may be undersmoothed; assumed."""
     roughest: float = 0.4

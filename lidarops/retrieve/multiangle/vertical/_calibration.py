@@ -188,29 +188,21 @@ def _trust(signal: Array, variance: Array) -> Array:
     return share
 
 
-def variance_ratios(
-    calibration: Calibration, upper: Integers, lower: Integers, roughness: float = 1.0
-) -> Array:
-    """Return variances of differences of optical depths over the posterior ones.
+def variance_ratio(calibration: Calibration, upper: Integers, lower: Integers) -> Array:
+    """Return calibrated over posterior variance of differences of optical depths.
 
     Parameters
     ----------
     calibration : Calibration
     upper, lower : (difference,) int64
         Altitudes in ascending order; -1 for the lidar.
-    roughness : float
-        Square of the roughness of the air over that of the model.
 
     Returns
     -------
-    (3, profile, difference) float64
-        Calibrated variance, its part by smoothing, and that part in air as rough as stated.
+    (profile, difference) float64
     """
     known = sandwich(calibration, upper, lower)
     below = np.where(lower >= 0, calibration.bias[:, np.maximum(lower, 0)], 0.0)
-    bias, scale = calibration.bias[:, upper] - below, calibration.scale[:, np.newaxis]
-    posterior, noise, model, of_pilot = known
-    square = scale * _smoothing_square(bias, known)
-    as_rough = np.stack([posterior, noise, roughness * model, of_pilot])
-    likely = scale * _smoothing_square(bias, as_rough)
-    return np.asarray(np.stack([noise + square, square, likely]) / posterior)
+    square = _smoothing_square(calibration.bias[:, upper] - below, known)
+    factor: Array = (known[1] + calibration.scale[:, np.newaxis] * square) / known[0]
+    return factor

@@ -34,8 +34,6 @@ class SmoothingChoice:
     """Mean over the scored profiles and the candidates."""
     saturated: bool
     """Whether the best weight is the largest that is allowed."""
-    roughness: float
-    """Square of the roughness of the air that the likelihood shows, over that of the weights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,31 +97,16 @@ def choose_smoothing(scores: Scores) -> SmoothingChoice:
     risky = max(risky, likely - PER_DECADE)
     rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
     best = risky if rougher else likely
-    weight, whole = GRID[best : best + 1], np.ones(1)
-    roughness = _roughness(scores.likelihood, weight, whole)
-    return SmoothingChoice(weight, whole, float(scores.freedom[best]), best == last, roughness)
-
-
-def _roughness(likelihood: Array, weight: Array, share: Array) -> float:
-    """Return the ratio of formula 7 of the page.
-
-    Air is smoother than the weights have it where Cp chose them, or where more smoothness is not
-    allowed.
-    """
-    likely = _relative_likelihood(likelihood)
-    root = float((likely / np.sqrt(GRID)).sum() / likely.sum())
-    return min(1.0, root**2 / float((share / weight).sum()))
-
-
-def _relative_likelihood(likelihood: Array) -> Array:
-    return np.asarray(np.exp(-0.5 * (likelihood - likelihood.min())))
+    return SmoothingChoice(
+        GRID[best : best + 1], np.ones(1), float(scores.freedom[best]), best == last
+    )
 
 
 def _average(scores: Scores, last: int) -> SmoothingChoice:
-    share = _relative_likelihood(scores.likelihood[: last + 1])
+    likelihood = scores.likelihood[: last + 1]
+    share = np.exp(-0.5 * (likelihood - likelihood.min()))
     kept = np.flatnonzero(share > THRESHOLDS.negligible_likelihood)
     share = share[kept] / share[kept].sum()
     freedom = float((share * scores.freedom[kept]).sum())
     saturated = int(kept[np.argmax(share)]) == last
-    roughness = _roughness(scores.likelihood, GRID[kept], share)
-    return SmoothingChoice(GRID[kept], share, freedom, saturated, roughness)
+    return SmoothingChoice(GRID[kept], share, freedom, saturated)

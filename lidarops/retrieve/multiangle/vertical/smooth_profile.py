@@ -28,8 +28,6 @@ Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
-_SLIGHTLY: Final = 1e-4
-"""Relative change of the weight of smoothness by which variances are differentiated."""
 _UNIFORM: Final = 1e-3
 """Largest relative deviation of a step from the mean step; allows for rounded altitudes."""
 
@@ -59,9 +57,6 @@ class _Candidates:
     share: Array
     """(candidate,), 1 in total."""
 
-    roughness: float
-    """Square of the roughness of the air over that of the model."""
-
     def solve(self, right: Array, bands: Array, stiffness: Array) -> Array:
         """Return solutions and the bands of the inverse, (4, profile * candidate, altitude)."""
         profiles, count = len(right), self.share.size
@@ -69,17 +64,6 @@ class _Candidates:
         row, smoothing = np.repeat(np.arange(profiles), count), np.tile(self.smoothing, profiles)
         _banded.solve_banded(bands, right, stiffness, row, smoothing, out)
         return out
-
-    def smoother(self) -> _Candidates:
-        """Return weights that are slightly larger."""
-        return replace(self, smoothing=self.smoothing * (1.0 + _SLIGHTLY))
-
-    def by_noise(self, variance: Array, smoother: Array) -> Array:
-        """Return the part of the variances that the noise adds, (profile, altitude).
-
-        Smoothing adds the decrease of a variance with the logarithm of the weight.
-        """
-        return self.mean(variance - (variance - smoother) / _SLIGHTLY)
 
     def mean(self, values: Array) -> Array:
         """Average (profile * candidate, altitude) rows into (profile, altitude)."""
@@ -107,8 +91,6 @@ class _Fit:
     extinction: Array
     """Optical depth of the layer from the altitude below."""
     extinction_variance: Array
-    extinction_by_noise: Array
-    """Part of the variance."""
     own: Array
     """Weight of each estimate in its own optical depth."""
 
@@ -175,21 +157,15 @@ class VerticalResult:
         if lower >= 0:
             right[:, lower] = -1.0
         estimates = _banded.multiply_rows(fit.bands, block.estimates)
-        candidates = fit.candidates
-        solutions = (
-            weights.solve(rows, fit.bands, block.stiffness)[0]
-            for weights, rows in (
-                (candidates, right), (candidates.smoother(), right), (candidates, estimates),
-            )
-        )  # fmt: skip
-        posterior, smoother, value = (
-            rows[:, [upper]] - (rows[:, [lower]] if lower >= 0 else 0.0) for rows in solutions
+        inverse, solved = (
+            fit.candidates.solve(rows, fit.bands, block.stiffness)[0] for rows in (right, estimates)
         )
-        depth, variance = candidates.mixed(value, posterior)
-        by_noise = candidates.by_noise(posterior, smoother)
-        variance = self.ratio.layer_variance(
-            np.array([upper]), np.array([lower]), depth, variance, by_noise
+        posterior, value = (
+            rows[:, [upper]] - (rows[:, [lower]] if lower >= 0 else 0.0)
+            for rows in (inverse, solved)
         )
+        depth, variance = fit.candidates.mixed(value, posterior)
+        variance *= self.ratio.of(np.array([upper]), np.array([lower]))
         reached = np.isfinite(self.optical_depth[:, upper])
         return (
             np.where(reached, depth[:, 0], np.nan),
@@ -205,47 +181,18 @@ class _Ratio:
     """None if the block is too small to be calibrated."""
     inflation: Array
     """(altitude,): because the noise is estimated from few residuals."""
-    roughness: float
-    """As in `_Candidates`."""
 
     def of(self, upper: Integers, lower: Integers) -> Array:
         """Return the factor on the variance of differences of optical depths.
 
         The shape is (profile, difference), or (difference,) if common to all profiles.
         """
-        few = self._few(upper, lower)
+        below = np.where(lower >= 0, self.inflation[np.maximum(lower, 0)], 1.0)
+        few: Array = np.maximum(self.inflation[upper], below)
         if self.calibration is None:
             return few
-        factor: Array = few * _calibration.variance_ratios(self.calibration, upper, lower)[0]
+        factor: Array = few * _calibration.variance_ratio(self.calibration, upper, lower)
         return factor
-
-    def _few(self, upper: Integers, lower: Integers) -> Array:
-        below = np.where(lower >= 0, self.inflation[np.maximum(lower, 0)], 1.0)
-        return np.asarray(np.maximum(self.inflation[upper], below))
-
-    def layer_variance(
-        self, upper: Integers, lower: Integers, depth: Array, variance: Array, by_noise: Array
-    ) -> Array:
-        """Return variances of the optical depths of layers, formula 8 of the page.
-
-        Those from the lidar keep the whole part by smoothing.
-
-        Parameters
-        ----------
-        upper, lower : (layer,) int64
-        depth, variance, by_noise : (profile, layer) float64
-            Optical depths, posterior variances, and their part by noise.
-        """
-        if self.calibration is None:
-            part = variance - by_noise
-            whole, likely = variance, self.roughness * part
-        else:
-            whole, part, likely = variance * _calibration.variance_ratios(
-                self.calibration, upper, lower, self.roughness
-            )
-        hidden = (THRESHOLDS.hidden_layer * depth) ** 2
-        kept = np.where(lower >= 0, np.minimum(part, np.maximum(likely, hidden)), part)
-        return np.asarray(self._few(upper, lower) * (whole - part + kept))
 
 
 def smooth_optical_depth(
@@ -300,7 +247,6 @@ def smooth_optical_depth(
     ratio = _Ratio(
         _calibrate(block, fit, within) if calibrated else None,
         _inflation(freedom, block.correlation, altitude.size),
-        fit.candidates.roughness,
     )
     return _result(block, fit, ratio, within, np.diff(altitude, prepend=0.0))
 
@@ -348,12 +294,12 @@ def _fit(block: _Block, information: Array) -> _Fit:
     choice = _smoothing_choice.choose_smoothing(
         _smoothing_choice.score_smoothing(bands, block.estimates, block.stiffness, unit)
     )
-    candidates = _Candidates(choice.smoothing * unit, choice.share, choice.roughness)
+    candidates = _Candidates(choice.smoothing * unit, choice.share)
     right = _banded.multiply_rows(bands, block.estimates)
     solved, diagonal, beside, second = candidates.solve(right, bands, block.stiffness)
     gained = np.diff(solved, axis=1, prepend=0.0)
-    uncertain = _gained_variance(diagonal, beside)
-    smoother = candidates.smoother().solve(right, bands, block.stiffness)
+    uncertain = diagonal.copy()
+    uncertain[:, 1:] += diagonal[:, :-1] - 2.0 * beside[:, :-1]
     repeated = np.repeat(bands, choice.share.size, axis=1)
     own = _own_weights(repeated, np.array([diagonal, beside, second]))
     return _Fit(
@@ -363,16 +309,8 @@ def _fit(block: _Block, information: Array) -> _Fit:
         candidates,
         *candidates.mixed(solved, diagonal),
         *candidates.mixed(gained, uncertain),
-        candidates.by_noise(uncertain, _gained_variance(*smoother[1:3])),
         candidates.mean(own),
     )
-
-
-def _gained_variance(diagonal: Array, beside: Array) -> Array:
-    """Return the variance of the layer from the altitude below."""
-    variance = diagonal.copy()
-    variance[:, 1:] += diagonal[:, :-1] - 2.0 * beside[:, :-1]
-    return variance
 
 
 def _precision(block: _Block, information: Array) -> Array:
@@ -455,10 +393,7 @@ def _result(
 ) -> VerticalResult:
     rows = np.arange(step.size)
     error = np.sqrt(fit.variance * ratio.of(rows, np.full(step.size, -1)))
-    gained_variance = ratio.layer_variance(
-        rows, rows - 1, fit.extinction, fit.extinction_variance, fit.extinction_by_noise
-    )
-    extinction_error = np.sqrt(gained_variance) / step
+    extinction_error = np.sqrt(fit.extinction_variance * ratio.of(rows, rows - 1)) / step
     certain = within & (np.abs(fit.depth) > error)
     response = _respond(block, fit, fit.depth)
     share = np.where(certain, response / np.where(certain, fit.depth, 1.0), np.nan)

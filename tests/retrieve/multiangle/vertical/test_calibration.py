@@ -129,7 +129,7 @@ def test_small_optical_depth_does_not_make_the_smoothing_error_small():
 
 def test_smoothing_error_is_scaled_and_noise_is_not():
     c = replace(calibration(), scale=np.array([1.0, 4.0]), bias=np.full((2, HEIGHTS), 5.0))
-    unscaled, fourfold = _calibration.variance_ratios(c, ROWS, np.full(HEIGHTS, -1))[0]
+    unscaled, fourfold = _calibration.variance_ratio(c, ROWS, np.full(HEIGHTS, -1))
     known = _calibration.sandwich(c, ROWS, np.full(HEIGHTS, -1))
     noise = known[1] / known[0]
     np.testing.assert_allclose(fourfold - noise, 4.0 * (unscaled - noise), rtol=1e-9)

@@ -108,18 +108,6 @@ def test_at_least_two_degrees_of_freedom_are_left():
     assert not choose_smoothing(scores(30, 30)).saturated
 
 
-def test_roughness_is_that_of_the_likelihood_where_the_weight_is_smaller():
-    assert choose_smoothing(scores(30, 30)).roughness == pytest.approx(1.0, abs=0.1)
-    a_decade = choose_smoothing(scores(30, 5)).roughness
-    assert a_decade == pytest.approx(0.1, rel=0.1)
-    beyond = choose_smoothing(scores(66, 66))
-    expected = float(beyond.smoothing[0] / GRID[66])
-    assert expected < 0.1
-    assert beyond.roughness == pytest.approx(expected, rel=0.5)
-    assert choose_smoothing(scores(66, 66, profiles=7)).roughness < 0.2
-    assert choose_smoothing(scores(30, 30, profiles=7)).roughness == pytest.approx(1.0, abs=0.1)
-
-
 def test_small_block_is_averaged_by_likelihood():
     choice = choose_smoothing(scores(30, 5, profiles=7))
     assert choice.share.sum() == pytest.approx(1.0)
