@@ -204,6 +204,20 @@ def _project(block: Any, tables: Tables, s: _Scratch) -> None:
 
 
 @_compiled
+def _all_have_gaps(block: Any) -> bool:
+    """Return whether no profile of the block can be solved here; look no further than needed."""
+    for p in range(BLOCK):
+        profile, gaps = block[p], False
+        for i in range(profile.size):
+            if not math.isfinite(profile[i]):
+                gaps = True
+                break
+        if not gaps:
+            return False
+    return True
+
+
+@_compiled
 def _classify(tables: Tables, s: _Scratch) -> None:
     """Set aside profiles that cannot be solved here; change the sign of inverted signals."""
     size = tables.size
@@ -538,10 +552,11 @@ def _settle_constant(tables: Tables, s: _Scratch, mode: Mode) -> None:
 
 @_compiled
 def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> None:
+    if _all_have_gaps(block):
+        s.state[:] = ROUTED
+        return
     _project(block, tables, s)
     _classify(tables, s)
-    if np.all(s.state == ROUTED):
-        return
     _start(tables, s)
     _leap(tables, s)
     _settle(tables, s)

@@ -1,4 +1,4 @@
-"""Compiled fits of the homogeneous path at a given background or from a given extinction."""
+"""Compiled fits of the homogeneous path from a given extinction."""
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
@@ -10,7 +10,12 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.homogeneous._direct import begin, describe, find_extinction, unscale
+from lidarops.retrieve.homogeneous._direct import (
+    begin,
+    describe,
+    unscale,
+    weigh,
+)
 from lidarops.retrieve.homogeneous._estimate import (
     AMPLITUDE,
     AMPLITUDE_RELATIVE_VARIANCE,
@@ -28,11 +33,10 @@ from lidarops.retrieve.homogeneous._misfit import describe_bend_given, judge_res
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
+    ProjectionScratch,
     compiled,
     evaluate,
     make_scratch,
-    product,
-    total_of,
 )
 
 Array = npt.NDArray[np.float64]
@@ -77,35 +81,44 @@ def _moved(p: Point, row: Array) -> Point:
         p.norm,
         p.slope_norm,
         p.gradient,
+        p.gauss,
         p.curvature,
+        p.energy,
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_above(
+@compiled
+def _solve_from(
     power: Any,
     noise: Array,
     is_variance: bool,
     rounding: float,
-    background: Array,
+    extinction: Array,
     g: Grid,
+    s: ProjectionScratch,
     out: Array,
+    is_prior: bool,
 ) -> None:
-    """Fit amplitude and extinction above given backgrounds, (profile or 1,).
-
-    The other parameters are those of `_direct.solve_direct`.
-    """
-    s = make_scratch(g.x.size, g.group_shapes.shape[1])
+    unit = 1.0
     for k in range(power.shape[0]):
+        if k < noise.shape[0]:
+            unit = weigh(noise[k], is_variance, s)
         row = out[k]
-        mode = (is_variance, rounding, background[k % background.size])
-        reference, scale, unit = begin(power[k], noise[k % noise.shape[0]], mode, s, row)
+        reference, scale, sums = begin(power[k], (unit, rounding, math.nan), s, row)
         if row[STATUS] == FITTED:
-            sums = (total_of(s.w), product(s.w, s.z), 0.0)
-            tau, p = find_extinction(g, s, sums)
+            tau = g.length * extinction[k % extinction.size]
+            p = evaluate(tau, g, s, sums)
             describe(g, s, p, tau, sums, row)
+            if is_prior:
+                _step(g, p, tau, row)
+                tau = row[EXTINCTION]
+                row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
+                p = _moved(evaluate(tau, g, s, sums), row)
             spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
             judge_residuals(g, s, p, tau, sums, spacing, row)
+            if not is_prior:
+                _describe_given(p, sums.weight, row)
+                describe_bend_given(p, row)
             unscale(g, reference, scale, unit, row)
 
 
@@ -125,24 +138,4 @@ def solve_from(
     From a prior, one linear step leads to the extinction. The other parameters are those of
     `_direct.solve_direct`.
     """
-    s = make_scratch(g.x.size, g.group_shapes.shape[1])
-    for k in range(power.shape[0]):
-        row = out[k]
-        mode = (is_variance, rounding, math.nan)
-        reference, scale, unit = begin(power[k], noise[k % noise.shape[0]], mode, s, row)
-        if row[STATUS] == FITTED:
-            tau = g.length * extinction[k % extinction.size]
-            sums = (total_of(s.w), product(s.w, s.z), 1.0)
-            p = evaluate(tau, g, s, sums)
-            describe(g, s, p, tau, sums, row)
-            if is_prior:
-                _step(g, p, tau, row)
-                tau = row[EXTINCTION]
-                row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
-                p = _moved(evaluate(tau, g, s, sums), row)
-            spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
-            judge_residuals(g, s, p, tau, sums, spacing, row)
-            if not is_prior:
-                _describe_given(p, sums[0], row)
-                describe_bend_given(p, row)
-            unscale(g, reference, scale, unit, row)
+    _solve_from(power, noise, is_variance, rounding, extinction, g, make_scratch(g), out, is_prior)

@@ -28,6 +28,7 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
+_FITTED_BACKGROUND: Final = np.full(1, np.nan)
 _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
 """Deviation from even spacing by rounding, over the last range."""
 
@@ -100,7 +101,7 @@ def _tables(problem: PathProblem) -> Tables | None:
 
 def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
     """Solve by least squares for all three unknowns."""
-    return _solution(_estimate(problem, _direct.solve_direct), problem)
+    return _solution(_estimate(problem, _direct.solve_direct, _FITTED_BACKGROUND), problem)
 
 
 def solve_by_linearization(problem: PathProblem) -> PathSolution:
@@ -125,7 +126,7 @@ def solve_with_known_background(problem: PathProblem) -> PathSolution:
     """Solve for amplitude and extinction above the given background."""
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
-    fit = _estimate(problem, _given.solve_above, background)
+    fit = _estimate(problem, _direct.solve_direct, background)
     spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
         added = _AddedVariances(
@@ -152,7 +153,7 @@ def solve_by_cubic(problem: PathProblem) -> PathSolution:
 def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Array) -> PathSolution:
     """Fit amplitude and extinction above a background that depends on the same power."""
     background = estimate.background
-    fit = _estimate(problem, _given.solve_above, background)
+    fit = _estimate(problem, _direct.solve_direct, background)
     spread = _propagated(problem, fit, gradients)
     fit = replace(
         fit,

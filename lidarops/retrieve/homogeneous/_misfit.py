@@ -22,6 +22,7 @@ from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
     ProjectionScratch,
+    Sums,
     compiled,
     evaluate,
     largest_of,
@@ -32,6 +33,7 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 
 INDEPENDENT: Final = THRESHOLDS.independent
+_Triple = tuple[float, float, float]
 
 
 class _TestShapes(NamedTuple):
@@ -41,9 +43,9 @@ class _TestShapes(NamedTuple):
     square ``phi^2``, as of a nonlinear detector.
     """
 
-    bent: tuple[float, float, float]
+    bent: _Triple
     """With level, shape and slope."""
-    square: tuple[float, float, float]
+    square: _Triple
     bent_norm: float
     shared: float
     square_norm: float
@@ -53,27 +55,31 @@ class _TestShapes(NamedTuple):
 def _sum_test_shapes(x: Array, w: Array, phi: Array, p: Point) -> _TestShapes:
     b0 = b1 = b2 = q0 = q1 = q2 = bb = bq = qq = 0.0
     for i in range(phi.size):
-        lever = x[i] - p.centroid
-        bent, square = lever * lever * phi[i], phi[i] * phi[i]
-        shape, slope = phi[i] - p.mean_phi, -2.0 * lever * phi[i] - p.mean_t
-        weighted_bent, weighted_square = w[i] * bent, w[i] * square
-        b0 += weighted_bent
-        b1 += weighted_bent * shape
-        b2 += weighted_bent * slope
+        lever, first, square = x[i] - p.centroid, w[i] * phi[i], phi[i] * phi[i]
+        bent, weighted_square = first * lever * lever, w[i] * square
+        b0 += bent
+        b1 += bent * phi[i]
+        b2 += bent * phi[i] * lever
         q0 += weighted_square
-        q1 += weighted_square * shape
-        q2 += weighted_square * slope
-        bb += weighted_bent * bent
-        bq += weighted_bent * square
+        q1 += weighted_square * phi[i]
+        q2 += weighted_square * phi[i] * lever
+        bb += bent * phi[i] * lever * lever
+        bq += bent * square
         qq += weighted_square * square
-    return _TestShapes((b0, b1, b2), (q0, q1, q2), bb, bq, qq)
+    return _TestShapes(
+        (b0, b1 - p.mean_phi * b0, -2.0 * b2 - p.mean_t * b0),
+        (q0, q1 - p.mean_phi * q0, -2.0 * q2 - p.mean_t * q0),
+        bb,
+        bq,
+        qq,
+    )
 
 
 class _Residuals(NamedTuple):
     """Weighted sums over the residuals."""
 
     energy: float
-    model: tuple[float, float, float]
+    model: _Triple
     """Products with level, shape and slope."""
     bent: float
     square: float
@@ -81,20 +87,32 @@ class _Residuals(NamedTuple):
 
 @summing
 def _sum_residuals(g: Grid, s: ProjectionScratch, fit: Point, p: Point) -> _Residuals:
-    """Fill the residuals in units of the noise; return their sums."""
+    """Fill the squared residuals in units of the noise; return the sums of the residuals."""
     energy = level = shape = slope = bent = square = 0.0
+    above = fit.mean_z - fit.b * fit.mean_phi
     for i in range(s.z.size):
         phi, lever = s.phi[i], g.x[i] - p.centroid
-        residual = s.z[i] - fit.mean_z - fit.b * (phi - fit.mean_phi)
+        residual = s.z[i] - above - fit.b * phi
         pull = s.w[i] * residual
+        s.residual[i] = pull * residual
         energy += pull * residual
-        s.residual[i] = math.sqrt(s.w[i]) * residual
         level += pull
-        shape += pull * (phi - p.mean_phi)
-        slope += pull * (-2.0 * lever * phi - p.mean_t)
-        bent += pull * lever * lever * phi
-        square += pull * phi * phi
-    return _Residuals(energy, (level, shape, slope), bent, square)
+        pull *= phi
+        shape += pull
+        square += pull * phi
+        pull *= lever
+        slope += pull
+        bent += pull * lever
+    model = (level, shape - p.mean_phi * level, -2.0 * slope - p.mean_t * level)
+    return _Residuals(energy, model, bent, square)
+
+
+@compiled
+def _fill_residuals(s: ProjectionScratch, fit: Point) -> None:
+    """Fill the residuals in units of the noise."""
+    above = fit.mean_z - fit.b * fit.mean_phi
+    for i in range(s.z.size):
+        s.residual[i] = math.sqrt(s.w[i]) * (s.z[i] - above - fit.b * s.phi[i])
 
 
 @summing
@@ -113,15 +131,12 @@ def _second_differences(s: ProjectionScratch, spacing: int) -> tuple[float, floa
 
 
 @compiled
-def _remainder(
-    product: float,
-    a: tuple[float, float, float],
-    b: tuple[float, float, float],
-    p: Point,
-    w0: float,
-) -> float:
-    """Return the part of the product of two vectors that is orthogonal to the model."""
-    return product - (a[0] * b[0] / w0 + a[1] * b[1] / p.norm + a[2] * b[2] / p.slope_norm)
+def _remainder(product: float, a: _Triple, b: _Triple, per: _Triple) -> float:
+    """Return the part of the product of two vectors that is orthogonal to the model.
+
+    `per` are the inverse squared lengths of level, shape and slope.
+    """
+    return product - (a[0] * b[0] * per[0] + a[1] * b[1] * per[1] + a[2] * b[2] * per[2])
 
 
 @compiled
@@ -131,15 +146,16 @@ def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, f
     Both are orthogonalised against the model, and the square against the bent signal.
     """
     energy = count = shared = 0.0
-    norm = _remainder(t.bent_norm, t.bent, t.bent, p, w0)
-    pulled = _remainder(r.bent, t.bent, r.model, p, w0)
+    per = (1.0 / w0, 1.0 / p.norm, 1.0 / p.slope_norm)
+    norm = _remainder(t.bent_norm, t.bent, t.bent, per)
+    pulled = _remainder(r.bent, t.bent, r.model, per)
     if norm > INDEPENDENT * t.bent_norm:
         energy += pulled * pulled / norm
         count += 1.0
-        shared = _remainder(t.shared, t.bent, t.square, p, w0) / norm
-    norm = _remainder(t.square_norm, t.square, t.square, p, w0) - shared * shared * norm
+        shared = _remainder(t.shared, t.bent, t.square, per) / norm
+    norm = _remainder(t.square_norm, t.square, t.square, per) - shared * shared * norm
     if norm > INDEPENDENT * t.square_norm:
-        along = _remainder(r.square, t.square, r.model, p, w0) - shared * pulled
+        along = _remainder(r.square, t.square, r.model, per) - shared * pulled
         energy += along * along / norm
         count += 1.0
     return energy, count
@@ -175,26 +191,29 @@ def judge_residuals(
     s: ProjectionScratch,
     p: Point,
     tau: float,
-    sums: tuple[float, float, float],
+    sums: Sums,
     noise_spacing: int,
     row: Array,
-) -> None:
+) -> _Triple:
     """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal.
 
-    A spacing of 0 stands for a known variance.
+    A spacing of 0 stands for a known variance. Returns the products of the residuals with level,
+    shape and slope.
     """
-    w0, wz, free = sums
+    w0, free = sums.weight, sums.free
     shapes = _sum_test_shapes(g.x, s.w, s.phi, p)
     _describe_bend(shapes, p, w0, free, row)
     full = p
     if free == 0.0:
         # The test shapes are orthogonal to the background even where it is given.
-        full = evaluate(tau, g, s, (w0, wz, 1.0))
+        full = evaluate(tau, g, s, Sums(sums.bins, w0, sums.value, sums.square, 1.0))
         shapes = _sum_test_shapes(g.x, s.w, s.phi, full)
-    residuals = _sum_residuals(g, s, p, full)
+    residuals: _Residuals = _sum_residuals(g, s, p, full)
     row[MISFIT] = residuals.energy
-    row[LARGEST] = largest_of(s.residual)
+    row[LARGEST] = math.sqrt(largest_of(s.residual))
     row[TREND], row[TREND_COUNT] = _trend(shapes, residuals, full, w0)
     row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
     if noise_spacing > 0:
+        _fill_residuals(s, p)
         row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s, noise_spacing)
+    return residuals.model

@@ -11,13 +11,14 @@ and divided by a power of two, the weights divided by a power of two.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.homogeneous._vector_loops import STRIDE, shape_moments
 
 Array = npt.NDArray[np.float64]
 
@@ -27,18 +28,25 @@ GROUPED: Final = 4
 _MOST_SINGLE: Final = 128
 """Profiles with more bins are searched on the first `BLOCK` bins and on sums over groups of
 `GROUPED` bins beyond."""
-BLOCK: Final = 16
+BLOCK: Final = STRIDE
 """Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning. Functions that may be
 # reassociated have to be inlined: see `lidarops.retrieve.background._shape_fit`.
 _SUMS: Final = {"reassoc", "contract", "nsz"}
-# Forced inlining also saves reference counting of arrays passed between functions.
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-summing = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
-finding = numba.njit(
-    cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"}
-)
+# Forced inlining lets functions share loops. Without the runtime they cannot allocate, and count no
+# references to arrays, which takes longer than a loop.
+_INLINED: Final[dict[str, Any]] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "forceinline": True,
+}
+_BARE: Final[dict[str, Any]] = {**_INLINED, "_nrt": False}
+allocating = numba.njit(**_INLINED)
+compiled = numba.njit(**_BARE)
+summing = numba.njit(**_BARE, fastmath=_SUMS)
+finding = numba.njit(**_BARE, fastmath={*_SUMS, "nnan"})
 
 
 class Grid(NamedTuple):
@@ -55,9 +63,9 @@ class Grid(NamedTuple):
     spacing: float
     scale: float
     shapes: Array
-    """(node, bin): phi of every node."""
+    """(2, bin, node): phi of every node, and its square."""
     group_shapes: Array
-    """(node, group): the same, averaged over groups of bins."""
+    """(2, group, node): phi averaged over groups of bins, and its square."""
     start: float
     """R_0, m."""
     length: float
@@ -67,16 +75,34 @@ class Grid(NamedTuple):
 
 
 class ProjectionScratch(NamedTuple):
-    z: Array
+    given: Array
+    """Weights by the noise alone, 0 where it is not usable."""
+    rows: Array
+    """(2, bin): weights, 0 where the power is not usable either, and weights times values."""
     w: Array
+    """The first of them."""
+    wz: Array
+    """The second."""
+    z: Array
     phi: Array
     residual: Array
     used: Array
-    fine: Array
-    lengths: Array
-    weights: Array
-    """Sums over groups of bins."""
-    values: Array
+    products: Array
+    """(3, node)."""
+    groups: Array
+    """(2, group): sums of `rows` over groups of bins."""
+
+
+class Sums(NamedTuple):
+    """Weighted sums over a loaded profile."""
+
+    bins: float
+    weight: float
+    value: float
+    square: float
+    """Of the squared values."""
+    free: float
+    """1 where the background is fitted, 0 where it is given."""
 
 
 class Point(NamedTuple):
@@ -90,7 +116,11 @@ class Point(NamedTuple):
     norm: float
     slope_norm: float
     gradient: float
+    gauss: float
+    """The curvature but for what the residuals add."""
     curvature: float
+    energy: float
+    """Of the residuals, by differences: no better than the rounding of the squared values."""
 
 
 _NEIGHBOURS: Final = np.ones(1, np.int64)
@@ -125,11 +155,11 @@ def make_grid(
     nodes = scale * np.sinh(np.linspace(first, last, NODES))
     nodes[0], nodes[-1] = lowest, highest
     envelope = (range_[0] / (range_[0] + length * x)) ** 2
-    shapes = np.exp(-2.0 * nodes[:, np.newaxis] * x) * envelope
+    shapes = np.exp(-2.0 * nodes * x[:, np.newaxis]) * envelope[:, np.newaxis]
     groups = shapes
     if range_.size > _MOST_SINGLE:
-        far = shapes[:, BLOCK:].reshape(NODES, -1, GROUPED).mean(axis=2)
-        groups = np.concatenate([shapes[:, :BLOCK], far], axis=1)
+        far = shapes[BLOCK:].reshape(-1, GROUPED, NODES).mean(axis=1)
+        groups = np.concatenate([shapes[:BLOCK], far])
     return Grid(
         x=x,
         envelope=envelope,
@@ -138,35 +168,44 @@ def make_grid(
         first=first,
         spacing=(last - first) / (NODES - 1),
         scale=scale,
-        shapes=shapes,
-        group_shapes=groups,
+        shapes=np.stack([shapes, shapes**2]),
+        group_shapes=np.stack([groups, groups**2]),
         start=float(range_[0]),
         length=length,
         noise_spacing=frozen(noise_spacing),
     )
 
 
-@compiled
-def make_scratch(n: int, groups: int) -> ProjectionScratch:
+@allocating
+def make_scratch(g: Grid) -> ProjectionScratch:
+    n, rows = g.x.size, np.zeros((2, g.x.size))
     return ProjectionScratch(
         np.zeros(n),
+        rows,
+        rows[0],
+        rows[1],
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
-        np.zeros(BLOCK),
-        np.zeros(NODES),
-        np.zeros(groups),
-        np.zeros(groups),
+        np.zeros((3, NODES)),
+        np.zeros((2, g.group_shapes.shape[1])),
     )
 
 
 @finding
 def largest_of(values: Array) -> float:
-    largest = 0.0
-    for i in range(values.size):
-        largest = max(largest, abs(values[i]))
-    return largest
+    """Return the largest absolute value of an array of whole blocks."""
+    a = b = c = d = 0.0
+    # Four maxima side by side do not wait for each other.
+    step = values.size // 4
+    second, third, fourth = values[step:], values[2 * step :], values[3 * step :]
+    for i in range(step):
+        a = max(a, abs(values[i]))
+        b = max(b, abs(second[i]))
+        c = max(c, abs(third[i]))
+        d = max(d, abs(fourth[i]))
+    return max(a, b, c, d)
 
 
 @compiled
@@ -197,89 +236,58 @@ def total_of(values: Array) -> float:
 
 
 @compiled
-def _shape(tau: float, x: Array, envelope: Array, step: float, phi: Array, fine: Array) -> None:
-    n = phi.size
-    if step == 0.0:
-        for i in range(n):
-            phi[i] = math.exp(-2.0 * tau * x[i]) * envelope[i]
-        return
-    # Two short geometric series instead of many exponentials: few roundings and no long chain.
-    ratio = math.exp(-2.0 * tau * step)
-    fine[0] = 1.0
-    for j in range(1, BLOCK):
-        fine[j] = fine[j - 1] * ratio
-    coarse = 1.0
-    ratio = math.exp(-2.0 * BLOCK * tau * step)
-    for k in range(0, n, BLOCK):
-        block, falling = phi[k : k + BLOCK], envelope[k : k + BLOCK]
-        for j in range(BLOCK):
-            block[j] = coarse * fine[j] * falling[j]
-        coarse *= ratio
-
-
-@summing
-def _moments(x: Array, w: Array, z: Array, phi: Array) -> tuple[float, float, float, float, float]:
-    s1 = s2 = sz = x1 = x2 = 0.0
-    for i in range(z.size):
-        weighted = w[i] * phi[i]
-        square = weighted * phi[i]
-        s1 += weighted
-        s2 += square
-        sz += weighted * z[i]
-        x1 += weighted * x[i]
-        x2 += square * x[i]
-    return s1, s2, sz, x1, x2
-
-
-@summing
-def _gradients(
-    x: Array,
-    w: Array,
-    z: Array,
-    phi: Array,
-    mean_phi: float,
-    mean_z: float,
-    b: float,
-    centroid: float,
-    mean_t: float,
-) -> tuple[float, float, float, float, float]:
-    """Return the products of residual, shape and its slope that a Newton step needs."""
-    rt = tt = rh = r0 = r1 = 0.0
-    for i in range(z.size):
-        lever = -2.0 * (x[i] - centroid)
-        first = lever * phi[i]
-        centred = phi[i] - mean_phi
-        slope = first - mean_t
-        residual = w[i] * (z[i] - mean_z - b * centred)
-        rt += residual * slope
-        tt += w[i] * slope * slope
-        rh += residual * lever * first
-        r0 += residual
-        r1 += residual * centred
-    return rt, tt, rh, r0, r1
+def _moments(tau: float, g: Grid, s: ProjectionScratch) -> Any:
+    """Fill the shape; return the products of `_vector_loops.shape_moments`."""
+    envelope = g.envelope
+    if g.step == 0.0:
+        envelope = s.phi
+        for i in range(envelope.size):
+            envelope[i] = math.exp(-2.0 * tau * g.x[i]) * g.envelope[i]
+    decay = math.exp(-2.0 * tau * g.step)
+    e2 = decay * decay
+    e4 = e2 * e2
+    return shape_moments(
+        g.x.ctypes.data,
+        s.w.ctypes.data,
+        s.wz.ctypes.data,
+        envelope.ctypes.data,
+        envelope.size // BLOCK,
+        decay,
+        e2,
+        e4,
+        e4 * e4,
+        s.phi.ctypes.data,
+    )
 
 
 @compiled
-def evaluate(tau: float, g: Grid, s: ProjectionScratch, sums: tuple[float, float, float]) -> Point:
-    w0, wz, free = sums
-    x, w, z, phi = g.x, s.w, s.z, s.phi
-    _shape(tau, x, g.envelope, g.step, phi, s.fine)
-    s1, s2, sz, x1, x2 = _moments(x, w, z, phi)
-    mean_phi, mean_z = free * s1 / w0, free * wz / w0
-    norm = s2 - s1 * mean_phi
+def evaluate(tau: float, g: Grid, s: ProjectionScratch, sums: Sums) -> Point:
+    """Return the linear fit at one extinction, from one pass over the bins."""
+    w0, wz, free = sums.weight, sums.value, sums.free
+    q0, q1, q2, p0, p1, p2, y0, y1, y2 = _moments(tau, g, s)
+    mean_phi, mean_z = free * q0 / w0, free * wz / w0
+    norm = p0 - q0 * mean_phi
     # About the information centroid, amplitude and extinction are uncorrelated.
-    centroid = (x2 - mean_phi * x1) / norm
-    mean_t = -2.0 * free * (x1 - centroid * s1) / w0
-    b = (sz - mean_phi * wz) / norm
-    rt, tt, rh, r0, r1 = _gradients(x, w, z, phi, mean_phi, mean_z, b, centroid, mean_t)
+    centroid = (p1 - mean_phi * q1) / norm
+    mean_t = -2.0 * free * (q1 - centroid * q0) / w0
+    along = y0 - mean_phi * wz
+    b = along / norm
+    # Residuals have no product with level and shape.
+    level = mean_z - b * mean_phi
+    first = y1 - level * q1 - b * p1
+    second = y2 - level * q2 - b * p2
+    rt, rh = -2.0 * first, 4.0 * (second - 2.0 * centroid * first)
+    tt = 4.0 * (p2 - centroid * (2.0 * p1 - centroid * p0)) - w0 * mean_t * mean_t
     return Point(
-        b + r1 / norm,
-        mean_z + free * r0 / w0,
+        b,
+        mean_z,
         mean_phi,
         mean_t,
         centroid,
         norm,
         tt,
         b * rt,
+        b * b * tt,
         b * b * tt - rt * rt / norm - b * rh,
+        sums.square - mean_z * wz - b * along,
     )

@@ -172,9 +172,65 @@ project_4_12 = _projection(rows=4, vectors=3)
 """``project_4_12(values, stride, matrix, terms, out, ahead, ahead_step)``: write the (4, 12)
 products of 4 rows of float64 `values`, `stride` bytes apart, with the (terms, 12) `matrix`, each
 summed over the terms in order; prefetch memory from the address `ahead` meanwhile."""
+project_2_24 = _projection(rows=2, vectors=6)
+project_1_24 = _projection(rows=1, vectors=6)
 project_1_12 = _projection(rows=1, vectors=3)
 project_1_8 = _projection(rows=1, vectors=2)
 project_1_4 = _projection(rows=1, vectors=1)
+
+
+def _decays(v: _Lanes, b: Any, e1: Any, e2: Any, e4: Any, e8: Any) -> list[Any]:
+    """Return the powers 0 to `STRIDE` - 1 of a decay from bin to bin, as two vectors."""
+    first = v.where(v.splat(v.cast(e1)), 1)
+    for power, bit in ((e2, 2), (e4, 4)):
+        first = b.fmul(first, v.where(v.splat(v.cast(power)), bit))
+    return [first, b.fmul(first, v.splat(v.cast(e8)))]
+
+
+@intrinsic
+def _shape_moments(  # type: ignore[no-untyped-def]
+    context, x, weights, values, envelope, steps, e1, e2, e4, e8, out
+):
+    """Write a shape to `out`; return its 3 x 3 products.
+
+    They are those of 1, x and x^2 with the weighted shape, the weighted square of the shape, and
+    the shape times the values, which are weighted. The shape is ``e1**i * envelope[i]``; arrays are
+    addresses of float64, of `steps` steps of `STRIDE` bins. The others are as in `residuals`.
+    """
+    signature = types.UniTuple(types.float64, 9)(
+        *[types.intp] * 5, *[types.float64] * 4, types.intp
+    )
+
+    def generate(target: Any, b: Any, _: Any, given: Any) -> Any:
+        x, weights, values, envelope, steps, e1, e2, e4, e8, out = given
+        v = _Lanes(b, _DOUBLE, _HALF, f"v{_HALF}f64")
+        decays = _decays(v, b, e1, e2, e4, e8)
+        e16 = b.fmul(e8, e8)
+        loop = _Loop(b, steps)
+        scale = loop.carried(_DOUBLE, ir.Constant(_DOUBLE, 1.0))
+        carried = [loop.carried(v.type, v.zero) for _ in range(9)]
+        factor, totals = v.splat(scale), list(carried)
+        for half, decay in enumerate(decays):
+            at = b.mul(loop.index, _integer(STRIDE * v.size))
+            at = b.add(at, _integer(_HALF * v.size * half))
+            distance = v.load(b.add(x, at))
+            shape = b.fmul(b.fmul(factor, decay), v.load(b.add(envelope, at)))
+            v.store(shape, b.add(out, at))
+            weighted = b.fmul(shape, v.load(b.add(weights, at)))
+            terms = (weighted, b.fmul(weighted, shape), b.fmul(shape, v.load(b.add(values, at))))
+            for j, term in enumerate(terms):
+                first = b.fmul(term, distance)
+                totals[3 * j] = b.fadd(totals[3 * j], term)
+                totals[3 * j + 1] = b.fadd(totals[3 * j + 1], first)
+                totals[3 * j + 2] = v.fma(first, distance, totals[3 * j + 2])
+        loop.close([(scale, b.fmul(scale, e16)), *zip(carried, totals, strict=True)])
+        sums = [v.fold(total, b.fadd) for total in totals]
+        return target.make_tuple(b, signature.return_type, sums)
+
+    return signature, generate
+
+
+shape_moments: Any = _shape_moments
 
 
 def _residual_pass(*, single: bool) -> Any:
@@ -190,11 +246,7 @@ def _residual_pass(*, single: bool) -> Any:
             element = ir.FloatType() if single else _DOUBLE
             v = _Lanes(b, element, _HALF, f"v{_HALF}f{32 if single else 64}")
             level = v.splat(v.cast(background))
-            first = v.where(v.splat(v.cast(e1)), 1)
-            for power, bit in ((e2, 2), (e4, 4)):
-                factors = v.where(v.splat(v.cast(power)), bit)
-                first = b.fmul(first, factors)
-            decays = [first, b.fmul(first, v.splat(v.cast(e8)))]
+            decays = _decays(v, b, e1, e2, e4, e8)
             e16 = b.fmul(e8, e8)
             loop = _Loop(b, steps)
             scale = loop.carried(_DOUBLE, amplitude)

@@ -71,6 +71,22 @@ def test_result_is_the_least_squares_minimum_with_the_errors_of_its_information(
         assert fit.valid_bins[k] == bins
 
 
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("bins", [12, 40, 225])
+@pytest.mark.parametrize("level", [-1e6, -5.0, 0.0, 1e6])
+@pytest.mark.parametrize("extinction", [0.0, 0.05, 2.0])
+def test_profiles_with_gaps_are_at_the_global_minimum(extinction, level, bins, known):
+    r = section(2500.0, 3000.0, bins)
+    rng = np.random.default_rng([bins, known])
+    power = level + signal(r, 1e4, extinction * KM) + rng.normal(size=(6, bins))
+    power[rng.random(power.shape) < 0.3] = np.nan
+    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None)
+    for k in range(6):
+        background, _, expected = slow_fit(r, power[k], np.isfinite(power[k]).astype(float))
+        assert abs(fit.extinction[k] - expected) < 1e-3 * fit.extinction_standard_error[k]
+        assert abs(fit.background[k] - background) < 1e-3 * fit.background_standard_error[k]
+
+
 @pytest.mark.filterwarnings("ignore:divide by zero")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("case", CASES)
