@@ -241,6 +241,9 @@ class _Scan:
             values["sha256"] = digest
             same = digest is not None and digest == before.sha256
             self._changed += not (same and before.scan_key == values["scan_key"])
+            # The time of a file that was good is known, also if its name tells none. The stamps
+            # leave it out, so that a scan that knows no more writes nothing.
+            values["start"] = values["start"] or before.start
         self._pending.append(row)
         if len(self._pending) >= _BATCH:
             self._flush()

@@ -1,7 +1,8 @@
 """Find the scenes to which refused files belong: their products state that these are unused.
 
 The header of a file that cannot be read gives no time. Names of raw files follow their time, so
-such a file is taken to belong where the files beside it in its folder belong.
+such a file is taken to belong where the files beside it in its folder belong, unless the catalog
+knew its time before.
 """
 
 from __future__ import annotations
@@ -70,6 +71,9 @@ def dated(
         series = {key: _Series.of(campaign, files) for key, files in rows.items()}
         undated: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
         for granule in granules:
+            if granule.start:
+                yield Refused(granule, granule.start)
+                continue
             beside = series.get((granule.instrument, granule.role))
             times = beside.times_beside(granule.path) if beside else []
             yield from (Refused(granule, time) for time in times)

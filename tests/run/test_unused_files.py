@@ -224,6 +224,35 @@ def test_a_product_states_dark_files_only_if_it_subtracts_some(tmp_path: Path) -
     assert not any(text for name, text in stated.items() if "_poor_" in name)
 
 
+@pytest.mark.parametrize("name", ["h0640", "h0700"])
+def test_a_file_that_was_good_belongs_to_its_scene_whatever_its_name(
+    tmp_path: Path, name: str
+) -> None:
+    """The last one of an hour and the first of the next, of names that are numbered on."""
+    archive = Archive(tmp_path, days=0)
+    del archive.tree["instruments"]["rich"]
+    archive.tree["scenes"] = {"window": "1h"}
+    for minute in range(0, 120, 20):
+        archive.raw(f"poor/h{600 + minute:04d}", 600 + minute, seed=minute)
+    campaign = archive.write()
+    assert reprocess(campaign) is not None
+    file = archive.folder / "raw/poor" / name
+    content = file.read_bytes()
+    file.write_bytes(bytes(9))
+    assert reprocess(campaign) is not None
+    hour = {"h0640": "T100000", "h0700": "T110000"}[name]
+    stating = set()
+    for path in campaign.products_root.rglob("*.nc"):
+        with xr.open_dataset(path) as product:
+            if f"poor/{name}: " in product.attrs.get(UNUSED_INPUTS, ""):
+                stating.add(path.stem[-7:])
+    assert stating == {hour}
+    assert reprocess(campaign) is None
+    file.write_bytes(content)
+    reprocess(campaign)
+    assert set(_unused(campaign).values()) == {""}
+
+
 def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
     refused = [
         Granule(f"dark/{n:04}", 0, 0, "poor", Role.DARK, Status.REFUSED, "x") for n in range(1000)
