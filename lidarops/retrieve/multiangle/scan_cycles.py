@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -108,7 +110,10 @@ def cycles(
 ) -> Integers:
     """Return the number of the cycle of each profile.
 
-    A cycle ends before the first direction that it already contains. It also ends at a pause (from
+    A cycle ends before the first direction that it already contains. The vertical is part of every
+    vertical plane, so that a volume returns to it with each azimuth: it ends a cycle only if all
+    beams of the cycle and the next have one azimuth, or if a direction that followed it in the
+    cycle follows it again. A cycle also ends at a pause (from
     the end of a profile to the start of the next) of more than 3 median intervals between starts,
     more than 1.5 times the longest dwell in a direction, and longer than the cycle up to it: a scan
     slews for less time than it measured before.
@@ -140,11 +145,13 @@ def cycles(
     RetrievalInputError
         For angles out of range, or times that do not rise.
     """
-    index = directions(zenith_angle, azimuth).index
+    scan = directions(zenith_angle, azimuth)
+    index = scan.index
     bounds = _bounds(time_bnds, index.size)
     stretch = _stretches(bounds, index)
     known = np.flatnonzero(index != _UNKNOWN)
-    numbers = _cycle_numbers(index[known], stretch[known], bounds[known])
+    bearing = np.where(_tilted(scan.zenith_angle), scan.azimuth, np.nan)
+    numbers = _cycle_numbers(index[known], stretch[known], bounds[known], bearing)
     previous = np.searchsorted(known, np.arange(index.size), side="right") - 1
     return np.append(numbers, 0)[np.maximum(previous, 0)] if known.size else np.zeros_like(index)
 
@@ -237,26 +244,47 @@ def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, In
     return plane, side
 
 
-def _cycle_numbers(index: Integers, stretch: Integers, bounds: Array) -> Integers:
-    """Return the cycles of profiles of known direction."""
+def _cycle_numbers(index: Integers, stretch: Integers, bounds: Array, bearing: Array) -> Integers:
+    """Return the cycles of profiles of known direction.
+
+    `bearing` is that of each direction, degree; NaN along the vertical.
+    """
     if index.size == 0:
         return np.empty(0, dtype=np.int64)
     begins = np.zeros(index.size, dtype=np.int64)
-    seen: set[int] = set()
+    # In order of their first visits.
+    seen: dict[int, None] = {}
     first = 0
-    for profile in _visits(index, stretch):
+    visits = _visits(index, stretch)
+    for number, profile in enumerate(visits):
         direction = int(index[profile])
         before = max(profile - 1, 0)
         stopped = bounds[before, 1]
         paused = stretch[profile] != stretch[before] and (
             bounds[profile, 0] - stopped > stopped - bounds[first, 0]
         )
-        if direction in seen or paused:
+        returns = direction in seen
+        if returns and np.isnan(bearing[direction]):
+            returns = _vertical_ends(list(seen), direction, index[visits[number + 1 :]], bearing)
+        if returns or paused:
             begins[profile] = 1
             seen.clear()
             first = profile
-        seen.add(direction)
+        seen[direction] = None
     return np.cumsum(begins)
+
+
+def _vertical_ends(seen: list[int], vertical: int, later: Integers, bearing: Array) -> bool:
+    """Return whether a cycle ends before a vertical beam that it already contains.
+
+    `seen` are the directions of the cycle in order, `later` those of the visits after the beam.
+    """
+    beams = bearing[[*seen, *later[:1]]]
+    sector = 2.0 * np.pi - widest_azimuth_gap(np.radians(beams[np.isfinite(beams)]))
+    if sector <= math.radians(THRESHOLDS.same_plane):
+        return True
+    following = itertools.takewhile(lambda direction: direction != vertical, later.tolist())
+    return not set(seen[seen.index(vertical) + 1 :]).isdisjoint(following)
 
 
 def _visits(index: Integers, stretch: Integers) -> Integers:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -208,6 +210,74 @@ def test_slews_between_the_planes_of_a_volume_begin_no_cycle():
     seconds[2 * elevations.size :] += 200.0
     numbers = numbered(zenith, azimuth, seconds=seconds, lengths=1.4)
     assert numbers[2 * elevations.size - 1 : 2 * elevations.size + 1] == [0, 1]
+
+
+RHI = [0.0, 30.0, 60.0, 80.0]
+AZIMUTHS = [0.0, 90.0, 180.0, 270.0]
+UP = list(itertools.product(AZIMUTHS, RHI))
+DOWN = list(itertools.product(AZIMUTHS, RHI[::-1]))
+
+
+def volumes(beams, repeated=3, lost=()):
+    """Return the cycles of repeated volumes of beams (azimuth, zenith angle), some of them lost."""
+    azimuth, zenith = np.delete(np.tile(np.transpose(beams), repeated), lost, axis=1)
+    return numbered(zenith, azimuth)
+
+
+def whole(length, repeated=3):
+    return np.repeat(np.arange(repeated), length).tolist()
+
+
+@pytest.mark.parametrize(
+    "beams",
+    [
+        UP,
+        DOWN,
+        # On one plane, to both sides one after the other.
+        [beam for beam in UP if beam[0] in (0.0, 180.0)],
+        # Each second azimuth the other way: two vertical beams follow each other.
+        [*DOWN[:4], *UP[4:8], *DOWN[8:12], *UP[12:]],
+        # The vertical between tilted beams of several azimuths.
+        [(0.0, 0.0), (0.0, 20.0), (0.0, 0.0), (90.0, 20.0), (0.0, 0.0), (180.0, 20.0)],
+        [(0.0, 20.0), (0.0, 0.0), (90.0, 20.0), (0.0, 0.0), (180.0, 20.0), (0.0, 0.0)],
+        # Plan-position scans after one vertical beam.
+        [(0.0, 0.0), *((azimuth, 60.0) for azimuth in range(0, 360, 20))],
+        # Azimuths close together, of a sector scan.
+        list(itertools.product([10.0, 12.0, 14.0, 16.0], RHI)),
+    ],
+)
+def test_the_vertical_beam_of_each_azimuth_of_a_volume_ends_no_cycle(beams):
+    assert volumes(beams) == whole(len(beams))
+
+
+def test_encoder_noise_of_vertical_beams_ends_no_cycle():
+    rng = np.random.default_rng(5)
+    azimuth, zenith = np.tile(np.transpose(UP), 6)
+    zenith = np.abs(zenith + rng.normal(0.0, 0.03, zenith.size))
+    assert numbered(zenith, azimuth + 1.0) == whole(len(UP), 6)
+
+
+def test_lost_beams_of_a_volume_with_vertical_beams_end_no_cycle():
+    size = len(UP)
+    for lost in (1, 4, 5, 7, size + 1, size + 4, size + 5, 2 * size - 1):
+        assert volumes(UP, lost=[lost]) == np.delete(whole(size), lost).tolist()
+
+
+def test_a_record_that_begins_within_a_volume_has_cycles_of_all_directions():
+    for beams in (UP, DOWN):
+        for lost in range(1, len(beams)):
+            numbers = volumes(beams, 4, lost=range(lost))
+            assert set(np.bincount(numbers)[:3]) <= {len(beams) - 1, len(beams), len(beams) + 1}
+
+
+def test_a_return_to_the_vertical_at_one_azimuth_begins_a_cycle():
+    assert numbered([0.0, 60.0, 70.0] * 3, [40.0] * 9) == whole(3)
+    assert numbered([0.0, 60.0, 0.0, 70.0], [40.0] * 4) == [0, 0, 1, 1]
+    # The azimuth of a vertical beam tells nothing.
+    assert numbered([0.0, 60.0, 70.0] * 3, [0.0, 40.0, 40.0] * 3) == whole(3)
+    # The first beams of the second sweep over the zenith are lost.
+    azimuth = [270.0, 270.0, 90.0, 90.0, 90.0]
+    assert numbered([60, 30, 0, 30, 60, 0, 30, 60], [*azimuth, 90, 90, 90]) == [0] * 5 + [1] * 3
 
 
 def test_a_direction_along_the_vertical_belongs_to_all_planes():
