@@ -233,7 +233,8 @@ def visible_misfit(range_: Array, signal: Array) -> Array:
     the model less its projections on the derivatives by background, amplitude and extinction.
     """
     fit = path_fit.fit_homogeneous_path(signal, range_, variance=1.0)
-    return np.sqrt(fit.reduced_chi2 * (fit.valid_bins - 3))
+    # Of signals without misfit, rounding leaves a negative square.
+    return np.sqrt(np.maximum(fit.reduced_chi2, 0.0) * (fit.valid_bins - 3))
 
 
 def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:

@@ -353,7 +353,10 @@ def _detection_limit(
     difference = np.hypot(error, by_level - of_chosen(by_level))
     difference = np.where(comparable, difference, np.inf).min(axis=-1)
     total = np.hypot(of_chosen(error)[:, 0], difference)
-    return np.asarray((THRESHOLDS.most_deviation + _PROBABLE) * total / of_chosen(scale)[:, 0])
+    # Without a window the index is -1, and the last one may have no signal.
+    limit = np.full(index.size, np.nan)
+    np.divide(total, of_chosen(scale)[:, 0], out=limit, where=index >= 0)
+    return np.asarray((THRESHOLDS.most_deviation + _PROBABLE) * limit)
 
 
 @_compiled
