@@ -97,7 +97,7 @@ def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
 @pytest.mark.parametrize("name", sorted(benchmark_results.SELECTIONS))
 def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
     path = benchmark_results.RESULTS / f"{name}.json"
-    assert path.stat().st_size < 120_000
+    assert path.stat().st_size < 150_000
     result = benchmark_results.read(name)
     assert result["machine"]["cores"]
     assert re.fullmatch("[0-9a-f]{16}", result["machine"]["code"])

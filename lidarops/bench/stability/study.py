@@ -128,7 +128,7 @@ DRAWS: Final = (
         0.05,
         pooled=True,
     ),
-    Draws("Raman", "raman", random_raman.score_raman, 8, 1000, 6, pooled=True),
+    Draws("Raman", "raman", random_raman.score_raman, 8, 500, 6, pooled=True),
     Draws("short sections", "homogeneous", random_sections.score_short_sections, 300, 600, 6),
     Draws("correlated noise", "homogeneous", random_sections.score_correlated_noise, 60, 400, 6),
     Draws("near the cut", "homogeneous", random_sections.score_near_the_cut, 1000, 400, 6),
