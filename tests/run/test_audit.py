@@ -62,7 +62,8 @@ def test_verify_names_products_that_the_ledger_does_not_know(archive: Archive) -
     campaign = archive.write()
     with Store(campaign.catalog_url, "other") as store, Lock(store) as lock:
         lock.acquire()
-        assert _mismatches(archive) == {("unlisted", stray)}
+        # A run of another campaign that shares the folder may yet enter it.
+        assert _mismatches(archive) == set()
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
         # The run that holds the lock may yet enter it.
