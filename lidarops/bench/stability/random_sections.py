@@ -41,18 +41,11 @@ def _fitted(paths: Paths, noise: Array, **options: Any) -> Any:
         return path_fit.fit_homogeneous_path(power, paths.range, **{"variance": 1.0, **options})
 
 
-def _extinction(failure: Failure, paths: Paths, fit: Any) -> ScoredValues:
-    error = fit.extinction - paths.extinction[:, 0]
+def _scored(failure: Failure, quantity: str, paths: Paths, fit: Any) -> ScoredValues:
+    error = getattr(fit, quantity) - getattr(paths, quantity)[:, 0]
     return ScoredValues(
-        failure, "extinction", error, fit.extinction_standard_error, fit.extinction_model_error,
-        np.asarray(fit.quality), HomogeneousQuality,
-    )  # fmt: skip
-
-
-def _background(failure: Failure, paths: Paths, fit: Any) -> ScoredValues:
-    error = fit.background - paths.background[:, 0]
-    return ScoredValues(
-        failure, "background", error, fit.background_standard_error, fit.background_model_error,
+        failure, quantity, error,
+        getattr(fit, f"{quantity}_standard_error"), getattr(fit, f"{quantity}_model_error"),
         np.asarray(fit.quality), HomogeneousQuality,
     )  # fmt: skip
 
@@ -74,7 +67,7 @@ def score_correlated_noise(cluster: int, profiles: int) -> Iterator[tuple[Scored
                 f"AR(1) {correlation:g}, correlation {words}", satisfied=bool(options),
                 unseen="" if options else _UNKNOWN,
             )  # fmt: skip
-            yield _extinction(failure, paths, _fitted(paths, noise, **options)), profiles
+            yield _scored(failure, "extinction", paths, _fitted(paths, noise, **options)), profiles
 
 
 def score_near_the_cut(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
@@ -84,7 +77,9 @@ def score_near_the_cut(cluster: int, profiles: int) -> Iterator[tuple[ScoredValu
     scale = fit.extinction + 1.0 / float(paths.range.mean())
     with np.errstate(invalid="ignore", divide="ignore"):
         near = fit.extinction_standard_error / scale > _NEAR_THE_CUT
-    values = _background(Failure("near the limit of POORLY_DETERMINED", satisfied=True), paths, fit)
+    values = _scored(
+        Failure("near the limit of POORLY_DETERMINED", satisfied=True), "background", paths, fit
+    )
     yield replace(values, error=np.where(near, values.error, np.nan)), profiles
 
 
@@ -98,8 +93,8 @@ def score_short_sections(cluster: int, profiles: int) -> Iterator[tuple[ScoredVa
         for words, variance in (("stated", 1.0), ("estimated", None)):
             failure = Failure(f"{least} to {most} bins, noise {words}", satisfied=True)
             fit = _fitted(paths, noise, variance=variance)
-            yield _extinction(failure, paths, fit), profiles
-            yield _background(failure, paths, fit), profiles
+            yield _scored(failure, "extinction", paths, fit), profiles
+            yield _scored(failure, "background", paths, fit), profiles
 
 
 def score_dying_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
@@ -112,6 +107,6 @@ def score_dying_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredVal
     )  # fmt: skip
     fit = _fitted(paths, rng.standard_normal((profiles, 40)))
     yield (
-        _extinction(Failure("signal that dies within a bin", satisfied=True), paths, fit),
+        _scored(Failure("signal that dies within a bin", satisfied=True), "extinction", paths, fit),
         profiles,
     )
