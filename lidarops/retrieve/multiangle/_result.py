@@ -33,11 +33,11 @@ class MultiAngleFlags:
     explain, as when extinction varies along the horizontal; or the residuals show a gradient that
     is too large for air. Extinction is withheld."""
     prior_dominated: Mask
-    """The best fit has the largest smoothness that is allowed; the data share of "joint" is below
-    0.9 or above 1.1; or that of "mld" and "mld_prior" is below 0.9, and extinction is withheld."""
+    """The best fit is little more than a straight line; the data share of "joint" is below 0.9 or
+    above 1.1; or that of "mld" and "mld_prior" is below 0.9, and extinction is withheld."""
     undersmoothed: Mask
-    """More than 10 degrees of freedom and more than 0.4 per altitude: the standard error may be
-    too small."""
+    """More than 10 degrees of freedom and more than 0.4 per altitude, which fit better than a
+    smoother profile: the standard error may be too small."""
     high_correlation: Mask
     """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
     small."""

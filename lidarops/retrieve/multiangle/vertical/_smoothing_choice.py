@@ -33,7 +33,9 @@ class SmoothingChoice:
     effective_degrees_of_freedom: float
     """Mean over the scored profiles and the candidates."""
     saturated: bool
-    """Whether the best weight is the largest that is allowed."""
+    """Whether the best weight leaves little more than a straight line."""
+    limited: bool
+    """Whether the best weight is the largest that is allowed, but leaves more than that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +81,11 @@ def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: floa
     return Scores(likelihood, risk.sum(axis=0), freedom.mean(axis=0), profiles)
 
 
-def choose_smoothing(scores: Scores) -> SmoothingChoice:
+def choose_smoothing(scores: Scores, largest: float) -> SmoothingChoice:
     """Choose the weight of a block, or the weights to average over.
+
+    Weights above `largest` are not allowed: without a limit, smooth extinction below would deny
+    the top of a layer above, where the data are too noisy to show it.
 
     Profiles of a block have similar shapes, but the likelihood treats them as independent; in
     clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
@@ -89,24 +94,31 @@ def choose_smoothing(scores: Scores) -> SmoothingChoice:
     admitted = np.flatnonzero(
         (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
     )
-    last = int(admitted[-1]) if admitted.size else 0
+    straight = int(admitted[-1]) if admitted.size else 0
+    last = min(straight, max(int(np.searchsorted(GRID, largest, side="right")) - 1, 0))
     likely = int(np.argmin(scores.likelihood[: last + 1]))
     if scores.profiles < THRESHOLDS.fewest_to_choose:
-        return _average(scores, last)
+        return _average(scores, last, straight)
     risky = int(np.argmin(scores.risk[: last + 1]))
     risky = max(risky, likely - PER_DECADE)
     rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
     best = risky if rougher else likely
     return SmoothingChoice(
-        GRID[best : best + 1], np.ones(1), float(scores.freedom[best]), best == last
+        GRID[best : best + 1],
+        np.ones(1),
+        float(scores.freedom[best]),
+        saturated=best == straight,
+        limited=best == last < straight,
     )
 
 
-def _average(scores: Scores, last: int) -> SmoothingChoice:
+def _average(scores: Scores, last: int, straight: int) -> SmoothingChoice:
     likelihood = scores.likelihood[: last + 1]
     share = np.exp(-0.5 * (likelihood - likelihood.min()))
     kept = np.flatnonzero(share > THRESHOLDS.negligible_likelihood)
     share = share[kept] / share[kept].sum()
     freedom = float((share * scores.freedom[kept]).sum())
-    saturated = int(kept[np.argmax(share)]) == last
-    return SmoothingChoice(GRID[kept], share, freedom, saturated)
+    best = int(kept[np.argmax(share)])
+    return SmoothingChoice(
+        GRID[kept], share, freedom, saturated=best == straight, limited=best == last < straight
+    )

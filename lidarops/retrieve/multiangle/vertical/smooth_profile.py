@@ -36,6 +36,8 @@ _UNIFORM: Final = 1e-3
 class _Block:
     """Estimates with the properties common to them."""
 
+    altitude: Array
+    """m above the lidar."""
     estimates: Array
     information: Array
     share: Array
@@ -85,6 +87,7 @@ class _Fit:
     """After the loss of weight of outlying estimates."""
     bands: Array
     saturated: bool
+    limited: bool
     candidates: _Candidates
     depth: Array
     variance: Array
@@ -119,9 +122,10 @@ class VerticalResult:
     downweighted: Booleans
     """The estimate is an outlier of its profile."""
     saturated: bool
-    """The best fit of the block has the largest smoothness that is allowed."""
+    """The best fit of the block is little more than a straight line."""
     undersmoothed: Booleans
-    """(profile,): more than 10 degrees of freedom and more than 0.4 per altitude."""
+    """(profile,): more than 10 degrees of freedom and more than 0.4 per altitude, which the data
+    prefer to a smoother profile."""
     high_correlation: bool
     """The correlation exceeds 0.85; standard errors may be too small."""
     block: _Block
@@ -273,7 +277,9 @@ def _block(
         share = np.clip(moments.inhomogeneity_share * amplitude, 0.0, 1.0)
         gaps = np.flatnonzero(moments.gaps)
     stiffness = _banded.penalty(altitude)
-    return _Block(depth, information, share, correlation, stiffness, float(altitude[highest]), gaps)
+    return _Block(
+        altitude, depth, information, share, correlation, stiffness, float(altitude[highest]), gaps
+    )
 
 
 def _solve_block(block: _Block, *, robust: bool) -> _Fit:
@@ -292,7 +298,8 @@ def _fit(block: _Block, information: Array) -> _Fit:
     bands = _precision(block, information)
     unit = float(information[information > 0.0].mean()) * block.extent**3
     choice = _smoothing_choice.choose_smoothing(
-        _smoothing_choice.score_smoothing(bands, block.estimates, block.stiffness, unit)
+        _smoothing_choice.score_smoothing(bands, block.estimates, block.stiffness, unit),
+        _largest_smoothing(block, information) / unit,
     )
     candidates = _Candidates(choice.smoothing * unit, choice.share)
     right = _banded.multiply_rows(bands, block.estimates)
@@ -306,11 +313,19 @@ def _fit(block: _Block, information: Array) -> _Fit:
         information,
         bands,
         choice.saturated,
+        choice.limited,
         candidates,
         *candidates.mixed(solved, diagonal),
         *candidates.mixed(gained, uncertain),
         candidates.mean(own),
     )
+
+
+def _largest_smoothing(block: _Block, information: Array) -> float:
+    """Return the weight with which extinction may change by its mean within a scale height."""
+    known = float((information * block.altitude**2).sum())
+    mean = float((information * block.estimates * block.altitude).sum()) / known
+    return THRESHOLDS.scale_height / (mean**2 + 1.0 / known)
 
 
 def _precision(block: _Block, information: Array) -> Array:
@@ -410,7 +425,9 @@ def _result(
         interpolated=within & ~used,
         downweighted=fit.information < THRESHOLDS.majority * block.information,
         saturated=fit.saturated,
-        undersmoothed=(freedom > THRESHOLDS.most_freedom)
+        # Where the data are smoother than allowed, their noise is not mistaken for structure.
+        undersmoothed=(not fit.limited)
+        & (freedom > THRESHOLDS.most_freedom)
         & (freedom > THRESHOLDS.roughest * used.sum(axis=1)),
         high_correlation=block.correlation > THRESHOLDS.highest_correlation,
         block=block,

@@ -92,24 +92,31 @@ def scores(likely, risky, profiles=300):
 
 
 def test_likelihood_decides_where_the_risk_agrees():
-    assert choose_smoothing(scores(30, 29)).smoothing == GRID[30]
-    assert choose_smoothing(scores(30, 35)).smoothing == GRID[30]
+    assert choose_smoothing(scores(30, 29), np.inf).smoothing == GRID[30]
+    assert choose_smoothing(scores(30, 35), np.inf).smoothing == GRID[30]
 
 
 def test_risk_decides_where_it_gives_more_freedom_up_to_a_decade():
-    assert choose_smoothing(scores(30, 25)).smoothing == GRID[25]
-    assert choose_smoothing(scores(30, 5)).smoothing == GRID[30 - PER_DECADE]
+    assert choose_smoothing(scores(30, 25), np.inf).smoothing == GRID[25]
+    assert choose_smoothing(scores(30, 5), np.inf).smoothing == GRID[30 - PER_DECADE]
 
 
 def test_at_least_two_degrees_of_freedom_are_left():
-    choice = choose_smoothing(scores(66, 66))
+    choice = choose_smoothing(scores(66, 66), np.inf)
     assert choice.saturated
     assert 2.0 <= choice.effective_degrees_of_freedom < 2.1
-    assert not choose_smoothing(scores(30, 30)).saturated
+    assert not choose_smoothing(scores(30, 30), np.inf).saturated
+
+
+@pytest.mark.parametrize("profiles", [1, 50])
+def test_no_weight_above_the_largest_is_chosen_and_none_there_is_saturated(profiles):
+    choice = choose_smoothing(scores(40, 40, profiles), 1.5 * GRID[30])
+    assert choice.smoothing.max() == GRID[31]
+    assert not choice.saturated
 
 
 def test_small_block_is_averaged_by_likelihood():
-    choice = choose_smoothing(scores(30, 5, profiles=7))
+    choice = choose_smoothing(scores(30, 5, profiles=7), np.inf)
     assert choice.share.sum() == pytest.approx(1.0)
     weight = np.exp(-0.5 * (np.arange(GRID.size) - 30.0) ** 2)
     where = np.searchsorted(GRID, choice.smoothing)
@@ -120,6 +127,6 @@ def test_small_block_is_averaged_by_likelihood():
 
 def test_data_that_never_reach_two_degrees_of_freedom_are_saturated():
     low = Scores(np.arange(GRID.size)[::-1] * 1.0, np.zeros(GRID.size), np.ones(GRID.size), 50)
-    choice = choose_smoothing(low)
+    choice = choose_smoothing(low, np.inf)
     assert choice.saturated
     assert choice.smoothing == GRID[0]
