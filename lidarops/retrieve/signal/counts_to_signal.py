@@ -191,16 +191,19 @@ def _add_rounding(variance: Array, scale: _Scale, relative_error: float = 0.0) -
     # Without a shot, the noise is unknown.
     rows[scale.shots <= 0] += np.inf
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        unit = (scale.step**2 * scale.shots)[:, np.newaxis]
-        coarse = np.flatnonzero((rows < THRESHOLDS.fine * unit).any(axis=-1))
-        unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
-        measured = rows[coarse] / unit
-        median = np.sort(measured, axis=-1)[:, (measured.shape[-1] - 1) // 2, np.newaxis]
-        noise = np.fmin(measured, median) / (1.0 + relative_error)
+        unit = scale.step**2 * scale.shots
+        fine = THRESHOLDS.fine * unit
+        coarse = np.flatnonzero((rows < fine[:, np.newaxis]).any(axis=-1))
+        middle = (rows.shape[-1] - 1) // 2
+        median = np.partition(rows[coarse], middle, axis=-1)[:, middle] / unit[coarse]
+        place, bins = np.nonzero(rows[coarse] < fine[coarse, np.newaxis])
+        profile = coarse[place]
+        measured = rows[profile, bins] / unit[profile]
+        noise = np.fmin(measured, median[place]) / (1.0 + relative_error)
         harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(noise - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
         common = np.maximum((0.25 - noise) / 3.0, harmonic)
-        raised = unit * (np.maximum(measured, 1.0 / 12.0) + shots * common)
-    rows[coarse] = np.where(measured >= THRESHOLDS.fine, rows[coarse], raised)
+        raised = np.maximum(measured, 1.0 / 12.0) + scale.shots[profile] * common
+        rows[profile, bins] = unit[profile] * raised
     return raised_variance
 
 
