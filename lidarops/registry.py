@@ -35,7 +35,8 @@ def registered(group: str, of: type[_Part], noun: str) -> dict[str, _Part]:
     Raises
     ------
     LidarOpsError
-        If an entry point cannot be loaded, is of another class or name, or two have one name.
+        If an entry point of another package cannot be loaded, or one is of another class or name,
+        or two have one name.
     """
     parts: dict[str, _Part] = {}
     for point in entry_points(group=group):
@@ -43,24 +44,30 @@ def registered(group: str, of: type[_Part], noun: str) -> dict[str, _Part]:
             part = point.load()
         except Exception as error:
             # The code of a package may raise anything; the cause is chained.
+            if _package(point) == __package__:
+                raise  # a bug of lidarops, whose traceback tells more
             raise LidarOpsError(
                 f"{noun} {point.name!r} cannot be loaded from {point.value}: {error!r}",
-                remedy=f"repair or remove the package {_package(point)}; python -c 'import"
+                remedy=f"repair or remove the package {_distribution(point)}; python -c 'import"
                 f" {point.module}' shows where it fails",
             ) from error
         if not isinstance(part, of) or part.name != point.name or part.name in parts:
             raise LidarOpsError(
                 f"{noun} {point.name!r} of {point.value} is no {of.__name__} of that name, or the"
                 " name is taken",
-                remedy=f"repair or remove the package {_package(point)}",
+                remedy=f"repair or remove the package {_distribution(point)}",
             )
         parts[part.name] = part
     return parts
 
 
-def _package(point: EntryPoint) -> str:
+def _distribution(point: EntryPoint) -> str:
     """Return the distribution that registers an entry point, or else its package."""
-    return point.dist.name if point.dist else point.module.partition(".")[0]
+    return point.dist.name if point.dist else _package(point)
+
+
+def _package(point: EntryPoint) -> str:
+    return point.module.partition(".")[0]
 
 
 def by_name(
