@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
-from lidarops.raw.formats import parse_raw_header
+from lidarops.raw.formats import parse_raw_header, read_start
 from lidarops.raw.header import HeaderOrder, RawHeader
 from lidarops.records import UNKNOWN_FORMAT, UNREADABLE, Granule, Role, Status
 
@@ -127,17 +127,25 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
     if due.rivals:
         claimants = f"{due.instrument} and {', '.join(due.rivals)}"
         return _refused(due, f"claimed by instruments {claimants} (make their patterns disjoint)")
+    head = b""
     try:
         head = headers.source.head(file.path, HEADER_BYTES)
         header = parse_raw_header(head, file=file.path, size=file.size)
         return _accepted(due, header, headers.place(due.instrument))
     except RawFormatError as error:
-        return _refused(due, str(error).removeprefix(f"{file.path}: "))
+        reason = str(error).removeprefix(f"{file.path}: ")
+        return _refused(due, reason, _start(head, headers.place(due.instrument)))
     except OSError as error:
         return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
 
 
-def _refused(due: UnreadFile, reason: str) -> Granule:
+def _start(head: bytes, place: _Place) -> datetime | None:
+    """Return the start of a file that is refused, by which it belongs to a scene."""
+    start = read_start(head)
+    return start and start - timedelta(seconds=place.facts_of(start).clock_offset)
+
+
+def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
     return Granule(
         path=printable(due.file.path),
         size=due.file.size,
@@ -146,6 +154,7 @@ def _refused(due: UnreadFile, reason: str) -> Granule:
         role=due.role,
         status=Status.REFUSED,
         reason=reason,
+        start=start,
     )
 
 

@@ -1,8 +1,7 @@
 """Find the scenes to which refused files belong: their products state that these are unused.
 
-The header of a file that cannot be read gives no time. Names of raw files follow their time, so
-such a file is taken to belong where the files beside it in its folder belong, unless the catalog
-knew its time before.
+Where a header gives no time, and the catalog knew none before, a file is taken to belong where the
+files beside it in its folder belong, because names of raw files follow their time.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cache
 from types import MappingProxyType
 from typing import Final
@@ -25,6 +26,10 @@ from lidarops.records import UNKNOWN_FORMAT
 from lidarops.registry import RAW_FORMATS, by_name, registered
 
 _INT32: Final = np.iinfo(np.int32)
+
+
+def _not_stated(_: bytes) -> None:
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +51,8 @@ class RawFormat:
     read_counts: Callable[[RawFile, int, Stretches | None, NDArray[np.int32]], None]
     """Fill a row with the counts at one of the `places` of a channel: open file, place, stretches
     of bins (None for all), row."""
+    read_start: Callable[[bytes], datetime | None] = _not_stated
+    """First bytes of a file that is refused -> when it starts; None where they do not tell."""
 
     def read_channel(
         self,
@@ -130,6 +137,12 @@ def _recognised(head: bytes, file: str) -> RawFormat:
         remedy=f"formats are {', '.join(raw_formats())}; install the package of any other format,"
         " or make the pattern of the instrument leave the file out",
     )
+
+
+def read_start(head: bytes) -> datetime | None:
+    """Return when a refused file starts by its first bytes; None where they do not tell."""
+    formats = [raw for raw in raw_formats().values() if raw.recognises(head)]
+    return formats[0].read_start(head) if len(formats) == 1 else None
 
 
 def read_raw_header(file: RawFile, known: str = "") -> RawHeader:

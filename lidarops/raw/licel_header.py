@@ -414,6 +414,16 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     )
 
 
+def read_start(buffer: bytes) -> datetime | None:
+    """Return the start that the first lines of a file state; None where they state none."""
+    try:
+        first, second = _line_ends(buffer, 0, 2)
+        dates = _DATES.search(buffer[first + 2 : second].decode("latin-1"))
+        return _moments(dates)[0] if dates else None
+    except RawFormatError:
+        return None
+
+
 def _refuse_export(data: bytes) -> None:
     """Refuse a file with text in the place of counts."""
     if holds_text(data):

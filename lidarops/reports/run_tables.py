@@ -19,7 +19,15 @@ from lidarops.figures.wording import (
 from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.records import Grade, LeftOut, PlannedStep, RunRecord, SceneOutcome, Verdicts
+from lidarops.records import (
+    Grade,
+    Granule,
+    LeftOut,
+    PlannedStep,
+    RunRecord,
+    SceneOutcome,
+    Verdicts,
+)
 from lidarops.reports.findings import disagreement_rows, finding_rows, scene_note_rows, unmade_words
 from lidarops.steps.reading import idle_window
 
@@ -65,6 +73,8 @@ class RefusedRow:
     when: str
     """``while cataloguing`` or ``while processing``."""
     files: tuple[str, ...]
+    days: str
+    """UTC days on which they start, as far as their headers tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,16 +375,21 @@ def flags(record: RunRecord) -> list[FlagRow]:
 
 def refused(record: RunRecord) -> list[RefusedRow]:
     """Group refused granules by reason, the most frequent first."""
-    files: dict[tuple[str, str], list[str]] = defaultdict(list)
+    granules: dict[tuple[str, str], list[Granule]] = defaultdict(list)
     for granule in record.refused:
-        files[granule.reason, "while cataloguing"].append(granule.path)
+        granules[granule.reason, "while cataloguing"].append(granule)
     for scene in record.scenes:
         for granule in scene.refused:
-            files[granule.reason, "while processing"].append(granule.path)
+            granules[granule.reason, "while processing"].append(granule)
     return [
-        RefusedRow(reason or "no reason was recorded", when, tuple(sorted(paths)))
-        for (reason, when), paths in sorted(
-            files.items(), key=lambda item: (-len(item[1]), item[0])
+        RefusedRow(
+            reason or "no reason was recorded",
+            when,
+            tuple(sorted(granule.path for granule in alike)),
+            listed({f"{granule.start:%Y-%m-%d}" for granule in alike if granule.start}),
+        )
+        for (reason, when), alike in sorted(
+            granules.items(), key=lambda item: (-len(item[1]), item[0])
         )
     ]
 

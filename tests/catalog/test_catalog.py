@@ -190,7 +190,7 @@ def test_an_archive_behind_a_url(campaign: Campaign, store: Store) -> None:
         assert (summary.files, summary.added, summary.refused) == (2, 2, 1)
         assert [idle.key for idle in summary.idle_patterns] == ["dark_files"]
         assert scan_archive(remote, store).unchanged == 2
-        assert [granule.path for granule in store.granules()] == ["coast/h1", "coast/h0"]
+        assert [granule.path for granule in store.granules()] == ["coast/h0", "coast/h1"]
     finally:
         memory.rm("/lidar-archive", recursive=True)
 

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
@@ -280,9 +280,12 @@ class TestDegenerateRuns:
             outcome(f"s{i}", plan=None, error=f"reason number {i}", seconds={}) for i in range(3)
         ]
         refused = [fab.granule(f"raw/{i}", f"cause {i % 2}") for i in range(9)]
+        refused[0] = replace(refused[0], start=datetime(2026, 3, 1, tzinfo=UTC))
         run = run_record(tmp_path, scenes, refused=tuple(refused))
         page = built(run, tmp_path / "report")
         assert "3 scenes failed and 9 granules refused." in page.text
+        assert "while cataloguing 2026-03-01 raw/0" in page.text
+        assert "while cataloguing not known raw/1" in page.text
         for i in range(3):
             assert f"reason number {i}" in page.text
         for granule in refused:

@@ -21,6 +21,7 @@ from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.global_attributes import MOST_UNUSED, UNUSED_INPUTS
 from lidarops.plan.unused_files import MOST_IN_DOUBT, dated
 from lidarops.records import Grade, Granule, Role, Status
+from lidarops.reports import run_tables
 from lidarops.reports.inspection import describe
 from lidarops.run.archive import bring_up_to_date, reprocess
 from lidarops.run.reproduction import reproduce_product
@@ -225,20 +226,30 @@ def test_a_product_states_dark_files_only_if_it_subtracts_some(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["h0640", "h0700"])
-def test_a_file_that_was_good_belongs_to_its_scene_whatever_its_name(
-    tmp_path: Path, name: str
+@pytest.mark.parametrize("was_good", [True, False])
+def test_a_file_of_known_start_belongs_to_its_scene_whatever_its_name(
+    tmp_path: Path, name: str, was_good: bool
 ) -> None:
-    """The last one of an hour and the first of the next, of names that are numbered on."""
+    """The last one of an hour and the first of the next, of names that are numbered on.
+
+    Its start is known because it was good, or because its header can be read.
+    """
     archive = Archive(tmp_path, days=0)
-    del archive.tree["instruments"]["rich"]
+    poor = archive.tree["instruments"]["poor"]
+    archive.tree["instruments"] = {"poor": poor}
+    # The clock runs ahead by a whole window.
+    poor["facts"] = [{"zenith_angle": 0, "clock_offset": 3600}]
     archive.tree["scenes"] = {"window": "1h"}
     for minute in range(0, 120, 20):
-        archive.raw(f"poor/h{600 + minute:04d}", 600 + minute, seed=minute)
+        archive.raw(f"poor/h{600 + minute:04d}", 660 + minute, seed=minute)
     campaign = archive.write()
-    assert reprocess(campaign) is not None
     file = archive.folder / "raw/poor" / name
     content = file.read_bytes()
-    file.write_bytes(bytes(9))
+    if was_good:
+        assert reprocess(campaign) is not None
+        file.write_bytes(bytes(9))
+    else:
+        file.write_bytes(content[:-100])
     assert reprocess(campaign) is not None
     hour = {"h0640": "T100000", "h0700": "T110000"}[name]
     stating = set()
@@ -251,6 +262,23 @@ def test_a_file_that_was_good_belongs_to_its_scene_whatever_its_name(
     file.write_bytes(content)
     reprocess(campaign)
     assert set(_unused(campaign).values()) == {""}
+
+
+def test_the_report_names_the_day_of_which_no_file_can_be_read(archive: Archive) -> None:
+    """No product can state it."""
+    for number in range(3):
+        file = archive.folder / f"raw/poor/h1{number}"
+        file.write_bytes(file.read_bytes()[:-100])
+    campaign = archive.write()
+    result = bring_up_to_date(campaign)
+    assert result.has_failures
+    assert set(_unused(campaign).values()) == {""}
+    record = result.record
+    assert record is not None
+    [row] = run_tables.refused(record)
+    assert (len(row.files), row.days) == (3, "2026-03-02")
+    assert "3 granules refused" in run_tables.verdict(record)
+    assert bring_up_to_date(campaign).has_failures
 
 
 def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
@@ -290,8 +318,7 @@ def test_products_without_dark_subtraction_state_the_dark_file_that_may_be_their
     whole = _unused(campaign)
     assert set(whole.values()) == {""}
     file = archive.raw(cut, 700 + 1440 * int(cut[-1]), seed=98)
-    content = file.read_bytes()
-    file.write_bytes(content[:-100])
+    file.write_bytes(bytes(9))
     reprocess(campaign)
     stated = {
         name for name, text in _unused(campaign).items() if text.startswith(f"dark file {cut}: ")
