@@ -225,7 +225,7 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     assert not np.isfinite(found["beam_signal"].values[:, beam]).any()
     # Of all channels together.
     (note,) = record.scenes[0].notes
-    assert note.startswith("blocked beam: elevation 3, azimuth 87 degree, from the range in")
+    assert note.startswith("blocked beams: elevation 3 (azimuth 87) degree, from the range in")
     assert (np.abs(found["analog_baseline"]) < 0.005).all()
     assert (found["usable"] < 2).all()
     rows = [int(np.abs(found["altitude"].values - 220.0 - z).argmin()) for z in HEIGHTS[1:]]

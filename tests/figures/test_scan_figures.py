@@ -483,6 +483,15 @@ class TestResiduals:
         assert sum(isinstance(layer, Curve) for layer in upper.layers) == max(planes)
         assert ("not known" in upper.x.label) == bool(np.isnan(azimuths).any())
 
+    def test_the_description_names_planes_and_single_beams_as_they_are_drawn(self):
+        product = multiangle().isel(beam=slice(4))
+        product = product.assign_coords(
+            beam_zenith_angle=("beam", np.array([30.0, 60.0, 70.0, 50.0])),
+            beam_azimuth=("beam", np.array([137.0, 62.0, 317.0, np.nan])),
+        )
+        words = residual_figure(product).words
+        assert words.endswith("toward azimuth 62 (one beam), 137, unknown (one beam) degree")
+
     def test_azimuths_may_be_missing(self):
         read = figure_data.read_residuals(multiangle().drop_vars("beam_azimuth"))
         np.testing.assert_array_equal(read.zenith_angle, np.sort(ZENITH))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from support.products.encoded_products import build_product
 from support.products.made_products import context, multiangle
 
 from lidarops.errors import ProductError
+from lidarops.products.multiangle.baseline import blocked_in_words
 
 
 def test_layers_have_their_errors():
@@ -54,3 +56,23 @@ def test_each_optional_row_may_be_left_out():
         product = build_product(multiangle().drop_vars(name), context("multiangle"))
         assert name not in product
         assert name in build_product(multiangle(), context("multiangle"))
+
+
+def test_blocked_low_beams_are_one_note():
+    elevation = np.array([3.0, 5.0, 5.0, 60.0])
+    product = xr.Dataset(
+        {"beam_obstruction": (("time", "beam"), [[200.0, np.nan, np.nan, np.nan]] * 2)},
+        coords={
+            "beam_zenith_angle": ("beam", 90.0 - elevation),
+            "beam_azimuth": ("beam", [87.0, 87.0, 127.0, 87.0]),
+        },
+    )
+    assert blocked_in_words(product.isel(beam=[1, 2, 3])) == []
+    product["beam_obstruction"][1, 2:] = 900.0
+    # The steepest one is behind a cloud.
+    assert blocked_in_words(product) == [
+        (
+            "blocked beams: elevation 3 (azimuth 87), 5 (azimuth 127) degree, from the range in"
+            " beam_obstruction of the product"
+        )
+    ]

@@ -100,24 +100,28 @@ def add_low_beams(beams: BlockedBeams, chunk: Chunk, profiles: Profiles) -> None
 
 
 def blocked_in_words(product: xr.Dataset) -> list[str]:
-    """Return a note on each low beam that is blocked.
+    """Return one note on the low beams that are blocked; none where all are free.
 
-    The channels of a scene have the same note, so that it is reported once: the range is that of
-    the product. Obstructions of steeper beams are clouds.
+    Channels with the same blocked beams have the same note, so that it is reported once: the range
+    is that of the product. Obstructions of steeper beams are clouds.
     """
     known = product["beam_obstruction"].notnull().any("time").to_numpy()
     elevation = 90.0 - product["beam_zenith_angle"].to_numpy()
     blocked = np.flatnonzero(known & (elevation < THRESHOLDS.lowest_free))
+    if not blocked.size:
+        return []
     sides = product["beam_azimuth"].to_numpy() if "beam_azimuth" in product.coords else None
-    notes = [
-        f"blocked beam: elevation {elevation[beam]:.3g}"
-        + ("" if sides is None else f", azimuth {sides[beam]:.3g}")
-        + " degree, from the range in beam_obstruction of the product"
-        for beam in blocked[:_NAMED]
+    beams = [
+        f"{elevation[beam]:.3g}" + ("" if sides is None else f" (azimuth {sides[beam]:.3g})")
+        for beam in blocked
     ]
-    if blocked.size > _NAMED:
-        notes.append(f"blocked beams: {blocked.size - _NAMED} more")
-    return notes
+    more = f" and {blocked.size - _NAMED} more" if blocked.size > _NAMED else ""
+    return [
+        (
+            f"blocked beams: elevation {', '.join(beams[:_NAMED])}{more}"
+            " degree, from the range in beam_obstruction of the product"
+        )
+    ]
 
 
 def with_baseline(

@@ -262,12 +262,20 @@ def _beam_label(residuals: ScanResiduals) -> str:
 
 
 def _sides(residuals: ScanResiduals) -> str:
-    """Return the azimuths of the positive zenith angles of several planes, in words."""
-    planes = [f"{azimuth:.4g}" for azimuth in residuals.azimuths if np.isfinite(azimuth)]
-    if len(residuals.azimuths) < 2 or not planes:
+    """Return the azimuths of the positive zenith angles of several planes, as they are drawn."""
+    if len(residuals.azimuths) < 2:
         return ""
-    more = ", ..." if len(planes) > _NAMED_PLANES else ""
-    return f"; planes, positive toward azimuth {', '.join(planes[:_NAMED_PLANES])}{more} degree"
+    beams = np.bincount(residuals.plane)
+    sides = [
+        ("unknown" if np.isnan(azimuth) else f"{azimuth:.4g}")
+        + (" (one beam)" if number == 1 else "")
+        for azimuth, number in zip(residuals.azimuths, beams, strict=True)
+    ]
+    more = ", ..." if len(sides) > _NAMED_PLANES else ""
+    return (
+        "; from left to right, positive zenith angles point toward azimuth"
+        f" {', '.join(sides[:_NAMED_PLANES])}{more} degree"
+    )
 
 
 FIGURES: Final = KindFigures(

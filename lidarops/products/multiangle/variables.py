@@ -134,8 +134,10 @@ def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
         error_kind=ErrorKind.BOTH,
         optional=True,
         comment=f"As {quantity}, with an inhomogeneity of the plane. Its error by the dead time is"
-        f" not stated: see {quantity}_dead_time_error. Missing where a test rejects the value."
-        f" {NO_STANDARD_NAME}",
+        f" not stated: see {quantity}_dead_time_error. Missing where a test of the plane alone"
+        " rejects the value; no flag grades the others. quality_flag and usable are those of all"
+        " beams together: where they reject a value, leave out those of its planes too, unless"
+        f" differences between planes are of interest. {NO_STANDARD_NAME}",
     )
     error = _gradient_error(f"plane_{quantity}", f"{words} of a plane", units)
     comment = (
