@@ -13,6 +13,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.compiled_code import summing
+
 Array = npt.NDArray[np.float64]
 
 HUGE: Final = 1e300
@@ -58,20 +60,11 @@ class Limits(NamedTuple):
 
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-# A function that the compiler may reassociate has to be inlined. As a symbol of its own it would
-# be optimised once alone and once within each caller, with different last digits, and the linker
-# takes the one or the other depending on what was compiled before and what came from the cache.
+# What calls a sum is inlined too: see `compiled_code.summing`.
 _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-_summing = numba.njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    forceinline=True,
-    fastmath={"reassoc", "contract", "nsz"},
-)
 
 
-@_summing
+@summing
 def _sums(values: Array, phi: Array, weights: Array) -> Any:
     """Return total weight, weighted means of shape and power, and their centred sums."""
     total = shape = power = 0.0
@@ -89,7 +82,7 @@ def _sums(values: Array, phi: Array, weights: Array) -> Any:
     return total, shape, power, square, product
 
 
-@_summing
+@summing
 def _bend(phi: Array, lever: Array, weights: Array, shape: float) -> Any:
     """Return the weighted sum of shape times distance, and its product with the centred shape."""
     bend = cross = 0.0
@@ -100,7 +93,7 @@ def _bend(phi: Array, lever: Array, weights: Array, shape: float) -> Any:
     return bend, cross
 
 
-@_summing
+@summing
 def _group(residuals: Array, phi: Array, lever: Array, weights: Array, tilt: Any) -> Any:
     """Return chi-square, weight and sum of residuals; norm and score of the curvature."""
     bend, slope, shape = tilt
@@ -116,7 +109,7 @@ def _group(residuals: Array, phi: Array, lever: Array, weights: Array, tilt: Any
     return chi2, weight, total, norm, score
 
 
-@_summing
+@summing
 def _fill_counts(
     weights: Array,
     phi: Array,
@@ -180,14 +173,14 @@ def _test_residuals(
     row[WAVES] = waves if groups >= FEWEST_GROUPS else 0.0
 
 
-@_summing
+@summing
 def _subtract(values: Array, phi: Array, row: Array, residuals: Array) -> None:
     background, amplitude = row[BACKGROUND], row[AMPLITUDE]
     for i in range(residuals.size):
         residuals[i] = values[i] - background - amplitude * phi[i]
 
 
-@_summing
+@summing
 def _count(usable: Array) -> int:
     bins = 0
     for i in range(usable.size):
@@ -309,7 +302,7 @@ def _include_choice(rows: Array, chosen: int, limits: Limits, odds: Array, row: 
         row[BACKGROUND_VARIANCE] = square / total
 
 
-@_summing
+@summing
 def _prepare(
     power: Array,
     shape: Array,

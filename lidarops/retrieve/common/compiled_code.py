@@ -1,4 +1,4 @@
-"""Cache of compiled code, separate for every state of the sources."""
+"""Options of compiled code, and its cache, separate for every state of the sources."""
 
 from __future__ import annotations
 
@@ -10,11 +10,25 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+import numba
 from numba import config
 
 _SOURCES: Final = Path(__file__).parents[1]
 _CONSTANTS: Final = ("constants.py", "flags.py")
 """Modules of lidarops beside the sources whose constants are compiled in."""
+
+summing: Final = numba.njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"reassoc", "contract", "nsz"},
+)
+"""Compile a sum whose terms the compiler may reassociate, so that it vectorises.
+
+NaN and infinity keep their meaning. The function has to be inlined. As a symbol of its own it would
+be optimised once alone and once within each caller, with different last digits, and the linker
+takes the one or the other depending on what was compiled before and what came from the cache."""
 
 
 def keep_apart(sources: Path = _SOURCES) -> str:

@@ -15,6 +15,7 @@ from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.compiled_code import summing
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
@@ -210,14 +211,7 @@ def _correlate(first: Array, second: Array) -> Array:
     return by_part
 
 
-# Inlined by force: a reassociated sum as a symbol of its own has other bits fresh than cached.
-@numba.njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    forceinline=True,
-    fastmath={"reassoc", "contract", "nsz"},
-)
+@summing
 def _product(first: Any, second: Any) -> float:
     total = 0.0
     for i in range(second.size):
