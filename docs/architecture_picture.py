@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from html import escape
 from pathlib import Path
 from typing import Final
@@ -49,6 +50,7 @@ LANE: Final = 10
 """Distance of two lines that pass a row side by side."""
 
 
+@cache
 def imports() -> dict[str, set[str]]:
     """Return, for each package at the root, the packages whose modules it imports."""
     graph: dict[str, set[str]] = {}

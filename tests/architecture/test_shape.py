@@ -6,15 +6,18 @@ import ast
 import re
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import pytest
 
 MOST_PACKAGES = 20
 MOST_LEVELS = 10
 MOST_MODULES = 25
+DEFINITIONS = (ast.FunctionDef, ast.ClassDef)
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +31,31 @@ def picture(repository: Path) -> ModuleType:
     return module
 
 
-def sources(repository: Path, *roots: str) -> Iterator[tuple[Path, ast.Module]]:
+class Source(NamedTuple):
+    """What a source imports and defines."""
+
+    imported: frozenset[str]
+    public: tuple[str, ...]
+    """Functions and classes without underscore."""
+    docstring: str | None
+
+
+@cache
+def source(path: Path) -> Source:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    definitions = (node.name for node in tree.body if isinstance(node, DEFINITIONS))
+    public = tuple(name for name in definitions if not name.startswith("_"))
+    return Source(frozenset(imported_modules(tree)), public, ast.get_docstring(tree))
+
+
+def sources(repository: Path, *roots: str) -> Iterator[tuple[Path, Source]]:
+    for path in paths(repository, *roots):
+        yield path, source(path)
+
+
+def paths(repository: Path, *roots: str) -> Iterator[Path]:
     for root in roots:
-        for path in sorted((repository / root).rglob("*.py")):
-            yield path, ast.parse(path.read_text(encoding="utf-8"))
+        yield from sorted((repository / root).rglob("*.py"))
 
 
 def imported_modules(tree: ast.Module) -> Iterator[str]:
@@ -61,7 +85,7 @@ def test_every_module_stands_in_a_package(repository: Path, picture: ModuleType)
 
 def test_no_folder_is_crowded(repository: Path):
     modules: dict[Path, int] = defaultdict(int)
-    for path, _ in sources(repository, "lidarops", "flows", "tests"):
+    for path in paths(repository, "lidarops", "flows", "tests"):
         modules[path.parent] += 1
     assert {folder: count for folder, count in modules.items() if count > MOST_MODULES} == {}
 
@@ -70,38 +94,37 @@ def test_a_public_name_means_one_thing_in_its_layer(repository: Path, picture: M
     """But that a labeled shell has the name of what it wraps, and each retrieval its thresholds."""
     level = {name: number for number, row in enumerate(picture.levels()) for name in row}
     places: dict[tuple[int, str], list[str]] = defaultdict(list)
-    for path, tree in sources(repository, "lidarops"):
+    for path, module in sources(repository, "lidarops"):
         package = path.relative_to(repository / "lidarops").parts[0]
         if package not in level or path.stem.startswith("labeled"):
             continue
-        for node in tree.body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
-                places[level[package], node.name].append(str(path.relative_to(repository)))
+        for name in module.public:
+            places[level[package], name].append(str(path.relative_to(repository)))
     several = {name: paths for (_, name), paths in places.items() if len(paths) > 1}
     assert {name: paths for name, paths in several.items() if name != "Thresholds"} == {}
 
 
 def test_no_test_imports_another_test_and_no_retrieval_test_a_benchmark(repository: Path):
     tests = {path.stem for path in (repository / "tests").rglob("test_*.py")}
-    for path, tree in sources(repository, "tests"):
-        names = set(imported_modules(tree))
+    for path, module in sources(repository, "tests"):
+        names = module.imported
         assert not {name for name in names if name.split(".")[0] in tests}, path
         if path.is_relative_to(repository / "tests/retrieve"):
             assert not {name for name in names if name.startswith("lidarops.bench")}, path
 
 
 def test_private_modules_are_imported_within_their_package_only(repository: Path):
-    for path, tree in sources(repository, "lidarops", "flows"):
+    for path, module in sources(repository, "lidarops", "flows"):
         package = ".".join(path.relative_to(repository).parent.parts)
-        for name in imported_modules(tree):
+        for name in module.imported:
             private = re.match(r"(lidarops\..*)\._[a-z]\w*", name)
             if private:
                 assert package.startswith(private[1]), f"{path} imports {name}"
 
 
 def test_every_package_and_module_says_what_it_is_for(repository: Path):
-    for path, tree in sources(repository, "lidarops", "flows"):
-        assert ast.get_docstring(tree), path
+    for path, module in sources(repository, "lidarops", "flows"):
+        assert module.docstring, path
 
 
 def test_the_picture_shows_the_packages_as_they_are(repository: Path, picture: ModuleType):

@@ -80,18 +80,9 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture
-def scheme(request: pytest.FixtureRequest) -> str:
-    """The colour scheme; pages differ by it in colours only."""
-    return str(getattr(request, "param", "light"))
-
-
-both_schemes = pytest.mark.parametrize("scheme", ["light", "dark"], indirect=True)
-
-
-@pytest.fixture
-def watched(chromium: Any, scheme: str) -> Iterator[Watched]:
+def watched(chromium: Any) -> Iterator[Watched]:
     size = {"width": 1280, "height": 900}
-    context = chromium.new_context(viewport=size, color_scheme=scheme, accept_downloads=True)
+    context = chromium.new_context(viewport=size, accept_downloads=True)
     watched_page = Watched(context.new_page())
     watched_page.page.on("request", lambda request: watched_page.requests.append(request.url))
     watched_page.page.on("requestfailed", watched_page.failed)
@@ -161,7 +152,6 @@ def _tab_to(page: Any, words: str) -> None:
     raise AssertionError(f"the keyboard does not reach {words!r}")
 
 
-@both_schemes
 def test_calendar_to_download_by_keyboard(site: Path, watched: Watched) -> None:
     page = watched.page
     watched.open(site / "index.html")
@@ -206,7 +196,6 @@ def test_names_in_tables_are_not_broken_on_a_phone(site: Path, watched: Watched)
         assert [text for count, text in lines if count > 1] == [], name
 
 
-@both_schemes
 def test_images_are_drawn_and_thumbnails_load(site: Path, watched: Watched) -> None:
     for file in _pages(site).values():
         watched.open(file)
@@ -234,7 +223,7 @@ def test_policy_blocks_other_sources(site: Path, watched: Watched) -> None:
 @pytest.mark.skipif(not AXE.exists(), reason="axe-core is not installed: npm ci in tests/site")
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-@both_schemes
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing(site: Path, chromium: Any, scheme: str, width: int) -> None:
     # The policy of the pages would block axe, as any script.
     size = {"width": width, "height": 900}
