@@ -74,7 +74,7 @@ def test_any_number_of_profiles_together_gives_the_same_bits(
         assert any(kind in path for path in whole), kind
     # Small scenes are one chunk otherwise.
     monkeypatch.setattr(execution, "IN_MEMORY", 0)
-    for profiles in (1, 3, 7, PROFILES):
+    for profiles in (1, 5, PROFILES):
         assert digests([replace(job, profiles_per_chunk=profiles) for job in jobs]) == whole
 
 

@@ -82,8 +82,7 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
         reprocess_network(campaign.model_copy(update={"output": str(tmp_path / name)}), **options)
         for name, options in (
             ("whole", {}),
-            ("one", {"profiles_per_chunk": 1}),
-            ("four", {"profiles_per_chunk": 4, "workers": 2}),
+            ("parts", {"profiles_per_chunk": 4, "workers": 2}),
         )
     ]
     digests = [
@@ -91,7 +90,7 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
         for record in records
     ]
     assert len(digests[0]) == 2
-    assert digests[0] == digests[1] == digests[2]
+    assert digests[0] == digests[1]
 
 
 def test_the_range_window_does_not_change_the_product(tmp_path):

@@ -18,7 +18,6 @@ from lidarops.records import DetectionMode
 
 SCAN = {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]}
 SHAPES: dict[str, dict[str, Any]] = {
-    "vertical": {"zenith": 0.0},
     "horizontal": {"zenith": 90.0, "azimuth": 200.0},
     "scan": SCAN,
     "one_profile": {"zenith": 3.0, "profiles": 1},

@@ -16,7 +16,13 @@ BEAMS = {
     "horizontal": {"zenith": 90.0, "azimuth": 200.0},
     "scan": {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]},
 }
-CASES = [pytest.param((kind, beam), id=f"{kind}-{beam}") for kind in MAKERS for beam in BEAMS]
+LEVEL = ("homogeneous", "visibility")
+"""Kinds of level beams."""
+CASES = [
+    pytest.param((kind, beam), id=f"{kind}-{beam}")
+    for kind in MAKERS
+    for beam in ("horizontal" if kind in LEVEL else "vertical", "scan")
+]
 
 
 @pytest.fixture(scope="session")

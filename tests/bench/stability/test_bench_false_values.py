@@ -124,8 +124,8 @@ def where_the_model_holds(score, clusters, profiles):
             yield values
 
 
-HOMOGENEOUS = (random_homogeneous.score_homogeneous, 100, 100)
-"""Score, clusters and profiles of the check of the default suite."""
+HOMOGENEOUS = (random_homogeneous.score_homogeneous, 50, 200)
+"""Score, clusters and profiles of the check of the default suite. Clusters take the time."""
 
 
 def test_where_the_model_holds_homogeneous_paths_are_not_false():

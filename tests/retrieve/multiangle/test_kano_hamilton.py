@@ -105,7 +105,8 @@ def test_order_of_the_beams_has_no_effect(seed, order):
     y, variance, path = some_beams(np.random.default_rng(seed), altitudes=5)
     ordered, permuted = (
         fitted(y, variance, path),
-        fitted(y[:, list(order)], variance[:, list(order)], path[list(order)]),
+        # In C order, for which the kernel is compiled already.
+        fitted(np.take(y, order, axis=1), np.take(variance, order, axis=1), path[list(order)]),
     )
     assert permuted == pytest.approx(ordered, rel=1e-11, abs=1e-12)
 
@@ -117,7 +118,11 @@ def test_missing_beams_have_no_effect():
     variance[:, missing], y[:, missing] = np.inf, 0.0
     whole, subset = (
         fitted(y, variance, path),
-        fitted(y[:, ~missing], variance[:, ~missing], path[~missing]),
+        fitted(
+            np.compress(~missing, y, axis=1),
+            np.compress(~missing, variance, axis=1),
+            path[~missing],
+        ),
     )
     assert np.array_equal(whole, subset)
 
