@@ -16,7 +16,7 @@ from lidarops.raw import licel
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import RawFormat
 from lidarops.raw.header import RawChannel, RawHeader, Stretches
-from lidarops.raw.licel_header import memories, read_start
+from lidarops.raw.licel_header import memories, stated_start
 
 _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
 
@@ -165,5 +165,5 @@ FORMAT: Final = RawFormat(
     recognises=_recognises,
     parse_header=_parse_header,
     read_counts=_read_counts,
-    read_start=read_start,
+    read_start=stated_start,
 )

@@ -414,7 +414,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     )
 
 
-def read_start(buffer: bytes) -> datetime | None:
+def stated_start(buffer: bytes) -> datetime | None:
     """Return the start that the first lines of a file state; None where they state none."""
     try:
         first, second = _line_ends(buffer, 0, 2)
