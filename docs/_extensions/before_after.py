@@ -10,9 +10,11 @@ import benchmark_results
 import tables
 import verdicts
 
-from lidarops.bench.harness.rows import Figure, Row, Unit, format_time, with_error
-from lidarops.bench.harness.verdicts import Target, unmet
+from lidarops.bench.harness.figure import Figure, Unit, format_time, with_error
+from lidarops.bench.harness.rows import Row
+from lidarops.bench.harness.verdicts import Judgement, Target
 from lidarops.bench.stability.random_scenes import TARGETS
+from lidarops.bench.stability.reasons import Unmet
 
 RATIO: Final = "ratio"
 """Beginning of a place that names two figures, of which the first is divided by the second."""
@@ -33,7 +35,7 @@ def _groups(groups: list[dict[str, Any]]) -> Iterator[str]:
                 row["figure"],
                 row["before"],
                 _text(measured(row["now"])),
-                verdict(row),
+                str(judgement(row) or ""),
                 f"`{command(row['now'])}`",
                 remark(row),
             )
@@ -63,10 +65,10 @@ def _row(place: list[Any]) -> Row:
     return row
 
 
-def verdict(row: dict[str, Any]) -> str:
+def judgement(row: dict[str, Any]) -> Judgement | None:
     """Return the target of a row and whether the figure meets it, as the benchmark decides."""
     if row["target"] is None:
-        return ""
+        return None
     return Target(**row["target"]).judged(measured(row["now"]))
 
 
@@ -77,14 +79,14 @@ def remark(row: dict[str, Any]) -> str:
 
 def why(row: dict[str, Any]) -> str:
     """Return why a figure does not meet its target: as stated beside it, or for the benchmark."""
-    text = verdict(row)
-    if unmet(text) is None:
+    judged = judgement(row)
+    if judged is None or judged.met:
         return ""
     if "why" in row or row["now"][0] != "stability":
         return str(row.get("why", ""))
     _, title, case, method, quantity = row["now"]
     target = next(name for name, shares in TARGETS.items() if quantity in (*shares, "share"))
-    return verdicts.why(verdicts.Unmet(title, case, method, target, "", text))
+    return verdicts.why(Unmet(title, case, method, target, judged))
 
 
 def _text(figure: Figure) -> str:

@@ -16,7 +16,9 @@ from typing import Any, Final, NamedTuple
 
 import tables
 
-from lidarops.bench.harness.rows import Row, Unit, table
+from lidarops.bench.harness.figure import Unit
+from lidarops.bench.harness.rows import Row
+from lidarops.bench.harness.tables import table
 
 RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
 DIGITS: Final = 6

@@ -12,9 +12,16 @@ from typing import Any, Final
 
 import before_after
 import benchmark_results
+import verdicts
 
-from lidarops.bench.harness.rows import share_text
-from lidarops.bench.stability.random_scenes import BROKEN, FALSE_PLAIN, FALSE_RANDOM, VIOLATED
+from lidarops.bench.harness.figure import share_text
+from lidarops.bench.stability.random_scenes import (
+    BROKEN,
+    FALSE_PLAIN,
+    FALSE_RANDOM,
+    TARGET,
+    VIOLATED,
+)
 
 FILE: Final = Path(benchmark_results.__file__).parents[2] / "lidarops/netcdf/measured_shares.py"
 TABLES: Final = ("homogeneous",)
@@ -90,7 +97,9 @@ def text() -> str:
         violated = {
             (row.case, row.method)
             for row in rows
-            if row.quantity == "target" and str(row.value).startswith(share_text(VIOLATED))
+            if row.quantity == TARGET
+            and (judged := verdicts.judgement(row))
+            and judged.limits == share_text(VIOLATED)
         }
         shares |= {
             (row.case, row.method): row

@@ -3,41 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 import benchmark_results
 import tables
 
-from lidarops.bench.harness.rows import Row, cell
-from lidarops.bench.harness.verdicts import unmet
-from lidarops.bench.stability import reasons
-from lidarops.bench.stability.random_scenes import TARGETS
+from lidarops.bench.harness.figure import share_text
+from lidarops.bench.harness.rows import CPU_TIME, Row
+from lidarops.bench.harness.tables import cell
+from lidarops.bench.harness.verdicts import Judgement, Verdict
+from lidarops.bench.stability import flag_rates, reasons
+from lidarops.bench.stability.random_scenes import SATISFIED, TARGET, TARGETS
+from lidarops.bench.stability.reasons import Unmet
 
-_WORDS: Final = {"target": "false", "needless target": "needless"}
-
-
-class Unmet(NamedTuple):
-    """A target that is missed, or for which the scenes do not decide."""
-
-    part: str
-    quantity: str
-    name: str
-    """Class."""
-    target: str
-    share: str
-    verdict: str
-    """Target and verdict."""
+_WORDS: Final = {TARGET: "false", "needless target": "needless"}
 
 
 def page() -> str:
     """Return a table of the targets that are not met, with the reasons."""
     columns = ("part", "quantity", "class", "share", "value", "target", "why")
+    unmet = list(_with_figures())
     rows = [
-        (one.part, one.quantity, one.name, _words(one.target), one.share, one.verdict, why(one))
-        for one in every_unmet()
+        (
+            *(one.part, one.quantity, one.name, _words(one.target)),
+            *("" if figure is None else cell(figure), str(one.judgement), why(one)),
+        )
+        for one, figure in unmet
     ]
-    judged = sum(row.quantity in TARGETS and row.value is not None for row in _rows())
-    missed = sum(one.verdict.endswith("MISSED") for one in every_unmet())
+    judged = sum(judgement(row) is not None for row in _rows())
+    missed = sum(one.judgement.verdict is Verdict.MISSED for one, _ in unmet)
     counts = (
         f"Of {judged} targets, {judged - len(rows)} are met, {missed} are missed, and for "
         f"{len(rows) - missed} the scenes do not decide."
@@ -51,32 +45,35 @@ def _words(target: str) -> str:
 
 def every_unmet() -> list[Unmet]:
     """Return the targets of the committed result that are not met."""
-    return list(_unmet())
+    return [one for one, _ in _with_figures()]
 
 
-def _unmet() -> Iterator[Unmet]:
+def _with_figures() -> Iterator[tuple[Unmet, Row | None]]:
+    """Yield the targets that are not met, with the rows that they judge."""
     for title, rows in benchmark_results.read("stability")["tables"].items():
         figures = {(row.case, row.method, row.quantity): row for row in rows}
         for row in rows:
-            if row.quantity in TARGETS and unmet(row.value):
-                shown = judged_row(figures, row)
-                yield Unmet(
-                    part_of(title), row.case, row.method, row.quantity,
-                    "" if shown is None else cell(shown), str(row.value),
-                )  # fmt: skip
+            judged = judgement(row)
+            if judged and not judged.met:
+                one = Unmet(part_of(title), row.case, row.method, row.quantity, judged)
+                yield one, judged_row(figures, row)
+
+
+def judgement(row: Row) -> Judgement | None:
+    """Return what a row states of a target; None where it states nothing."""
+    stated = row.quantity in TARGETS and row.value is not None
+    return Judgement.read(str(row.value)) if stated else None
 
 
 def judged_row(figures: dict[tuple[str, str, str], Row], row: Row) -> Row | None:
-    """Return the row of the share that a target is for."""
+    """Return the row of the figure that a target is for."""
     held, elsewhere = TARGETS[row.quantity]
-    # Where the model holds, intervals have targets.
-    holds = figures.get((row.case, row.method, "95 % target"))
-    pooled = row.method == "all where the model holds"
-    name = held if pooled or (holds is not None and holds.value) else elsewhere
-    for quantity in (name, "share", "CPU time"):
-        found = figures.get((row.case, row.method, quantity))
-        if found is not None:
-            return found
+    judged = judgement(row)
+    holds = judged is not None and judged.limits == share_text(SATISFIED)
+    for quantity in (held if holds else elsewhere, flag_rates.SHARE, CPU_TIME):
+        figure = figures.get((row.case, row.method, quantity))
+        if figure is not None:
+            return figure
     return None
 
 
@@ -97,8 +94,4 @@ def stated_reasons() -> list[reasons.Reason]:
 
 def why(one: Unmet) -> str:
     """Return the reason of a target that is not met; empty if none is stated."""
-    verdict = unmet(one.verdict)
-    if verdict is None:
-        return ""
-    missed = reasons.Unmet(one.part, one.quantity, one.name, one.target, verdict)
-    return reasons.why(missed, stated_reasons())
+    return reasons.why(one, stated_reasons())

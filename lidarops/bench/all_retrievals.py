@@ -13,22 +13,10 @@ import numpy as np
 
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Chapter,
-    Figure,
-    Results,
-    Row,
-    Score,
-    Scores,
-    Study,
-    Work,
-    cpu_time,
-    error_against_time,
-    rows_of,
-    rows_of_scores,
-    share,
-)
+from lidarops.bench.harness.charts import error_against_time
+from lidarops.bench.harness.figure import Figure, cpu_time, share
+from lidarops.bench.harness.rows import CPU_TIME, Row, Score, Scores, rows_of, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study, Work
 from lidarops.bench.harness.timing import least_times
 from lidarops.figures.charts import Chart
 

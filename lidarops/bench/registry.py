@@ -12,7 +12,7 @@ from typing import TypeVar
 from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, network
 from lidarops.bench.harness.benchmark import BenchmarkKind, Effort
-from lidarops.bench.harness.rows import Study
+from lidarops.bench.harness.study import Study
 from lidarops.bench.harness.timing import cpu_seconds
 from lidarops.bench.stability import study
 from lidarops.bench.throughput import (

@@ -10,7 +10,8 @@ from lidarops.bench import all_retrievals
 from lidarops.bench.accuracy import elastic, homogeneous, multiangle, multiangle_cases, network
 from lidarops.bench.accuracy.multiangle import StudySize
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import Figure, Work, cpu_time
+from lidarops.bench.harness.figure import Figure, cpu_time
+from lidarops.bench.harness.study import Work
 
 SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20)
 

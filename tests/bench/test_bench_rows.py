@@ -6,23 +6,11 @@ import json
 
 import pytest
 
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Chapter,
-    Figure,
-    Results,
-    Row,
-    Study,
-    Unit,
-    by_method,
-    cpu_time,
-    error_against_time,
-    panel,
-    rows_of_scores,
-    share,
-    table,
-    with_error,
-)
+from lidarops.bench.harness.charts import error_against_time, panel
+from lidarops.bench.harness.figure import Figure, Unit, cpu_time, share, with_error
+from lidarops.bench.harness.rows import CPU_TIME, Row, by_method, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study
+from lidarops.bench.harness.tables import table
 from lidarops.errors import CatalogError
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from lidarops.bench.harness.rows import Figure, Unit
-from lidarops.bench.harness.verdicts import Target, Verdict, unmet
+from lidarops.bench.harness.figure import Figure, Unit
+from lidarops.bench.harness.verdicts import Judgement, Target, Verdict
 
 
 @pytest.mark.parametrize(
@@ -33,14 +33,14 @@ def test_a_share_needs_no_lower_limit():
 
 def test_the_text_states_the_target_whose_it_is_and_the_verdict():
     share = Figure(0.2, 0.001, Unit.SHARE)
-    assert Target(0.13, own=True).judged(share) == "own target 13 % MISSED"
-    assert Target(0.97, 0.94).judged(share) == "94 to 97 % MISSED"
-    assert Target(2.5).judged(Figure(9.3)) == "2.5 MISSED"
-    assert Target(2.5).judged(Figure(2.4)) == "2.5 met"
+    assert str(Target(0.13, own=True).judged(share)) == "own target 13 % MISSED"
+    assert str(Target(0.97, 0.94).judged(share)) == "94 to 97 % MISSED"
+    assert str(Target(2.5).judged(Figure(9.3))) == "2.5 MISSED"
+    assert str(Target(2.5).judged(Figure(2.4))) == "2.5 met"
 
 
-def test_what_is_not_met_is_found_in_the_text():
-    assert unmet("0.1 % MISSED") is Verdict.MISSED
-    assert unmet("94 to 97 % undecided") is Verdict.UNDECIDED
-    assert unmet("0.1 % met") is None
-    assert unmet(None) is None
+@pytest.mark.parametrize("verdict", Verdict)
+def test_what_a_result_states_is_read_again(verdict):
+    judgement = Judgement("own target 94 to 97 %", verdict)
+    assert Judgement.read(str(judgement)) == judgement
+    assert judgement.met == (verdict is Verdict.MET)

@@ -8,7 +8,8 @@ import measured_shares
 import pytest
 import verdicts
 
-from lidarops.bench.stability.random_scenes import FALSE_TARGET, POOLED
+from lidarops.bench.harness.verdicts import Verdict
+from lidarops.bench.stability.random_scenes import POOLED, TARGET
 from lidarops.kinds import kinds
 from lidarops.netcdf import false_shares
 from lidarops.netcdf.measured_shares import SHARES
@@ -81,7 +82,7 @@ FLAGGED = {
 def test_comments_state_every_class_that_misses_its_target() -> None:
     beside = [tuple(place[:4]) for place in measured_shares.BESIDE.values()]
     for one in verdicts.every_unmet():
-        if one.target != FALSE_TARGET or not one.verdict.endswith("MISSED"):
+        if one.target != TARGET or one.judgement.verdict is not Verdict.MISSED:
             continue
         pooled = one.name in POOLED or one.part in FLAGGED
         of_path = one.part == "homogeneous" and one.quantity in CLASSES

@@ -12,8 +12,8 @@ import typer
 import verdicts
 
 from lidarops.bench.harness.benchmark import BenchmarkKind
-from lidarops.bench.harness.rows import Figure, Unit
-from lidarops.bench.harness.verdicts import Target, Verdict, unmet
+from lidarops.bench.harness.figure import Figure, Unit
+from lidarops.bench.harness.verdicts import Judgement, Target, Verdict
 from lidarops.bench.registry import Benchmark
 from lidarops.bench.stability import study
 from lidarops.bench.stability.random_scenes import TARGETS
@@ -126,7 +126,7 @@ def test_published_targets_are_those_of_the_code() -> None:
             assert share is not None
             figure = Figure(float(share.value or 0.0), share.error, Unit.SHARE)
             words = Target(**targets_of(str(row.value))).judged(figure)
-            assert words == row.value, (title, row)
+            assert str(words) == row.value, (title, row)
             judged += 1
     assert judged > 200
 
@@ -161,7 +161,7 @@ def test_every_reason_is_for_a_class_of_the_benchmark() -> None:
     ]
     for reason in verdicts.stated_reasons():
         verdict = Verdict.UNDECIDED if reason.verdict == Verdict.UNDECIDED else Verdict.MISSED
-        assert any(reason.matches(Unmet(*row, verdict)) for row in rows), reason
+        assert any(reason.matches(Unmet(*row, Judgement("", verdict))) for row in rows), reason
 
 
 def test_the_page_of_targets_counts_those_that_are_not_met() -> None:
@@ -169,7 +169,7 @@ def test_the_page_of_targets_counts_those_that_are_not_met() -> None:
     unmet = verdicts.every_unmet()
     assert text.count("\n| ") == len(unmet) + 2
     assert "Of " in text
-    assert all(one.verdict in text for one in unmet)
+    assert all(str(one.judgement) in text for one in unmet)
 
 
 def _rows_before():
@@ -181,7 +181,8 @@ def _rows_before():
 def test_a_figure_that_does_not_meet_its_target_says_why(row) -> None:
     """Every figure of the independent study is measured today."""
     assert before_after.measured(row["now"]).value >= 0.0
-    if unmet(before_after.verdict(row)):
+    judged = before_after.judgement(row)
+    if judged and not judged.met:
         assert before_after.why(row)
 
 

@@ -14,26 +14,12 @@ import numpy.typing as npt
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.accuracy.elastic_cases import BackgroundEstimates, SimulatedSky
 from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.charts import chart, panel
 from lidarops.bench.harness.costs import batch_label, cost_chapter, time_methods
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Array,
-    Chapter,
-    Figure,
-    Mask,
-    Results,
-    Row,
-    Score,
-    Scores,
-    Study,
-    Work,
-    chart,
-    cpu_time,
-    panel,
-    rows_of_scores,
-    share,
-)
+from lidarops.bench.harness.figure import Array, Figure, Mask, cpu_time, share
+from lidarops.bench.harness.rows import CPU_TIME, Row, Score, Scores, rows_of_scores
 from lidarops.bench.harness.statistics import SIGMAS, mean, root, share_inside
+from lidarops.bench.harness.study import Chapter, Results, Study, Work
 from lidarops.bench.harness.timing import READ, affordable
 from lidarops.figures.charts import Chart
 from lidarops.retrieve.elastic.inversion import ElasticResult

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import Array, Mask
+from lidarops.bench.harness.figure import Array, Mask
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel

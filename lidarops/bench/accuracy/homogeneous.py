@@ -23,23 +23,11 @@ from lidarops.bench.accuracy.homogeneous_cases import (
 )
 from lidarops.bench.accuracy.peers import SLOW, iterative_peers
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Chapter,
-    Figure,
-    Results,
-    Score,
-    Scores,
-    Study,
-    Work,
-    chart,
-    cpu_time,
-    error_against_time,
-    panel,
-    rows_of_scores,
-    share,
-)
+from lidarops.bench.harness.charts import chart, error_against_time, panel
+from lidarops.bench.harness.figure import Figure, cpu_time, share
+from lidarops.bench.harness.rows import CPU_TIME, Score, Scores, rows_of_scores
 from lidarops.bench.harness.statistics import TWO_SIDED, mean, root, share_inside
+from lidarops.bench.harness.study import Chapter, Results, Study, Work
 from lidarops.retrieve.background.cubic_and_tail import cubic
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import Array, Mask
+from lidarops.bench.harness.figure import Array, Mask
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit

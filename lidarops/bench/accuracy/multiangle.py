@@ -13,27 +13,11 @@ import numpy as np
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.bench.accuracy.multiangle_cases import Scan, ScanEstimates, ScanSolver, Scene
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Array,
-    Chapter,
-    Figure,
-    Mask,
-    Results,
-    Row,
-    Score,
-    Scores,
-    Study,
-    Work,
-    chart,
-    cpu_time,
-    error_against_time,
-    panel,
-    rows_of_scores,
-    share,
-    with_error,
-)
+from lidarops.bench.harness.charts import chart, error_against_time, panel
+from lidarops.bench.harness.figure import Array, Figure, Mask, cpu_time, share, with_error
+from lidarops.bench.harness.rows import CPU_TIME, Row, Score, Scores, rows_of_scores
 from lidarops.bench.harness.statistics import SIGMAS, over_blocks, root
+from lidarops.bench.harness.study import Chapter, Results, Study, Work
 from lidarops.figures.charts import Chart
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import lsq_linear
 
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
     retrieve_optical_depth,

@@ -15,32 +15,17 @@ import numpy as np
 from lidarops.bench.accuracy import network_cases
 from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals
 from lidarops.bench.harness.benchmark import Effort
+from lidarops.bench.harness.charts import chart, panel
 from lidarops.bench.harness.costs import READS
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Array,
-    Chapter,
-    Figure,
-    Mask,
-    Results,
-    Row,
-    Score,
-    Scores,
-    Study,
-    Work,
-    by_method,
-    chart,
-    cpu_time,
-    panel,
-    rows_of_scores,
-    share,
-)
+from lidarops.bench.harness.figure import Array, Figure, Mask, cpu_time, share
+from lidarops.bench.harness.rows import CPU_TIME, Row, Score, Scores, by_method, rows_of_scores
 from lidarops.bench.harness.statistics import (
     SIGMAS,
     mean_by_block,
     root_by_block,
     share_by_block,
 )
+from lidarops.bench.harness.study import Chapter, Results, Study, Work
 from lidarops.bench.harness.timing import READ
 from lidarops.figures.charts import Chart
 from lidarops.retrieve.air import visibility as sight

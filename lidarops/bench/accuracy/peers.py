@@ -19,7 +19,7 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     Scenario,
     estimated,
 )
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 
 KILOMETRE: Final = 1e3
 JIT: Final = "LM, numba"

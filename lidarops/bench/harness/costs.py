@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Final
 
-from lidarops.bench.harness.rows import CPU_TIME, Chapter, Results, Row, cpu_time, rows_of
+from lidarops.bench.harness.figure import cpu_time
+from lidarops.bench.harness.rows import CPU_TIME, Row, rows_of
+from lidarops.bench.harness.study import Chapter, Results
 from lidarops.bench.harness.timing import READ, in_threads, least_times
 from lidarops.figures.charts import Ladder
 from lidarops.figures.wording import counted

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import Array, Figure, Mask, share
+from lidarops.bench.harness.figure import Array, Figure, Mask, share
 
 TWO_SIDED: Final = 1.959963984540054
 """Standard deviations that hold 95 percent of a normal distribution."""

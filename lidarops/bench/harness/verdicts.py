@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, Self
 
-from lidarops.bench.harness.rows import Figure, Unit, share_text
+from lidarops.bench.harness.figure import Figure, Unit, share_text
 
 ERRORS: Final = 2.0
 """Monte Carlo errors that a verdict allows for."""
@@ -22,6 +22,29 @@ class Verdict(StrEnum):
     """A limit of the target is less than 2 Monte Carlo errors away."""
     MISSED = "MISSED"
     """Outside the target by more than 2 Monte Carlo errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A target, and whether a figure meets it."""
+
+    limits: str
+    """In words, with the unit."""
+    verdict: Verdict
+
+    @classmethod
+    def read(cls, text: str) -> Self:
+        """Return the judgement that a committed result states."""
+        limits, _, verdict = text.rpartition(" ")
+        return cls(limits, Verdict(verdict))
+
+    def __str__(self) -> str:
+        return f"{self.limits} {self.verdict}"
+
+    @property
+    def met(self) -> bool:
+        """Whether the target is met for sure."""
+        return self.verdict is Verdict.MET
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,18 +66,10 @@ class Target:
             return Verdict.MISSED
         return Verdict.UNDECIDED
 
-    def judged(self, figure: Figure) -> str:
+    def judged(self, figure: Figure) -> Judgement:
         """Return the target and the verdict."""
         shares = figure.unit is Unit.SHARE
         limits = share_text(self.most) if shares else f"{self.most:g}"
         if math.isfinite(self.least):
             limits = f"{100.0 * self.least if shares else self.least:g} to {limits}"
-        return f"{'own target ' if self.own else ''}{limits} {self.verdict(figure)}"
-
-
-def unmet(text: object) -> Verdict | None:
-    """Return the verdict of the text of a target if it is not that the target is met."""
-    for verdict in (Verdict.MISSED, Verdict.UNDECIDED):
-        if str(text).endswith(f" {verdict}"):
-            return verdict
-    return None
+        return Judgement(f"{'own target ' if self.own else ''}{limits}", self.verdict(figure))

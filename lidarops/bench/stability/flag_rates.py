@@ -12,12 +12,12 @@ from lidarops.bench.harness.rows import Scores
 from lidarops.bench.harness.statistics import clustered_share
 from lidarops.bench.harness.verdicts import Target
 from lidarops.bench.stability.random_homogeneous import random_paths
+from lidarops.bench.stability.random_scenes import TARGET
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 SHARE: Final = "share"
-TARGET: Final = "target"
 _REJECTED: Final = np.int32(rejecting((*Quality, *HomogeneousQuality)))
 _DECIDED: Final = (Quality.LOW_SIGNAL, Quality.NEGATIVE_AMPLITUDE)
 _NEEDLESS: Final = Target(1e-3, own=True)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import ErrorKind

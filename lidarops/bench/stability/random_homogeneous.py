@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from lidarops.bench.accuracy.multiangle_cases import correlated
-from lidarops.bench.harness.rows import Array, Mask
+from lidarops.bench.harness.figure import Array, Mask
 from lidarops.bench.stability.random_scenes import COVERED, Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -187,11 +187,14 @@ _SAME_SHAPE: Final = (
 _SHORT_SCALE: Final = (
     "a change over the whole section has nearly the shape of extinction and background"
 )
+_WITH_GAPS: Final = Failure("gaps", satisfied=True)
+_NOISE_NOT_STATED: Final = Failure("none, noise not stated", satisfied=True)
+_OUTLIERS: Final = Failure("outliers")
 FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
     (Failure("none", satisfied=True), _none),
-    (Failure("none, noise not stated", satisfied=True), _none),
-    (Failure("gaps", satisfied=True), _none),
-    (Failure("outliers"), _none),
+    (_NOISE_NOT_STATED, _none),
+    (_WITH_GAPS, _none),
+    (_OUTLIERS, _none),
     (Failure("slope of the backscatter along the section", unseen=_SAME_SHAPE), _slope),
     (Failure("bent backscatter"), _curved),
     (Failure("plume"), _plume),
@@ -249,11 +252,11 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValue
         with np.errstate(under="ignore"):
             violated = violate(paths, rng)
         power = paths.background + violated.signal + rng.standard_normal(violated.signal.shape)
-        if failure.name == "gaps":
+        if failure is _WITH_GAPS:
             power = _with_gaps(power, rng)
-        elif failure.name == "outliers":
+        elif failure is _OUTLIERS:
             power = _with_outliers(power, rng)
-        noise = None if "not stated" in failure.name else 1.0
+        noise = None if failure is _NOISE_NOT_STATED else 1.0
         wider = _widening(paths.range.size) if noise is None else 1.0
         solvable: Mask = within & (wider * least <= _SOLVABLE)
         misfit = None if violate is _none else visible_misfit(paths.range, violated.signal)
@@ -280,7 +283,7 @@ def _solved(
     fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
     bits = np.asarray(fit.quality)
     # Missing bins lose information.
-    expected = solvable if failure.satisfied and failure.name != "gaps" else None
+    expected = solvable if failure.satisfied and failure is not _WITH_GAPS else None
     count = len(power)
     yield (
         ScoredValues(

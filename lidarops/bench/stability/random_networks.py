@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals, signals
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.errors import LidarOpsError
 from lidarops.retrieve.network import extinction_field, labeled
@@ -31,6 +31,10 @@ class _Measurement:
     power: Array
     variance: Array
     exponent: float = 1.0
+
+
+DrawAir = Callable[[Random], Air]
+Damage = Callable[[_Measurement, Signals, Random], _Measurement]
 
 
 def random_network(rng: Random) -> LidarLine:
@@ -142,7 +146,7 @@ def _with_offset(measurement: _Measurement, _: Signals, rng: Random) -> _Measure
 
 _UNKNOWN_EXPONENT: Final = "the signals do not determine the exponent: the user declares it"
 _NOT_CANCELLED: Final = "overlap errors do not cancel, and beams that agree may share them"
-FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
+FAILURES: Final[tuple[tuple[Failure, DrawAir, Damage], ...]] = (
     (Failure("none, homogeneous", satisfied=True), homogeneous, _undamaged),
     (Failure("none, layered", satisfied=True), layered, _undamaged),
     (Failure("none, plume", satisfied=True), plume, _undamaged),
@@ -197,7 +201,7 @@ def score_networks(
 
 
 def _solve_damaged(
-    rng: Random, draw_air: Any, damage: Any, profiles: int
+    rng: Random, draw_air: DrawAir, damage: Damage, profiles: int
 ) -> tuple[extinction_field.NetworkResult, Array] | None:
     """Return the result and the truth; None where the beams do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
@@ -229,7 +233,7 @@ _DECLARED: Final = (("2 %, the default, declared", 0.02), ("10 % declared", _VAR
 _NOT_SHOWN: Final = "the signals do not show how the lidar ratio varies: the user declares it"
 
 
-def _drawn(rng: Random, draw_air: Any) -> tuple[Signals, float] | None:
+def _drawn(rng: Random, draw_air: DrawAir) -> tuple[Signals, float] | None:
     """Return clean signals of a random network, and the noise; None where beams do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
     net = random_network(rng).network()
@@ -239,9 +243,12 @@ def _drawn(rng: Random, draw_air: Any) -> tuple[Signals, float] | None:
 
 
 def score_short_blocks(
-    cluster: int, profiles: int, *, draw_air: Any, length: int
+    cluster: int, profiles: int, *, draw_air: DrawAir, name: str, length: int
 ) -> Iterator[tuple[ScoredValues, int]]:
-    """Yield results of networks that are solved in blocks of a few profiles."""
+    """Yield results of networks that are solved in blocks of a few profiles; a class of that name.
+
+    `length` is the number of profiles of a block.
+    """
     rng = np.random.default_rng((81, cluster))
     drawn = _drawn(rng, draw_air)
     if drawn is None:
@@ -252,7 +259,6 @@ def score_short_blocks(
         power, clean.range, clean.network, variance=variance, full_overlap_range=_FULL_OVERLAP,
         blocks=np.arange(profiles) // length,
     )  # fmt: skip
-    name = f"{draw_air.__name__}, blocks of {length}"
     yield _scored(Failure(name, satisfied=True), result, clean.truth(profiles), 0.0), profiles
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scan, Scene
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues, held_first, joined
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality

@@ -13,9 +13,10 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.harness.rows import Array, Figure, Mask, Score, Scores
+from lidarops.bench.harness.figure import Array, Figure, Mask
+from lidarops.bench.harness.rows import Score, Scores
 from lidarops.bench.harness.statistics import clustered_share, design_effect
-from lidarops.bench.harness.verdicts import Target
+from lidarops.bench.harness.verdicts import Judgement, Target
 from lidarops.flags import FlagBit, Quality, rejecting
 
 FALSE: Final = 4.0
@@ -198,7 +199,7 @@ class Tally:
             "false, with systematic": part("false", "kept"),
             FALSE_PLAIN: false_plain,
             # Where the model holds, random errors alone must cover the truth.
-            FALSE_TARGET: _judged(false_random, Target(SATISFIED))
+            TARGET: _judged(false_random, Target(SATISFIED))
             if holds
             else _judged(false_plain, Target(VIOLATED)),
             "of these undetectable": part("false hidden", "plain") if measured else None,
@@ -216,7 +217,7 @@ class Tally:
         }
 
 
-def _judged(figure: Figure | None, target: Target | None) -> str | None:
+def _judged(figure: Figure | None, target: Target | None) -> Judgement | None:
     return None if figure is None or target is None else target.judged(figure)
 
 
@@ -246,7 +247,8 @@ COVERED_BY_68: Final = Target(0.72, 0.66)
 """The same within one."""
 FALSE_RANDOM: Final = "false, random error"
 FALSE_PLAIN: Final = "and not uncertain"
-FALSE_TARGET: Final = "target"
+TARGET: Final = "target"
+"""Of false values, and of what else a table judges."""
 COVERED_SHARE: Final = "within 1.96"
 COVERED_TARGET: Final = "95 % target"
 ONE_SHARE: Final = "within 1"
@@ -256,7 +258,7 @@ NEEDLESS_TARGET: Final = "needless target"
 TARGETS: Final = {
     COVERED_TARGET: (COVERED_SHARE, COVERED_SHARE),
     ONE_TARGET: (ONE_SHARE, ONE_SHARE),
-    FALSE_TARGET: (FALSE_RANDOM, FALSE_PLAIN),
+    TARGET: (FALSE_RANDOM, FALSE_PLAIN),
     NEEDLESS_TARGET: (NEEDLESS, NEEDLESS),
 }
 """Quantities with a verdict, and the shares that they judge where the model holds and elsewhere."""

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy.multiangle_cases import correlated
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 from lidarops.bench.stability.random_homogeneous import Paths, random_paths
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.harness.rows import Array
+from lidarops.bench.harness.figure import Array
 from lidarops.bench.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
@@ -219,7 +219,7 @@ def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
     for number, (failure, process) in held_first(FAILURES):
         rng = np.random.default_rng((75, cluster, number))
         errors = process(rng, profiles)
-        clean = failure.satisfied and "cubic" not in failure.name
+        clean = failure.satisfied and process is not _cubic
         yield (
             ScoredValues(
                 failure, errors.quantity, errors.error, errors.random, errors.systematic,

@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
-from lidarops.bench.harness.verdicts import Verdict
+from lidarops.bench.harness.verdicts import Judgement
 
 FILE: Final = Path(__file__).parents[3] / "docs/results/reasons.json"
 """Not in an installed package."""
@@ -24,9 +24,7 @@ class Unmet:
     name: str
     """Class."""
     target: str
-    verdict: Verdict
-    text: str = ""
-    """Limits and verdict."""
+    judgement: Judgement
 
     @property
     def place(self) -> str:
@@ -34,7 +32,7 @@ class Unmet:
         return f"{self.name} ({self.quantity})" if self.quantity else self.name
 
     def __str__(self) -> str:
-        return f"{self.part}: {self.place}, {self.target} {self.text}"
+        return f"{self.part}: {self.place}, {self.target} {self.judgement}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +50,7 @@ class Reason:
         """Return whether the reason is for this target."""
         pairs = (
             (one.part, self.part), (one.quantity, self.quantity), (one.name, self.name),
-            (one.target, self.target), (one.verdict, self.verdict),
+            (one.target, self.target), (one.judgement.verdict, self.verdict),
         )  # fmt: skip
         return all(fnmatchcase(text, pattern) for text, pattern in pairs)
 

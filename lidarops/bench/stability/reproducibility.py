@@ -13,7 +13,8 @@ import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.network_cases import signals
-from lidarops.bench.harness.rows import Array, Scores
+from lidarops.bench.harness.figure import Array
+from lidarops.bench.harness.rows import Scores
 from lidarops.bench.stability import random_networks
 from lidarops.retrieve.network import extinction_field
 

@@ -9,18 +9,11 @@ from functools import partial
 from typing import Final
 
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import (
-    CPU_TIME,
-    Chapter,
-    Results,
-    Scores,
-    Study,
-    cpu_time,
-    rows_of_scores,
-    share_text,
-)
+from lidarops.bench.harness.figure import cpu_time, share_text
+from lidarops.bench.harness.rows import CPU_TIME, Scores, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.harness.timing import cpu_seconds
-from lidarops.bench.harness.verdicts import Verdict, unmet
+from lidarops.bench.harness.verdicts import Judgement, Verdict
 from lidarops.bench.stability import (
     flag_rates,
     random_elastic,
@@ -35,11 +28,11 @@ from lidarops.bench.stability.random_scenes import (
     BROKEN,
     COVERED,
     FALSE,
-    FALSE_TARGET,
     FINE,
     HALF,
     HELD,
     SATISFIED,
+    TARGET,
     TARGETS,
     VIOLATED,
     VISIBLE,
@@ -84,10 +77,12 @@ class Draws:
         return self.score(cluster, self.profiles)
 
 
-def _blocks(draw_air: object, length: int, clusters: int, profiles: int = 6) -> Draws:
-    name = getattr(draw_air, "__name__", "")
-    score = partial(random_networks.score_short_blocks, draw_air=draw_air, length=length)
-    return Draws(f"networks, {name}, blocks of {length}", "network", score, profiles, clusters, 4)
+def _blocks(
+    draw_air: random_networks.DrawAir, air: str, length: int, clusters: int, profiles: int = 6
+) -> Draws:
+    name = f"{air}, blocks of {length}"
+    score = partial(random_networks.score_short_blocks, draw_air=draw_air, name=name, length=length)
+    return Draws(f"networks, {name}", "network", score, profiles, clusters, 4)
 
 
 def _scans(length: int) -> Draws:
@@ -137,11 +132,11 @@ DRAWS: Final = (
     _scans(1),
     _scans(2),
     Draws("scans of photon counts", "multiangle", random_scans.score_counted_scans, 8, 250, 6),
-    _blocks(random_networks.plume, 1, 2000),
-    _blocks(random_networks.plume, 2, 1500),
-    _blocks(random_networks.plume, 3, 1500),
-    _blocks(random_networks.homogeneous, 1, 2000, 3),
-    _blocks(random_networks.layered, 1, 2500, 3),
+    _blocks(random_networks.plume, "plume", 1, 2000),
+    _blocks(random_networks.plume, "plume", 2, 1500),
+    _blocks(random_networks.plume, "plume", 3, 1500),
+    _blocks(random_networks.homogeneous, "homogeneous", 1, 2000, 3),
+    _blocks(random_networks.layered, "layered", 1, 2500, 3),
     Draws(
         "networks, varying lidar ratio", "network", random_networks.score_lidar_ratios, 6, 200, 4
     ),
@@ -199,7 +194,7 @@ def measure_stability(
         )
     )
     targets_unmet += unmet_targets(COST, of_cost)
-    missed = [one for one in targets_unmet if one.verdict is Verdict.MISSED]
+    missed = [one for one in targets_unmet if one.judgement.verdict is Verdict.MISSED]
     reasons = read_reasons()
     return Study(
         "Stability: false values without a flag", effort.date, chapters,
@@ -266,12 +261,12 @@ def cost_scores(costs: dict[str, float], *, whole: bool = True) -> Scores:
     total = sum(costs.values())
     verdict = Verdict.MET if total <= LONGEST else Verdict.MISSED
     scores: Scores = {
-        ("", name): {CPU_TIME: cpu_time(1e9 * seconds), FALSE_TARGET: None}
+        ("", name): {CPU_TIME: cpu_time(1e9 * seconds), TARGET: None}
         for name, seconds in costs.items()
     }
-    target = f"{LONGEST / 60.0:g} min {verdict}"
+    target = Judgement(f"{LONGEST / 60.0:g} min", verdict)
     if whole:
-        scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), FALSE_TARGET: target}
+        scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), TARGET: target}
     return scores
 
 
@@ -331,7 +326,7 @@ def targets(scores: Scores) -> str:
     targets_unmet = unmet_targets("", scores)
     sentences = []
     for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNDECIDED, "Undecided")):
-        names = [one.place for one in targets_unmet if one.verdict is verdict]
+        names = [one.place for one in targets_unmet if one.judgement.verdict is verdict]
         if names:
             sentences.append(f"{words}: {', '.join(names)}.")
     return " ".join(sentences) or "All targets are met."
@@ -340,8 +335,8 @@ def targets(scores: Scores) -> str:
 def unmet_targets(part: str, scores: Scores) -> list[Unmet]:
     """Return the targets of a part that are missed or undecided."""
     return [
-        Unmet(part, quantity, name, target, verdict, str(score[target]))
+        Unmet(part, quantity, name, target, judgement)
         for (quantity, name), score in scores.items()
         for target in TARGETS
-        if (verdict := unmet(score.get(target))) is not None
+        if isinstance(judgement := score.get(target), Judgement) and not judgement.met
     ]

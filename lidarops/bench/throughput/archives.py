@@ -12,16 +12,10 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
-from lidarops.bench.harness.rows import (
-    Chapter,
-    Results,
-    Score,
-    Study,
-    chart,
-    cpu_time,
-    panel,
-    rows_of_scores,
-)
+from lidarops.bench.harness.charts import chart, panel
+from lidarops.bench.harness.figure import cpu_time
+from lidarops.bench.harness.rows import Score, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.harness.timing import in_fresh_process, peak_memory
 from lidarops.bench.throughput import stand_in_archives
 from lidarops.bench.throughput.campaigns import CampaignSize, simulate_campaign

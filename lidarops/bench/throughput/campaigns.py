@@ -17,17 +17,10 @@ import yaml
 from scipy import stats
 
 from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
-from lidarops.bench.harness.rows import (
-    Chapter,
-    Results,
-    Row,
-    Scores,
-    Study,
-    chart,
-    panel,
-    rows_of_scores,
-    share,
-)
+from lidarops.bench.harness.charts import chart, panel
+from lidarops.bench.harness.figure import share
+from lidarops.bench.harness.rows import Row, Scores, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.throughput import orchestration
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError

@@ -13,7 +13,8 @@ import numpy as np
 import yaml
 
 from lidarops.bench.harness.benchmark import CAMPAIGN_FILE, Effort
-from lidarops.bench.harness.rows import Chapter, Results, Scores, Study, rows_of_scores
+from lidarops.bench.harness.rows import Scores, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.harness.timing import in_fresh_process, peak_memory
 from lidarops.bench.throughput.campaigns import campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from lidarops.bench.harness.rows import Chapter, Results, Scores, rows_of_scores, share
+from lidarops.bench.harness.figure import share
+from lidarops.bench.harness.rows import Scores, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results
 from lidarops.errors import SceneError
 
 SERIAL: Final = "plain loop"

@@ -10,7 +10,9 @@ import xarray as xr
 
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import time_methods
-from lidarops.bench.harness.rows import CPU_TIME, Chapter, Results, Row, Study, cpu_time, rows_of
+from lidarops.bench.harness.figure import cpu_time
+from lidarops.bench.harness.rows import CPU_TIME, Row, rows_of
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.harness.timing import READ
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.molecular import MolecularProfile

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import Chapter, Results, Study, rows_of
+from lidarops.bench.harness.rows import rows_of
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.harness.timing import least_times
 from lidarops.errors import RawFormatError
 from lidarops.raw.archive import open_archive

@@ -16,7 +16,8 @@ from lidarops.bench.accuracy.multiangle_cases import Scan
 from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.benchmark import Effort
 from lidarops.bench.harness.costs import batch_label, cost_chapter, thread_gain, time_methods
-from lidarops.bench.harness.rows import Chapter, Results, Row, Scores, Study, rows_of_scores
+from lidarops.bench.harness.rows import Row, Scores, rows_of_scores
+from lidarops.bench.harness.study import Chapter, Results, Study
 from lidarops.bench.harness.timing import READ, affordable
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 

@@ -25,7 +25,8 @@ from lidarops.bench.accuracy.homogeneous_cases import (
 )
 from lidarops.bench.accuracy.peers import JIT, iterative_peers
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import CPU_TIME, Study
+from lidarops.bench.harness.rows import CPU_TIME
+from lidarops.bench.harness.study import Study
 from lidarops.bench.harness.timing import READ, in_threads, least_times
 from lidarops.bench.throughput import retrievals
 from lidarops.cli import app

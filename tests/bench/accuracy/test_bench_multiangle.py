@@ -14,7 +14,8 @@ from lidarops.bench.accuracy import multiangle, multiangle_cases
 from lidarops.bench.accuracy.multiangle import StudySize
 from lidarops.bench.harness import statistics
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import CPU_TIME, Figure
+from lidarops.bench.harness.figure import Figure
+from lidarops.bench.harness.rows import CPU_TIME
 from lidarops.bench.harness.timing import READ
 from lidarops.bench.throughput import retrievals
 from lidarops.retrieve.multiangle import mld

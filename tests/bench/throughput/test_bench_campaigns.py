@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.harness.rows import Study
+from lidarops.bench.harness.study import Study
 from lidarops.bench.throughput import campaigns, orchestration
 from lidarops.bench.throughput.campaigns import CampaignCost, CampaignSize, Stage
 from lidarops.errors import SceneError
