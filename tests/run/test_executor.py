@@ -15,7 +15,7 @@ from distributed import Client, Nanny
 from distributed.core import Status
 from distributed.deploy.spec import SpecCluster
 from support.archives.scene_jobs import catalogued_scenes, scene_jobs
-from support.archives.small_archive import Archive, made
+from support.archives.small_archive import Archive
 from support.poison import HALF, Poison
 
 from lidarops.catalog.ledger import RunStatus
@@ -48,14 +48,6 @@ def client() -> Iterator[Client]:
 def archive(tmp_path: Path) -> Archive:
     """A small archive."""
     return Archive(tmp_path, days=2)
-
-
-def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client: Client) -> None:
-    campaign = archive.write()
-    alone = reprocess(campaign.model_copy(update={"output": str(archive.folder / "alone")}))
-    together = reprocess(campaign, client=client)
-    assert made(alone) == made(together)
-    assert archive.contents("alone/products") == archive.contents("out/products")
 
 
 @pytest.mark.parametrize("page", ["json/identity.json", "info/main/workers.html"])

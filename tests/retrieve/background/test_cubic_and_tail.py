@@ -107,7 +107,7 @@ def test_largest_real_root_is_the_background_and_spread_decides_the_root_class()
     rng = np.random.default_rng(1)
     counts = {True: 0, False: 0}
     with mp.workdps(50):
-        for _ in range(1150):
+        for _ in range(400):
             bins = int(rng.integers(7, 20))
             lag = int(rng.integers(1, (bins - 1) // 2 + 1))
             # Exactly uniform, so that the identity of the triples is exact.
@@ -129,8 +129,9 @@ def test_largest_real_root_is_the_background_and_spread_decides_the_root_class()
                 three = spread < 1 / mp.sqrt(8)
                 counts[bool(three)] += 1
                 assert (len(roots) == 3) == three
-    assert sum(counts.values()) >= 1000
-    assert min(counts.values()) >= 100
+    # What fails in one of a hundred cases is met with 97 %.
+    assert sum(counts.values()) >= 350
+    assert min(counts.values()) >= 35
 
 
 @settings(max_examples=200, deadline=None)
