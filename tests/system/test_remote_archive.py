@@ -38,7 +38,8 @@ def campaign(tmp_path: Path) -> Iterator[Campaign]:
         raw_archives.write(path, raw_archives.content(minute))
     handler = functools.partial(_Quiet, directory=str(tmp_path / "raw"))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        # Its end is looked for every half a second otherwise.
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         url = f"http://127.0.0.1:{server.server_port}"
         yield factories.campaign().model_copy(
             update={"archive": url, "output": str(tmp_path / "out")}

@@ -143,7 +143,7 @@ def test_http_is_read_and_never_written(tmp_path: Path) -> None:
     made = products(tmp_path / "served", a=b"one", b=b"two!")
     handler = functools.partial(QuietHandler, directory=str(tmp_path / "served"))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         try:
             store = RemoteStore(f"http://127.0.0.1:{server.server_port}")
             assert [(f.path, f.size) for f in store.files()] == [
