@@ -45,16 +45,9 @@ BESIDE: Final[dict[tuple[str, str], list[Any]]] = {
     ("scans", "layer"): [
         *("stability", "multi-angle", "extinction", "layer of a few altitudes", FALSE_RANDOM)
     ],
-    ("scans", "layer, blocks of 1"): [
-        *("stability", "scans, blocks of 1", "extinction"),
-        *("layer of a few altitudes, blocks of 1", FALSE_RANDOM),
-    ],
     ("scans", "layer, blocks of 2"): [
         *("stability", "scans, blocks of 2", "extinction"),
         *("layer of a few altitudes, blocks of 2", FALSE_RANDOM),
-    ],
-    ("scans", "calm air, blocks of 2"): [
-        *("stability", "scans, blocks of 2", "extinction", "calm air, blocks of 2", FALSE_RANDOM)
     ],
     ("network", "plume, blocks of 1"): [
         *("stability", "networks, plume, blocks of 1", "extinction", "plume, blocks of 1"),

@@ -280,10 +280,9 @@ LAYOUT: Final = Layout(
             comment="Mean over the layer in altitude_bnds, at the wavelength of the channel. The"
             " error by smoothing is a mean over altitudes, too small in thin layers. Simulated:"
             " of extinctions with a layer of a few altitudes,"
-            f" {percent('scans', 'layer')} of 8 scans differ by more than 4 standard errors,"
-            f" {percent('scans', 'layer, blocks of 1')} of single scans, and"
-            f" {percent('scans', 'layer, blocks of 2')} of two; of two scans of calm air"
-            f" {percent('scans', 'calm air, blocks of 2')}."
+            f" {percent('scans', 'layer')} of 8 scans together and"
+            f" {percent('scans', 'layer, blocks of 2')} of two differ by more than 4 standard"
+            " errors."
             f" {NO_STANDARD_NAME}",
         ),
         _gradient_error("total_extinction", "extinction", "m-1"),

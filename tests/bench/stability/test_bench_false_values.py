@@ -151,10 +151,7 @@ def networks(cluster, profiles):
 
 
 KNOWN = {
-    ("calm air", "extinction"), ("layer of a few altitudes", "extinction"),
-    ("calm air, blocks of 1", "extinction"),
-    ("layer of a few altitudes, blocks of 1", "extinction"),
-    ("calm air, blocks of 2", "extinction"),
+    ("layer of a few altitudes", "extinction"),
     ("layer of a few altitudes, blocks of 2", "extinction"),
     ("8 to 10 bins, noise estimated", "extinction"),
     ("8 to 10 bins, noise estimated", "background"),
