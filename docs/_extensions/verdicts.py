@@ -48,6 +48,15 @@ def every_unmet() -> list[Unmet]:
     return [one for one, _ in _with_figures()]
 
 
+def above_target() -> set[tuple[str, str]]:
+    """Return class and quantity of the shares of false values that are above their target."""
+    return {
+        (one.name, one.quantity)
+        for one, figure in _with_figures()
+        if one.target == TARGET and figure is not None and float(figure.value or 0) > SATISFIED
+    }
+
+
 def _with_figures() -> Iterator[tuple[Unmet, Row | None]]:
     """Yield the targets that are not met, with the rows that they judge."""
     for title, rows in benchmark_results.read("stability")["tables"].items():

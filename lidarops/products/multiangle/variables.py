@@ -279,10 +279,10 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.BOTH,
             comment="Mean over the layer in altitude_bnds, at the wavelength of the channel. The"
             " error by smoothing is a mean over altitudes, too small in thin layers. Simulated:"
-            " of extinctions with a layer of a few altitudes,"
-            f" {percent('scans', 'layer')} of 8 scans together and"
-            f" {percent('scans', 'layer, blocks of 2')} of two differ by more than 4 standard"
-            " errors."
+            " of all extinctions of scenes with a layer of a few altitudes,"
+            f" {percent('scans', 'layer')} differ by more than 4 standard errors where 8 scans are"
+            f" solved together, {percent('scans', 'layer, blocks of 2')} where two are; nearly all"
+            " within the layer."
             f" {NO_STANDARD_NAME}",
         ),
         _gradient_error("total_extinction", "extinction", "m-1"),

@@ -128,12 +128,10 @@ class Thresholds:
     assumed."""
     bend: float = 0.15
     """Standard deviation of ln extinction over the crossings by the curvature of a field: that of a
-    gradient; the largest part of the errors of single profiles. Networks of ``lidarops bench
-    stability`` in blocks of 1, percent in 95 and 68 percent intervals: homogeneous air 99.4(2) and
-    95.2(7), plumes 95.6(6) and 76.6(12), of these 0.8(4) beyond 4 errors. With half of it and a
-    `doubt` of 1.5: 99.1(3) and 93.2(8), 92.1(8) and 69.6(13), 1.4(5). With at most the deviation of
-    the prior: 99.2(3) and 91.3(11), 92.3(9) and 70.6(13), 1.5(5). What makes homogeneous air right
-    makes plumes false."""
+    gradient; the largest part of the errors of single profiles. With half of it and a `doubt` of
+    1.5, or with at most the deviation of the prior, fewer than 94 percent of the 95 percent
+    intervals of plumes hold the truth in blocks of 1 (``lidarops bench stability``), and those of
+    homogeneous air are still too wide: what makes these right makes plumes false."""
     largest_deviation: float = 8.0
     """Limit of the deviation of a profile from the median, in median standard errors; assumed."""
 
