@@ -198,8 +198,8 @@ class Thresholds:
     more; by definition."""
     scale_height: float = 2000.0
     """m over which extinction may change by its mean: scale height of aerosol. Without a limit of
-    smoothness, optical depths above a boundary layer were 5 standard errors too large
-    (`test_the_top_of_a_layer_is_within_its_errors`)."""
+    smoothness, extinctions and optical depths around the top of a haze are false
+    (`test_errors_around_the_top_of_a_haze_cover_the_truth`)."""
     fewest_to_choose: int = 8
     """Profiles from which one weight of smoothness is chosen, and errors are calibrated; with
     fewer, solutions are averaged; by coverage in the ten scenes of `test_smooth_profile`."""

@@ -44,11 +44,6 @@ def rms(values):
     return float(np.sqrt(np.nanmean(np.square(values))))
 
 
-def under(top, altitude):
-    """Return the optical depth of uniform haze up to an altitude, and a quarter of it above."""
-    return 2e-4 * np.minimum(altitude, top) + 5e-5 * np.maximum(altitude - top, 0.0)
-
-
 def truth_of(scene, result):
     """Return true optical depth and extinction, (profile, altitude)."""
     depth = np.broadcast_to(scene.truth, result.optical_depth.shape)
@@ -577,20 +572,3 @@ def test_altitudes_that_are_not_uniform_are_refused():
     with pytest.raises(RetrievalInputError) as caught:
         smooth_optical_depth(np.zeros((4, 60)), np.ones((4, 60)), ALTITUDE**1.1)
     assert caught.value.field == "altitude"
-
-
-@pytest.mark.parametrize("profiles", [1, 12])
-def test_the_top_of_a_layer_is_within_its_errors(profiles):
-    rng = np.random.default_rng(5)
-    # As of a scan to low elevations: precise below, where extinction is smooth, and noisy above.
-    altitude = 60.0 + 60.0 * np.arange(45)
-    truth = under(1400.0, altitude)
-    error = np.broadcast_to(2e-4 * np.exp(altitude / 300.0), (profiles, altitude.size))
-    scores = []
-    for _ in range(20):
-        depth = truth + error * rng.normal(size=error.shape)
-        result = smooth_optical_depth(depth, error**-2.0, altitude)
-        scores.append((result.optical_depth - truth) / result.optical_depth_standard_error)
-    # Without a limit of smoothness, up to 12, and 54 to 67 percent.
-    assert np.abs(scores).max() < 4.5
-    assert np.mean(np.abs(scores) < 1.96) > 0.93
