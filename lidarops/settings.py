@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Final, Literal, Self
@@ -107,6 +108,20 @@ def _clean_pattern(value: str) -> str:
     return value
 
 
+def _words(patterns: list[str]) -> list[str]:
+    """Return patterns with each choice in braces written out, as a shell does: a{b,c} as ab, ac."""
+    words: list[str] = []
+    for pattern in patterns:
+        # Between [ and ], a brace stands for itself.
+        braces = re.search(r"(?<!\[)\{([^{},]*(?:,[^{},]*)+)\}", pattern)
+        if braces is None:
+            words.append(pattern)
+        else:
+            begin, end = pattern[: braces.start()], pattern[braces.end() :]
+            words += _words([f"{begin}{word}{end}" for word in braces[1].split(",")])
+    return list(dict.fromkeys(words))
+
+
 def as_interval(value: Any) -> Any:
     """Return an interval for a text such as 6h or 30min; leave other values as they are."""
     if isinstance(value, str) and value != "day":
@@ -151,8 +166,11 @@ Interval = Annotated[
 Inside = Annotated[str, AfterValidator(_clean_pattern)]
 """Path below the folder of the campaign file, relative to it."""
 Patterns = Annotated[
-    list[Inside], BeforeValidator(_as_list, json_schema_input_type=str | list[str])
+    list[Inside],
+    BeforeValidator(_as_list, json_schema_input_type=str | list[str]),
+    AfterValidator(_words),
 ]
+"""Patterns of paths below the archive, as of a shell; `sources.path_pattern` reads each."""
 Identifier = Annotated[
     str,
     Field(

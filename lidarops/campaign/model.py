@@ -272,7 +272,8 @@ class Instrument(SettingsModel):
     station: Identifier = Field(description="key of one of stations")
     name: str = Field(default="", description="in words, for products and pages")
     files: Patterns = Field(
-        description="patterns of the raw files below archive; ** crosses folders"
+        description="patterns of the raw files below archive, as of a shell: *, ?, [67], {a,b}; **"
+        " crosses folders"
     )
     dark_files: Patterns = Field(
         default=[], description="patterns of the files with a covered telescope"

@@ -13,7 +13,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from lidarops.catalog.sources import RawFile, Source, path_pattern, printable
+from lidarops.catalog.sources import (
+    RawFile,
+    Source,
+    literal_pattern,
+    path_pattern,
+    printable,
+)
 from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
@@ -73,7 +79,7 @@ class FileGroup:
     @property
     def pattern(self) -> str:
         """Pattern of the paths of the files; those of another group may match it too."""
-        return f"{self.folder}{self.stem}*"
+        return f"{literal_pattern(self.folder)}{self.stem}*"
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,13 +387,13 @@ def _patterns(groups: Sequence[FileGroup], everything: Sequence[str]) -> Iterato
     for stem, members in by_stem.items():
         folders = {group.folder for group in members}
         common = _common(folders)
-        whole = f"{common}**/{stem}*"
+        whole = f"{literal_pattern(common)}**/{stem}*"
         if len(folders) > 1 and not _matches(whole, foreign):
             yield whole
             continue
         for pattern in dict.fromkeys(group.pattern for group in members):
             if _matches(pattern, foreign):
-                yield from (p for p in sorted(own) if _matches(pattern, [p]))
+                yield from (literal_pattern(p) for p in sorted(own) if _matches(pattern, [p]))
             else:
                 yield pattern
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
+from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
@@ -210,6 +211,11 @@ class _Scan:
         return bool(self._owners(path))
 
     def _owners(self, path: str) -> list[_Claim]:
+        # The index of a web server encodes names: "+45" is "%2B45".
+        encoded = "%" in path and self._archive.startswith(("http://", "https://"))
+        return self._matching(path) or (self._matching(unquote(path)) if encoded else [])
+
+    def _matching(self, path: str) -> list[_Claim]:
         folder, slash, name = path.rpartition("/")
         if folder + slash != self._folder:
             self._folder = folder + slash
@@ -336,7 +342,7 @@ def _likeness(pattern: str, path: str) -> float:
 
     Folders and names are compared apart: a name is often longer than its pattern.
     """
-    folder, _, name = pattern.replace("*", "").replace("?", "").rpartition("/")
+    folder, _, name = re.sub(r"[*?]|\[.*?\]", "", pattern).rpartition("/")
     of_file, _, file = path.rpartition("/")
     begin = f"{of_file}/{file[: len(name)]}"
     return difflib.SequenceMatcher(None, f"{folder}/{name}", begin).ratio()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fnmatch
 import hashlib
 import os
 import re
@@ -29,10 +30,25 @@ def printable(path: str) -> str:
 
 
 def path_pattern(pattern: str) -> re.Pattern[str]:
-    """Return the expression of a pattern of paths, in which ** stands for any folders."""
+    """Return the expression of a pattern of paths: that of a shell, whose ** stands for folders."""
     expressions = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-    tokens = re.split(r"(\*\*/|\*\*|\*|\?)", pattern)
-    return re.compile("".join(expressions.get(token, re.escape(token)) for token in tokens) + r"\Z")
+    tokens = re.split(r"(\*\*/|\*\*|\*|\?|\[[!^]?\]?[^]/]*\])", pattern)
+    expression = "".join(
+        expressions.get(token) or (_choice(token) if number % 2 else re.escape(token))
+        for number, token in enumerate(tokens)
+    )
+    return re.compile(expression + r"\Z")
+
+
+def _choice(brackets: str) -> str:
+    """Return the expression of characters in brackets, such as [67], [a-f], [!0]."""
+    translated = fnmatch.translate(re.sub(r"^\[\^", "[!", brackets))
+    return "(?!/)" + translated.removeprefix("(?s:")[: -len(r")\Z")]
+
+
+def literal_pattern(path: str) -> str:
+    """Return the pattern that matches one path only, whatever characters it holds."""
+    return re.sub(r"[*?\[{]", r"[\g<0>]", path)
 
 
 def _rank(entry: os.DirEntry[str]) -> str:

@@ -9,12 +9,14 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 from support import factories
 from support.archives import raw_archives
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog.folder import instruments_of, read_folder
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
@@ -241,6 +243,67 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> RemoteStore:
     filled._fs.makedirs(filled._name("coast"), exist_ok=True)
     filled._fs.pipe_file(filled._name("coast/h0"), raw_archives.content(0))
     return filled
+
+
+NAMES = ["h6.0", "h7.0", "h8.0", "h6/h6.0", "+4 5/h6.0", "[a]/h6.0", "{a,b}/h6.0", "a/b/h6.0"]
+"""Files whose folders and names hold characters that patterns and URLs use."""
+
+
+@pytest.fixture(params=["folder", "http", "s3", "memory", "file"])
+def archive(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Folder or URL of each kind that holds one raw file under each of `NAMES`."""
+    files = {f"n/{name}": raw_archives.content(0) for name in NAMES}
+    if request.param in {"folder", "http"}:
+        for path, content in files.items():
+            raw_archives.write(tmp_path / "raw" / path, content)
+        if request.param == "folder":
+            return str(tmp_path / "raw" / "n")
+        return f"{request.getfixturevalue('campaign').archive}/n"
+    urls = {"memory": f"memory://{tmp_path.name}", "file": f"file://{tmp_path}/store"}
+    if request.param == "s3":
+        urls["s3"] = f"{request.getfixturevalue('s3')}/{tmp_path.name}"
+    filled = RemoteStore(urls[request.param])
+    for path, content in files.items():
+        filled._fs.makedirs(filled._name(path.rpartition("/")[0]), exist_ok=True)
+        filled._fs.pipe_file(filled._name(path), content)
+    return f"{filled.url}/n"
+
+
+PATTERNS = {
+    "h6*": ["h6.0"],
+    "h[67].0*": ["h6.0", "h7.0"],
+    "h[!67].?": ["h8.0"],
+    "h[^6-7].?": ["h8.0"],
+    "h[7-6].0": [],
+    "h{6,8}.0": ["h6.0", "h8.0"],
+    "{h{7,8}.0,+4 5/h*,a/b/*}": ["+4 5/h6.0", "a/b/h6.0", "h7.0", "h8.0"],
+    "*/h*": ["+4 5/h6.0", "[a]/h6.0", "h6/h6.0", "{a,b}/h6.0"],
+    "h?[!x]h*": [],
+    "[[]a]/h*": ["[a]/h6.0"],
+    "[{]a,b}/h*": ["{a,b}/h6.0"],
+    "[a]/**": ["a/b/h6.0"],
+    "**/h[6]*": sorted(name for name in NAMES if "h6.0" in name),
+}
+
+
+def _claimed(archive: str, files: str | list[str], output: Path) -> list[str]:
+    """Return the names that the patterns of a campaign file claim in an archive."""
+    scanned = factories.campaign(files=files, dark_files=[]).model_copy(
+        update={"archive": archive, "output": str(output)}
+    )
+    with Store(scanned.catalog_url, "c") as catalog:
+        scan_archive(scanned, catalog)
+        return sorted(unquote(granule.path) for granule in catalog.granules())
+
+
+def test_patterns_are_those_of_a_shell_in_each_store(archive: str, tmp_path: Path) -> None:
+    for number, (pattern, names) in enumerate(PATTERNS.items()):
+        assert _claimed(archive, pattern, tmp_path / f"out{number}") == names, pattern
+
+
+def test_drafted_patterns_match_the_files_of_each_store(archive: str, tmp_path: Path) -> None:
+    (instrument,) = instruments_of(read_folder(archive).groups)
+    assert _claimed(archive, list(instrument.files), tmp_path) == sorted(NAMES)
 
 
 @pytest.mark.parametrize("path", [*ESCAPES, *ELSEWHERE])
