@@ -20,7 +20,7 @@ from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.records import IdlePattern, Role, Status
+from lidarops.records import UNREADABLE, IdlePattern, Role, Status
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import Processes
 from lidarops.system.stores import without_keys
@@ -179,6 +179,8 @@ class _Scan:
         self._new: set[str] | None = set() if store.count() else None
         self._added = 0
         self._gone: list[Fingerprint] = []
+        self._readable = False
+        """Whether a file could be read, now or when the catalog got to know it."""
 
     def due(
         self, pairs: Iterable[tuple[RawFile | None, Fingerprint | None]]
@@ -205,6 +207,8 @@ class _Scan:
             ):
                 self._judged.append(before)
                 yield _due(file, owners, key)
+            else:
+                self._readable = True
 
     def is_claimed(self, path: str) -> bool:
         """Return whether an instrument claims a path."""
@@ -234,6 +238,7 @@ class _Scan:
         """Enter the row of the next file in `due`, unless it is unchanged."""
         before = self._judged.popleft()
         values = row.values
+        self._readable |= not values["reason"].startswith(UNREADABLE)
         if before is None:
             self._added += 1
             if self._new is not None:
@@ -251,7 +256,7 @@ class _Scan:
             # leave it out, so that a scan that knows no more writes nothing.
             values["start"] = values["start"] or before.start
         self._pending.append(row)
-        if len(self._pending) >= _BATCH:
+        if len(self._pending) >= _BATCH and self._readable:
             self._flush()
 
     def _digest(self, path: str) -> str | None:
@@ -276,6 +281,13 @@ class _Scan:
         """Write the remaining rows, and return the numbers."""
         if self._gone and not self._files:
             raise self._emptied()
+        if self._files > 1 and not self._readable:
+            raise CatalogError(
+                f"gives none of its {self._files} files; the catalog stays unchanged",
+                file=without_keys(self._archive),
+                field="archive",
+                remedy="check the keys and permissions with which lidarops reads it",
+            )
         self._flush()
         moved = self._moved()
         if moved:

@@ -8,7 +8,6 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -151,21 +150,8 @@ class RemoteSource(Source):
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""
-        with _of_one_file():
-            return self._store.head(path, size)
+        return self._store.head(path, size)
 
     def digest(self, path: str) -> str:
         """Return the SHA-256 of a file."""
-        with _of_one_file():
-            return self._store.digest(path)
-
-
-@contextmanager
-def _of_one_file() -> Iterator[None]:
-    """Re-raise the cause if one file cannot be read; keep other errors of the store."""
-    try:
-        yield
-    except CatalogError as error:
-        if isinstance(error.__cause__, FileNotFoundError | PermissionError):
-            raise error.__cause__ from error
-        raise
+        return self._store.digest(path)

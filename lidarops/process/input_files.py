@@ -26,18 +26,17 @@ _VANISHED: Final = "vanished after it was catalogued (run lidarops catalog again
 
 
 @contextmanager
-def local_files(archive: str, scene: Scene) -> Iterator[Path]:
-    """Yield the folder under which the scene's granules can be opened.
+def local_files(archive: str, scene: Scene) -> Iterator[tuple[Path, Mapping[str, str]]]:
+    """Yield the folder under which the scene's granules can be opened, and why some cannot.
 
     Files of an archive behind an fsspec URL are fetched for the time of the scene.
     """
     if "://" not in archive:
-        yield Path(archive)
+        yield Path(archive), {}
         return
     paths = [granule.path for granule in (*scene.granules, *scene.dark)]
     with _temporary_folder() as folder:
-        RemoteStore(archive).fetch(paths, Path(folder))
-        yield Path(folder)
+        yield Path(folder), RemoteStore(archive).fetch(paths, Path(folder))
 
 
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
@@ -52,7 +51,7 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def check_files(
-    scene: Scene, root: Path, *, read_all: bool
+    scene: Scene, root: Path, *, read_all: bool, denied: Mapping[str, str] | None = None
 ) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...], int]:
     """Check every file against the catalog, and take its digest.
 
@@ -66,6 +65,8 @@ def check_files(
         Folder of the granules.
     read_all : bool
         Whether unchanged files are read too.
+    denied : mapping of str to str, optional
+        Path of a file that the store did not give -> why.
 
     Returns
     -------
@@ -88,7 +89,9 @@ def check_files(
                 read += granule.size
                 sha256 = _read_digest(granule, root)
         except FileNotFoundError:
-            refused.append(replace(granule, status=Status.REFUSED, reason=_VANISHED))
+            why = (denied or {}).get(granule.path)
+            reason = f"{UNREADABLE}: {why}" if why else _VANISHED
+            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
         except OSError as error:
             reason = f"{UNREADABLE}: {error.strerror or error}"
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))

@@ -85,8 +85,8 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     begin = time.thread_time()
 
     def process() -> tuple[SceneOutcome, bool]:
-        with local_files(job.campaign.archive, job.scene) as root:
-            return _process(job, root)
+        with local_files(job.campaign.archive, job.scene) as (root, denied):
+            return _process(job, root, denied)
 
     result = guarded(process)
     if isinstance(result, Failure):
@@ -97,12 +97,12 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     return replace(outcome, cpu_seconds=time.thread_time() - begin), final
 
 
-def _process(job: Job, root: Path) -> tuple[SceneOutcome, bool]:
+def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutcome, bool]:
     clock = _Clock()
     if not any(is_product(step) for step in job.plan.steps):
         return Failure(nothing_to_do(job.plan)).outcome(job.scene, job.plan), True
     read_all = job.campaign.all_steps
-    usable, inputs, refused, read = check_files(job.scene, root, read_all=read_all)
+    usable, inputs, refused, read = check_files(job.scene, root, read_all=read_all, denied=denied)
     clock.lap("digest")
     failure = Failure("").outcome(job.scene, job.plan)
     failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)

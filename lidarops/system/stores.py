@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 from urllib.parse import unquote
@@ -26,8 +27,15 @@ from lidarops.system.files import sha256_of
 _READ_ONLY: Final = frozenset({"http", "https"})
 _ABSENT: Final = frozenset({404, 410})
 """Answers of a web server that lacks a file."""
-_DENIED: Final = frozenset({401, 403, 451})
-"""Answers of a web server that does not give a file away; it may have others."""
+_OF_STORE: Final = frozenset({407, 408, 425, 429})
+"""Answers 4xx that concern the whole store: log in, too slow, too early, too often."""
+_CODES_OF_STORE: Final = frozenset(
+    {"ExpiredToken", "InvalidAccessKeyId", "InvalidToken", "NoSuchBucket", "RequestTimeTooSkewed",
+     "RequestTimeout", "SignatureDoesNotMatch"}
+)  # fmt: skip
+"""Errors of S3 that concern the whole store though its answer is of another 4xx."""
+_NO_SUCH_RANGE: Final = 416
+"""Answer where a file has none of the bytes, as an empty one."""
 # Schemes by which an object appears only when its upload is complete.
 _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
 # A secret may hold slashes, so it is matched up to the last @. In Azure URLs the @ separates
@@ -198,12 +206,11 @@ class RemoteStore:
                 yield name, self._fs.info(name)
             except FileNotFoundError as error:
                 # Drivers of the web raise this whatever the server answers.
-                status = _status(error)
-                if status in _DENIED:
+                if error.__cause__ is None or _status(error) in _ABSENT:
+                    _LOG.warning("%s lists %r, which it does not have", self.url, path)
+                elif _is_of_one_object(error):
                     # Whoever reads the file learns of it.
                     yield name, info
-                elif error.__cause__ is None or status in _ABSENT:
-                    _LOG.warning("%s lists %r, which it does not have", self.url, path)
                 else:
                     problem = f"the size of {path} is not given: {error.__cause__!r}"
                     raise OSError(errno.EIO, problem) from error
@@ -233,13 +240,17 @@ class RemoteStore:
         Raises
         ------
         CatalogError
-            If it cannot be read.
+            If the store fails.
         OSError
-            If its path leads out of the URL.
+            If the store does not give this file, or its path leads out of the URL.
         """
-        _confine(path)
-        with self._errors_as(CatalogError, f"{path} cannot be read"):
-            data: bytes = self._fs.cat_file(self._name(path), start=0, end=size)
+        with self._one_object(path):
+            try:
+                data: bytes = self._fs.cat_file(self._name(path), start=0, end=size)
+            except _failures() as error:
+                if _status(error) != _NO_SUCH_RANGE or self._fs.size(self._name(path)):
+                    raise
+                return b""
         return data
 
     def digest(self, path: str) -> str:
@@ -247,41 +258,49 @@ class RemoteStore:
 
         Raises
         ------
-        CatalogError
-            If it cannot be read.
-        OSError
-            If its path leads out of the URL.
+        CatalogError, OSError
+            As `head`.
         """
-        _confine(path)
-        with (
-            self._errors_as(CatalogError, f"{path} cannot be read"),
-            self._fs.open(self._name(path), "rb") as stream,
-        ):
+        with self._one_object(path), self._fs.open(self._name(path), "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
-    def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Copy files to a local folder under their paths; skip files that the store lacks.
+    def fetch(self, paths: Sequence[str], folder: Path) -> dict[str, str]:
+        """Copy files to a local folder under their paths, without those that the store lacks.
+
+        Returns
+        -------
+        dict
+            Path of a file that the store has and does not give -> why.
 
         Raises
         ------
         CatalogError
-            If the store cannot be reached.
+            If the store fails.
         OSError
             If a path leads out of the folder; no file is copied then.
         """
         for path in paths:
             _confine(path)
         pairs = [(self._name(path), str(folder / path)) for path in paths]
+        refused: dict[str, str] = {}
         with self._errors_as(CatalogError, "cannot be read"):
             for path in paths:
                 (folder / path).parent.mkdir(parents=True, exist_ok=True)
             try:
                 self._fs.get(*_columns(pairs), batch_size=_BATCH)
-            except FileNotFoundError:
+            except _failures() as error:
+                if not _is_of_one_object(error):
+                    raise
                 # Rare, so existing files may be fetched twice.
-                for name, target in pairs:
-                    with suppress(FileNotFoundError):
-                        self._fs.get_file(name, target)
+                for path, pair in zip(paths, pairs, strict=True):
+                    try:
+                        with self._one_object(path):
+                            self._fs.get_file(*pair)
+                    except FileNotFoundError:
+                        continue
+                    except OSError as answer:
+                        refused[path] = answer.strerror or str(answer)
+        return refused
 
     def publish(
         self, root: Path, products: Mapping[str, str], journal: Path, *, beside: str = ""
@@ -378,19 +397,34 @@ class RemoteStore:
         return f"{self._prefix}/{path}"
 
     @contextmanager
+    def _one_object(self, path: str) -> Iterator[None]:
+        """Raise an OSError where an answer concerns one object, else as `_errors_as`."""
+        _confine(path)
+        try:
+            with self._errors_as(CatalogError, f"{path} cannot be read"):
+                yield
+        except CatalogError as error:
+            cause = error.__cause__
+            if not (isinstance(cause, Exception) and _is_of_one_object(cause)):
+                raise
+            status = _status(cause)
+            if status is None:
+                raise cause from None
+            kind = FileNotFoundError if status in _ABSENT else OSError
+            raise kind(errno.EIO, f"the server answers {status}") from error
+
+    @contextmanager
     def _errors_as(self, kind: type[LidarOpsError], problem: str) -> Iterator[None]:
         try:
             yield
         except LidarOpsError:
             raise
         except _failures() as error:
-            status = _status(error)
-            denied = PermissionError(errno.EACCES, f"the server answers {status}")
             raise kind(
                 f"{problem}: {without_keys(repr(error))}",
                 file=self.url,
                 remedy="check address, network and keys",
-            ) from (denied if status in _DENIED else error)
+            ) from error
 
 
 @contextmanager
@@ -443,10 +477,29 @@ def _failures() -> tuple[type[Exception], ...]:
     )
 
 
+def _response(error: Exception) -> Mapping[str, Any]:
+    """Return what a server of S3 answered that made an error; empty for other servers."""
+    answer = getattr(error, "response", getattr(error.__cause__, "response", None))
+    return answer if isinstance(answer, Mapping) else {}
+
+
 def _status(error: Exception) -> int | None:
-    """Return what a web server answered, where this made an error."""
-    status: int | None = getattr(error, "status", getattr(error.__cause__, "status", None))
-    return status
+    """Return the status of the answer that made an error; None if it was none of a server."""
+    stated = _response(error).get("ResponseMetadata", {}).get("HTTPStatusCode")
+    places = ((place, name) for place in (error, error.__cause__) for name in ("status", "code"))
+    found = chain([stated], (getattr(place, name, None) for place, name in places))
+    return next((status for status in found if isinstance(status, int)), None)
+
+
+def _is_of_one_object(error: Exception) -> bool:
+    """Return whether an error concerns one object, so that the store may give others."""
+    status = _status(error)
+    if status is not None:
+        code = _response(error).get("Error", {}).get("Code")
+        return 400 <= status < 500 and status not in _OF_STORE and code not in _CODES_OF_STORE
+    # Drivers of the web raise FileNotFoundError for whatever happened, and state it as the cause.
+    lacking = isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
+    return lacking and error.__cause__ is None
 
 
 def _stamp(info: dict[str, Any]) -> int:

@@ -16,7 +16,6 @@ from support.archives.small_archive import Archive
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
-from lidarops.errors import CatalogError
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.global_attributes import MOST_UNUSED, UNUSED_INPUTS
 from lidarops.plan.unused_files import MOST_IN_DOUBT, dated
@@ -97,8 +96,7 @@ def _refused_by_a_store(_: Path, patch: pytest.MonkeyPatch) -> None:
 
     def failing(store: RemoteStore, path: str, size: int) -> bytes:
         if path == "poor/h01":
-            cause = PermissionError(f"https://user:secret@host/{path}?key=secret")
-            raise CatalogError("cannot be read", file=path) from cause
+            raise PermissionError(f"https://user:secret@host/{path}?key=secret")
         return head(store, path, size)
 
     patch.setattr(RemoteStore, "head", failing)
@@ -107,8 +105,8 @@ def _refused_by_a_store(_: Path, patch: pytest.MonkeyPatch) -> None:
 def _gone_from_a_store(_: Path, patch: pytest.MonkeyPatch) -> None:
     fetch = RemoteStore.fetch
 
-    def without(store: RemoteStore, paths: list[str], folder: Path) -> None:
-        fetch(store, [path for path in paths if path != "poor/h01"], folder)
+    def without(store: RemoteStore, paths: list[str], folder: Path) -> dict[str, str]:
+        return fetch(store, [path for path in paths if path != "poor/h01"], folder)
 
     patch.setattr(RemoteStore, "fetch", without)
 

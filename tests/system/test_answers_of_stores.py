@@ -1,0 +1,127 @@
+"""What a store answers for one file costs this file alone; what it answers for all ends a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support import factories
+from support.archives import raw_archives
+from support.servers.stand_ins import SCHEMES, StandIn, served
+
+from lidarops.campaign.model import Campaign
+from lidarops.catalog.scan import scan_archive
+from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
+from lidarops.plan.scenes import cut_scenes
+from lidarops.process.input_files import check_files, local_files
+from lidarops.records import Status
+
+FILES = 4
+
+
+@pytest.fixture
+def stand_in(tmp_path: Path) -> Iterator[StandIn]:
+    """A server of four raw files."""
+    for minute in range(FILES):
+        path = tmp_path / "raw" / "coast" / f"h{minute}"
+        raw_archives.write(path, raw_archives.content(minute))
+    with served(tmp_path / "raw") as server:
+        yield server
+
+
+def _campaign(archive: str, tmp_path: Path) -> Campaign:
+    return factories.campaign().model_copy(
+        update={"archive": archive, "output": str(tmp_path / "out")}
+    )
+
+
+@pytest.fixture(params=["local", *SCHEMES])
+def archive(request: pytest.FixtureRequest, stand_in: StandIn) -> str:
+    """The same files in a folder, on a web server and in an object store."""
+    local = request.param == "local"
+    return str(stand_in.folder) if local else stand_in.url(request.param)
+
+
+def test_an_empty_file_is_refused_alone_and_says_so(
+    archive: str, stand_in: StandIn, tmp_path: Path
+) -> None:
+    (stand_in.folder / "coast" / "h1").write_bytes(b"")
+    campaign = _campaign(archive, tmp_path)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        for _ in range(2):
+            summary = scan_archive(campaign, store)
+            assert (summary.files, summary.refused) == (FILES, 1)
+        (refused,) = store.refused()
+    assert (refused.path, refused.size) == ("coast/h1", 0)
+    assert not refused.reason.startswith("cannot be read")
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 404, 409, 410, 416])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_an_answer_about_one_file_costs_this_file_alone(
+    stand_in: StandIn, scheme: str, status: int, tmp_path: Path
+) -> None:
+    campaign = _campaign(stand_in.url(scheme), tmp_path)
+    stand_in.statuses["h1"] = status
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        good = [granule.path for granule in store.granules(status=Status.GOOD)]
+        assert good == ["coast/h0", "coast/h2", "coast/h3"]
+        # The index of a web server names what it does not have.
+        dead_link = scheme == "http" and status in {404, 410}
+        reasons = [granule.reason for granule in store.refused()]
+        assert reasons == ([] if dead_link else [f"cannot be read: the server answers {status}"])
+        stand_in.statuses.clear()
+        scan_archive(campaign, store)
+        assert len(store.granules(status=Status.GOOD)) == FILES
+
+
+@pytest.mark.parametrize("status", [429, 500, 503])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_an_answer_about_the_store_ends_the_scan(
+    stand_in: StandIn, scheme: str, status: int, tmp_path: Path
+) -> None:
+    campaign = _campaign(stand_in.url(scheme), tmp_path)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        before = store.granules()
+        (stand_in.folder / "coast" / "h1").write_bytes(raw_archives.content(9))
+        stand_in.statuses["h1"] = status
+        with pytest.raises(CatalogError, match="coast/h1"):
+            scan_archive(campaign, store)
+        assert store.granules() == before
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_store_that_gives_no_file_ends_the_scan(
+    stand_in: StandIn, scheme: str, tmp_path: Path
+) -> None:
+    campaign = _campaign(stand_in.url(scheme), tmp_path)
+    stand_in.statuses = {f"h{minute}": 403 for minute in range(FILES)}
+    with Store(campaign.catalog_url, campaign.name) as store:
+        with pytest.raises(CatalogError, match=f"gives none of its {FILES} files"):
+            scan_archive(campaign, store)
+        assert store.granules() == []
+
+
+@pytest.mark.parametrize(
+    ("status", "reason"),
+    [(403, "cannot be read: the server answers 403"), (404, "vanished after it was catalogued")],
+)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_file_that_is_denied_while_its_scene_is_processed_costs_this_file_alone(
+    stand_in: StandIn, scheme: str, status: int, reason: str, tmp_path: Path
+) -> None:
+    campaign = _campaign(stand_in.url(scheme), tmp_path)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        (scene,) = cut_scenes(campaign, store.granules()).scenes
+    stand_in.statuses["h1"] = status
+    with local_files(campaign.archive, scene) as (root, denied):
+        usable, _, refused, _ = check_files(scene, root, read_all=True, denied=denied)
+    assert [granule.path for granule in usable.granules] == ["coast/h0", "coast/h2", "coast/h3"]
+    assert [(granule.path, granule.reason[: len(reason)]) for granule in refused] == [
+        ("coast/h1", reason)
+    ]
