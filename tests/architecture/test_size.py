@@ -1,0 +1,74 @@
+"""The size of the house and the way of one file through it: limits that only fall."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from support import shape
+from typer.testing import CliRunner
+
+from lidarops.cli import app
+
+MOST = {
+    "lines": 93_100,
+    "lines of code alone": 61_500,
+    "lines without bench": 83_200,
+    "modules": 470,
+    "dataclasses": 425,
+    "lines of dataclasses": 10_700,
+    "tuning numbers": 260,
+    "tuning numbers that are assumed": 86,
+    "copied thresholds": 55,
+    "most parameters": 24,
+    "lines of the largest package": 9_900,
+}
+MOST_OF_ONE_FILE = {
+    "homogeneous": {"modules": 106, "functions": 910, "changes": 700},
+    "elastic": {"modules": 110, "functions": 1_010, "changes": 740},
+}
+
+
+def test_the_library_does_not_grow():
+    figures = shape.figures()
+    assert figures.keys() == MOST.keys()
+    above = {name: (figures[name], most) for name, most in MOST.items() if figures[name] > most}
+    assert above == {}
+
+
+@pytest.mark.parametrize("kind", MOST_OF_ONE_FILE)
+def test_one_file_passes_few_modules_functions_and_packages(
+    repository: Path, tmp_path: Path, kind: str
+):
+    campaign = write_campaign(repository, tmp_path, kind)
+    places = os.pathsep.join([str(repository), str(repository / "tests")])
+    done = subprocess.run(
+        [sys.executable, "-m", "support.trace", str(campaign)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": places},
+    )
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    assert figures.pop("products") == [kind]
+    most = MOST_OF_ONE_FILE[kind]
+    assert {name: (n, most[name]) for name, n in figures.items() if n > most[name]} == {}
+
+
+def write_campaign(repository: Path, folder: Path, kind: str) -> Path:
+    """Write the campaign of the one instrument with a kind of product, and its one raw file."""
+    whole = yaml.safe_load((repository / "tests/architecture/campaigns/one_file.yaml").read_text())
+    for section in (whole["instruments"], whole["simulation"]["instruments"]):
+        for name in section.keys() - {kind}:
+            del section[name]
+    path = folder / "campaign.yaml"
+    path.write_text(yaml.safe_dump(whole))
+    result = CliRunner().invoke(app, ["simulate", str(path)])
+    assert result.exit_code == 0, result.output
+    return path

@@ -1,0 +1,75 @@
+"""What is called of lidarops in one run: ``python -m support.trace CAMPAIGN``.
+
+Makes the stale products of a campaign, and prints as JSON how many modules of lidarops
+were entered, how many functions called, and how often a function called one of another package.
+Code that numba has compiled is not seen. Each run needs a new process: what an earlier one cached
+is not called again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import CodeType, FrameType
+
+import lidarops
+from lidarops.campaign.model import load_campaign
+from lidarops.run.archive import reprocess
+
+ROOT = Path(lidarops.__file__).parent
+
+
+class Trace:
+    """Counts calls, as a profile function of `sys.setprofile`."""
+
+    def __init__(self) -> None:
+        self.functions: set[CodeType] = set()
+        self.changes = 0
+        """Number of calls from one package at the root to another."""
+        self._modules: dict[str, str] = {}
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> None:
+        """Count one call."""
+        module = self._module(frame)
+        if event != "call" or not module or frame.f_code.co_name.startswith("<"):
+            return
+        self.functions.add(frame.f_code)
+        caller = frame.f_back
+        while caller is not None and not self._module(caller):
+            caller = caller.f_back
+        if caller is not None:
+            self.changes += self._module(caller).split(".")[0] != module.split(".")[0]
+
+    def _module(self, frame: FrameType) -> str:
+        """Return the name of a module within lidarops; empty for one of others."""
+        file = frame.f_code.co_filename
+        if file not in self._modules:
+            path = Path(file)
+            inside = path.is_relative_to(ROOT)
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts) if inside else ""
+            self._modules[file] = name
+        return self._modules[file]
+
+    def figures(self) -> dict[str, int]:
+        """Return what was counted."""
+        return {
+            "modules": len({self._modules[code.co_filename] for code in self.functions}),
+            "functions": len(self.functions),
+            "changes": self.changes,
+        }
+
+
+def main(path: Path) -> None:
+    """Trace a run over a campaign, and print the figures."""
+    campaign = load_campaign(path)
+    trace = Trace()
+    sys.setprofile(trace)
+    record = reprocess(campaign)
+    sys.setprofile(None)
+    made = [product.kind for scene in record.scenes for product in scene.products] if record else []
+    sys.stdout.write(json.dumps({**trace.figures(), "products": made}))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
