@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,12 +28,11 @@ from lidarops.cli.app import (
     wrapped,
 )
 from lidarops.cli.findings import findings_document, show_findings
-from lidarops.cli.plan_summary import grouped, scene_title, show_refused, show_scene, show_times
+from lidarops.cli.plan_summary import grouped, scene_title, show_count, show_refused, show_scene
 from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
-    from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import LeftOut, Plan, PlannedStep
     from lidarops.run.archive import EarlierProblems
     from lidarops.run.selection import Selection
@@ -66,10 +65,10 @@ def show_plan(
 
     Makes no folder: without an output folder the catalog is made for the moment.
 
-    Shows a summary of each scene; with --all every step with its settings and reasons. Also shows
-    the estimated CPU time, and the memory that a process needs for each scene. Exit code 1 if a
-    file is refused, a scene cannot be planned, failed before or gave no usable value, a pattern or
-    channel is in no file, or headers contradict a station.
+    Shows a summary of each scene, with the memory that a process needs for it; with --all every
+    step with its settings and reasons. Exit code 1 if a file is refused, a scene cannot be planned,
+    failed before or gave no usable value, a pattern or channel is in no file, or headers contradict
+    a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
@@ -91,7 +90,6 @@ def _plan(
     as_json: bool,
 ) -> None:
     from lidarops.catalog.store import Store
-    from lidarops.plan.cost_estimate import RunTime
     from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.selection import selects_no_scene
     from lidarops.steps.memory import scene_memory
@@ -100,47 +98,33 @@ def _plan(
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
-    making, whole_run = RunTime(), RunTime()
     scenes = []
-    no_scene = True
+    count = to_be_made = 0
     failed = False
     earlier = earlier_problems(settings, selection)
     for judged in judgements:
-        no_scene = False
+        count += 1
+        to_be_made += bool(judged.stale)
         failed |= not judged.planned
         if judged.due or judged.held:
             for problems in earlier:
                 problems.pop(judged.scene.id, None)
         failed |= judged.held
-        scene, whole = judged.scene, settings.all_steps
-        times = {
-            "to_be_made": making.add(scene, judged.needed(), whole=whole),
-            "everything": whole_run.add(scene, judged.requested, whole=whole),
-        }
         memory = {
-            "to_be_made": scene_memory(scene, judged.needed()).total,
-            "everything": scene_memory(scene, judged.requested).total,
+            "to_be_made": scene_memory(judged.scene, judged.needed()).total,
+            "everything": scene_memory(judged.scene, judged.requested).total,
         }
         if as_json:
-            estimates = {"estimated_cpu_seconds": times, "estimated_memory_bytes": memory}
-            scenes.append({**_plain(judged), **estimates})
+            scenes.append({**_plain(judged), "estimated_memory_bytes": memory})
             continue
-        needs = {
-            name: f"about {times[name]:.2g} s of CPU time and {memory[name] / 1e6:.0f} MB of memory"
-            for name in times
-        }
+        needs = f"about {memory['to_be_made' if stale else 'everything'] / 1e6:.0f} MB of memory"
         if everything:
             _show_all(judged, needs, plan=not stale)
         else:
-            show_scene(judged, needs["to_be_made" if stale else "everything"], plan=not stale)
+            show_scene(judged, needs, plan=not stale)
         _show_frozen(judged)
-    no_scene = no_scene and selects_no_scene(settings, selection)
-    # With --stale, fresh scenes were not judged.
-    runs = {"to be made": making} | ({} if stale else {"everything, with --force": whole_run})
+    no_scene = not count and selects_no_scene(settings, selection)
     if as_json:
-        estimate = {
-            name.partition(",")[0].replace(" ", "_"): run.parts for name, run in runs.items()
-        }
         no_scene_found = {"no_scene_selected": no_scene}
         document = {
             "scenes": scenes,
@@ -150,7 +134,6 @@ def _plan(
             "refused_files": {granule.path: granule.reason for granule in refused},
             **findings_document(findings),
             "lacking_metadata": list(settings.metadata.lacking),
-            "estimated_cpu_seconds": estimate,
         }
         typer.echo(json.dumps(document, indent=2))
     else:
@@ -163,15 +146,16 @@ def _plan(
             for line in wrapped(f"metadata of the campaign: products will lack {names}", ""):
                 say(line)
         _show_earlier(earlier)
-        (_show_times if everything else show_times)(runs)
+        # With --stale, fresh scenes are not judged.
+        show_count(to_be_made, None if stale else count)
     exit_with_status(failed=failed or bool(refused) or any(earlier) or findings.failed)
 
 
-def _show_all(judged: Judgement, needs: Mapping[str, str], *, plan: bool) -> None:
-    title = scene_title(judged)
+def _show_all(judged: Judgement, needs: str, *, plan: bool) -> None:
+    title = f"{scene_title(judged)}, {needs}"
     if plan:
-        _show_plan(f"{title}, {needs['everything']}", judged.requested)
-    _show_stale(f"{title}, {needs['to_be_made']}", judged)
+        _show_plan(title, judged.requested)
+    _show_stale(title, judged)
 
 
 def _show_plan(title: str, plan: Plan) -> None:
@@ -227,15 +211,6 @@ def _settings(step: PlannedStep) -> Iterator[str]:
         number = f"{value:.6g}" if isinstance(value, float) else f"{value}"
         unit = "" if value is None else unit_of(model, key)
         yield f"{key} {number} {unit}".rstrip()
-
-
-def _show_times(runs: Mapping[str, RunTime]) -> None:
-    rows = (
-        (name, run.count, *(f"{seconds:.2g}" for seconds in run.parts.values()))
-        for name, run in runs.items()
-    )
-    columns = ("", "scenes", "processing", "start", "report", "all")
-    show_rows("Estimated CPU time in s on a common server core", columns, rows)
 
 
 def _show_earlier(earlier: EarlierProblems) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from lidarops.cli.app import say, wrapped
@@ -13,7 +13,6 @@ from lidarops.steps.channels import READ_STEP
 from lidarops.steps.step import REQUEST
 
 if TYPE_CHECKING:
-    from lidarops.plan.cost_estimate import RunTime
     from lidarops.records import Plan
     from lidarops.run.staleness import Judgement
 
@@ -34,7 +33,7 @@ def show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
     ----------
     judged : Judgement
     needs : str
-        Time and memory.
+        Memory.
     plan : bool
         Whether steps are shown; a scene without anything to be made is left out otherwise.
     """
@@ -104,13 +103,9 @@ def show_refused(reasons: Sequence[str]) -> None:
         _say(f"{counted(rest, 'file')}: other reasons", "  ")
 
 
-def show_times(runs: Mapping[str, RunTime]) -> None:
-    """Print the estimated times of runs, and how to see more."""
-    times = (
-        f"{name}: about {run.parts['all']:.2g} s for {counted(run.count, 'scene')}"
-        for name, run in runs.items()
-    )
-    _say(f"CPU time of a run with its start and report, {'; '.join(times)}", "")
+def show_count(stale: int, scenes: int | None) -> None:
+    """Print how many scenes are stale, of how many if all were judged, and how to see more."""
+    _say(f"{counted(stale, 'stale scene')}{'' if scenes is None else f' of {scenes}'}", "")
     _say("--all shows settings and reasons of every step; --json shows everything.", "")
 
 

@@ -166,10 +166,6 @@ class Dark(Step[ChannelCase, DarkSettings]):
         if data.source.dark is not None:
             data[DARK] = labeled.read_dark(data.source.dark, data.channel, method=settings.method)
 
-    def cpu_time(self, settings: DarkSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time, s."""
-        return 0.035
-
     def held(self, settings: DarkSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the signals of dark files, and of their mean at the peak."""
         return _BYTES_OF_A_DARK_BIN * len(work.scene.dark) * work.bins

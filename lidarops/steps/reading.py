@@ -10,7 +10,6 @@ import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.raw.header import Stretches
-from lidarops.raw.model import count_bins
 from lidarops.records import PlannedStep
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
@@ -18,7 +17,6 @@ from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ChannelCase
 from lidarops.steps.channels import (
     READ_STEP,
-    file_channels,
     prepared_channels,
     range_channel,
     range_offset,
@@ -26,7 +24,6 @@ from lidarops.steps.channels import (
 )
 from lidarops.steps.data import Data
 from lidarops.steps.step import REQUEST, Datum, Decisions, Definition, Leave, Run, Step
-from lidarops.steps.workload import Workload
 
 ARCHIVE: Final = Datum[xr.Dataset]("archive")
 """Raw counts of all profiles of the scene, lazy or in memory."""
@@ -72,17 +69,6 @@ class Read(Step[ChannelCase, ReadSettings]):
         """Give the archive and the wavelength."""
         data[ARCHIVE] = data.source.archive
         data[WAVELENGTH] = settings.wavelength
-
-    def cpu_time(self, settings: ReadSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time to read and condition the bins that products need, s."""
-        if not any(step.product and step.channel == work.channel for step in work.plan.steps):
-            # Read for a glued channel, which counts both parts.
-            return 0.0
-        concerned = ("", work.scene.instrument)
-        windows = read_windows([s for s in work.plan.steps if s.instrument in concerned])
-        bins = work.file_bins() | {name: count_bins(bins) for name, bins in windows.items()}
-        values = work.profiles * sum(bins[name] for name in file_channels(work.channel))
-        return 0.01 + 1.2e-7 * values
 
 
 READ: Final = Read()

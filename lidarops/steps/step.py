@@ -92,10 +92,6 @@ class Definition(ABC, Generic[S]):
         """Return the ancillary files that the step reads, by path, with their roles."""
         return {}
 
-    def cpu_time(self, settings: S, work: Workload) -> float:  # noqa: ARG002 - most cost little
-        """Return the estimated CPU time on a common server core, s."""
-        return 0.0
-
     def held(self, settings: S, work: Workload) -> float:  # noqa: ARG002 - most hold little
         """Return the estimated number of bytes that are held for the whole scene."""
         return 0.0

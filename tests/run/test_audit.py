@@ -110,9 +110,6 @@ def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) 
     planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
     summary = json.loads(planned.stdout)
     (scene,) = summary["scenes"]
-    times = scene["estimated_cpu_seconds"]
-    assert 0 < times["to_be_made"] <= times["everything"]
-    assert summary["estimated_cpu_seconds"]["to_be_made"]["scenes"] == times["to_be_made"]
     assert {stale["reason"] for stale in scene["stale"]} == {"changed: signal poor/h10"}
     log = archive.folder / "log.jsonl"
     words = ["--log-json", "--log-level", "info", "--log-file", str(log), "--json"]

@@ -244,7 +244,6 @@ def _planned(archive: Archive, *options: str) -> dict[str, Any]:
 
 def test_the_plan_of_a_selection_shows_its_products_only(archive: Archive) -> None:
     archive.write()
-    whole = _planned(archive)["estimated_cpu_seconds"]["everything"]
     summary = _planned(archive, "--product", "homogeneous")
     for scene in summary["scenes"]:
         rich = scene["scene"].startswith("rich")
@@ -253,11 +252,8 @@ def test_the_plan_of_a_selection_shows_its_products_only(archive: Archive) -> No
         assert ("homogeneous" in names) == bool(names) == rich
         assert not names & {"signal", "background", "elastic", "reference"}
         assert {left["name"] for left in scene["left_out"]} >= {"homogeneous"} - names
-    some = summary["estimated_cpu_seconds"]["everything"]
-    assert 0 < some["scenes"] < whole["scenes"]
     nothing = _planned(archive, "--product", "homogeneous", "--instrument", "poor")
     assert {scene["fresh"] for scene in nothing["scenes"]} == {0}
-    assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
 
 
 def _window_effects(summary: dict[str, Any]) -> list[str]:
@@ -303,9 +299,7 @@ def test_products_that_were_never_made_are_not_fresh(archive: Archive, tmp_path:
     for kinds in ([], ["--product", "signal"], ["--product", "homogeneous"]):
         summary = _planned(archive, "--out", str(tmp_path / "new"), *kinds)
         assert {scene["fresh"] for scene in summary["scenes"]} == {0}
-        times = summary["estimated_cpu_seconds"]
-        assert times["to_be_made"] == times["everything"]
-        assert times["everything"]["all"] > 0
+        assert all(scene["stale"] for scene in summary["scenes"] if scene["steps"])
 
 
 def test_a_selection_without_scene_is_reported_as_text_and_json(archive: Archive) -> None:

@@ -123,7 +123,6 @@ def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
         line = ["plan", str(net.file), "--json", "--product", kind, "--instrument", "valley"]
         (scene,) = json.loads(CliRunner().invoke(app, line).stdout)["scenes"]
         assert bool(scene["steps"]) is some
-        assert (scene["estimated_cpu_seconds"]["everything"] > 0) is some
         assert (len(scene["stale"]), scene["fresh"]) == (int(some), 0)
 
 

@@ -200,10 +200,6 @@ class Elastic(ProductStep[ElasticSettings, InversionSettings]):
         """Return the product, whose averages are inverted as they become complete."""
         return _Inversion(settings, data)
 
-    def cpu_time(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time by the number of bins of all averages, s."""
-        return 0.1 + 5e-7 * work.bins * _averages(work)
-
     def held(self, settings: InversionSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the averages that are completed together, and of their inversion."""
         together = min(_averages(work), MEANS_TOGETHER)

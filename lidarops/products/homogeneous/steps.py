@@ -149,10 +149,6 @@ class LookForSignal(Choice[Case, LookSettings]):
             reason = "sections in which no sampled profile shows a signal are not retrieved"
             yield Run(reason, LookSettings(profiles=LOOKED_AT), number=float(LOOKED_AT))
 
-    def cpu_time(self, settings: LookSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time, which is mostly that of opening files, s."""
-        return 0.04
-
 
 class AlongPath(Choice[Case, NoSettings]):
     """Add visibility along the sections."""

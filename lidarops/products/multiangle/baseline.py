@@ -59,10 +59,6 @@ class Baseline(Step[ProductCase[MultiAngleSettings], NoSettings]):
         """Request the baseline of the blocked beams that the product finds."""
         data[BASELINE] = True
 
-    def cpu_time(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time of a second pass over all profiles, s: where a beam is blocked."""
-        return 4e-7 * work.profiles * work.bins if _low_profiles(work) else 0.0
-
     def held(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
         """Return the bytes of the low beams that are averaged together."""
         return _BYTES_OF_A_BIN * min(_TOGETHER, _low_profiles(work)) * work.bins

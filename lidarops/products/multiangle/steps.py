@@ -401,10 +401,6 @@ class MultiAngle(ProductStep[MultiAngleSettings, ScanSettings]):
         """Return the product, which holds the cycles of all profiles."""
         return _Scans(settings, data)
 
-    def cpu_time(self, settings: ScanSettings, work: Workload) -> float:
-        """Return the CPU time by the number of altitudes of all profiles, s."""
-        return 0.1 + 6e-6 * work.profiles * settings.highest / settings.step
-
     def together(self, settings: ScanSettings, work: Workload) -> int:  # noqa: ARG002
         """Return the number of profiles of the longest batch of cycles."""
         granules = work.scene.granules

@@ -242,10 +242,6 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
         """Return the product, whose averages are retrieved as they become complete."""
         return _Dark(settings, data) if settings.dark else _Retrieval(settings, data)
 
-    def cpu_time(self, settings: RetrievalSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time by the number of averages, s."""
-        return 0.1 + 0.02 * _averages(work)
-
     def held(self, settings: RetrievalSettings, work: Workload) -> float:
         """Return the bytes of the averages that are completed together, and of their solution."""
         names = (work.channel, *self.companions(settings))

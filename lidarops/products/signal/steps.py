@@ -29,7 +29,6 @@ from lidarops.steps.step import (
     ProductStep,
     Run,
 )
-from lidarops.steps.workload import Workload
 
 
 class RangeCorrection(SettingsModel):
@@ -65,10 +64,6 @@ class Signal(ProductStep[SignalSettings, RangeCorrection]):
     def stream(self, settings: RangeCorrection, data: Data) -> RowProduct:
         """Return the product, which is written as profiles come."""
         return _Signals(settings, data)
-
-    def cpu_time(self, settings: RangeCorrection, work: Workload) -> float:  # noqa: ARG002
-        """Return the CPU time by the number of bins of all profiles, s."""
-        return 0.05 + 2e-8 * work.profiles * work.bins
 
 
 class _Signals(RowProduct):

@@ -155,10 +155,6 @@ class Visibility(NetworkProductStep[VisibilityProductSettings, NetworkSettings])
         """Return the product, which holds averages of the beams."""
         return _NetworkStream(settings, members, data[AVERAGE])
 
-    def cpu_time(self, settings: NetworkSettings, work: Workload) -> float:
-        """Return the CPU time by the number of averages of all beams, s."""
-        return 0.2 + 2.5e-3 * _averages(settings, work)
-
     def held(self, settings: NetworkSettings, work: Workload) -> float:
         """Return the bytes of the averages of all beams."""
         bins = max(channel.bins for member in work.scene.members for channel in member.layout)

@@ -20,7 +20,6 @@ from lidarops.steps.data import Chunk, Data, RowProduct
 from lidarops.steps.preparation import BACKGROUND, FEWEST_BINS, Background, tail
 from lidarops.steps.profiles import gluing
 from lidarops.steps.step import REQUESTED, Decisions, Leave, ProductStep, Run
-from lidarops.steps.workload import Workload
 
 
 class WindowSettings(SettingsModel):
@@ -69,10 +68,6 @@ class Integrated(ProductStep[IntegratedSettings, WindowSettings]):
     def stream(self, settings: WindowSettings, data: Data) -> RowProduct:
         """Return the product, which is written as profiles come."""
         return _Integrals(settings, data)
-
-    def cpu_time(self, settings: WindowSettings, work: Workload) -> float:
-        """Return the CPU time by the number of bins of all profiles, for each window, s."""
-        return 0.05 + 1e-8 * work.profiles * work.bins * len(settings.windows)
 
 
 class _Integrals(RowProduct):
