@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import entry_points
@@ -53,7 +52,7 @@ def code_version(kind: str, *others: str) -> str:
 
     These are the modules of the kind, those that every product passes through, those of all raw
     formats, and all that they import of lidarops and of the packages that add kinds or formats.
-    Comments and docstrings do not count.
+    Every change of their text counts, that of a comment too.
 
     Parameters
     ----------
@@ -111,18 +110,16 @@ def version_of(kind: Kind, sources: Sources, *others: str) -> str:
     return sources.digest((*_EVERY_PRODUCT, *_formats(), kind.package, *modules, *others))
 
 
-def sources_in(roots: Mapping[str, Sequence[Path]], cache_folder: Path | None = None) -> Sources:
+def sources_in(roots: Mapping[str, Sequence[Path]]) -> Sources:
     """Return the sources of lidarops and of packages with kinds of product or raw formats.
 
     Parameters
     ----------
     roots : mapping of str to sequence of Path
         Folders of each top-level package.
-    cache_folder : Path, optional
-        Where facts about sources are kept.
     """
     with_data = (*_WITH_DATA, *(root for root in roots if root != "lidarops"))
-    return Sources(roots, apart=_APART, with_data=with_data, cache=cache_folder)
+    return Sources(roots, apart=_APART, with_data=with_data)
 
 
 def reading_version() -> str:
@@ -177,7 +174,7 @@ def source_version() -> str:
 
 @cache
 def _installed() -> Sources:
-    return sources_in(source_roots(), _cache_folder())
+    return sources_in(source_roots())
 
 
 def source_roots() -> dict[str, tuple[Path, ...]]:
@@ -197,16 +194,3 @@ def source_roots() -> dict[str, tuple[Path, ...]]:
 def _formats() -> tuple[str, ...]:
     """Return the modules of raw formats. No import leads to them, and any file may need any."""
     return tuple(point.module for point in entry_points(group=RAW_FORMATS))
-
-
-def _cache_folder() -> Path | None:
-    """Return the folder of numba's cache if one is set, else that of the user's caches."""
-    compiled = os.environ.get("NUMBA_CACHE_DIR")
-    if compiled:
-        return Path(compiled)
-    try:
-        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:
-        # A container may run as a user without a home folder.
-        return None
-    return Path(caches) / "lidarops"

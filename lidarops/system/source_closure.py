@@ -2,94 +2,46 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
-import json
-import sys
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 from lidarops.errors import LidarOpsError
-from lidarops.system.files import write_atomically
 
 _NO_DATA: Final = (".py", ".pyc", ".pyi", ".nbc", ".nbi", "~")
 """Endings of files beside modules that are no data of them."""
-_MOST_KEPT: Final = 5000
-"""Sources whose facts one file of the cache holds."""
-_WITHOUT_MEANING: Final = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
-"""Fields of syntax nodes that follow from others or change nothing."""
+_NO_STATEMENT: Final = re.compile(r"#[^\n]*|\\\n")
+_FOR_TYPES: Final = re.compile(
+    r"^([ \t]*)if (?:\w+\.)?TYPE_CHECKING:[^\n]*\n(?:\1[ \t]+[^\n]*\n|[ \t]*\n)*", re.MULTILINE
+)
+_IMPORT: Final = re.compile(
+    r"(?:^|[;:])[ \t]*"
+    r"(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n;]+)|import[ \t]+([^\n;]+))",
+    re.MULTILINE,
+)
 
 
-class SourceFacts(NamedTuple):
-    """What one source says."""
+def imported_modules(source: str) -> tuple[str, ...]:
+    """Return the modules that a source may import, also within functions, but not for types.
 
-    digest: str
-    """Equal for sources that differ in comments, docstrings, layout or line endings."""
-    imports: tuple[str, ...]
-    """Modules that it may import, also within functions, but not for type checking. ``from a
-    import b`` gives ``a`` and ``a.b``, because ``b`` may be a module; a relative import begins with
-    its dots."""
-
-
-def source_facts(source: bytes) -> SourceFacts:
-    """Return the digest of a source by its syntax tree, and its imports.
-
-    Raises
-    ------
-    SyntaxError, ValueError, RecursionError
-        If it is not Python, or an expression is nested too deeply.
+    ``from a import b`` gives ``a`` and ``a.b``, because ``b`` may be a module; a relative import
+    begins with its dots. A text that reads like an import counts as one.
     """
-    imports: set[str] = set()
-    content = _content(ast.parse(source), imports)
-    return SourceFacts(hashlib.sha256(content.encode()).hexdigest(), tuple(sorted(imports)))
-
-
-def _content(value: Any, imports: set[str]) -> str:
-    """Return a syntax tree as text, and add its imports.
-
-    `ast.dump` and `repr` write other text in other versions of Python.
-    """
-    if isinstance(value, list):
-        items = [_content(item, imports) for item in _effective(value)]
-        return f"[{','.join(items)}]" if items else ""
-    if not isinstance(value, ast.AST):
-        return ascii(value)
-    imports.update(_imports(value))
-    fields = (
-        (name, getattr(value, name, None)) for name in value._fields if name not in _WITHOUT_MEANING
-    )
-    texts = [
-        f"{name}={text}"
-        for name, field in fields
-        if field is not None and (text := _content(field, imports))
-    ]
-    return f"{type(value).__name__}({','.join(texts)})"
-
-
-def _effective(items: Iterable[Any]) -> Iterator[Any]:
-    """Yield the items of a list without those that change nothing."""
-    for item in items:
-        if isinstance(item, ast.If) and "TYPE_CHECKING" in (
-            getattr(item.test, "id", ""),
-            getattr(item.test, "attr", ""),
-        ):
-            yield from _effective(item.orelse)
-        elif not isinstance(item, ast.Pass) and not (
-            isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)
-        ):
-            yield item
-
-
-def _imports(node: ast.AST) -> Iterator[str]:
-    if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names)
-    elif isinstance(node, ast.ImportFrom):
-        module = "." * node.level + (node.module or "")
-        yield module
+    statements = _FOR_TYPES.sub("", _NO_STATEMENT.sub(" ", source))
+    found: set[str] = set()
+    for module, names, modules in _IMPORT.findall(statements):
         dot = "" if module.endswith(".") else "."
-        yield from (f"{module}{dot}{alias.name}" for alias in node.names)
+        found |= {module} if module else set()
+        found |= {f"{module}{dot}{name}" for name in _listed(names)}
+        found |= set(_listed(modules))
+    return tuple(sorted(found))
+
+
+def _listed(names: str) -> list[str]:
+    """Return the names in ``a as b, c``, with or without parentheses."""
+    return [words[0] for part in names.strip("() \t\n").split(",") if (words := part.split())]
 
 
 class Sources:
@@ -104,9 +56,6 @@ class Sources:
         Modules and packages that do not count, whoever imports them.
     with_data : collection of str
         Packages whose other files, such as tables, count also, if one of their modules counts.
-    cache : Path, optional
-        Folder that keeps facts about sources by their content. Without it, or where it cannot be
-        used, sources are parsed anew.
     """
 
     def __init__(
@@ -115,13 +64,11 @@ class Sources:
         *,
         apart: Collection[str] = (),
         with_data: Collection[str] = (),
-        cache: Path | None = None,
     ) -> None:
         self._roots = roots
         self._apart = apart
         self._with_data = with_data
-        self._kept = _KeptFacts(cache)
-        self._facts: dict[Path, SourceFacts] = {}
+        self._texts: dict[Path, str] = {}
         self._paths: dict[str, Path | None] = {}
         self._imports: dict[str, tuple[str, ...]] = {}
 
@@ -143,9 +90,9 @@ class Sources:
             If a source is missing or cannot be read.
         """
         closure = self.closure(starts)
-        contents = [f"{name}={self._of(path).digest}" for name, path in closure.items()]
+        contents = [f"{name}={_digest(self._text(path))}" for name, path in closure.items()]
         contents += [
-            f"{name}:{data.relative_to(path.parent).as_posix()}={_data_digest(data)}"
+            f"{name}:{data.relative_to(path.parent).as_posix()}={_digest(_read(data))}"
             for name, path in closure.items()
             if path.name == "__init__.py" and _within(name, self._with_data)
             for data in _data(path.parent)
@@ -177,7 +124,6 @@ class Sources:
             if path is not None and name not in files:
                 files[name] = path
                 waiting += self._imported(name, path)
-        self._kept.save()
         return files
 
     def _imported(self, module: str, path: Path) -> tuple[str, ...]:
@@ -186,7 +132,7 @@ class Sources:
             package = module if path.name == "__init__.py" else module.rpartition(".")[0]
             names = (
                 name
-                for target in self._of(path).imports
+                for target in imported_modules(self._text(path))
                 for name in self._run_by(_absolute(target, package))
             )
             self._imports[module] = tuple(dict.fromkeys(names))
@@ -199,17 +145,17 @@ class Sources:
             names = (".".join(parts[:count]) for count in range(1, len(parts) + 1))
             yield from (name for name in names if self.has(name))
 
-    def _of(self, path: Path) -> SourceFacts:
-        if path not in self._facts:
+    def _text(self, path: Path) -> str:
+        if path not in self._texts:
             try:
-                self._facts[path] = self._kept.of(path.read_bytes())
-            except (OSError, SyntaxError, ValueError, RecursionError) as error:
+                self._texts[path] = _read(path)
+            except OSError as error:
                 raise LidarOpsError(
-                    f"is not a source that Python can read: {error}",
+                    f"cannot be read: {error.strerror}",
                     file=path,
                     remedy="mend it, or install its package again",
                 ) from error
-        return self._facts[path]
+        return self._texts[path]
 
     def _path(self, module: str) -> Path | None:
         if module not in self._paths:
@@ -250,45 +196,10 @@ def _data(folder: Path) -> Iterator[Path]:
             yield from _data(path)
 
 
-def _data_digest(path: Path) -> str:
-    # Line endings depend on the checkout.
-    return hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()
+def _read(path: Path) -> str:
+    """Return the bytes of a file as text; line ends depend on the checkout."""
+    return path.read_bytes().decode("latin-1").replace("\r\n", "\n")
 
 
-class _KeptFacts:
-    """Facts about sources by their content, kept in a file because parsing takes long."""
-
-    def __init__(self, folder: Path | None) -> None:
-        # Facts are valid for the code that found them and for the grammar of this Python.
-        code = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
-        version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        self._file = None if folder is None else folder / f"syntax-{version}-{code}.json"
-        self._facts: dict[str, SourceFacts] = {}
-        self._used: set[str] = set()
-        self._new = False
-        if self._file is not None:
-            # Absent, or damaged: it is written anew.
-            with suppress(OSError, ValueError, TypeError):
-                self._facts = {
-                    content: SourceFacts(digest, tuple(imports))
-                    for content, digest, *imports in json.loads(self._file.read_bytes())
-                }
-
-    def of(self, source: bytes) -> SourceFacts:
-        content = hashlib.sha256(source).hexdigest()
-        self._used.add(content)
-        if content not in self._facts:
-            self._facts[content] = source_facts(source)
-            self._new = True
-        return self._facts[content]
-
-    def save(self) -> None:
-        if self._file is None or not self._new:
-            return
-        self._new = False
-        names = self._used if len(self._facts) > _MOST_KEPT else self._facts
-        rows = [[name, self._facts[name].digest, *self._facts[name].imports] for name in names]
-        # Where the folder cannot be written, every process parses the sources.
-        with suppress(OSError):
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(self._file, json.dumps(rows).encode())
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("latin-1")).hexdigest()

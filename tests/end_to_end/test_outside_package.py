@@ -279,21 +279,15 @@ def test_changed_bytes_of_a_file_in_its_settings_make_it_stale(copied: Campaign)
     assert stale(changed) == {KIND: "changed: overlap overlap.csv"}
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of facts about sources."""
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def changed_sources(
-    repository: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Path]:
     """A copy of the package that the run takes for the installed one."""
     package = tmp_path / "lidar_extras"
     shutil.copytree(repository / "tests/plugin/lidar_extras", package)
     roots = {"lidarops": (repository / "lidarops",), "lidar_extras": (package,)}
-    monkeypatch.setattr(versions, "_installed", lambda: sources_in(roots, cache))
+    monkeypatch.setattr(versions, "_installed", lambda: sources_in(roots))
     versions.code_version.cache_clear()
     yield package
     versions.code_version.cache_clear()

@@ -19,19 +19,16 @@ class Copy:
         Root of the checkout.
     folder : Path
         Folder for the copy.
-    cache : Path
-        Folder for facts about sources. Copies may share it.
     """
 
-    def __init__(self, repository: Path, folder: Path, cache: Path) -> None:
+    def __init__(self, repository: Path, folder: Path) -> None:
         self.root = folder / "lidarops"
-        self._cache = cache
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(repository / "lidarops", self.root, ignore=ignored)
 
     def sources(self) -> Sources:
         """Return the sources as they are now."""
-        return sources_in({**source_roots(), "lidarops": (self.root,)}, self._cache)
+        return sources_in({**source_roots(), "lidarops": (self.root,)})
 
     def versions(self) -> dict[str, str]:
         """Return the code version of every kind."""
@@ -43,6 +40,6 @@ class Copy:
         (self.root / module).write_text(text, encoding="utf-8")
 
     def change(self, module: str, statement: str = "_UNHEARD_OF = 1") -> None:
-        """Append a statement to a module, by default one that changes its syntax tree."""
+        """Append a statement to a module."""
         with (self.root / module).open("a", encoding="utf-8") as file:
             file.write(f"\n{statement}\n")

@@ -1,7 +1,8 @@
-"""Digests of modules with all that they import, and the cache of facts about sources."""
+"""Digests of modules with all that they import."""
 
 from __future__ import annotations
 
+import ast
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from lidarops.errors import LidarOpsError
-from lidarops.system import source_closure
-from lidarops.system.source_closure import Sources
+from lidarops.system.source_closure import Sources, imported_modules
 
 PACKAGE: Mapping[str, str] = {
     "__init__.py": "",
@@ -36,14 +36,14 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
-def sources(root: Path, cache: Path | None = None) -> Sources:
+def sources(root: Path) -> Sources:
     """Return the sources of the package as they are now."""
-    return Sources({"package": (root,)}, apart=["package.apart"], cache=cache)
+    return Sources({"package": (root,)}, apart=["package.apart"])
 
 
-def digest(root: Path, cache: Path | None = None) -> str:
+def digest(root: Path) -> str:
     """Return the digest of what one module imports."""
-    return sources(root, cache).digest(["package.start"])
+    return sources(root).digest(["package.start"])
 
 
 def test_a_closure_holds_modules_and_the_packages_around_them(root: Path):
@@ -70,51 +70,58 @@ def test_the_name_of_a_module_counts(root: Path):
     assert len({before, first, digest(root)}) == 3
 
 
-def test_a_source_is_parsed_once(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    parsed: list[bytes] = []
-    parse = source_closure.source_facts
-    monkeypatch.setattr(
-        source_closure, "source_facts", lambda source: parsed.append(source) or parse(source)
-    )
-    before = digest(root, tmp_path / "cache")
-    parsed.clear()
-    assert digest(root, tmp_path / "cache") == before
-    assert parsed == []
-    (root / "far.py").write_text("away = 2\n")
-    assert digest(root, tmp_path / "cache") != before
-    assert parsed == [b"away = 2\n"]
+def parsed_imports(tree: ast.AST) -> set[str]:
+    """Return the modules of all import statements but those for types, by the syntax tree."""
+    found: set[str] = set()
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            module = "." * node.level + (node.module or "")
+            dot = "" if module.endswith(".") else "."
+            found |= {module, *(f"{module}{dot}{alias.name}" for alias in node.names)}
+        found |= parsed_imports(node)
+    return found
 
 
-def test_facts_that_are_no_longer_used_are_given_up(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(source_closure, "_MOST_KEPT", 6)
-    for number in range(20):
-        (root / "far.py").write_text(f"away = {number}\n" + "a = 1\n" * 100)
-        digest(root, tmp_path / "cache")
-    (file,) = (tmp_path / "cache").iterdir()
-    assert file.read_text().count("[") <= 7
+def test_no_import_of_any_source_is_missed(repository: Path):
+    for path in sorted((repository / "lidarops").rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        assert parsed_imports(ast.parse(text)) <= set(imported_modules(text)), path
 
 
-@pytest.mark.parametrize("content", ["", "[1, 2]", '[["a"]]', '{"a": 1}', "[[["])
-def test_a_damaged_cache_is_written_anew(root: Path, tmp_path: Path, content: str):
-    before = digest(root, tmp_path / "cache")
-    (file,) = (tmp_path / "cache").iterdir()
-    good = file.read_bytes()
-    file.write_text(content)
-    assert digest(root, tmp_path / "cache") == before
-    assert file.read_bytes() == good
+@pytest.mark.parametrize(
+    ("statement", "modules"),
+    [
+        ("import a.b, c as d", {"a.b", "c"}),
+        ("from a import (  # words (of two\n    b,\n    c as d,\n)", {"a", "a.b", "a.c"}),
+        ("from a import b, \\\n    c", {"a", "a.b", "a.c"}),
+        ("from .. import a", {"..", "..a"}),
+        ("from .a import b", {".a", ".a.b"}),
+        ("try: import a; import b\nexcept ImportError: pass", {"a", "b"}),
+        ("def late():\n    from a import *", {"a", "a.*"}),
+        ("if typing.TYPE_CHECKING:\n    import a\n\n    import b\nimport c", {"c"}),
+        ("if TYPE_CHECKING:\n    import a\nelse:\n    import b", {"b"}),
+        ("# import a\nimported = from_a", set()),
+    ],
+)
+def test_every_form_of_import_is_found(statement: str, modules: set[str]):
+    ast.parse(statement)
+    assert set(imported_modules(statement)) == modules
 
 
-def test_without_a_cache_folder_digests_are_the_same(root: Path, tmp_path: Path):
-    # A folder cannot be made below a file.
-    (tmp_path / "file").write_text("")
-    assert digest(root, tmp_path / "file") == digest(root) == digest(root, tmp_path / "cache")
+def test_a_source_that_cannot_be_read_is_an_error(root: Path, monkeypatch: pytest.MonkeyPatch):
+    read = Path.read_bytes
 
+    def fail(path: Path) -> bytes:
+        if path.name == "far.py":
+            raise PermissionError(13, "Permission denied")
+        return read(path)
 
-def test_a_source_that_is_no_python_is_an_error(root: Path):
-    (root / "far.py").write_text("def (:\n")
-    with pytest.raises(LidarOpsError, match=r"far\.py: is not a source that Python can read"):
+    monkeypatch.setattr(Path, "read_bytes", fail)
+    with pytest.raises(LidarOpsError, match=r"far\.py: cannot be read: Permission denied"):
         digest(root)
 
 
