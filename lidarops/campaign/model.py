@@ -283,6 +283,12 @@ class Instrument(SettingsModel):
         description="order of the coordinates in headers; with ignore, a header may state any"
         " position and altitude",
     )
+    header_pointing: Literal["stated", "elevation", "zenith_angle"] = Field(
+        default="stated",
+        description="what the angle in headers is that do not state a scan: elevation (of either"
+        " sign), or zenith_angle (negative on the opposite side); stated: a zenith angle, -90"
+        " upwards, and files with another negative one are refused",
+    )
     position_tolerance: float = quantity(
         0.5,
         unit="degree",

@@ -22,7 +22,7 @@ from lidarops.catalog.sources import (
 )
 from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import parse_raw_header
-from lidarops.raw.header import RawHeader
+from lidarops.raw.header import HeaderPointing, RawHeader
 from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
@@ -75,6 +75,8 @@ class FileGroup:
     """Oddities of the headers, in words."""
     beams: tuple[FileBeam, ...]
     """By file."""
+    header_pointing: HeaderPointing = "stated"
+    """As what doubtful angles are read."""
 
     @property
     def pattern(self) -> str:
@@ -208,8 +210,10 @@ class InstrumentHeaders:
         )
 
 
-def read_folder(root: str) -> FolderContents:
+def read_folder(root: str, *, guess_pointing: bool = False) -> FolderContents:
     """Return the raw files of a folder or URL, grouped; reads all headers.
+
+    On request, doubtful angles of instruments are read as what they probably are.
 
     Raises
     ------
@@ -232,8 +236,15 @@ def read_folder(root: str) -> FolderContents:
                 refused.append((printable(file.path), str(error)))
         else:
             headers[_likeness(file.path, header)].append((file.path, header))
+    lidars: dict[tuple[object, ...], list[RawHeader]] = defaultdict(list)
+    for members in headers.values():
+        lidars[_lidar(members[0][1])] += [header for _, header in members]
+    guesses = {key: _pointing(own) if guess_pointing else "stated" for key, own in lidars.items()}
     return FolderContents(
-        tuple(_group(members) for _, members in sorted(headers.items(), key=_place)),
+        tuple(
+            _group(members, guesses[_lidar(members[0][1])])
+            for _, members in sorted(headers.items(), key=_place)
+        ),
         tuple(refused),
         tuple(other),
         tuple(printable(file.path) for file in copies),
@@ -284,8 +295,26 @@ def _place(item: tuple[tuple[object, ...], list[tuple[str, RawHeader]]]) -> str:
     return item[1][0][0]
 
 
-def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
-    headers = [header for _, header in members]
+def _lidar(stated: RawHeader | FileGroup) -> tuple[object, ...]:
+    """Return what the headers of one instrument have in common."""
+    return stated.site, stated.coordinates, frozenset(c.name for c in stated.layout)
+
+
+def _pointing(headers: Sequence[RawHeader]) -> HeaderPointing:
+    """Return as what the doubtful angles of an instrument are probably meant.
+
+    A single one among others is probably damaged.
+    """
+    written = [header.written_angle for header in headers if header.written_angle is not None]
+    doubtful = {header.written_angle for header in headers if header.doubt} - {None}
+    if not doubtful or len(doubtful) == 1 < len(set(written)):
+        return "stated"
+    return "zenith_angle" if max(written) >= 0.0 else "elevation"
+
+
+def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -> FileGroup:
+    doubts = tuple(sorted({header.doubt for _, header in members if header.doubt}))
+    headers = [header.read_as(pointing) for _, header in members]
     first, known = headers[0], [header for header in headers if not header.doubt]
     folder, stem = _split(members[0][0])
     angles = [header.zenith_angle for header in known if header.zenith_angle is not None]
@@ -303,7 +332,7 @@ def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
         zenith_angles=tuple(sorted(set(angles))),
         azimuths=tuple(sorted({h.azimuth for h in known if h.azimuth is not None})),
         without_zenith=len(headers) - len(angles),
-        doubts=tuple(sorted({header.doubt for header in headers if header.doubt})),
+        doubts=doubts,
         notes=tuple(sorted({note for header in headers for note in header.notes})),
         beams=tuple(
             FileBeam(
@@ -314,6 +343,7 @@ def _group(members: Sequence[tuple[str, RawHeader]]) -> FileGroup:
             )
             for header in headers
         ),
+        header_pointing=pointing,
     )
 
 
@@ -368,13 +398,7 @@ def instruments_of(
 
 
 def _one_instrument(one: FileGroup, other: FileGroup) -> bool:
-    if one.pattern == other.pattern:
-        return True
-    return (one.site, one.coordinates, {c.name for c in one.layout}) == (
-        other.site,
-        other.coordinates,
-        {c.name for c in other.layout},
-    )
+    return one.pattern == other.pattern or _lidar(one) == _lidar(other)
 
 
 def _patterns(groups: Sequence[FileGroup], everything: Sequence[str]) -> Iterator[str]:

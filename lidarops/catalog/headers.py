@@ -15,7 +15,7 @@ from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, read_start
-from lidarops.raw.header import HeaderOrder, RawHeader
+from lidarops.raw.header import HeaderOrder, HeaderPointing, RawHeader
 from lidarops.records import UNKNOWN_FORMAT, UNREADABLE, Granule, Role, Status
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ class _Place:
     longitude: float
     altitude: float
     header_position: HeaderOrder | Literal["ignore"]
+    header_pointing: HeaderPointing
     position_tolerance: float
     """degree."""
     altitude_tolerance: float
@@ -82,6 +83,10 @@ class _Place:
         """Return whether a position is that of the station, within the tolerance."""
         eastward = (longitude - self.longitude + 180.0) % 360.0 - 180.0
         return max(abs(latitude - self.latitude), abs(eastward)) <= self.position_tolerance
+
+    def is_as_high(self, altitude: float) -> bool:
+        """Return whether an altitude is that of the station, within the tolerance."""
+        return abs(altitude - self.altitude) <= self.altitude_tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,13 +165,14 @@ def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Gra
 
 def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
     facts = place.facts_of(header.start)
+    header = header.read_as(place.header_pointing)
     if header.doubt and facts.zenith_angle is None:
         raise RawFormatError(
             header.doubt,
             file=header.path,
             field="pointing",
-            remedy="leave the file out, or give zenith_angle in the facts if the beam is fixed: it"
-            " holds for all files of the period",
+            remedy="leave the file out, or set header_pointing if it states no scan, or give"
+            " zenith_angle in the facts if the beam is fixed: it holds for all files of the period",
         )
     shift = timedelta(seconds=facts.clock_offset)
     order = place.header_position
@@ -179,7 +185,7 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
         instrument=due.instrument,
         role=due.role,
         status=Status.GOOD,
-        notes=(*header.notes, *_overridden(header, facts)),
+        notes=(*header.notes, *_overridden(header, facts, place)),
         contradictions=() if order == "ignore" else tuple(_contradictions(header, position, place)),
         start=header.start - shift,
         stop=header.stop - shift,
@@ -212,7 +218,7 @@ def _contradictions(
             f" campaign {place.latitude:.1f} N {place.longitude:.1f} E ({remedy})"
         )
     altitude = header.altitude
-    if altitude is not None and abs(altitude - place.altitude) > place.altitude_tolerance:
+    if altitude is not None and not place.is_as_high(altitude):
         remedy = "correct the station, or set header_position: ignore or altitude_tolerance"
         if abs(altitude - 1e3 * place.altitude) <= place.altitude_tolerance:
             remedy = "that of the station looks like km: give m"
@@ -222,11 +228,23 @@ def _contradictions(
         )
 
 
-def _overridden(header: RawHeader, facts: _Facts) -> Iterator[str]:
-    """Yield facts of the campaign that override what the header states."""
-    stated, given = header.zenith_angle, facts.zenith_angle
-    if stated is not None and given is not None and abs(stated - given) > _ROUNDING_OF_ANGLES:
-        yield f"zenith_angle {given:g} degree of the campaign overrides {stated:g} of the header"
+def _overridden(header: RawHeader, facts: _Facts, place: _Place) -> Iterator[str]:
+    """Yield what of the campaign overrides what the header states otherwise."""
+    for name in ("zenith_angle", "azimuth"):
+        stated, given = getattr(header, name), getattr(facts, name)
+        if None not in (stated, given) and (
+            abs((stated - given + 180.0) % 360.0 - 180.0) > _ROUNDING_OF_ANGLES
+        ):
+            yield f"{name} {given:g} degree of the campaign overrides {stated:g} of the header"
+    if header.doubt:
+        given = facts.zenith_angle
+        yield f"zenith_angle {given:g} degree of the campaign overrides the header: {header.doubt}"
+    if place.header_position == "ignore":
+        pair, altitude = header.coordinates, header.altitude
+        if pair is not None and not (place.is_near(*pair) or place.is_near(*pair[::-1])):
+            yield f"header_position: ignore overrides {pair[0]:g}, {pair[1]:g} of the header"
+        if altitude is not None and not place.is_as_high(altitude):
+            yield f"header_position: ignore overrides the altitude {altitude:g} m of the header"
     wavelengths = dict(facts.wavelengths)
     for channel in header.layout if wavelengths else ():
         wavelength = wavelengths.get(channel.name, math.nan)
@@ -244,6 +262,7 @@ def _place(station: Station, instrument: Instrument) -> _Place:
         station.longitude,
         station.altitude,
         instrument.header_position,
+        instrument.header_pointing,
         instrument.position_tolerance,
         instrument.altitude_tolerance,
         tuple(

@@ -410,6 +410,7 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 role.value,
                 patterns,
                 instrument.header_position,
+                instrument.header_pointing,
                 instrument.position_tolerance,
                 instrument.altitude_tolerance,
                 station.model_dump(),

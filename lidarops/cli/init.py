@@ -51,7 +51,7 @@ def init(
             wrong_use=True,
         )
     text = draft_campaign(
-        read_folder(str(root)),
+        read_folder(str(root), guess_pointing=True),
         archive=Path(os.path.relpath(root, base)).as_posix(),
         output=_free_output(campaign),
         name=root.name,

@@ -20,7 +20,7 @@ from lidarops.catalog.folder import (
 )
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
-from lidarops.raw.header import HeaderOrder
+from lidarops.raw.header import POINTING_NOTE, HeaderOrder
 from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.steps.channels import file_channels
@@ -32,8 +32,6 @@ _ALTITUDES: Final = (-500.0, 9000.0)
 """m; those that a station of a campaign may have."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
-_POINTING: Final = "taken as"
-"""Words of the notes on headers that tell how their pointing is read."""
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
 
@@ -202,6 +200,11 @@ def _instrument(
         yield "    header_position: ignore  # headers state no position on Earth"
     else:
         yield f"    header_position: {site.order}  # ? order of {_pair(site.coordinates)}"
+    pointing = headers.main.header_pointing
+    if pointing != "stated":
+        other = "elevation" if pointing == "zenith_angle" else "zenith_angle"
+        doubts = [doubt for group in groups for doubt in group.doubts]
+        yield f"    header_pointing: {pointing}  # ? or {other}: {doubts[0]}"
     yield from _facts(headers, estimates=estimates)
     yield from _products(headers)
 
@@ -240,20 +243,23 @@ def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:
 def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
     angles = sorted({angle for group in headers.signal for angle in group.zenith_angles})
     sides = {side for group in headers.signal for side in group.azimuths}
+    doubts = [doubt for group in headers.signal for doubt in group.doubts]
+    refused = headers.without_zenith if doubts else 0
+    # A fact would hold for the files with doubtful pointings too.
+    mark = "# " if refused else ""
     if not angles:
-        yield "zenith_angle: 0  # ? degree, headers state none; 0 is up, 90 level"
+        yield f"{mark}zenith_angle: 0  # ? degree, headers state none; 0 is up, 90 level"
     elif len(angles) > 1:
         yield (
             f"# zenith_angle: the beam moves from {angles[0]:g} to {angles[-1]:g} degree by the"
             f" headers, over {len(sides) or 'no known'} azimuths"
         )
     else:
-        notes = {note for group in headers.signal for note in group.notes if _POINTING in note}
+        notes = {note for group in headers.signal for note in group.notes if POINTING_NOTE in note}
         source = "; ".join(sorted(notes)) or f"headers state {angles[0]:g}"
-        yield f"zenith_angle: {abs(angles[0]):g}  # ? degree, {source}"
-    if angles and headers.without_zenith:
-        doubts = [doubt for group in headers.signal for doubt in group.doubts]
-        yield f"# ? {headers.without_zenith} files state no sure pointing and are refused"
+        yield f"{mark}zenith_angle: {abs(angles[0]):g}  # ? degree, {source}"
+    if refused:
+        yield f"# ? {refused} files state no sure pointing and are refused without zenith_angle"
         yield from (f"#   {doubt}" for doubt in doubts[:1])
 
 

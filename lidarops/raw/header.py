@@ -21,6 +21,9 @@ _TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\r\n"
 
 _Channel = TypeVar("_Channel")
 HeaderOrder = Literal["longitude_first", "latitude_first"]
+HeaderPointing = Literal["stated", "elevation", "zenith_angle"]
+POINTING_NOTE: Final = "taken as"
+"""Words of the notes on headers that tell how their pointing is read."""
 
 Stretches = tuple[tuple[int, int], ...]
 """Stretches of bins of a channel, ascending: first bin, and the one past the last."""
@@ -115,9 +118,27 @@ class RawHeader(NamedTuple):
     """Oddities of the header, in words."""
     doubt: str = ""
     """Why the pointing is unknown although the header holds one, in words; the file is refused
-    unless the campaign gives zenith_angle."""
+    unless the campaign gives header_pointing or zenith_angle."""
+    written_angle: float | None = None
+    """degree; the angle as written, where no line of the file tells what it is."""
     record: Any = None
     """The header as its format holds it, a dataclass; ``lidarops inspect`` shows its fields too."""
+
+    def read_as(self, pointing: HeaderPointing) -> RawHeader:
+        """Return the header with its written angle read as what the campaign says that it is.
+
+        Elevations may be positive or negative upwards. Where a zenith angle is negative, or an
+        elevation beyond 90 degree, the beam is on the side opposite to its azimuth.
+        """
+        if pointing == "stated" or self.written_angle is None:
+            return self
+        written, azimuth = self.written_angle, self.azimuth
+        angle = 90.0 - abs(written) if pointing == "elevation" else written
+        if azimuth is not None and angle < 0.0:
+            azimuth = (azimuth + 180.0) % 360.0
+        notes = [note for note in self.notes if POINTING_NOTE not in note]
+        notes.append(f"the angle of the header is {POINTING_NOTE} {pointing}: header_pointing")
+        return self._replace(zenith_angle=abs(angle), azimuth=azimuth, doubt="", notes=tuple(notes))
 
     def position(self, order: HeaderOrder = "longitude_first") -> tuple[float, float] | None:
         """Return latitude and longitude in degree; None where the header holds none.

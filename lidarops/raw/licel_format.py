@@ -65,6 +65,7 @@ def raw_header(header: licel.Header) -> RawHeader:
         site=header.site,
         notes=header.notes,
         doubt=header.pointing_doubt,
+        written_angle=header.zenith_as_written if header.scan is None else None,
         record=header,
     )
 

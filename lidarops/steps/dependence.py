@@ -47,8 +47,8 @@ OPERATION: Final = frozenset(
 """Settings of a campaign that change neither the scenes nor the content of a product."""
 _OF_CAMPAIGN: Final = OPERATION | {"all_steps", "scenes", "stations", "instruments", "networks"}
 _OF_INSTRUMENT: Final = frozenset(
-    {"files", "dark_files", "header_position", "position_tolerance", "altitude_tolerance", "facts",
-     "products"}
+    {"files", "dark_files", "header_position", "header_pointing", "position_tolerance",
+     "altitude_tolerance", "facts", "products"}
 )  # fmt: skip
 """Settings that affect products only through plan, scene and inputs. All others count."""
 _EDGES: Final = frozenset({"valid_from", "valid_to"})

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import pytest
@@ -178,6 +179,32 @@ def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None
     scan_archive(campaign.model_copy(update={"instruments": changed}), store)
     assert store.granules()[0].contradictions == ()
     assert store.granules()[0].latitude == 46.4
+
+
+@pytest.mark.parametrize(
+    ("stated", "changes", "note"),
+    [
+        ({"zenith_angle": 30.0}, {"zenith_angle": 0}, "zenith_angle 0 degree of the campaign over"),
+        ({"zenith_angle": -15.0}, {"zenith_angle": 0}, "header: the pointing -15 degree may be"),
+        ({"zenith_angle": 15.0}, {"header_pointing": "elevation"}, "angle of the header is taken"),
+        ({"azimuth": 2.0}, {"azimuth": 350}, "azimuth 350 degree of the campaign overrides 2 of"),
+        ({"position": (40.0, 9.0)}, {"header_position": "ignore"}, "overrides 9, 40 of the header"),
+        ({"altitude": 500.0}, {"header_position": "ignore"}, "overrides the altitude 500 m"),
+        ({"zenith_angle": 30.0, "azimuth": 0.5}, {"zenith_angle": 29.5, "azimuth": 359.8}, ""),
+        ({}, {"header_position": "ignore"}, ""),
+    ],
+)
+def test_what_the_campaign_states_otherwise_than_a_header_is_noted(
+    campaign: Campaign, store: Store, stated: dict[str, Any], changes: dict[str, Any], note: str
+) -> None:
+    raw_archives.write(Path(campaign.archive) / "coast/h0", raw_archives.content(**stated))
+    facts = {name: value for name, value in changes.items() if name in {"zenith_angle", "azimuth"}}
+    others = {name: value for name, value in changes.items() if name not in facts}
+    changed = factories.campaign(facts=[facts], **others)
+    scan_archive(changed.model_copy(update={"archive": campaign.archive}), store)
+    (granule,) = store.granules(status=Status.GOOD)
+    assert note in " ".join(granule.notes)
+    assert bool(granule.notes) == bool(note)
 
 
 def test_an_archive_behind_a_url(campaign: Campaign, store: Store) -> None:

@@ -30,10 +30,16 @@ def test_a_product_states_the_notes_on_its_files(tmp_path: Path) -> None:
     overridden = "zenith_angle 3 degree of the campaign overrides 0 of the header: 3 of 3 files"
     assert rich == overridden
     assert all(reproduce_product(path).identical for path in notes)
-    # A product without notes does not carry the attribute.
     archive.tree["instruments"]["poor"]["header_position"] = "ignore"
     assert reprocess(archive.write()) is not None
-    with xr.open_dataset(next(iter(notes))) as product:
+    first = next(iter(notes))
+    with xr.open_dataset(first) as product:
+        ignored = product.attrs["lidarops_input_notes"]
+    assert ignored == "header_position: ignore overrides -64.2, -31.4 of the header: 1 of 4 files"
+    # A product without notes does not carry the attribute.
+    (archive.folder / "raw/poor/h-foreign").unlink()
+    assert reprocess(archive.write()) is not None
+    with xr.open_dataset(first) as product:
         assert "lidarops_input_notes" not in product.attrs
 
 

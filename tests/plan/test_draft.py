@@ -122,6 +122,51 @@ def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
     assert [granule.zenith_angle for granule in granules(campaign)] == [0.0, 30.0, 60.0]
 
 
+@pytest.mark.parametrize(
+    ("written", "pointing", "zenith", "azimuth"),
+    [
+        ((-15.0, -40.0, -90.0), "elevation", [75.0, 50.0, 0.0], [20.0, 20.0, 20.0]),
+        ((-15.0, -40.0, -60.0), "elevation", [75.0, 50.0, 30.0], [20.0, 20.0, 20.0]),
+        ((-60.0, -30.0, 0.0, 45.0), "zenith_angle", [60, 30, 0, 45], [200, 200, 20, 20]),
+    ],
+)
+def test_a_scan_whose_headers_do_not_tell_what_its_angles_are_is_a_question(
+    tmp_path: Path,
+    written: tuple[float, ...],
+    pointing: str,
+    zenith: list[float],
+    azimuth: list[float],
+) -> None:
+    """It is drafted as a scan: a zenith angle in the facts would flatten it."""
+    for number, angle in enumerate(written):
+        write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle, azimuth=20.0))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert lidar.facts[0].zenith_angle is None
+    assert lidar.header_pointing == pointing
+    (line,) = (line for line in text.splitlines() if "header_pointing" in line)
+    assert "# ? or " in line
+    assert "may be an elevation or a zenith angle" in line
+    assert set(lidar.products.requested()) == {"signal", "multiangle"}
+    known = granules(campaign)
+    assert [granule.zenith_angle for granule in known] == zenith
+    assert [granule.azimuth for granule in known] == azimuth
+    assert all("header_pointing" in " ".join(granule.notes) for granule in known)
+
+
+def test_a_single_doubtful_angle_among_others_is_refused(tmp_path: Path) -> None:
+    """A zenith angle in the facts would hold for it too."""
+    for number, angle in enumerate((-90.0, -90.0, -12.0, -90.0)):
+        write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert "# zenith_angle: 0  # ? degree, zenith angle -90 taken as vertical" in text
+    assert "1 files state no sure pointing and are refused" in text
+    known = granules(campaign)
+    assert [g.zenith_angle for g in known if g.status is Status.GOOD] == [0.0] * 3
+    (reason,) = (granule.reason for granule in known if granule.status is Status.REFUSED)
+    assert "set header_pointing if it states no scan" in reason
+
+
 def test_files_of_single_beams_beside_a_scan_are_left_out(tmp_path: Path) -> None:
     """A low beam stays, because it may be blocked, and then shows the analog baseline."""
     scan = {f"scan/h{number}": (number, 30.0 * (number % 3)) for number in range(6)}

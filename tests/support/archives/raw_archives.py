@@ -20,6 +20,8 @@ def content(
     position: tuple[float, float] = (46.4, 30.7),
     site: str = "Coast",
     zenith_angle: float = 90.0,
+    azimuth: float | None = None,
+    altitude: float = 20.0,
 ) -> bytes:
     """Return a file with an analog and a photon channel that starts so long after midnight."""
     start: datetime = factories.DAY + timedelta(minutes=minutes)
@@ -29,10 +31,11 @@ def content(
         site=site,
         start=start,
         stop=start + timedelta(minutes=1),
-        altitude=20.0,
+        altitude=altitude,
         latitude=position[0],
         longitude=position[1],
         zenith_angle=zenith_angle,
+        azimuth=azimuth,
         datasets=[
             licel.new_dataset(kind=licel.DatasetKind.ANALOG, **common),
             licel.new_dataset(kind=licel.DatasetKind.PHOTON, **common),
