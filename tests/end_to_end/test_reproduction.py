@@ -120,7 +120,7 @@ def test_files_state_methods_reference_and_source_of_the_air(campaign: Campaign)
     assert states(elastic, "molecular_source") == "sounding"
     assert states(elastic, "background_method") == "known_shape"
     assert states(opened["signal"], "background_method") == "tail_mean"
-    assert states(opened["homogeneous"], "retrieval_method") == "compressed"
+    assert states(opened["homogeneous"], "retrieval_method") == "direct"
     # The method that ran, not auto, which was requested.
     ran = states(opened["multiangle"], "retrieval_method")
     assert f"; {ran}: " in opened["multiangle"].attrs["lidarops_steps"]

@@ -132,13 +132,13 @@ def test_a_section_outside_the_bins_is_left_out(section: list[float]) -> None:
 @pytest.mark.parametrize(
     ("pointings", "farthest", "method"),
     [
-        ([(90.0, 20.0), (90.0, 20.0)], 4500, "auto"),
+        ([(90.0, 20.0), (90.0, 20.0)], 4500, "direct"),
         ([(90.0, 20.0), (60.0, 20.0)], 4500, "known_background"),
         ([(90.0, 20.0), (90.0, 25.0)], 4500, "known_background"),
-        ([(90.0, 359.99), (90.0, 0.01)], 4500, "auto"),
+        ([(90.0, 359.99), (90.0, 0.01)], 4500, "direct"),
         ([(90.0, 358.0), (90.0, 3.0)], 4500, "known_background"),
         # The last tenth of the bins begins before.
-        ([(90.0, 20.0), (90.0, 25.0)], 14_500, "auto"),
+        ([(90.0, 20.0), (90.0, 25.0)], 14_500, "direct"),
     ],
 )
 def test_the_background_of_a_moving_beam_is_that_of_the_far_range(

@@ -63,8 +63,10 @@ def measure_solvers(effort: Effort, *, profiles: int | None = None) -> Study:
         [Results("Gain of two threads", rows_of_scores(gains), case="data")],
     )
     text = (
-        f"Path {PATH.label}, {PATH.bins} bins; all outputs and flags, one thread, least CPU time "
-        "of interleaved repeats. numba is timed once compiled."
+        f"Path {PATH.label}, {PATH.bins} bins; one variance for all profiles or none, no "
+        "correlation length or exposure: with those of products, compressed is solved by direct. "
+        "All outputs and flags, one thread, least CPU time of interleaved repeats. numba is timed "
+        "once compiled."
     )
     chapters = [cost_chapter("time", text, rows), threads]
     return Study("Homogeneous path: time per profile", effort.date, chapters)

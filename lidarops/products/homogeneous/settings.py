@@ -35,8 +35,9 @@ class HomogeneousSettings(ChannelProduct):
         default="auto",
         description="known_background takes the background from the far range, for paths that end"
         " there, or from background; auto does the former where the beam moves and the sections end"
-        " before the last tenth of the bins; the other methods retrieve it from the section."
-        " linearized takes one step from extinction, known_extinction takes it as exact",
+        " before the last tenth of the bins, and is direct elsewhere; the other methods retrieve it"
+        " from the section. linearized takes one step from extinction, known_extinction takes it"
+        " as exact",
     )
     extinction: float | None = quantity(
         None,

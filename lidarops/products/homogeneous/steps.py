@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.flags import Quality
 from lidarops.products.homogeneous.look import (
     LEVEL,
@@ -22,7 +23,7 @@ from lidarops.products.homogeneous.look import (
     omitted_sections,
 )
 from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
-from lidarops.products.homogeneous.variables import AUTOMATIC, LAYOUT
+from lidarops.products.homogeneous.variables import LAYOUT
 from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
@@ -94,15 +95,16 @@ def _level(case: Case) -> list[Section]:
 
 
 def _method(case: Case) -> Method:
-    """Return the method: `auto` of a moving beam takes the background of the far range.
+    """Return the method that runs: `auto` is the direct fit, or of a moving beam the far range.
 
     A beam of a scan has few shots, and a section cannot tell its background from its extinction.
     Bins of the far range are no part of a section.
     """
-    requested = case.request.method
+    if case.request.method != "auto":
+        return case.request.method
     start = tail(case, None)[0]
     apart = all(far <= start for _, far in _level(case))
-    return "known_background" if requested == "auto" and apart and moves(case) else requested
+    return "known_background" if apart and moves(case) else "direct"
 
 
 class SectionWindow(Window, Choice[Case, WindowSettings]):
@@ -197,6 +199,11 @@ _BACKGROUNDS: Final = {
     "cubic": "is that of the cubic",
 }
 """Where the background comes from, by method, unless from the section with extinction."""
+_PAPERS: Final = {
+    "cubic": CUBIC_PAPER,
+    **dict.fromkeys(("linearized", "known_background", "known_extinction"), LEAST_SQUARES_PAPER),
+}
+"""Papers of the methods that have one."""
 _WARNINGS: Final = {
     # `test_the_cubic_needs_a_strong_signal`
     "cubic": "the cubic rejects all values where the signal of the first bin of a section is less"
@@ -289,7 +296,7 @@ def _whence(settings: HomogeneousSettings, method: Method) -> str:
     if settings.background:
         return "is given by the campaign"
     whence = _BACKGROUNDS.get(method, "is retrieved together with extinction")
-    if method != settings.method:
+    if method == "known_background" and settings.method == "auto":
         return f"{whence}, because the beam moves and the sections end before it"
     return whence if settings.lag is None else f"{whence} with a lag of {settings.lag} bins"
 
@@ -404,10 +411,9 @@ class _Sections(WholeProduct):
             definition = VisibilityDefinition(self._data[WAVELENGTH], **dict(requested))
             sections = _with_visibility(sections, definition)
         method = self._settings.method
-        row = LAYOUT.row("retrieval_method")
-        return in_one_batch(
-            sections.assign(retrieval_method=row.code(AUTOMATIC if method == "auto" else method))
-        )
+        stated = sections.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
+        paper = _PAPERS.get(method)
+        return in_one_batch(stated.assign_attrs(references=paper) if paper else stated)
 
 
 def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:

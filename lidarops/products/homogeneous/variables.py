@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final, get_args
 
-from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.netcdf.false_shares import by_class, percent
 from lidarops.netcdf.variables import (
     NO_STANDARD_NAME,
@@ -28,9 +27,6 @@ _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
 _OF_EXTINCTION = ("total_extinction_model_error", *_OF_FIT)
 
-AUTOMATIC: Final = "compressed"
-"""What the method ``auto`` of the settings stands for."""
-_METHODS: Final = (AUTOMATIC, *(name for name in get_args(Method) if name != "auto"))
 _CURVED_SIGNAL = (
     "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
     " section, and by the opposite amount at the other"
@@ -66,8 +62,6 @@ LAYOUT: Final = Layout(
     ),
     processing_level="L2: retrieved quantities",
     references=(
-        CUBIC_PAPER,
-        LEAST_SQUARES_PAPER,
         "Golub, G. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432, doi:10.1137/0710036.",
     ),
     comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 total_extinction r),"
@@ -166,9 +160,9 @@ LAYOUT: Final = Layout(
             valid_min=0.0,
         ),
         retrieval_method(
-            _METHODS,
-            "compressed: least squares from few sums over the bins, by direct where a profile has"
-            " gaps; auto of the settings stands for it.",
+            ("compressed", *(name for name in get_args(Method) if name != "auto")),
+            "The method that ran: auto of the settings is direct, least squares over the bins, or"
+            " known_background. compressed stands in older files only, which direct made too.",
         ),
         quality(_SECTIONS, FLAGS),
         shots(of="the profile"),
