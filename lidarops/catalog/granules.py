@@ -41,6 +41,12 @@ class Fingerprint(NamedTuple):
     sha256: str | None
     start: datetime | None
     """UTC, without a zone."""
+    status: str
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether the file is refused for its content, of which `sha256` is the digest."""
+        return self.status == Status.REFUSED and self.sha256 is not None
 
 
 class DatedFile(NamedTuple):
@@ -71,7 +77,7 @@ class Granules(Database):
         """Yield a fingerprint of every granule, ordered by path, without holding them all."""
         columns = (_C.path, _C.size, _C.mtime_ns, _C.scan_key, _C.stamp_low, _C.stamp_high)
         query = (
-            sa.select(*columns, _C.sha256, _C.start)
+            sa.select(*columns, _C.sha256, _C.start, _C.status)
             .where(_C.campaign == self.campaign)
             .order_by(_C.path)
         )

@@ -387,11 +387,20 @@ class Ledger(Granules):
             connection.execute(self.insert_new(STAGE), stages)
 
     def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
-        """Enter granules that could not be read; the next scan tries them again."""
+        """Enter granules that cannot be used; the next scan tries what was not read again."""
         # Whole rows: a scan leaves a row whose stamp is that of the file as it reads it.
-        rows = [row_of(granule, self.campaign, RETRY).values for granule in refused]
+        rows = [
+            row_of(granule, self.campaign, self._scan_key(connection, granule)).values
+            for granule in refused
+        ]
         if rows:
             connection.execute(self.upsert(GRANULE), rows)
+
+    def _scan_key(self, connection: sa.Connection, refused: Granule) -> str:
+        """Return the key by which a scan knows a damaged file, or `RETRY` if it was not read."""
+        here = GRANULE.c.campaign == self.campaign, GRANULE.c.path == refused.path
+        known = sa.select(GRANULE.c.scan_key).where(*here)
+        return (connection.scalar(known) if refused.sha256 else None) or RETRY
 
     # Products
 

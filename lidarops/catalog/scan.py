@@ -200,15 +200,17 @@ class _Scan:
             if self._files % _BATCH == 0:
                 self._report_progress()
             key = _key(owners)
-            if before is None or (before.size, before.mtime_ns, before.scan_key) != (
-                file.size,
-                file.mtime_ns,
-                key,
-            ):
+            if before is None or not self._is_known(before, file, key):
                 self._judged.append(before)
                 yield _due(file, owners, key)
             else:
                 self._readable = True
+
+    def _is_known(self, before: Fingerprint, file: RawFile, key: str) -> bool:
+        """Return whether the catalog holds what a file is; a damaged one may have been repaired."""
+        known = before.size, before.mtime_ns, before.scan_key
+        same = known == (file.size, file.mtime_ns, key)
+        return same and (not before.is_damaged or self._digest(file.path) == before.sha256)
 
     def is_claimed(self, path: str) -> bool:
         """Return whether an instrument claims a path."""
@@ -247,10 +249,11 @@ class _Scan:
             return
         else:
             # Read a whole file only if a product was made from it.
-            readable = before.sha256 and values["status"] == Status.GOOD
-            digest = self._digest(values["path"]) if readable else None
-            values["sha256"] = digest
-            same = digest is not None and digest == before.sha256
+            was_used = before.sha256 is not None and not before.is_damaged
+            readable = was_used and values["status"] == Status.GOOD
+            same = readable and self._digest(values["path"]) == before.sha256
+            # The processing checks any other content.
+            values["sha256"] = before.sha256 if same else None
             self._changed += not (same and before.scan_key == values["scan_key"])
             # The time of a file that was good is known, also if its name tells none. The stamps
             # leave it out, so that a scan that knows no more writes nothing.

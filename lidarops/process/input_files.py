@@ -14,9 +14,10 @@ from typing import Final
 import xarray as xr
 
 from lidarops.campaign.model import Campaign
-from lidarops.errors import CatalogError, LidarOpsError, SceneError
+from lidarops.errors import CatalogError, LidarOpsError, SceneError, UnreadableFileError
 from lidarops.raw.archive import open_archive
-from lidarops.raw.formats import parse_raw_header
+from lidarops.raw.file import RawFile
+from lidarops.raw.formats import parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
 from lidarops.steps.dependence import scene_facts
@@ -82,26 +83,34 @@ def check_files(
     refused: list[Granule] = []
     read = 0
     for granule in (*scene.granules, *scene.dark):
+        sha256 = None
         try:
             same = not read_all and _is_unchanged(granule, root)
             sha256 = granule.sha256 if same else None
             if sha256 is None:
                 read += granule.size
-                sha256 = _read_digest(granule, root)
+                content = _read(granule, root)
+                sha256 = hashlib.sha256(content).hexdigest()
+                _check(content, granule, root)
         except FileNotFoundError:
             why = (denied or {}).get(granule.path)
             reason = f"{UNREADABLE}: {why}" if why else _VANISHED
-            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
+            refused.append(_refused(granule, reason))
         except OSError as error:
-            reason = f"{UNREADABLE}: {error.strerror or error}"
-            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
+            refused.append(_refused(granule, f"{UNREADABLE}: {error.strerror or error}"))
         except LidarOpsError as error:
-            reason = str(error).removeprefix(f"{granule.path}: ")
-            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
+            passing = isinstance(error, UnreadableFileError)
+            error.file = None
+            refused.append(_refused(granule, str(error), None if passing else sha256))
         else:
             usable[granule.path] = granule if same else replace(granule, header_digest=None)
             inputs.append(InputRecord(granule.path, granule.role, sha256))
     return _without(scene, usable), tuple(inputs), tuple(refused), read
+
+
+def _refused(granule: Granule, reason: str, sha256: str | None = None) -> Granule:
+    """Return a granule as refused; with the SHA-256 of its content if this is at fault."""
+    return replace(granule, status=Status.REFUSED, reason=reason, sha256=sha256)
 
 
 def _is_unchanged(granule: Granule, root: Path) -> bool:
@@ -110,15 +119,21 @@ def _is_unchanged(granule: Granule, root: Path) -> bool:
     return (status.st_size, status.st_mtime_ns) == (granule.size, granule.mtime_ns)
 
 
-def _read_digest(granule: Granule, root: Path) -> str:
+def _read(granule: Granule, root: Path) -> bytes:
     data = (root / granule.path).read_bytes()
     if len(data) != granule.size:
         raise SceneError(
             f"holds {len(data)} bytes, {granule.size} according to the catalog",
             remedy="run lidarops catalog again",
         )
-    parse_raw_header(data, file=granule.path, size=len(data), known=granule.format)
-    return hashlib.sha256(data).hexdigest()
+    return data
+
+
+def _check(content: bytes, granule: Granule, root: Path) -> None:
+    """Raise an error if header or counts cannot be used, also those that no step reads."""
+    header = parse_raw_header(content, file=granule.path, size=granule.size, known=granule.format)
+    with RawFile(root / granule.path) as file:
+        read_all_counts(file, header)
 
 
 def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:

@@ -17,6 +17,7 @@ import dask.local
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.errors import RawFormatError
 from lidarops.netcdf.context import Context, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.process import execution
@@ -50,7 +51,6 @@ from lidarops.steps.dependence import (
     is_product,
     plan_closure,
     scene_facts,
-    with_unused,
 )
 from lidarops.steps.network import Member
 from lidarops.steps.reading import ARCHIVE, WAVELENGTH, read_windows
@@ -92,7 +92,6 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     if isinstance(result, Failure):
         return result.outcome(job.scene, job.plan), result.final
     outcome, final = result
-    # The next scan reads refused files again.
     final &= not outcome.refused
     return replace(outcome, cpu_seconds=time.thread_time() - begin), final
 
@@ -106,25 +105,28 @@ def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutc
     clock.lap("digest")
     failure = Failure("").outcome(job.scene, job.plan)
     failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
-    usable = with_unused(usable, refused)
-    if not usable.granules:
-        return replace(failure, error="no granule of the scene can be read"), True
+    if refused:
+        # Without them the scene is another one, of another plan.
+        lost = "" if usable.granules else "no granule of the scene can be read"
+        return replace(failure, error=lost), not lost
     # Of a scheduler by its name, dask loads `distributed`, which takes 0.3 s.
     with dask.config.set(scheduler=dask.local.get_sync), count_bytes_read() as tally:
         process = _Network if usable.members else _Instrument
         work = process(job, usable, inputs, root, clock)
-        products = guarded(lambda: tuple(work.products()))
+        products = guarded(work.all_products)
     outcome = replace(
         failure,
         plan=work.job.plan,
         inputs=work.inputs,
+        refused=work.refused,
         seconds=clock.laps,
         notes=tuple(work.notes),
         bytes_read=read + tally.bytes,
     )
     if isinstance(products, Failure):
         # Those before the failure are on the disk, so that the ledger must know them.
-        failed = replace(outcome, error=products.error, internal=products.internal)
+        error = "" if work.refused else products.error
+        failed = replace(outcome, error=error, internal=products.internal)
         return replace(failed, products=tuple(work.made)), products.final
     return replace(outcome, products=products), True
 
@@ -159,6 +161,21 @@ class _Work:
         """Products that are written, in the order in which they were complete."""
         self.notes: dict[str, None] = {}
         """What the data did not give, each once."""
+        self.refused: tuple[Granule, ...] = ()
+        """Files of the scene that cannot be used, of which one turned out when steps read it."""
+
+    def all_products(self) -> tuple[ProductRecord, ...]:
+        """Make all products, and return their records."""
+        try:
+            return tuple(self.products())
+        except RawFormatError:
+            # A file of known content was not checked, and differs from it or cannot be read now.
+            self.refused = check_files(self.job.scene, self._root, read_all=True)[2]
+            raise
+
+    def products(self) -> Iterator[ProductRecord]:
+        """Make the products, and yield their records."""
+        raise NotImplementedError
 
     def _source(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from lidarops.records import (
     Granule,
     LeftOut,
     PlannedStep,
+    Role,
     RunRecord,
     SceneOutcome,
     Verdicts,
@@ -159,8 +161,9 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
     done = [scene for scene in record.scenes if not scene.error]
     failed, internal = len(failed_scenes(record)), len(internal_errors(record))
     ended_internally = f", {internal:,} with an internal error" if internal else ""
-    processed = sum(max(scene.granules - len(scene.refused), 0) for scene in done)
-    refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
+    processed = sum(
+        scene.granules - sum(file.role is Role.SIGNAL for file in scene.refused) for scene in done
+    )
     products = Counter(p.kind for scene in record.scenes for p in scene.products)
     kinds = ", ".join(f"{count:,} {kind}" for kind, count in sorted(products.items()))
     return [
@@ -175,7 +178,7 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
             counted(len(record.scenes), "scene") + f", {failed:,} failed{ended_internally}",
         ),
         ("Products", f"{products.total():,}" + (f": {kinds}" if kinds else "")),
-        ("Granules", f"{processed:,} processed, {refused:,} refused"),
+        ("Granules", f"{processed:,} processed, {_number_refused(record):,} refused"),
         *(
             (
                 f"Quality, {kind}",
@@ -268,8 +271,14 @@ def _cautions(record: RunRecord) -> Iterator[str]:
 
 
 def _refused_granules(record: RunRecord) -> str:
-    refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
+    refused = _number_refused(record)
     return f"{counted(refused, 'granule')} refused" if refused else ""
+
+
+def _number_refused(record: RunRecord) -> int:
+    """Return the number of refused files; several scenes may have refused a dark file."""
+    of_scenes = (scene.refused for scene in record.scenes)
+    return len({granule.path for granule in itertools.chain(record.refused, *of_scenes)})
 
 
 def instruments(record: RunRecord) -> list[InstrumentRow]:
@@ -385,7 +394,7 @@ def refused(record: RunRecord) -> list[RefusedRow]:
         RefusedRow(
             reason or "no reason was recorded",
             when,
-            tuple(sorted(granule.path for granule in alike)),
+            tuple(sorted({granule.path for granule in alike})),
             listed({f"{granule.start:%Y-%m-%d}" for granule in alike if granule.start}),
         )
         for (reason, when), alike in sorted(

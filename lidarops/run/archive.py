@@ -40,7 +40,7 @@ from lidarops.run.leftovers import Orphan
 from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session, sweep
-from lidarops.run.staleness import DaysJudged, Judge, Judgement, Signature
+from lidarops.run.staleness import REACH, DaysJudged, Judge, Judgement, Signature
 from lidarops.steps.dependence import planned_products
 from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
@@ -300,6 +300,8 @@ class _Pass:
     session: Session | None = None
     lost_worker: bool = False
     """Whether a worker died, or was abandoned at a stop."""
+    reduced: set[int] = field(default_factory=set)
+    """Days whose products may use a file that the processing has refused."""
     failing: int = 0
     """Number of scenes in a row that failed for a cause that may pass."""
 
@@ -324,6 +326,7 @@ class _Pass:
                 preload_modules(_WORKER_MODULES)
             with StopRequest() as stop:
                 self._process(days, client, stop)
+                self._process_reduced(signatures.keys(), client, stop)
                 caught = stop.signal
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
@@ -398,6 +401,18 @@ class _Pass:
                 if used_client is not None:
                     self._enter_suspects(used_client, stop)
 
+    def _process_reduced(
+        self, known: Collection[int], client: Client | None, stop: StopRequest
+    ) -> None:
+        """Process what is stale without the refused files: other scenes or plans may follow."""
+        stated = self.gathered
+        while self.reduced and not stop:
+            days = self.selection.days(sorted(self.reduced.intersection(known)))
+            self.judge, self.reduced, self.suspects = self._new_judge(again=True), set(), []
+            self.gathered = _Gathered(verdicts=stated.verdicts, open=stated.open)
+            self._process(days, client, stop)
+        self.gathered = stated
+
     def _enter_suspects(self, client: Client, stop: StopRequest) -> None:
         for job in self.suspects:
             self._take(job)
@@ -431,6 +446,8 @@ class _Pass:
             judged = self.judgements.pop(scene.outcome.scene)
             outcome = session.end(judged, scene.outcome, final=scene.final)
             self.lost_worker = self.lost_worker or scene.lost_worker
+            if outcome.refused:
+                self.reduced.update(range(judged.day - REACH, judged.day + REACH + 1))
             if not scene.refused:
                 self.failing = self.failing + 1 if outcome.error and not scene.final else 0
             if self.failing >= MOST_FAILURES_IN_A_ROW:

@@ -310,7 +310,8 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
         _LOG.error("scene %s: %s\n%s", outcome.scene, outcome.error, outcome.internal)
     record = next((made for made in outcome.products if made.kind == recipe.kind), None)
     if record is None:
-        problem = outcome.error or f"no longer gives a {recipe.kind} product"
+        refused = "; ".join(f"{file.path}: {file.reason}" for file in outcome.refused)
+        problem = outcome.error or refused or f"no longer gives a {recipe.kind} product"
         yield Difference("processing", recipe.plan.scene, problem)
         return
     if record.sha256 != sha256_of(recipe.file):

@@ -30,7 +30,7 @@ from lidarops.records import (
 from lidarops.reports.run_journal import Journal
 from lidarops.reports.run_record import save_run_record
 from lidarops.run.staleness import Judge, Judgement
-from lidarops.steps.dependence import ProductKey, with_unused
+from lidarops.steps.dependence import ProductKey
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.stores import without_keys
 
@@ -99,7 +99,7 @@ class Session:
         self._judge = judge
         self._output = Path(campaign.output)
         self._kept: dict[str, str] = {}
-        self._outcomes: list[SceneOutcome] = []
+        self._outcomes: dict[str, SceneOutcome] = {}
         self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
         self._named = 0
         self.settled: set[str] = set()
@@ -157,6 +157,8 @@ class Session:
         self._named += outcome.granules
         # A million file names would fill memory, and the page shows few.
         brief = outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
+        if outcome.scene in self._outcomes:
+            brief = _joined(self._outcomes[outcome.scene], brief)
         # First, so that whatever the ledger knows is in the report, also of a run that is killed.
         if self._journal:
             self._journal.add(brief)
@@ -164,7 +166,7 @@ class Session:
         self._settle(judged, outcome, new)
         self._settle_versions(judged, outcome)
         self._log(outcome)
-        self._outcomes.append(brief)
+        self._outcomes[outcome.scene] = brief
         return outcome
 
     def _settle(self, judged: Judgement, outcome: SceneOutcome, new: Sequence[NewProduct]) -> None:
@@ -179,7 +181,7 @@ class Session:
 
     def add(self, outcome: SceneOutcome) -> None:
         """Add a scene that was not tried to the record of the run."""
-        self._outcomes.append(outcome)
+        self._outcomes[outcome.scene] = outcome
 
     def finish(
         self,
@@ -208,18 +210,20 @@ class Session:
         """
         if lost_worker:
             sweep(self._store, self._output)
-        refused = (*self._store.refused(), *set_aside)
+        unused = (*self._store.refused(), *set_aside)
+        stated = {file.path for outcome in self._outcomes.values() for file in outcome.refused}
+        refused = tuple(granule for granule in unused if granule.path not in stated)
         listed = dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES))
         record = replace(
             self._record(refused, findings),
-            scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
+            scenes=tuple(self._outcomes[scene] for scene in sorted(self._outcomes)),
             empty_scenes=listed,
             more_empty_scenes=len(empty_scenes or {}) - len(listed),
             frozen=dict(frozen or {}),
         )
         if self._journal:
             self._save(record)
-        self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
+        self._store.end_run(self.id, status, refused=len(unused), token=self._lock.token)
         _LOG.info("run %s %s: %d scenes", self.id, status.value, len(self._outcomes))
         return record
 
@@ -258,14 +262,15 @@ class Session:
         self, judged: Judgement, outcome: SceneOutcome
     ) -> tuple[list[NewProduct], SceneOutcome]:
         new = []
-        scene = with_unused(judged.scene, outcome.refused)
         for record in outcome.products:
             mtime_ns = self._written(record)
             if mtime_ns is None:
                 error = f"{record.path}: vanished or changed after it was written"
                 return [], replace(outcome, products=(), error=error)
             product: ProductKey = (record.kind, record.channel)
-            depends_on, used = self._judge.depends_on(scene, judged.plan, product, outcome.inputs)
+            depends_on, used = self._judge.depends_on(
+                judged.scene, judged.plan, product, outcome.inputs
+            )
             new.append(
                 NewProduct(record, mtime_ns, depends_on, used, self._kept.get(record.path, ""))
             )
@@ -311,6 +316,18 @@ class Session:
         for granule in outcome.refused:
             facts = {"scene": outcome.scene, "granule": granule.path}
             _LOG.warning("refused %s: %s", granule.path, granule.reason, extra=facts)
+
+
+def _joined(before: SceneOutcome, after: SceneOutcome) -> SceneOutcome:
+    """Return the outcome of a scene that was processed again without files that were refused."""
+    made = {product.path: product for product in (*before.products, *after.products)}
+    refused = {file.path: file for file in (*before.refused, *after.refused)}
+    return replace(
+        after,
+        granules=before.granules,
+        products=tuple(made.values()),
+        refused=tuple(refused.values()),
+    )
 
 
 def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:

@@ -56,6 +56,8 @@ from lidarops.system.code_version import code_version, joint_code_version, sourc
 from lidarops.system.files import sha256_of
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
+REACH: Final = NEAR_DAYS + DARK_DAYS
+"""Days before and after a file on which products may use it."""
 MOST_GRANULES: Final = 50_000
 """Granules that are judged at a time, unless one day has more. Memory holds the current group and,
 if workers process the scenes, the next group."""
@@ -688,7 +690,7 @@ def _add_around(
 ) -> None:
     """Add what is known of files of a day to the sums of all days whose products may use them."""
     sums[day].append(fingerprint)
-    reach = NEAR_DAYS + (DARK_DAYS if role is Role.DARK else 0)
+    reach = REACH if role is Role.DARK else NEAR_DAYS
     for near in range(1, reach + 1):
         sums[day - near].append((near, *fingerprint))
         sums[day + near].append((-near, *fingerprint))
