@@ -65,6 +65,8 @@ class ChannelLayout:
     """m."""
     adc_bits: int
     """0 for photon counting."""
+    recorder: str = ""
+    """What digitises it, such as ``BT5``; empty where the raw format names none."""
 
     def __hash__(self) -> int:
         # Layouts are looked up for every file.
@@ -75,6 +77,8 @@ UNREADABLE: Final = "cannot be read"
 """Start of the reason if a disk or a network did not give a file."""
 UNKNOWN_FORMAT: Final = "is of no known raw format"
 """Start of the reason if no installed format recognises a file."""
+FEWEST_ALIKE: Final = 3
+"""Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 LONGEST_REASON: Final = 300
 """Characters of a reason that products state; a damaged header may be quoted in it."""
 
@@ -128,6 +132,8 @@ class Holding:
     """Start of the period, not of its first file."""
     layout: tuple[ChannelLayout, ...]
     files: int
+    first: datetime
+    """Start of the first one."""
 
 
 class UnusedFile(NamedTuple):

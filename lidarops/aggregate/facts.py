@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
+from lidarops.netcdf.global_attributes import RECORDERS
 from lidarops.netcdf.sizes import check_sizes
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
@@ -69,6 +70,8 @@ class Facts:
     grid: str
     """Digest of what must be equal in products that are joined along time."""
     code_version: str
+    recorder: str = ""
+    """What digitised its channels; empty where the raw files name none. Part of the grid."""
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Quality bit name -> number of values that carry it, if any."""
 
@@ -85,7 +88,8 @@ class Facts:
     @property
     def group(self) -> Group:
         """Group of products that this one can be joined with."""
-        return Group(self.station, self.instrument, self.kind, self.channel, self.grid)
+        series = (self.station, self.instrument, self.kind, self.channel)
+        return Group(*series, self.grid, self.recorder)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -97,6 +101,12 @@ class Group:
     kind: str
     channel: str
     grid: str
+    recorder: str = ""
+
+    @property
+    def grid_words(self) -> str:
+        """The grid, with the recorder where it is known."""
+        return self.grid[:8] + (f" of recorder {self.recorder}" if self.recorder else "")
 
     @property
     def name(self) -> str:
@@ -261,6 +271,7 @@ def read_facts(root: Path, path: str) -> Facts:
             unflagged=flags.size - int(np.count_nonzero(flags)),
             grid=_grid_digest(product, kind),
             code_version=attributes["lidarops_code_version"],
+            recorder=attributes.get(RECORDERS, ""),
             flagged={bit.word.upper(): n for bit, n in count_bits(flags, bits).items()},
         )
 
@@ -333,8 +344,8 @@ def coordinate_names(kind: str) -> frozenset[str]:
 def _grid_digest(product: xr.Dataset, kind: str) -> str:
     """Return a digest of what must be equal in products that are joined along time.
 
-    These are names, types, dimensions, units and flags of the variables, and the values of all
-    coordinates that do not change with time, including the position of the station.
+    These are names, types, dimensions, units and flags of the variables, the recorders, and the
+    values of all coordinates that do not change with time, including the position of the station.
 
     Parameters
     ----------
@@ -347,7 +358,7 @@ def _grid_digest(product: xr.Dataset, kind: str) -> str:
     str
         16 hexadecimal digits.
     """
-    digest = hashlib.sha256(kind.encode())
+    digest = hashlib.sha256(f"{kind}{product.attrs.get(RECORDERS, '')}".encode())
     coordinates = coordinate_names(kind)
     for name in sorted(str(name) for name in product.variables):
         if name in UNSHARED:
@@ -399,7 +410,7 @@ def grid_notes(all_groups: Iterable[Group]) -> list[str]:
     grids: dict[tuple[str, str, str, str], list[str]] = {}
     for group in all_groups:
         series = (group.station, group.instrument, group.kind, group.channel)
-        grids.setdefault(series, []).append(group.grid[:8])
+        grids.setdefault(series, []).append(group.grid_words)
     return [
         f"{' '.join(series)}: products of {len(names)} grids, which are not joined:"
         f" {', '.join(names)}"

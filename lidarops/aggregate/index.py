@@ -25,7 +25,7 @@ from lidarops.kinds import flags_of, kinds
 from lidarops.system.files import write_atomically
 
 INDEX: Final = "products.parquet"
-FORMAT: Final = b"2"
+FORMAT: Final = b"3"
 """Raised with every change of the columns."""
 _KEY: Final = b"lidarops_index"
 _PREFIX_BYTES: Final = 16
@@ -49,6 +49,7 @@ _COLUMNS: Final[Mapping[str, tuple[str, _Cell]]] = {
     "instrument": ("dictionary", lambda facts: facts.instrument),
     "channel": ("dictionary", lambda facts: facts.channel),
     "mode": ("dictionary", lambda facts: facts.mode),
+    "recorder": ("dictionary", lambda facts: facts.recorder),
     "wavelength": ("float64", lambda facts: facts.wavelength),
     "start": ("time", lambda facts: facts.start),
     "stop": ("time", lambda facts: facts.stop),

@@ -122,7 +122,7 @@ def _path_of(source: Paths) -> str | None:
 
 def _choices(all_groups: Iterable[Group]) -> str:
     return "; ".join(
-        f"{group.station} {group.instrument} {group.kind} {group.channel} grid {group.grid[:8]}"
+        f"{group.station} {group.instrument} {group.kind} {group.channel} grid {group.grid_words}"
         for group in all_groups
     )
 

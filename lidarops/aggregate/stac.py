@@ -125,6 +125,7 @@ def _item(pystac: Any, product: Facts) -> Any:
         "id": product.id,
         "kind": product.kind,
         "channel": product.channel,
+        "recorder": product.recorder or None,
         "wavelength": wavelength,
         "station_altitude": product.altitude,
         "profiles": product.profiles,

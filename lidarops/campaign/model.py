@@ -82,6 +82,11 @@ class Station(SettingsModel):
 class ChannelFacts(SettingsModel):
     """Facts about one channel in a validity period."""
 
+    recorder: str | None = Field(
+        default=None,
+        min_length=1,
+        description="such as BT5, by default that of the name in the files with most recorders",
+    )
     wavelength: float | None = quantity(
         None, unit="m", gt=1e-7, lt=2e-5, description="where the header is wrong"
     )

@@ -7,7 +7,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, NamedTuple
 
@@ -23,6 +23,7 @@ from lidarops.catalog.sources import (
 from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import HeaderPointing, RawHeader
+from lidarops.raw.recorders import named_layout, recorder_names
 from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
@@ -115,7 +116,7 @@ class InstrumentHeaders:
     @property
     def main(self) -> FileGroup:
         """Its largest group of signal files; a few headers of an archive may be damaged."""
-        return max(self.signal, key=lambda group: len(group.files))
+        return max(self.signal, key=lambda group: (len(group.files), len(group.layout)))
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:
@@ -240,15 +241,20 @@ def read_folder(root: str, *, guess_pointing: bool = False) -> FolderContents:
     for members in headers.values():
         lidars[_lidar(members[0][1])] += [header for _, header in members]
     guesses = {key: _pointing(own) if guess_pointing else "stated" for key, own in lidars.items()}
+    groups = [_group(members, guesses[_lidar(members[0][1])]) for members in headers.values()]
     return FolderContents(
-        tuple(
-            _group(members, guesses[_lidar(members[0][1])])
-            for _, members in sorted(headers.items(), key=_place)
-        ),
+        tuple(sorted(_named(groups), key=lambda group: group.files)),
         tuple(refused),
         tuple(other),
         tuple(printable(file.path) for file in copies),
     )
+
+
+def _named(groups: Sequence[FileGroup]) -> Iterator[FileGroup]:
+    """Yield groups with names of channels that are the same in all files of an instrument."""
+    for own in _by_instrument(groups):
+        names = recorder_names((group.layout, len(group.files), group.start) for group in own)
+        yield from (replace(group, layout=named_layout(group.layout, names)) for group in own)
 
 
 def _is_copy(source: Source, file: RawFile, files: Sequence[RawFile]) -> bool:
@@ -287,12 +293,8 @@ def _split(path: str) -> tuple[str, str]:
 
 
 def _likeness(path: str, header: RawHeader) -> tuple[object, ...]:
-    grids = tuple((c.name, c.bins, c.bin_width, c.adc_bits) for c in header.layout)
+    grids = tuple((c.name, c.bins, c.bin_width, c.adc_bits, c.recorder) for c in header.layout)
     return (*_split(path), header.format, header.site, header.coordinates, grids)
-
-
-def _place(item: tuple[tuple[object, ...], list[tuple[str, RawHeader]]]) -> str:
-    return item[1][0][0]
 
 
 def _lidar(stated: RawHeader | FileGroup) -> tuple[object, ...]:
@@ -382,19 +384,23 @@ def instruments_of(
     groups = tuple(groups)
     everything = [path for group in groups for path in group.files]
     groups = tuple(group for group in groups if group not in left_out)
-    sets: list[list[FileGroup]] = []
-    for group in groups:
-        alike = [own for own in sets if any(_one_instrument(group, other) for other in own)]
-        sets = [own for own in sets if own not in alike]
-        sets.append([member for own in alike for member in own] + [group])
     return tuple(
         InstrumentHeaders(
             tuple(own),
             tuple(_patterns([group for group in own if not group.dark], everything)),
             tuple(_patterns([group for group in own if group.dark], everything)),
         )
-        for own in sets
+        for own in _by_instrument(groups)
     )
+
+
+def _by_instrument(groups: Iterable[FileGroup]) -> list[list[FileGroup]]:
+    sets: list[list[FileGroup]] = []
+    for group in groups:
+        alike = [own for own in sets if any(_one_instrument(group, other) for other in own)]
+        sets = [own for own in sets if own not in alike]
+        sets.append([member for own in alike for member in own] + [group])
+    return sets
 
 
 def _one_instrument(one: FileGroup, other: FileGroup) -> bool:

@@ -230,20 +230,6 @@ class Granules(Database):
                 )
             )
 
-    def layouts(self) -> list[tuple[str, tuple[ChannelLayout, ...]]]:
-        """Return pairs of instrument and layout of channels that occur in good signal granules."""
-        inner = sa.select(_C.instrument, _C.layout).distinct().where(*self._signals()).subquery()
-        query = (
-            sa.select(inner.c.instrument, LAYOUT.c.channels)
-            .join(LAYOUT, LAYOUT.c.hash == inner.c.layout)
-            .order_by(inner.c.instrument, inner.c.layout)
-        )
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            return list(
-                self.decoded((instrument, _layout_from(channels)) for instrument, channels in rows)
-            )
-
     def _signals(self) -> tuple[sa.ColumnElement[bool], ...]:
         good, signal = Status.GOOD.value, Role.SIGNAL.value
         return _C.campaign == self.campaign, _C.status == good, _C.role == signal
@@ -264,24 +250,29 @@ class Granules(Database):
         begins = [datetime.min.replace(tzinfo=UTC), *edges]
         later = [(_C.start >= naive(edge), k) for k, edge in enumerate(edges, 1)]
         period = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
-        inner = (
-            sa.select(_C.instrument, period.label("period"), _C.layout)
+        signal = (
+            sa.select(_C.instrument, period.label("period"), _C.layout, _C.start)
             .where(*self._signals())
             .subquery()
         )
-        columns = tuple(inner.c)
+        *columns, start = signal.c
+        # Grouped before the texts are joined: in half the time.
+        groups = (
+            sa.select(*columns, sa.func.count().label("files"), sa.func.min(start).label("first"))
+            .group_by(*columns)
+            .subquery()
+        )
         query = (
-            sa.select(*columns, sa.func.count(), LAYOUT.c.channels)
-            .join(LAYOUT, LAYOUT.c.hash == inner.c.layout)
-            .group_by(*columns, LAYOUT.c.channels)
-            .order_by(*columns)
+            sa.select(groups, LAYOUT.c.channels)
+            .join(LAYOUT, LAYOUT.c.hash == groups.c.layout)
+            .order_by(groups.c.instrument, groups.c.period, groups.c.layout)
         )
         with self.transaction() as connection:
             rows = connection.execute(query)
             return list(
                 self.decoded(
-                    Holding(instrument, begins[index], _layout_from(channels), files)
-                    for instrument, index, _, files, channels in rows
+                    Holding(name, begins[k], _layout_from(text), files, first.replace(tzinfo=UTC))
+                    for name, k, _, files, first, text in rows
                 )
             )
 

@@ -5,7 +5,6 @@ Processes that read headers import only this module, so it imports little, to st
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -28,8 +27,6 @@ HEADER_BYTES: Final = 16384
 """Bytes that hold the header of any format."""
 _ROUNDING_OF_ANGLES: Final = 1.0
 """degree; headers hold whole degrees."""
-_ROUNDING_OF_WAVELENGTHS: Final = 1e-9
-"""m; headers hold whole nanometres."""
 
 
 class UnreadFile(NamedTuple):
@@ -53,8 +50,6 @@ class _Facts(NamedTuple):
     azimuth: float | None = None
     clock_offset: float = 0.0
     """s; clock of the instrument minus UTC."""
-    wavelengths: tuple[tuple[str, float], ...] = ()
-    """Channel and m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,15 +240,6 @@ def _overridden(header: RawHeader, facts: _Facts, place: _Place) -> Iterator[str
             yield f"header_position: ignore overrides {pair[0]:g}, {pair[1]:g} of the header"
         if altitude is not None and not place.is_as_high(altitude):
             yield f"header_position: ignore overrides the altitude {altitude:g} m of the header"
-    wavelengths = dict(facts.wavelengths)
-    for channel in header.layout if wavelengths else ():
-        wavelength = wavelengths.get(channel.name, math.nan)
-        # Not where the wavelength of the header is implausible, and so NaN.
-        if abs(wavelength - channel.wavelength) > _ROUNDING_OF_WAVELENGTHS:
-            yield (
-                f"{channel.name}: wavelength {wavelength * 1e9:.5g} nm of the campaign overrides"
-                f" {channel.wavelength * 1e9:.5g} nm of the header"
-            )
 
 
 def _place(station: Station, instrument: Instrument) -> _Place:
@@ -267,16 +253,7 @@ def _place(station: Station, instrument: Instrument) -> _Place:
         instrument.altitude_tolerance,
         tuple(
             _Facts(
-                fact.valid_from,
-                fact.valid_to,
-                fact.zenith_angle,
-                fact.azimuth,
-                fact.clock_offset,
-                tuple(
-                    (name, channel.wavelength)
-                    for name, channel in fact.channels.items()
-                    if channel.wavelength is not None
-                ),
+                fact.valid_from, fact.valid_to, fact.zenith_angle, fact.azimuth, fact.clock_offset
             )
             for fact in instrument.facts
         ),

@@ -418,17 +418,7 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 instrument.altitude_tolerance,
                 station.model_dump(),
                 [
-                    (
-                        str(fact.valid_from),
-                        fact.zenith_angle,
-                        fact.azimuth,
-                        fact.clock_offset,
-                        [
-                            (name, channel.wavelength)
-                            for name, channel in fact.channels.items()
-                            if channel.wavelength is not None
-                        ],
-                    )
+                    (str(fact.valid_from), fact.zenith_angle, fact.azimuth, fact.clock_offset)
                     for fact in instrument.facts
                 ],
             ]

@@ -94,6 +94,7 @@ def catalog(
     Example: lidarops catalog catalogs/demo.yaml --rebuild
     """
     from lidarops.catalog.store import Store
+    from lidarops.plan.channel_names import ChannelNames
     from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
 
@@ -107,7 +108,8 @@ def catalog(
             rebuilt = rebuild_ledger(settings, wait=wait, progress=bar.advance)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
-        notes = store.file_notes(settings.instruments)
+        own = settings.instruments
+        notes = (*store.file_notes(own), *ChannelNames(settings, store).notes(own))
     findings = Findings(file_notes=notes, idle_patterns=summary.idle_patterns)
     if as_json:
         reasons = [{"path": granule.path, "reason": granule.reason} for granule in refused]

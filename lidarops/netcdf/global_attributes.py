@@ -14,8 +14,10 @@ from lidarops import __version__
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.provenance import product_id
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
+from lidarops.raw.recorders import POLARISATIONS, label_of
 from lidarops.records import GLUED, DetectionMode, LeftOut, PlannedStep, Role, is_glued
 
+RECORDERS: Final = "lidarops_recorder"
 UNUSED_INPUTS: Final = "lidarops_unused_inputs"
 MOST_UNUSED: Final = 20
 """Unused files that a product names; its provenance names all."""
@@ -241,6 +243,12 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_instrument": context.instrument_key,
         "lidarops_channel": context.channel,
         "lidarops_detection_mode": _mode(context),
+        RECORDERS: ", ".join(
+            step.settings["recorder"]
+            for step in provenance.plan.steps
+            if step.settings.get("recorder") and not is_glued(step.channel)
+        ),
+        "lidarops_polarisation": POLARISATIONS.get(label_of(context.channel)[-1:], ""),
         "lidarops_plan_sha256": provenance.plan.hash,
         "lidarops_code_version": provenance.code_version,
         "lidarops_input_count": np.int32(len(provenance.inputs)),

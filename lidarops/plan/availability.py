@@ -7,14 +7,16 @@ that some files lack is a lidar that was changed.
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Final
 
-from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
+from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, channel_facts
+from lidarops.raw.recorders import label_of
 from lidarops.records import ChannelLayout, FactsNote, Holding, LeftOut, Unmet, is_glued
-from lidarops.steps.channels import LAG_STEP, READ_STEP, glued_parts, joined_layout
+from lidarops.steps.channels import LAG_STEP, READ_STEP, file_channels, glued_parts, joined_layout
 
 FACTS: Final = "facts"
 _ABSENT: Final = "channel_present"
@@ -55,7 +57,7 @@ def missing_channels(
     for kind, settings in instrument.products.requested().items():
         for name in settings.named:
             if name not in present and name not in glued:
-                reason = _why_absent(name, present)
+                reason = _why_absent(name, present, channel_facts(facts, name).recorder)
                 yield LeftOut(kind, name, reason, rule=_ABSENT, product=kind)
     for name, facts_of_channel in facts.channels.items():
         if name not in present:
@@ -98,10 +100,17 @@ def _instead(name: str, present: Mapping[str, ChannelLayout]) -> str:
     if is_glued(name) and set(glued_parts(name)) <= set(present):
         analog, photon = glued_parts(name)
         return f"give the lag to {analog}, and dead time and lidar ratio to {photon}"
-    return f"they hold {', '.join(present)}"
+    return f"they hold {_held(name, present)}"
 
 
-def _why_absent(name: str, present: Mapping[str, ChannelLayout]) -> str:
+def _held(missing: str, present: Mapping[str, ChannelLayout]) -> str:
+    """Return the channels of files, with the recorders of those that are like a missing one."""
+    labels = {label_of(name) for name in file_channels(missing)}
+    recorders = {n: c.recorder for n, c in present.items() if label_of(n) in labels and c.recorder}
+    return ", ".join(f"{n} (recorder {recorders[n]})" if n in recorders else n for n in present)
+
+
+def _why_absent(name: str, present: Mapping[str, ChannelLayout], recorder: str | None) -> str:
     if is_glued(name):
         parts = glued_parts(name)
         if set(parts) <= set(present):
@@ -109,7 +118,8 @@ def _why_absent(name: str, present: Mapping[str, ChannelLayout]) -> str:
             return f"its analog and photon-counting channels have bins of {' and '.join(widths)}"
         missing = [part for part in parts if part not in present]
         return f"the files hold no {' and no '.join(missing)} to glue"
-    return f"the files hold no such channel, only {', '.join(present)}"
+    stated = f" of the recorder {recorder} that the facts state" if recorder else ""
+    return f"the files hold no such channel{stated}, only {_held(name, present)}"
 
 
 def validity_edges(campaign: Campaign) -> list[datetime]:
@@ -121,33 +131,6 @@ def validity_edges(campaign: Campaign) -> list[datetime]:
         for edge in (facts.valid_from, facts.valid_to)
     }
     return sorted(edges - {_FIRST, _LAST})
-
-
-def lacks_channels(
-    campaign: Campaign, layouts: Iterable[tuple[str, tuple[ChannelLayout, ...]]]
-) -> bool:
-    """Return whether files may lack a channel that the campaign names, at any time.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    layouts : iterable of (str, tuple of ChannelLayout)
-        Instruments, and the channels of their files.
-    """
-    return any(
-        _lacking(layout, owner, facts)
-        for name, layout in layouts
-        if (owner := campaign.instruments.get(name)) is not None
-        for facts in owner.facts or (InstrumentFacts(),)
-    )
-
-
-def names_channels(campaign: Campaign) -> bool:
-    """Return whether a campaign names channels, so that files may lack them."""
-    return any(
-        any(named_channels(instrument)) or any(facts.channels for facts in instrument.facts)
-        for instrument in campaign.instruments.values()
-    )
 
 
 def _lacking(
@@ -222,6 +205,23 @@ def unavailable_channels(
         having = held[name, channel] if of_facts else whole - files
         unmet.append(Unmet(name, channel, requester, max(counts)[1], files, whole, having))
     return tuple(sorted(unmet, key=lambda request: (not request.nowhere, request.instrument)))
+
+
+def exchanged_recorders(holdings: Iterable[Holding]) -> Iterator[FactsNote]:
+    """Yield the channels of which no file holds both recorders: one may have replaced the other."""
+    found: dict[tuple[str, str], dict[tuple[str, str], set[int]]] = defaultdict(dict)
+    for number, held in enumerate(holdings):
+        for channel in held.layout:
+            alike = found[held.instrument, label_of(channel.name)]
+            alike.setdefault((channel.name, channel.recorder), set()).add(number)
+    for (instrument, _), alike in sorted(found.items()):
+        for (name, recorder), (other, new) in itertools.combinations(sorted(alike), 2):
+            if name != other and new and alike[name, recorder].isdisjoint(alike[other, new]):
+                reason = (
+                    f"no file holds both its recorder {new} and {recorder} of {name}: if it took"
+                    f" its place, state recorder: {new} for {name} in the facts from then on"
+                )
+                yield FactsNote(instrument, other, reason)
 
 
 def period_of(facts: InstrumentFacts) -> str:

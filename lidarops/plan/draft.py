@@ -217,14 +217,15 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     if headers.pairs:
         yield f"        # pairs that can be joined: {', '.join(headers.pairs)}"
     if len({group.layout for group in headers.signal}) > 1:
-        yield "        # ? Other files have other bins: each set of bins makes scenes of its own."
+        yield "        # ? Other files have other channels or bins, which make scenes of their own."
     yield "        channels:"
     # Without dead times, all values of a scan are rejected where rates are high (SAVANT).
     estimated = {name for pair in headers.pairs if estimates for name in file_channels(pair)}
     for channel in headers.layout:
         photon = channel.mode is DetectionMode.PHOTON
         facts = "{dead_time: estimate}" if photon and channel.name in estimated else "{}"
-        grid = f"{channel.bins} bins of {channel.bin_width:g} m"
+        recorder = f", {channel.recorder}" if channel.recorder else ""
+        grid = f"{channel.bins} bins of {channel.bin_width:g} m{recorder}"
         question = _unknown(channel, estimated=channel.name in estimated)
         yield f"          {channel.name}: {facts}  # {grid}{question}"
 

@@ -16,12 +16,14 @@ from lidarops.catalog.granules import by_wording
 from lidarops.catalog.rows import day_of
 from lidarops.plan.outlying_intervals import lone_intervals
 from lidarops.plan.outlying_pointings import lone_pointings
-from lidarops.plan.surroundings import FEWEST_ALIKE, Outlying, ReadHeader, granules_around
+from lidarops.plan.surroundings import Outlying, ReadHeader, granules_around
 from lidarops.raw.header import RawChannel, RawHeader
-from lidarops.records import FileNote, Granule, Role, Status
+from lidarops.records import FEWEST_ALIKE, FileNote, Granule, Role, Status
 
-_OF_VALUES: Final = frozenset({"wavelength_label", "bins", "bin_width", "adc_bits", "input_range"})
-"""Properties of a channel by which its values or their ranges would be wrong."""
+_OF_VALUES: Final = frozenset(
+    {"wavelength_label", "bins", "bin_width", "adc_bits", "input_range", "device"}
+)
+"""Properties of a channel by which its values, their ranges or its name would be wrong."""
 _FREE: Final = frozenset({"name", "shots", "scale", "places", "mode", "wavelength", "polarisation"})
 """Properties that vary from file to file, or that follow from others."""
 _COMPARED: Final = tuple(

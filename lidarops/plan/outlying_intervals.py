@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from lidarops.plan.surroundings import FEWEST_ALIKE, Outlying, ReadHeader, granules_around
-from lidarops.records import Granule
+from lidarops.plan.surroundings import Outlying, ReadHeader, granules_around
+from lidarops.records import FEWEST_ALIKE, Granule
 
 _RESOLUTION: Final = 2.0
 """s; two times in whole seconds may make an interval so much longer than another one."""

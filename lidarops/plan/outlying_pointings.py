@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 
-from lidarops.plan.surroundings import FEWEST_ALIKE, Outlying, granules_around
-from lidarops.records import Granule
+from lidarops.plan.surroundings import Outlying, granules_around
+from lidarops.records import FEWEST_ALIKE, Granule
 
 
 def lone_pointings(

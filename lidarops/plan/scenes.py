@@ -307,6 +307,8 @@ def _by_layout(
                     for granule in dark
                     if granule.instrument == instrument
                     and _layout_key(granule) == key
+                    and [c.recorder for c in granule.layout]
+                    == [c.recorder for c in group[0].layout]
                     and _start(group[0]) - DARK_REACH
                     <= _start(granule)
                     <= _start(group[-1]) + DARK_REACH

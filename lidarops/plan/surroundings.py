@@ -11,8 +11,6 @@ from lidarops.records import Granule
 
 NEAR_DAYS: Final = 1
 """Days before and after that of a file whose files are compared with it."""
-FEWEST_ALIKE: Final = 3
-"""Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 
 ReadHeader = Callable[[Granule], RawHeader | None]
 """Header of a file; None where it cannot be read."""

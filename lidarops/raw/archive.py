@@ -13,7 +13,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,9 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import raw_format, read_raw_header
-from lidarops.raw.header import RawChannel, Stretches, channel_names, to_physical
+from lidarops.raw.header import RawChannel, RawHeader, Stretches, channel_names, to_physical
 from lidarops.raw.model import Columns, Position, build_raw_dataset
+from lidarops.raw.recorders import Layout, named_layout, recorder_names
 from lidarops.records import Granule
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
@@ -77,7 +79,7 @@ def open_archive(
         supply start, stop, altitude and pointing in place of the header.
     channels : iterable of str, optional
         Channels to open, with equal range grids in all files; by default all signal channels,
-        which must then be the same in all files.
+        which must then be the same in all files. A name is one recorder, its ``device``.
     mask_and_scale : bool
         Whether to return physical values (float32, mV or MHz) or raw counts (int32).
     profiles_per_chunk : int, optional
@@ -135,23 +137,48 @@ def _read_headers(
     is requested: the catalog may hold another position.
     """
     stamps = []
-    variants: dict[tuple[str, int], int] = {}
+    variants: dict[tuple[str, int, object], int] = {}
+    unnamed: list[RawHeader] = []
     for path, granule in files.items():
-        digest_and_size = None
+        alike = None
         if granule is not None and granule.header_digest and columns.position_order == "ignore":
-            digest_and_size = granule.header_digest, granule.size
-            if digest_and_size in variants:
-                columns.append_alike(granule, path, variants[digest_and_size])
+            alike = granule.header_digest, granule.size, granule.layout
+            if alike in variants:
+                columns.append_alike(granule, path, variants[alike])
                 stamps.append((path, granule.size, granule.mtime_ns))
                 continue
         with RawFile(path) as file:
             header = read_raw_header(file, "" if granule is None else granule.format)
-            known = columns.position_order == "ignore" and granule is not None and granule.start
-            columns.append(header, granule if known else None)
             stamps.append((path, file.size, file.mtime_ns))
-        if digest_and_size == (header.digest, header.size):
-            variants[digest_and_size] = columns.variant[-1]
+        if granule is None:
+            unnamed.append(header._replace(record=None))
+            continue
+        known = columns.position_order == "ignore" and granule.start
+        named = _renamed(header, granule.layout or header.layout)
+        columns.append(named, granule if known else None)
+        if alike == (header.digest, header.size, granule.layout):
+            variants[alike] = columns.variant[-1]
+    names = recorder_names((header.layout, 1, header.start) for header in unnamed)
+    for header in unnamed:
+        columns.append(_renamed(header, named_layout(header.layout, names)))
     return stamps
+
+
+def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
+    """Return a header whose channels have the names of a layout of the same recorders."""
+    if [channel.device for channel in header.channels] != [own.recorder for own in layout]:
+        raise RawFormatError(
+            "holds other channels than the catalog states",
+            file=header.path,
+            remedy="run lidarops catalog again",
+        )
+    return header._replace(channels=_with_names(header.channels, layout))
+
+
+# Files with equal channels share one tuple.
+@lru_cache(maxsize=128)
+def _with_names(channels: tuple[RawChannel, ...], layout: Layout) -> tuple[RawChannel, ...]:
+    return tuple(replace(c, name=own.name) for c, own in zip(channels, layout, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

@@ -201,6 +201,7 @@ def _layout(channels: tuple[RawChannel, ...]) -> tuple[ChannelLayout, ...]:
             bins=channel.bins,
             bin_width=channel.bin_width,
             adc_bits=channel.adc_bits,
+            recorder=channel.device,
         )
         for channel in channels
     )

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import raw_format
 from lidarops.raw.header import RawChannel, RawHeader, Stretches, check_layout, select_channels
+from lidarops.raw.recorders import POLARISATIONS
 from lidarops.records import Granule
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
@@ -37,13 +38,6 @@ POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
 
 _EPOCH = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
 _MICROSECOND = timedelta(microseconds=1)
-_POLARISATIONS = {
-    "o": "no",
-    "p": "parallel",
-    "s": "perpendicular",
-    "r": "right circular",
-    "l": "left circular",
-}
 
 
 class _Property(NamedTuple):
@@ -307,11 +301,10 @@ def _channel_properties(
     columns: Columns, index: int, *, scaled: bool
 ) -> tuple[dict[str, xr.Variable], dict[str, Any]]:
     channel = columns.selected[index]
-    devices = sorted(set(columns.channel_values(index, "device").tolist()))
     attributes = {
         **_attributes(channel, scaled=scaled),
         "conversion": raw_format(columns.format).conversion,
-        "device": ", ".join(devices),
+        "device": channel.device,
         **_full_scale(columns, index, scaled=scaled),
     }
     variables = {}
@@ -352,7 +345,7 @@ def _is_constant(values: NDArray[Any]) -> bool:
 
 
 def _attributes(channel: RawChannel, *, scaled: bool) -> dict[str, Any]:
-    polarisation = _POLARISATIONS.get(channel.polarisation, channel.polarisation)
+    polarisation = POLARISATIONS.get(channel.polarisation, channel.polarisation)
     mode = channel.mode.value
     label = int(channel.wavelength_label.partition(".")[0])
     wavelength = {} if math.isnan(channel.wavelength) else {"wavelength": channel.wavelength}

@@ -50,13 +50,17 @@ def find(
         if selection.owner(name, station_of(campaign, name))
     ]
     instruments = {member for name in owners for member in _members(campaign, name)}
+    exchanged = availability.exchanged_recorders(judge.names.holdings)
     return Findings(
-        unmet=_unmet(campaign, store, selection, instruments),
-        file_notes=store.file_notes(instruments),
+        unmet=_unmet(judge, selection, instruments),
+        file_notes=(*store.file_notes(instruments), *judge.names.notes(instruments)),
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
         unmade=tuple(_unmade(judge, store, selection, owners, orphans)),
-        incomplete_facts=tuple(_incomplete_facts(campaign, store, sorted(instruments))),
+        incomplete_facts=(
+            *_incomplete_facts(campaign, store, sorted(instruments)),
+            *(note for note in exchanged if note.instrument in instruments),
+        ),
         idle_facts=tuple(_idle_facts(campaign, store, sorted(instruments))),
     )
 
@@ -67,19 +71,11 @@ def _members(campaign: Campaign, owner: str) -> Collection[str]:
     return (owner,) if network is None else network.instruments
 
 
-def _unmet(
-    campaign: Campaign, store: Store, selection: Selection, instruments: Collection[str]
-) -> tuple[Unmet, ...]:
+def _unmet(judge: Judge, selection: Selection, instruments: Collection[str]) -> tuple[Unmet, ...]:
     """Return the channels that products or facts name and files do not hold."""
-    # Usually no file lacks anything, which is faster to find out than to count files.
-    if not (
-        availability.names_channels(campaign)
-        and availability.lacks_channels(campaign, store.layouts())
-    ):
-        return ()
     return availability.unavailable_channels(
-        campaign,
-        store.holdings(availability.validity_edges(campaign)),
+        judge.campaign,
+        judge.names.holdings,
         instruments=instruments,
         kinds=selection.kinds,
         since=selection.since,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
@@ -16,6 +16,7 @@ from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import read_origin
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
+from lidarops.raw.recorders import named_layout, recorder_names
 from lidarops.records import (
     Granule,
     InputRecord,
@@ -158,6 +159,7 @@ class Recipe:
         start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
         raw = (record for record in inputs if record.role in RAW)
         granules = [_granule(archive, record, keys["instrument"], part["facts"]) for record in raw]
+        granules = [_named(granule, self.plan) for granule in granules]
         granules.sort(key=_order)
         return Scene(
             id=self.plan.scene,
@@ -263,3 +265,16 @@ def _granule(root: Path, record: InputRecord, instrument: str, facts: Mapping[st
         layout=header.layout,
         format=header.format,
     )
+
+
+def _named(granule: Granule, plan: Plan) -> Granule:
+    """Return a granule with the channel names of a product, whose plan states their recorders."""
+    own = {channel.name: channel.recorder for channel in granule.layout}
+    stated = {
+        step.channel: step.settings["recorder"]
+        for step in plan.steps
+        if step.settings.get("recorder", "") not in ("", own.get(step.channel))
+        and step.instrument in ("", granule.instrument)
+    }
+    names = recorder_names([(granule.layout, 1, datetime.fromtimestamp(0, UTC))], stated)
+    return replace(granule, layout=named_layout(granule.layout, names))

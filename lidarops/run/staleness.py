@@ -27,6 +27,7 @@ from lidarops.catalog.store import Store
 from lidarops.errors import AncillaryError, ProductError, RawFormatError
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
+from lidarops.plan.channel_names import ChannelNames
 from lidarops.plan.outlying_headers import new_notes, without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
@@ -63,6 +64,7 @@ MOST_GRANULES: Final = 50_000
 if workers process the scenes, the next group."""
 
 _PLANNING: Final = (
+    "lidarops.plan.channel_names",
     "lidarops.plan.outlying_headers",
     "lidarops.plan.scene_plan",
     "lidarops.plan.scenes",
@@ -248,11 +250,12 @@ class Judge:
         return products, broken
 
     def _base(self) -> str:
-        settings = as_settings(self.campaign)
+        settings, held = as_settings(self.campaign), self.names.holdings
         return dependence.digest(
             [
                 {key: value for key, value in settings.items() if key not in OPERATION},
                 joint_code_version(requested_kinds(self.campaign), *_PLANNING),
+                sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
             ]
         )
 
@@ -362,7 +365,8 @@ class Judge:
         return last is not None and bool(last.error) and complete
 
     def _cut(self, first: int, last: int, days: set[int]) -> Cut:
-        granules = self._store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
+        stored = self._store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
+        granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
         kept, refused = without_outlying(granules, used, self._header)
         aside = [granule for granule in refused if day_of(_moment(granule)) in days]
@@ -382,6 +386,11 @@ class Judge:
             set_aside=(*cut.set_aside, *aside),
             file_notes=tuple(new_notes(granules, kept, days)),
         )
+
+    @cached_property
+    def names(self) -> ChannelNames:
+        """Names of the channels of all files in the catalog."""
+        return ChannelNames(self.campaign, self._store)
 
     @cached_property
     def _refused(self) -> tuple[Refused, ...]:

@@ -38,6 +38,7 @@ class ReadSettings(SettingsModel):
     """Settings of the step ``read``."""
 
     wavelength: float = quantity(unit="m")
+    recorder: str = ""
 
 
 class Read(Step[ChannelCase, ReadSettings]):
@@ -63,7 +64,8 @@ class Read(Step[ChannelCase, ReadSettings]):
         if math.isnan(metres):
             yield Leave(NO_WAVELENGTH, rule="channel")
         else:
-            yield Run(required_by(requesters), ReadSettings(wavelength=metres), rule="channel")
+            settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder)
+            yield Run(required_by(requesters), settings, rule="channel")
 
     def carry_out(self, settings: ReadSettings, data: Data) -> None:
         """Give the archive and the wavelength."""

@@ -13,8 +13,6 @@ from support import factories
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.store import Store
 from lidarops.plan.availability import (
-    lacks_channels,
-    names_channels,
     unavailable_channels,
     validity_edges,
 )
@@ -37,12 +35,8 @@ def unavailable(
     campaign = factories.campaign(facts=facts, products=products or {"signal": {}})
     with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
         store.replace([row_of(granule, campaign.name, "key") for granule in granules])
-        channels = list(
-            unavailable_channels(campaign, store.holdings(validity_edges(campaign)), **selection)
-        )
-        # The quick check covers every channel of the full one.
-        assert lacks_channels(campaign, store.layouts()) or not channels
-        return channels
+        holdings = store.holdings(validity_edges(campaign))
+        return list(unavailable_channels(campaign, holdings, **selection))
 
 
 def file_of(day: int, *layout: Any, minutes: float = 0.0, role: Role = Role.SIGNAL) -> Granule:
@@ -129,19 +123,3 @@ def test_the_selection_restricts_the_result(
     files = [file_of(0, OLD), file_of(1, OLD)]
     missing = unavailable(facts, *files, products=products, folder=tmp_path, **selection)
     assert {channel.channel for channel in missing} == channels
-
-
-def test_a_campaign_that_names_no_channel_needs_no_check() -> None:
-    assert not names_channels(factories.campaign(facts=[{}], products={"signal": {}}))
-    assert names_channels(
-        factories.campaign(facts=[dead_times_of("photon_532o")], products={"signal": {}})
-    )
-    assert names_channels(factories.campaign(facts=[{}], products={"signal": {"channels": ["a"]}}))
-
-
-def test_files_that_hold_all_need_no_count() -> None:
-    """As in most archives; counting a million files takes seconds."""
-    campaign = factories.campaign(facts=[dead_times_of("photon_532o")], products={"signal": {}})
-    assert not lacks_channels(campaign, [("lidar", (OLD,)), ("lidar", (OLD, NEW))])
-    assert not lacks_channels(campaign, [("another", (NEW,))])
-    assert lacks_channels(campaign, [("lidar", (OLD, NEW)), ("lidar", (NEW,))])
