@@ -256,7 +256,6 @@ class Granules(Database):
             .subquery()
         )
         *columns, start = signal.c
-        # Grouped before the texts are joined: in half the time.
         groups = (
             sa.select(*columns, sa.func.count().label("files"), sa.func.min(start).label("first"))
             .group_by(*columns)

@@ -319,9 +319,10 @@ def test_channels_in_another_order_are_the_same_channels(tmp_path):
 
 
 def test_properties_that_vary_are_variables(tmp_path):
-    make(tmp_path, "a", 10)
+    photon = PHOTON.replace("BC0", "BC1")
+    make(tmp_path, "a", 10, datasets=(ANALOG, photon))
     other = ANALOG.replace("0800", "0900").replace("0.500", "0.020")
-    make(tmp_path, "b", 20, datasets=(other.replace("000101", "000099"), PHOTON))
+    make(tmp_path, "b", 20, datasets=(other.replace("000101", "000099"), photon))
     opened = open_archive(tmp_path)
     assert opened.analog_532p_high_voltage.values.tolist() == [800.0, 900.0]
     assert opened.analog_532p_input_range.values.tolist() == [0.5, 0.02]
