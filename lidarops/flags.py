@@ -105,6 +105,14 @@ class Quality(FlagBit):
             " may have shifted the root of the cubic"
         ),
     )
+    SINGLE_RECORD = (
+        7,
+        Severity.CARE,
+        (
+            "analog detection and photon counting are not glued: one alone gives the signal, as the"
+            " other is missing, saturated or too weak, or no range is linear in both"
+        ),
+    )
     NEGATIVE_AMPLITUDE = 8, Severity.REJECT, "the fitted amplitude is not positive"
     NOT_HOMOGENEOUS = (
         11,
@@ -133,8 +141,9 @@ class Quality(FlagBit):
         16,
         Severity.REJECT,
         (
-            "there is no range in which the photon-counting signal is linear in the analog one, so"
-            " they are not glued: one is not linear there, or the lag between them is wrong"
+            "analog detection and photon counting are not glued, and none alone gives the signal:"
+            " their ratio shows that one is not linear or that the lag is wrong, both are too weak,"
+            " or the scale of analog detection is not known"
         ),
     )
 
@@ -144,12 +153,17 @@ SIGNAL_BITS: Final = (
     Quality.SATURATED,
     Quality.PILE_UP,
     Quality.INCOMPLETE_OVERLAP,
+    Quality.SINGLE_RECORD,
     Quality.OUTLIER,
     Quality.LOW_SIGNAL_TO_NOISE,
     Quality.BACKGROUND_UNCERTAIN,
     Quality.NO_GLUING,
 )
 """Bits of signals that retrievals of profiles pass on."""
+WITHHELD: Final = int(
+    Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
+)
+"""Bits of bins that retrievals of profiles do not use."""
 
 
 def rejecting(bits: Iterable[FlagBit]) -> int:

@@ -594,7 +594,8 @@ SUBTRACTED_BACKGROUND: Final = Row(
     cell_methods="time: mean",
     ancillaries=("shots",),
     uncertain=True,
-    comment=f"Not calibrated. {NO_STANDARD_NAME}",
+    comment="Not calibrated. Missing where a glued signal is analog alone, less its unknown offset."
+    f" {NO_STANDARD_NAME}",
 )
 """Background that was subtracted from the signal of a channel."""
 
@@ -621,7 +622,8 @@ GLUING: Final = (
         coverage=Coverage.AUXILIARY,
         optional=True,
         uncertain=True,
-        comment=f"Missing where there is no range in which both are linear. {NO_STANDARD_NAME}",
+        comment="Of analog alone that of the scene. Missing where none is known or used."
+        f" {NO_STANDARD_NAME}",
     ),
     *(
         Row(
@@ -633,6 +635,7 @@ GLUING: Final = (
             coverage=Coverage.AUXILIARY,
             optional=True,
             comment="The glued signal is analog at shorter and photon counting at longer ranges."
+            " Both ends are that of the bins for analog alone, and 0 for photon counting alone."
             f" {NO_STANDARD_NAME}",
         )
         for end, verb in (("bottom", "begins"), ("top", "ends"))

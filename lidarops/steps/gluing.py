@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from typing import Final, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.retrieve.signal import labeled_gluing
@@ -61,16 +63,9 @@ class Lag(Step[ChannelCase, LagSettings]):
         """Give whether the lag is to be estimated; a given one has shifted the analog ranges."""
         data[LAG] = settings.method == "estimate"
 
-    def held(self, settings: LagSettings, work: Workload) -> float:
-        """Return the bytes of the profiles from which a lag is estimated."""
-        if settings.method == "given":
-            return 0.0
-        profiles = min(PROFILES_AT_ONCE, len(work.scene.granules))
-        return _BYTES_OF_A_LAG_BIN * profiles * work.bins
-
 
 _BYTES_OF_A_LAG_BIN: Final = 65.0
-"""Bytes per bin of a profile of the estimate."""
+"""Bytes per bin of a profile of the estimate of a lag; gluing takes four times as many."""
 
 
 class GlueSettings(SettingsModel):
@@ -104,7 +99,17 @@ class Glue(Step[ChannelCase, GlueSettings]):
             lag = labeled_gluing.estimate_lag(_groups(analog, photon), known=lag.bins)
         # Parts of a glued channel are channels of the files.
         of_analog, of_photon = (cast("FileProfiles", part[PROFILES]) for part in (analog, photon))
-        data[PROFILES] = GluedProfiles(of_analog, of_photon, lag)
+
+        @functools.cache
+        def slope() -> labeled_gluing.Slope:
+            return labeled_gluing.scene_slope(_samples(analog, photon), lag)
+
+        data[PROFILES] = GluedProfiles(of_analog, of_photon, lag, slope)
+
+    def held(self, settings: GlueSettings, work: Workload) -> float:  # noqa: ARG002
+        """Return the bytes of the profiles from which lag and slope are taken."""
+        profiles = min(PROFILES_AT_ONCE, len(work.scene.granules))
+        return _BYTES_OF_A_LAG_BIN * profiles * work.bins
 
 
 def _groups(analog: Data, photon: Data) -> Iterator[tuple[_Power, _Power]]:
@@ -112,6 +117,16 @@ def _groups(analog: Data, photon: Data) -> Iterator[tuple[_Power, _Power]]:
     count = min(labeled_gluing.LAG_PROFILES, analog[ARCHIVE].sizes["time"])
     for rows in profile_groups(count):
         yield _power(analog, rows), _power(photon, rows)
+
+
+def _samples(analog: Data, photon: Data) -> Iterator[tuple[xr.Dataset, xr.Dataset]]:
+    """Yield profiles of both channels from all over a scene, some at a time."""
+    number, together = analog[ARCHIVE].sizes["time"], PROFILES_AT_ONCE // 4
+    rows = np.unique(np.linspace(0, number - 1, labeled_gluing.SLOPE_PROFILES).astype(int))
+    for first in range(0, rows.size, together):
+        some = rows[first : first + together]
+        one, other = (part[PROFILES].of(part[ARCHIVE].isel(time=some)) for part in (analog, photon))
+        yield one, other
 
 
 def _power(part: Data, rows: slice) -> _Power:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, TypedDict
 
 import numpy as np
@@ -130,12 +130,18 @@ class GluedProfiles(Profiles):
     analog, photon : FileProfiles
     lag : ChannelLag
         Lag of the analog record behind the photon-counting one.
+    slope : callable
+        Returns that of profiles that cannot be glued. Kinds that take means do not compare them.
     """
 
     def __init__(
-        self, analog: FileProfiles, photon: FileProfiles, lag: labeled_gluing.ChannelLag
+        self,
+        analog: FileProfiles,
+        photon: FileProfiles,
+        lag: labeled_gluing.ChannelLag,
+        slope: Callable[[], labeled_gluing.Slope],
     ) -> None:
-        self._analog, self._photon, self._lag = analog, photon, lag
+        self._analog, self._photon, self._lag, self._slope = analog, photon, lag, slope
 
     @property
     def range(self) -> npt.NDArray[np.float64]:
@@ -148,7 +154,8 @@ class GluedProfiles(Profiles):
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles, and the variables of the gluing."""
-        return labeled_gluing.glue(self._analog.of(counts), self._photon.of(counts), self._lag)
+        records = self._analog.of(counts), self._photon.of(counts)
+        return labeled_gluing.glue(*records, self._lag, self._slope())
 
     def averages(self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float) -> Averages:
         """Return an empty average of profiles over clock intervals."""

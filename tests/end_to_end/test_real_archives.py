@@ -145,17 +145,21 @@ def test_sections_of_a_vertical_path_are_left_out(
     assert all(item.number is not None and item.number > 100.0 for item in left)
 
 
-def test_nothing_is_invented_where_photon_counting_is_paralysed(pilar: RunRecord) -> None:
-    for channel, bit in (
-        ("photon_532p", Quality.PILE_UP),
-        ("glued_532p", Quality.NO_GLUING),
-    ):
-        product = _open(pilar, "elastic", channel)
-        flags = product["quality_flag"].values
-        assert (flags & bit).all()
-        assert ((flags & flags_of("elastic").rejecting) != 0).all() or (flags != 0).all()
-    glued = _open(pilar, "elastic", "glued_532p")
-    assert np.isnan(glued["aerosol_backscatter"].values).all()
+def test_by_day_the_analog_record_of_pilar_is_inverted_alone(pilar: RunRecord) -> None:
+    photon = _open(pilar, "elastic", "photon_532p")
+    flags = photon["quality_flag"].values
+    assert (flags & Quality.PILE_UP).all()
+    assert (flags != 0).all()
+    glued, analog = (_open(pilar, "elastic", f"{record}_532p") for record in ("glued", "analog"))
+    assert (glued["quality_flag"].values & Quality.SINGLE_RECORD).all()
+    assert (glued["glue_top"].values > glued["range"].values[-1]).all()
+    rejected = glued["quality_flag"].values & flags_of("elastic").rejecting
+    assert ((rejected == 0).mean(axis=1) > 0.5).all()
+    value, error = ("aerosol_backscatter", "aerosol_backscatter_standard_error")
+    difference = np.abs(glued[value] - analog[value]).values
+    both = np.isfinite(difference)
+    assert both.mean() > 0.5
+    assert (difference < 0.5 * analog[error].values)[both].all()
 
 
 def test_pilar_has_aerosol_below_clean_air(pilar: RunRecord) -> None:

@@ -28,6 +28,7 @@ SHARED = {
     "too_few_bins": 4,
     "no_signal": 5,
     "low_signal": 6,
+    "single_record": 7,
     "negative_amplitude": 8,
     "not_homogeneous": 11,
     "outlier": 12,
@@ -94,7 +95,7 @@ RETIRED = {"multiangle": {25, 30}}
 """Places of bits of former versions: one_sided and horizontal_gradient."""
 
 LEFT = {
-    "shared": 3,
+    "shared": 2,
     "signal": 14,
     "homogeneous": 9,
     "elastic": 8,
@@ -127,7 +128,8 @@ SCENES = {
     "test_values_below_their_error_are_used_with_care",
     "Quality.BACKGROUND_UNCERTAIN": "test_labeled_elastic::"
     "test_aerosol_in_the_far_range_makes_the_background_uncertain",
-    "Quality.NO_GLUING": "test_labeled_gluing::test_no_gluing_where_no_range_is_linear_in_both",
+    "Quality.SINGLE_RECORD": "test_labeled_gluing::test_each_record_alone_has_the_bit",
+    "Quality.NO_GLUING": "test_labeled_gluing::test_no_gluing_where_neither_record_shows_light",
     "ElasticQuality.CLOUD": "test_labeled_elastic::"
     "test_a_cloud_below_the_reference_is_flagged_with_all_bins_below_it",
     "ElasticQuality.NO_REFERENCE": "test_labeled_elastic::test_an_opaque_cloud_leaves_no_reference",

@@ -15,6 +15,7 @@ FLAGS: Final = Flags(
         Quality.SATURATED,
         Quality.PILE_UP,
         Quality.INCOMPLETE_OVERLAP,
+        Quality.SINGLE_RECORD,
         Quality.LOW_SIGNAL_TO_NOISE,
         Quality.BACKGROUND_UNCERTAIN,
         Quality.NO_GLUING,

@@ -14,6 +14,7 @@ FLAGS: Final = Flags(
         Quality.SATURATED,
         Quality.PILE_UP,
         Quality.INCOMPLETE_OVERLAP,
+        Quality.SINGLE_RECORD,
         Quality.NO_REAL_SOLUTION,
         Quality.LOW_SIGNAL_TO_NOISE,
         Quality.BACKGROUND_UNCERTAIN,

@@ -14,6 +14,7 @@ FLAGS: Final = Flags(
         Quality.INPUT_MISSING,
         Quality.PILE_UP,
         Quality.LOW_SIGNAL,
+        Quality.SINGLE_RECORD,
         Quality.OUTLIER,
         Quality.NO_REAL_SOLUTION,
         Quality.BACKGROUND_UNCERTAIN,

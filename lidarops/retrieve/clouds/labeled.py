@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air import reference_window as _reference
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
@@ -28,16 +28,7 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 
-_CARRIED: Final = int(
-    Quality.INPUT_MISSING
-    | Quality.SATURATED
-    | Quality.PILE_UP
-    | Quality.INCOMPLETE_OVERLAP
-    | Quality.NO_GLUING
-)
-WITHHELD: Final = int(
-    Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
-)
+_CARRIED: Final = WITHHELD | int(Quality.PILE_UP | Quality.SINGLE_RECORD)
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
 PARTLY_CLOUDY: Final = 1
 CLOUDY: Final = 2

@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air import reference_window as _reference
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.clouds.labeled import (
-    WITHHELD,
     MeanProfiles,
     MeanSignal,
     Reference,
@@ -30,7 +29,7 @@ from lidarops.retrieve.clouds.labeled import (
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import dead_time_error
+from lidarops.retrieve.signal.labeled import dead_time_error, without_analog_background
 from lidarops.retrieve.signal.screening import cloud_contrast
 
 Array = npt.NDArray[np.float64]
@@ -149,7 +148,7 @@ def invert_elastic(
         name: np.where(solution.valid, values, np.nan)
         for name, values in _profile_variables(solution).items()
     }
-    return xr.Dataset(
+    product = xr.Dataset(
         {
             **{name: (("time", "range"), values) for name, values in profiles.items()},
             "molecular_backscatter": ("range", air.backscatter),
@@ -185,6 +184,7 @@ def invert_elastic(
         },
         coords={name: averages[name] for name in averages.coords},
     )
+    return without_analog_background(product, averages)
 
 
 def _dead_time_error(averages: xr.Dataset, means: MeanProfiles, signal: MeanSignal) -> Array:

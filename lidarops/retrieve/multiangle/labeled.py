@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled_altitudes import CARE, WITHHELD
+from lidarops.retrieve.multiangle.labeled_altitudes import CARE
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
 )

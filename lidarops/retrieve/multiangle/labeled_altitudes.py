@@ -11,7 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air.molecular import MolecularProfile, molecular_lidar_ratio
 from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
@@ -26,11 +26,7 @@ Flags = npt.NDArray[np.int32]
 Integers = npt.NDArray[np.int64]
 _Block = npt.NDArray[Any]
 
-WITHHELD: Final = (
-    Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
-)
-"""A bin with one of these bits is not used."""
-CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
+CARE: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
 _CUBE: Final = ("time", "beam", "altitude")
 _DIMENSIONS: Final = {

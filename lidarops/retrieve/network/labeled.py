@@ -29,7 +29,7 @@ Integers = npt.NDArray[np.int64]
 
 _UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
 """Bits of a bin that is not used. Bins before full overlap are excluded by range."""
-_WARNINGS: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
+_WARNINGS: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
 """Bits of bins that are passed on to the values they contribute to."""
 _QUALITY_OF_FLAG: Final = {
     "ill_conditioned": NetworkQuality.POORLY_DETERMINED,

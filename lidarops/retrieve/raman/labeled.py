@@ -31,8 +31,10 @@ from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmis
 from lidarops.retrieve.signal.labeled import (
     CORRELATION_LENGTH,
     actual_noise,
+    analog_alone,
     counts_per_power,
     dead_time_error,
+    without_analog_background,
 )
 from lidarops.retrieve.signal.screening import cloud_contrast
 
@@ -40,12 +42,10 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 Booleans = npt.NDArray[np.bool_]
 
-_ANY: Final = int(
-    Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
-)
 _WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
 _DOUBTED: Final = _WITHHELD | int(Quality.PILE_UP)
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
+_ANY: Final = (_DOUBTED | int(Quality.INCOMPLETE_OVERLAP | Quality.SINGLE_RECORD)) & ~int(_MISSING)
 _DIGITS_OF_A_BIN: Final = 6
 """Digits of the difference of ranges in bins, which are no more certain: 1e-6 bins are 10 um."""
 
@@ -201,6 +201,10 @@ def retrieve(
     climb = float(np.cos(np.deg2rad(elastic["zenith_angle"])))
     others = [raman] if water is None else [raman, water.averages]
     distance, bins = _common_bins(elastic, others, climb, station_altitude)
+    if water is not None:
+        # The calibration constant is one of signals in MHz.
+        scaled = ~(analog_alone(raman) | analog_alone(water.averages))
+        others[1] = water.averages.assign(power=water.averages["power"].where(scaled))
     channels = [
         _Channel(averages, part, distance)
         for averages, part in zip((elastic, *others), bins, strict=True)
@@ -239,7 +243,8 @@ def retrieve(
         doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
         variables |= {**of_water, "quality_flag": (dims, bits | doubt)}
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
-    return xr.Dataset(variables, coords={**coords, "range": ("range", cells.range)})
+    product = xr.Dataset(variables, coords={**coords, "range": ("range", cells.range)})
+    return without_analog_background(product, elastic)
 
 
 def without_signal(

@@ -55,6 +55,22 @@ class GluedSignal:
     expected one. A channel is then not linear (dead time, saturation), or the channels receive
     different light (overlap, fields of view). A wrong lag may pass: it only scales a falling
     signal."""
+    misfit: Booleans
+    """(...): a poor fit by chi-square, and with `photon_change` too: one channel is wrong."""
+
+
+def lit_bins(
+    power: Array, variance: Array, highest: npt.ArrayLike = np.inf
+) -> npt.NDArray[np.int64]:
+    """Return the number of bins, (...), whose smoothed signal is `Thresholds.least_snr` of noise.
+
+    `power` and `variance` are (..., range); signals above `highest`, (...), do not count.
+    """
+    rows = frozen(power.reshape(-1, power.shape[-1]))
+    noise = np.broadcast_to(variance, power.shape).reshape(rows.shape)
+    with np.errstate(invalid="ignore"):
+        lit = _is_lit(rows, noise) & (_smooth(rows) <= np.reshape(highest, (-1, 1)))
+    return np.asarray((lit & np.isfinite(rows)).sum(axis=-1).reshape(power.shape[:-1]))
 
 
 def glue(
@@ -135,14 +151,13 @@ def glue(
     lines = fitted(y)
     length = inputs.profile_values(analog_correlation_length, "analog_correlation_length", leading)
     lines[:, _VARIANCES] *= _correlated_share(xv, yv, lines, first, past, length)
-    change = np.zeros((len(x), 1))
+    joined = _joined(x, y, xv, yv, lines, near)
+    change, changed = np.broadcast_to(0.0, y.shape), lines
     if np.any(photon_change):
         moved = frozen(y + inputs.noise_rows(photon_change, "photon_change", grid, leading))
-        change = _joined_power(x, moved, fitted(moved), near)
-        change -= _joined_power(x, y, lines, near)
-    change = np.broadcast_to(change, y.shape)
-    joined = _joined(x, y, xv, yv, lines, near)
-    return _result(lines, (first, past), (*joined, change), leading, grid)
+        changed = fitted(moved)
+        change = _joined(x, moved, xv, yv, changed, near)[0] - joined[0]
+    return _result((lines, changed), (first, past), (*joined, change), leading, grid)
 
 
 def _correlated_share(
@@ -158,16 +173,6 @@ def _correlated_share(
     return np.where(np.isfinite(share), share, 1.0)[:, np.newaxis]
 
 
-def _joined_power(x: Array, y: Array, lines: Array, near: Booleans) -> Array:
-    """Return the signal of `_joined`."""
-    column = np.where(lines[:, _line_fit.SLOPE, np.newaxis] > 0.0, lines, np.nan).T[..., np.newaxis]
-    slope = column[_line_fit.SLOPE]
-    with np.errstate(invalid="ignore", over="ignore"):
-        power = np.where(near, slope * x + column[_line_fit.INTERCEPT], y)
-        valid = (np.abs(power) < _line_fit.HUGE) & (slope > 0.0)
-    return np.where(valid, power, np.nan)
-
-
 def _joined(
     x: Array, y: Array, xv: Array, yv: Array, lines: Array, near: Booleans
 ) -> tuple[Array, Array, Array]:
@@ -175,12 +180,13 @@ def _joined(
     column = np.where(lines[:, _line_fit.SLOPE, np.newaxis] > 0.0, lines, np.nan).T[..., np.newaxis]
     slope = column[_line_fit.SLOPE]
     with np.errstate(invalid="ignore", over="ignore"):
+        power = np.where(near, slope * x + column[_line_fit.INTERCEPT], y)
+        valid = (np.abs(power) < _line_fit.HUGE) & (slope > 0.0)
         lever = x - column[_line_fit.CENTRE]
         of_line = column[_line_fit.SLOPE_VARIANCE] * lever * lever
         of_line = of_line + column[_line_fit.CENTRE_VARIANCE]
         variance, systematic = np.where(near, slope * slope * xv, yv), np.where(near, of_line, 0.0)
-    power = _joined_power(x, y, lines, near)
-    variance[np.isnan(power)] = systematic[np.isnan(power)] = np.nan
+    power[~valid] = variance[~valid] = systematic[~valid] = np.nan
     return power, variance, systematic
 
 
@@ -212,9 +218,8 @@ def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Ind
     """Return first and past-the-last bin of the window of each profile, (0, 0) for none."""
     rate = _smooth(y)
     with np.errstate(invalid="ignore"):
-        noise = np.sqrt(_smooth(np.where(np.isfinite(x), xv, np.nan)))
         usable = (rate >= THRESHOLDS.count_rates[0]) & (rate <= highest[:, np.newaxis])
-        usable &= _smooth(x) >= THRESHOLDS.least_snr * noise
+    usable &= _is_lit(x, xv)
     first, past = np.zeros((2, len(x)), dtype=np.intp)
     _line_fit.longest_runs(usable, first, past)
     index = np.arange(rate.shape[1])
@@ -226,6 +231,13 @@ def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Ind
     return np.where(wide, first, 0), np.where(wide, past, 0)
 
 
+def _is_lit(x: Array, variance: Array) -> Booleans:
+    """Return where smoothed signals exceed the noise of a bin by the least ratio."""
+    with np.errstate(invalid="ignore"):
+        noise = np.sqrt(_smooth(np.where(np.isfinite(x), variance, np.nan)))
+        return np.asarray(_smooth(x) >= THRESHOLDS.least_snr * noise)
+
+
 def _smooth(values: Array) -> Array:
     """Return averages over `Thresholds.smoothing` bins, fewer at the ends, skipping NaN."""
     smooth = np.empty(values.shape)
@@ -233,29 +245,38 @@ def _smooth(values: Array) -> Array:
     return smooth
 
 
+def _misfits(lines: Array) -> Booleans:
+    """Return which lines have a chi-square that noise does not explain."""
+    freedom = _degrees_of_freedom(lines)
+    noise = special.chdtri(freedom, THRESHOLDS.misfit_false_alarm)
+    largest = np.maximum(THRESHOLDS.largest_misfit * freedom, noise)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(lines[:, _line_fit.CHI2] > largest)
+
+
+def _degrees_of_freedom(lines: Array) -> npt.NDArray[np.int64]:
+    return np.maximum(np.nan_to_num(lines[:, _line_fit.POINTS]).astype(np.int64) - 2, 0)
+
+
 def _result(
-    lines: Array,
+    fits: tuple[Array, Array],
     window: tuple[Indices, Indices],
     joined: tuple[Array, Array, Array, Array],
     leading: tuple[int, ...],
     grid: inputs.RangeGrid,
 ) -> GluedSignal:
+    lines, misfit = fits[0], [_misfits(fit) for fit in fits]
     first, past = window
     empty = past == 0
     start = np.where(empty, np.nan, grid.values[first])
     stop = np.where(empty, np.nan, grid.values[np.maximum(past - 1, 0)])
-    freedom = np.maximum(np.nan_to_num(lines[:, _line_fit.POINTS]).astype(np.int64) - 2, 0)
-    slope, chi2 = lines[:, _line_fit.SLOPE], lines[:, _line_fit.CHI2]
+    slope = lines[:, _line_fit.SLOPE]
     slope_error = np.sqrt(lines[:, _line_fit.SLOPE_VARIANCE])
     intercept_error = np.sqrt(
         lines[:, _line_fit.CENTRE_VARIANCE] + (lines[:, _line_fit.CENTRE] * slope_error) ** 2
     )
-    largest = np.maximum(
-        THRESHOLDS.largest_misfit * freedom,
-        special.chdtri(freedom, THRESHOLDS.misfit_false_alarm),
-    )
     with np.errstate(invalid="ignore"):
-        poor_fit = (chi2 > largest) | ~(slope >= THRESHOLDS.least_slope * slope_error)
+        poor_fit = misfit[0] | ~(slope >= THRESHOLDS.least_slope * slope_error)
     power, variance, systematic, change = (
         grid.turn(values.reshape(*leading, grid.size)) for values in joined
     )
@@ -268,10 +289,11 @@ def _result(
         slope_standard_error=slope_error.reshape(leading),
         intercept=lines[:, _line_fit.INTERCEPT].reshape(leading),
         intercept_standard_error=intercept_error.reshape(leading),
-        chi2=chi2.reshape(leading),
-        degrees_of_freedom=freedom.reshape(leading),
+        chi2=lines[:, _line_fit.CHI2].reshape(leading),
+        degrees_of_freedom=_degrees_of_freedom(lines).reshape(leading),
         start=start.reshape(leading),
         stop=stop.reshape(leading),
         no_window=empty.reshape(leading),
         poor_fit=(poor_fit & ~empty).reshape(leading),
+        misfit=(misfit[0] & misfit[1]).reshape(leading),
     )

@@ -254,10 +254,10 @@ def correct_for_range(
     words = background_words(method, background_range)
     result = xr.Dataset(dict(zip(_CORRECTED, arrays, strict=True)), attrs={"steps": words})
     error = dead_time_error(conditioned, result["background"])
-    if error is None:
-        return result
-    error *= conditioned["range"].astype(np.float64) ** 2
-    return result.assign(signal_dead_time_error=error.astype(np.float32))
+    if error is not None:
+        error *= conditioned["range"].astype(np.float64) ** 2
+        result["signal_dead_time_error"] = error.astype(np.float32)
+    return without_analog_background(result, conditioned)
 
 
 class ActualNoise(NamedTuple):
@@ -309,13 +309,35 @@ def counts_per_power(
     if DEAD_TIME_ERROR not in profiles["power"].attrs or ("glue_top" in profiles and not glued):
         return None
     width = float(np.median(np.diff(profiles["range"].to_numpy().astype(np.float64))))
-    return np.asarray(np.maximum(shots, 1) * (width / LICEL_RANGE_PER_MICROSECOND))
+    counts = np.asarray(np.maximum(shots, 1) * (width / LICEL_RANGE_PER_MICROSECOND))
+    # A count is nothing of analog detection.
+    return np.where(analog_alone(profiles), np.inf, counts)
+
+
+def analog_alone(profiles: xr.Dataset) -> xr.DataArray:
+    """Return which profiles of a glued channel are analog detection alone, (time,).
+
+    They are without background.
+    """
+    if "glue_top" not in profiles:
+        return xr.zeros_like(profiles["power"].isel(range=0, drop=True), dtype=bool)
+    top = profiles["glue_top"]
+    return (top > 0.0) & (top == profiles["glue_bottom"])
+
+
+def without_analog_background(product: xr.Dataset, profiles: xr.Dataset) -> xr.Dataset:
+    """Return a product without the backgrounds of glued profiles that are `analog_alone`."""
+    known = ~analog_alone(profiles)
+    names = ("background", "background_standard_error")
+    return product.assign({name: product[name].where(known) for name in names})
 
 
 def _glued_until(profiles: xr.Dataset) -> xr.DataArray:
     """Return the range in m to which profiles are glued; below all ranges where they are not."""
     if "glue_top" in profiles:
-        middle: xr.DataArray = 0.5 * (profiles["glue_bottom"] + profiles["glue_top"])
+        bottom, top = profiles["glue_bottom"], profiles["glue_top"]
+        # Of a single record, the far half tells the noise of all.
+        middle: xr.DataArray = (0.5 * (bottom + top)).where(bottom != top, -np.inf)
         return middle
     return xr.full_like(profiles["power"].isel(range=0, drop=True), -np.inf)
 

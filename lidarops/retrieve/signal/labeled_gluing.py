@@ -15,13 +15,20 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, DEAD_TIME_ERROR
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, DEAD_TIME_ERROR, analog_alone
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
+Slope = tuple[float, float]
+"""MHz mV-1, and its standard error."""
 _Block = npt.NDArray[Any]
+
+UNKNOWN_SLOPE: Final[Slope] = (math.nan, math.nan)
 
 LAG_PROFILES: Final = 256
 """Number of profiles, the first of a scene, from which the lag is estimated."""
+SLOPE_PROFILES: Final = 64
+"""Number of profiles, all over a scene, that give its slope."""
 
 _PARTS: Final = ("power", "variance", "quality")
 _LINE: Final = {"glue_slope": "MHz mV-1", "glue_slope_standard_error": "MHz mV-1"}
@@ -47,6 +54,19 @@ class ChannelLag:
 NO_LAG: Final = ChannelLag()
 
 
+def scene_slope(parts: Iterable[tuple[xr.Dataset, xr.Dataset]], lag: ChannelLag) -> Slope:
+    """Return the slope of the profiles of a scene that can be glued, from some of all, `glue`'s.
+
+    The standard error holds the scatter of the slopes, as by a drift of the gain. NaN without any.
+    """
+    glued = [glue(*part, lag, UNKNOWN_SLOPE)[[*_LINE]].compute() for part in parts]
+    slope, error = (np.concatenate([part[name].to_numpy() for part in glued]) for name in _LINE)
+    slope, error = slope[lines := np.isfinite(slope)], error[lines]
+    if not slope.size:
+        return UNKNOWN_SLOPE
+    return float(np.median(slope)), math.hypot(slope.std(), np.median(error))
+
+
 def estimate_lag(groups: Iterable[tuple[Array, Array]], *, known: float) -> ChannelLag:
     """Return the lag of analog behind photon counting, estimated from their noise.
 
@@ -59,23 +79,26 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]], *, known: float) -> Chan
         Bins, where the correlation is not significant
         (`lidarops.retrieve.signal.lag.estimate_lag`).
     """
-    estimate = _lag.estimate_lag_of_groups(_same_bins(*group) for group in groups)
+    estimate = _lag.estimate_lag_of_groups(
+        (analog[:, : photon.shape[-1]], photon[:, : analog.shape[-1]]) for analog, photon in groups
+    )
     if not estimate.significant:
         return ChannelLag(known)
     return ChannelLag(float(estimate.lag), float(estimate.standard_error))
 
 
-def _same_bins(analog: Array, photon: Array) -> tuple[Array, Array]:
-    bins = min(analog.shape[-1], photon.shape[-1])
-    return analog[:, :bins], photon[:, :bins]
-
-
-def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr.Dataset:
+def glue(
+    analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG, slope: Slope | None = None
+) -> xr.Dataset:
     """Return the glued profiles of two channels that record the same light.
 
     Analog signals are shifted by the lag, the mean of the last tenth of the bins is subtracted
     from both, and each profile is glued by its own line (`lidarops.retrieve.signal.gluing.glue`).
     Photon counting is corrected for dead time before. Its background remains in the result.
+
+    Without a line, as by day, the record alone serves that shows light in more bins, photon
+    counting within `Thresholds.count_rates` (SINGLE_RECORD). So it does where the error of the dead
+    time explains a misfit; any other misfit says that one of the records is wrong.
 
     Parameters
     ----------
@@ -84,6 +107,9 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
         the same width; may be dask-backed.
     lag : ChannelLag
         Lag of analog behind photon counting (`range_lag`, `estimate_lag`).
+    slope : (float, float), optional
+        Of analog alone, whose background is 0; without a known one it does not serve. None where
+        profiles are not compared: 1 mV is then 1 MHz.
 
     Returns
     -------
@@ -93,7 +119,8 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
         ``dead_time_error`` (MHz), the change of the power with one standard error of the dead
         time, where the power of photon counting states that; ``glue_lag`` and ``glue_slope`` with
         their standard errors, and the ends of the window, ``glue_bottom`` and ``glue_top``, over
-        time. NO_GLUING where there is no line.
+        time: both the end of the bins for analog alone, and 0 for photon counting alone. NO_GLUING
+        where no record serves.
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
@@ -104,6 +131,7 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
         "lag": lag.bins,
         "distance": photon["range"].to_numpy().astype(np.float64),
         "dead_time_error": (dead_time_error or 0.0) * 1e6,
+        "slope": slope,
     }
     outputs = xr.apply_ufunc(
         _glue,
@@ -121,7 +149,8 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
     for name, value in zip(_LAG, (lag.bins, lag.standard_error), strict=True):
         result[name] = xr.full_like(result["glue_slope"], value)
     # That of photon counting is less, so that errors of its part become too large.
-    result[CORRELATION_LENGTH] = analog[CORRELATION_LENGTH].assign_attrs(units="1")
+    length = analog[CORRELATION_LENGTH].where(result["glue_top"] != 0.0, 1.0)
+    result[CORRELATION_LENGTH] = length.assign_attrs(units="1")
     for name, unit in {**units, **_LAG}.items():
         result[name].attrs = {"units": unit} if unit else {}
     if dead_time_error is None:
@@ -131,7 +160,9 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, lag: ChannelLag = NO_LAG) -> xr
 
 
 def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dict[str, Any]:
-    """Return ``part_power`` and ``part_variance`` of glued means, by the lines of the means.
+    """Return ``part_power``, ``part_variance`` and ``part_quantum`` of glued means.
+
+    They follow from the lines of the means.
 
     Parameters
     ----------
@@ -147,7 +178,7 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     middle = (0.5 * (glued["glue_bottom"] + glued["glue_top"])).to_numpy()[
         :, np.newaxis, np.newaxis
     ]
-    slope = glued["glue_slope"].to_numpy()[:, np.newaxis, np.newaxis]
+    slope = glued["glue_slope"].fillna(1.0).to_numpy()[:, np.newaxis, np.newaxis]
     near = cells <= middle
     along = ("time", "part", "cell")
     power, variance = (
@@ -156,7 +187,11 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     )
     # Without a line it is not known which record holds.
     power[~np.isfinite(middle[:, 0, 0])] = np.nan
-    return {"part_power": (along, power, cells_of_parts), "part_variance": (along, variance)}
+    return {
+        "part_power": (along, power, cells_of_parts),
+        "part_variance": (along, variance),
+        "part_quantum": photon["part_quantum"].where(~analog_alone(glued), 0.0),
+    }
 
 
 def _whole_profiles(array: xr.DataArray) -> xr.DataArray:
@@ -177,6 +212,7 @@ def _glue(
     lag: float,
     distance: npt.NDArray[np.float64],
     dead_time_error: float,
+    slope: Slope | None,
 ) -> tuple[_Block, ...]:
     # Bins at negative ranges hold no light and are not glued.
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
@@ -184,53 +220,62 @@ def _glue(
     if lag:
         analog, analog_variance = _lag.shift_signal(analog, lag, variance=analog_variance)
         analog_quality = _shifted_quality(analog_quality, lag)
+    analog, photon = _unsaturated(analog, analog_quality), _unsaturated(photon, photon_quality)
     dark, sky = (
-        cubic_and_tail.tail_mean(_unsaturated(power, quality)[..., ahead], r).background
-        for power, quality in ((analog, analog_quality), (photon, photon_quality))
+        cubic_and_tail.tail_mean(power[..., ahead], r).background for power in (analog, photon)
     )
-    sky_change = sky**2 * dead_time_error
     change = photon**2
     change *= dead_time_error
-    change -= sky_change[..., np.newaxis]
+    change -= (sky_change := sky**2 * dead_time_error)[..., np.newaxis]
+    x, y = (analog - dark[..., np.newaxis])[..., ahead], (photon - sky[..., np.newaxis])[..., ahead]
+    xv, yv = (np.nan_to_num(v[..., ahead]) for v in (analog_variance, photon_variance))
     glued = gluing.glue(
-        (analog - dark[..., np.newaxis])[..., ahead],
-        (photon - sky[..., np.newaxis])[..., ahead],
+        x,
+        y,
         r,
-        analog_variance=np.nan_to_num(analog_variance[..., ahead]),
-        photon_variance=np.nan_to_num(photon_variance[..., ahead]),
+        analog_variance=xv,
+        photon_variance=yv,
         photon_background=np.nan_to_num(sky),
-        photon_change=np.nan_to_num(change, copy=False)[..., ahead],
+        photon_change=np.nan_to_num(change[..., ahead]),
         analog_correlation_length=correlation_length,
     )
-    power, variance, change = (np.full(photon.shape, np.nan) for _ in range(3))
-    change[..., ahead] = glued.change + sky_change[..., np.newaxis]
-    power[..., ahead] = glued.power + sky[..., np.newaxis]
-    variance[..., ahead] = glued.variance + glued.systematic_variance
-    quality = _quality(glued, analog_quality, photon_quality, distance)
+    used, error = slope or (1.0, 0.0)
+    level, of_sky = sky[..., np.newaxis], sky_change[..., np.newaxis]
+    by_analog = gluing.lit_bins(x * used, xv * used**2)
+    by_photons = gluing.lit_bins(y, yv, THRESHOLDS.count_rates[1] - sky)
+    line = ~(glued.no_window | glued.poor_fit)
+    alone = ~(line | glued.misfit)
+    alone &= np.maximum(by_analog, by_photons) >= THRESHOLDS.fewest_glued_bins
+    records = line, alone & (by_analog >= by_photons), alone & (by_analog < by_photons)
+
+    def of_records(*values: _Block) -> _Block:
+        """Return those of the line, of analog or of photon counting alone, (..., range)."""
+        joined = np.full(photon.shape, np.nan)
+        joined[..., ahead] = np.select([r[..., np.newaxis] for r in records], values, np.nan)
+        return joined
+
+    power = of_records(glued.power + level, used * x, y + level)
+    variance = glued.variance + glued.systematic_variance
+    variance = of_records(variance, used**2 * xv + (error * x) ** 2, yv)
+    change = of_records(glued.change + of_sky, np.zeros(x.shape), change[..., ahead] + of_sky)
+    end = np.full(sky.shape, 1.5 * distance[-1] - 0.5 * distance[-2])
+    window = [np.select(records, (e, end, 0.0 * end), np.nan) for e in (glued.start, glued.stop)]
+    bottom, top = (edge[..., np.newaxis] for edge in window)
+    quality = np.where(distance <= top, analog_quality, 0)
+    quality |= np.where(distance >= bottom, photon_quality, 0)
+    quality |= np.where(alone, int(Quality.SINGLE_RECORD), 0)[..., np.newaxis]
+    quality |= np.where(alone | line, 0, int(Quality.NO_GLUING))[..., np.newaxis]
+    quality |= np.where(distance <= 0.0, _MISSING, 0)
     power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
-    line = (glued.slope, glued.slope_standard_error, glued.start, glued.stop)
-    return power, variance, quality, change, *line
+    variance[np.isnan(power)] = np.nan
+    own = zip((glued.slope, glued.slope_standard_error), slope or UNKNOWN_SLOPE, strict=True)
+    slopes = (np.select(records[:2], values, np.nan) for values in own)
+    return power, variance, quality.astype(np.int32), change, *slopes, *window
 
 
 def _unsaturated(power: _Block, quality: _Block) -> _Block:
     """Return power without bins that were saturated in some profiles of a mean."""
     return np.where((quality & np.int32(Quality.SATURATED)) != 0, np.nan, power)
-
-
-def _quality(
-    glued: gluing.GluedSignal,
-    analog: _Block,
-    photon: _Block,
-    distance: npt.NDArray[np.float64],
-) -> _Block:
-    """Return the bits of the signal that a bin comes from; in the window, those of both."""
-    near = distance <= glued.stop[..., np.newaxis]
-    far = distance >= glued.start[..., np.newaxis]
-    not_glued = (glued.no_window | glued.poor_fit)[..., np.newaxis]
-    bits = np.where(near, analog, 0) | np.where(far, photon, 0)
-    bits |= np.where(not_glued, int(Quality.NO_GLUING), 0)
-    bits |= np.where(distance <= 0.0, _MISSING, 0)
-    return bits.astype(np.int32)
 
 
 def _shifted_quality(quality: _Block, lag: float) -> _Block:

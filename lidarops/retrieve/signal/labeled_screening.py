@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD
 from lidarops.retrieve.signal.averaging import Averages
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, ClockAverage, PartSums
@@ -25,10 +25,6 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-
-_UNUSABLE: Final = np.int32(
-    Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +150,7 @@ class ScreenedAverage:
 
     def _cells(self, record: Record, sums: PartSums) -> PartCells:
         """Return the signal of parts without background, (part, cell), and its variance."""
-        usable = (sums.quality & _UNUSABLE) == 0
+        usable = (sums.quality & np.int32(WITHHELD)) == 0
         lag = record.lag
         power, variance = cells_of_parts(
             sums.sums.sums, usable, self._first + lag, self._past + lag, self._bins

@@ -9,11 +9,10 @@ import pytest
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.products.elastic.flags import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.air.reference_window import Rejection
-from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import Reference, constant_ratio, invert_elastic
 from lidarops.retrieve.signal.counts_to_signal import difference_variance, photon_signal
@@ -698,7 +697,7 @@ def assert_missing_is_flagged(retrieved):
         values = retrieved[name].to_numpy()
         assert not np.isinf(values).any(), name
         assert (flags[np.isnan(values)] != 0).all(), name
-    rejected = (flags & int(ElasticQuality.NO_REFERENCE | labeled.WITHHELD)) != 0
+    rejected = (flags & int(ElasticQuality.NO_REFERENCE | WITHHELD)) != 0
     assert np.isnan(retrieved["aerosol_backscatter"].to_numpy()[rejected]).all()
     assert not (flags & ~np.int32(sum(FLAGS))).any()
 

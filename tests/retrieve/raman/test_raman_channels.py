@@ -138,6 +138,25 @@ def test_a_broken_channel_of_water_vapour_concerns_water_vapour_alone(exact, bro
     np.testing.assert_array_equal(product["aerosol_extinction"], exact["aerosol_extinction"])
 
 
+@pytest.mark.parametrize("channel", ["nitrogen", "water"])
+def test_analog_alone_in_a_glued_channel_has_no_scale_for_water_vapour(exact, channel):
+    nitrogen, water = averages(raman_power(RAMAN)), averages(HUMIDITY * raman_power(WATER))
+    # In mV instead of MHz.
+    concerned = nitrogen if channel == "nitrogen" else water
+    scaled = concerned.assign(
+        power=concerned["power"] / 20.0,
+        variance=concerned["variance"] / 400.0,
+        **{f"glue_{end}": ("time", [R[-1] + 1.0]) for end in ("bottom", "top")},
+    )
+    pair = (scaled, water) if channel == "nitrogen" else (nitrogen, scaled)
+    product = retrieved(*pair)
+    assert np.isnan(product["water_vapour_mixing_ratio"]).all()
+    assert np.all(product["quality_flag"] & np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR))
+    for name in ("aerosol_extinction", "aerosol_backscatter"):
+        values = (between(one, name, 300.0, 5000.0) for one in (product, exact))
+        np.testing.assert_allclose(*values, rtol=1e-6, atol=1e-12)
+
+
 def test_lines_of_nitrogen_in_a_narrow_filter_do_not_change_water_vapour():
     width, r = 0.3e-9, np.array([600.0, 10_000.0])
     share = nitrogen_line_share(AIR.at(R)[1], LASER, RAMAN, width)

@@ -8,7 +8,7 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.signal import labeled_gluing
-from lidarops.retrieve.signal.labeled import actual_noise, correct_for_range
+from lidarops.retrieve.signal.labeled import actual_noise, correct_for_range, counts_per_power
 from lidarops.retrieve.signal.labeled_gluing import ChannelLag
 
 DIMS = ("time", "range")
@@ -134,20 +134,174 @@ def test_near_bins_are_analog_and_far_ones_photon_counting():
     )
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        # Too weak for analog, too bright for counting, sky at the limit of counting.
-        lambda: recorded(truth(constant=2e4)),
-        lambda: recorded(truth(sky=60.0)),
-        lambda: recorded(truth(), noise=30.0),
-    ],
-)
-def test_no_gluing_where_no_range_is_linear_in_both(make):
-    result = labeled_gluing.glue(*make())
+def test_no_gluing_where_neither_record_shows_light():
+    result = labeled_gluing.glue(*recorded(truth(constant=2e3)))
     quality = result["quality"].to_numpy()
     assert (quality & int(Quality.NO_GLUING) != 0).all()
     assert np.isnan(result["power"]).all()
+
+
+def lost(record):
+    """Return a record without data."""
+    bits = xr.full_like(record["quality"], int(Quality.INPUT_MISSING))
+    return record.assign(power=xr.full_like(record["power"], np.nan), quality=bits)
+
+
+def weak(record):
+    """Return a record of a few dark counts, or of noise."""
+    rng = np.random.default_rng(3)
+    noise = np.sqrt(record["variance"].to_numpy().min())
+    return record.assign(power=record["power"].copy(data=noise * rng.random(record["power"].shape)))
+
+
+def alone(record, score):
+    """Assert that profiles are those of a record, within their errors where it shows light."""
+    assert (record["quality"].to_numpy() & int(Quality.SINGLE_RECORD) != 0).all()
+    assert (record["quality"].to_numpy() & int(Quality.NO_GLUING) == 0).all()
+    np.testing.assert_array_equal(record["glue_bottom"], record["glue_top"])
+    assert np.isfinite(score).all()
+    assert 0.95 < np.sqrt(np.mean(score**2)) < 1.05
+
+
+@pytest.mark.parametrize(
+    ("sky", "counter"), [(0.2, lost), (0.2, weak), (19.8, None), (25.0, None), (60.0, lost)]
+)
+def test_where_the_counter_cannot_be_used_analog_alone_is_the_signal(sky, counter):
+    rate = truth(sky=sky)
+    analog, photon = recorded(rate, profiles=30)
+    result = labeled_gluing.glue(analog, photon if counter is None else counter(photon))
+    unsaturated = (rate / RATIO + 2.0 < 0.98 * FULL_SCALE) & (distance < 0.9 * distance[-1])
+    # Not scaled, and without its mean in the far range.
+    expected = (rate - rate[-200:].mean()) / RATIO
+    error = np.sqrt(result["variance"].to_numpy())
+    alone(result, ((result["power"] - expected) / error).to_numpy()[:, unsaturated])
+    assert (result["glue_top"] > distance[-1]).all()
+    assert np.isnan(result["glue_slope"]).all()
+    length = result["noise_correlation_length"]
+    np.testing.assert_array_equal(length, analog["noise_correlation_length"])
+    # As of the analog channel by itself, without a count and the dead time of a counter.
+    product = correct_for_range(result, (0.9 * distance[-1], distance[-1]))
+    own = correct_for_range(analog, (0.9 * distance[-1], distance[-1]))
+    for name in ("signal", "signal_standard_error"):
+        np.testing.assert_allclose(
+            product[name][:, unsaturated], own[name][:, unsaturated], rtol=1e-5, atol=1e-2
+        )
+    assert np.isnan(product["background"]).all()
+    assert np.isinf(counts_per_power(with_dead_time(result), np.full(30, SHOTS), glued=True)).all()
+
+
+def with_dead_time(record, error=4e-9):
+    return record.assign(power=record["power"].assign_attrs(dead_time_standard_error=error))
+
+
+def test_each_record_alone_has_the_bit():
+    analog, photon = recorded(truth())
+    for records in ((lost(analog), photon), (analog, lost(photon))):
+        quality = labeled_gluing.glue(*records)["quality"].to_numpy()
+        assert (quality & int(Quality.SINGLE_RECORD) != 0).all()
+    quality = labeled_gluing.glue(analog, photon)["quality"].to_numpy()
+    assert (quality & int(Quality.SINGLE_RECORD) == 0).all()
+
+
+def test_analog_alone_has_no_error_by_the_dead_time():
+    rate = truth(sky=60.0)
+    analog, photon = recorded(rate)
+    glued = labeled_gluing.glue(analog, with_dead_time(photon))
+    error = correct_for_range(glued, (0.9 * distance[-1], distance[-1]))["signal_dead_time_error"]
+    np.testing.assert_allclose(error, 0.0, atol=1.0)
+
+
+@pytest.mark.parametrize("analog_is", [None, lost, weak])
+def test_where_analog_cannot_be_used_photon_counting_alone_is_the_signal(analog_is):
+    rate = truth()
+    analog, photon = recorded(rate, profiles=30, noise=30.0 if analog_is is None else 0.02)
+    photon = with_dead_time(photon)
+    result = labeled_gluing.glue(analog if analog_is is None else analog_is(analog), photon)
+    linear = rate < 20.0
+    error = np.sqrt(result["variance"].to_numpy())
+    alone(result, ((result["power"] - rate) / error).to_numpy()[:, linear])
+    counted = (photon["quality"].to_numpy() & int(Quality.SATURATED)) == 0
+    np.testing.assert_allclose(
+        result["power"].to_numpy()[counted], photon["power"].to_numpy()[counted], rtol=1e-12
+    )
+    assert (result["quality"].to_numpy()[~counted] & int(Quality.SATURATED) != 0).all()
+    assert (result["glue_top"] == 0.0).all()
+    assert (result["noise_correlation_length"] == 1.0).all()
+    np.testing.assert_allclose(
+        result["dead_time_error"].to_numpy()[counted],
+        photon["power"].to_numpy()[counted] ** 2 * 4e-3,
+        rtol=1e-9,
+    )
+
+
+def test_profiles_that_are_compared_have_the_slope_of_those_that_are_glued():
+    lag = ChannelLag(3.0)
+    night, day = recorded(truth(), lag=3.0, profiles=20), recorded(truth(sky=60.0), lag=3.0, seed=1)
+    unknown = labeled_gluing.scene_slope([day], lag)
+    known = labeled_gluing.scene_slope([day, night, day], lag)
+    assert abs(known[0] - RATIO) < 2.0 * known[1] < 0.1 * RATIO
+    # In MHz, or not at all.
+    result = labeled_gluing.glue(*day, lag, known)
+    rate = truth()
+    seen = (distance > 500.0) & (distance < 4000.0)
+    error = np.sqrt(result["variance"].to_numpy())
+    score = ((result["power"] - rate + rate[-200:].mean()) / error).to_numpy()[:, seen]
+    assert np.sqrt(np.mean(score**2)) < 1.3
+    assert (result["quality"].to_numpy() & int(Quality.SINGLE_RECORD) != 0).all()
+    assert (result["glue_slope"] == known[0]).all()
+    nothing = labeled_gluing.glue(*day, lag, unknown)
+    assert (nothing["quality"].to_numpy() & int(Quality.NO_GLUING) != 0).all()
+    assert np.isnan(nothing["power"]).all()
+    # Those with a line of their own are as without it.
+    xr.testing.assert_identical(
+        labeled_gluing.glue(*night, lag, unknown), labeled_gluing.glue(*night, lag)
+    )
+
+
+def test_a_misfit_by_an_unknown_dead_time_leaves_analog_alone():
+    rate = truth()
+    analog, photon = recorded(rate, profiles=400, noise=0.02)
+    mean = [
+        channel(
+            record["power"].mean("time", skipna=False).to_numpy()[np.newaxis],
+            record["variance"].to_numpy()[:1] / 400.0,
+            np.bitwise_or.reduce(record["quality"].to_numpy(), axis=0)[np.newaxis],
+            record["power"].attrs["units"],
+        )
+        for record in (analog, photon)
+    ]
+    mean[1]["power"] = mean[1]["power"] / (1.0 + mean[1]["power"] * DEAD_TIME)
+    for error, bit in ((4e-9, Quality.SINGLE_RECORD), (1e-12, Quality.NO_GLUING)):
+        glued = labeled_gluing.glue(mean[0], with_dead_time(mean[1], error))
+        assert (glued["quality"].to_numpy() & int(bit) != 0).all()
+    assert float(labeled_gluing.glue(mean[0], with_dead_time(mean[1]))["glue_top"][0]) > 1e4
+
+
+def test_bins_that_saturate_in_some_profiles_of_a_mean_give_no_line():
+    """They hold the counts of some of the profiles, the analog record those of all."""
+    sky = np.linspace(2.0, 18.0, 40)
+    rate = truth(sky=0.0) + sky[:, np.newaxis]
+    analog, photon = recorded(rate, profiles=40)
+    saturated = rate > 20.0
+    bits = np.where(saturated.any(axis=0), int(Quality.SATURATED), 0)[np.newaxis]
+    counted = np.where(saturated, np.nan, photon["power"].to_numpy())
+    with np.errstate(invalid="ignore"):
+        mean = np.nansum(counted, axis=0) / np.maximum((~saturated).sum(axis=0), 1)
+    means = (
+        channel(
+            analog["power"].mean("time", skipna=False).to_numpy()[np.newaxis],
+            analog["variance"].to_numpy()[:1] / 40.0,
+            np.bitwise_or.reduce(analog["quality"].to_numpy(), axis=0)[np.newaxis],
+            "mV",
+        ),
+        channel(mean[np.newaxis], photon["variance"].to_numpy().mean(axis=0) / 40.0, bits, "MHz"),
+    )
+    means[1]["power"][:] = mean
+    result = labeled_gluing.glue(*means)
+    assert (result["quality"].to_numpy() & int(Quality.NO_GLUING) == 0).all()
+    slope = float(result["glue_slope"][0])
+    if np.isfinite(slope):
+        assert abs(slope - RATIO) < 4.0 * float(result["glue_slope_standard_error"][0])
 
 
 def test_channels_that_receive_different_light_are_not_glued():
@@ -173,8 +327,11 @@ def test_every_missing_value_has_a_bit_of_its_source_channel():
     result = labeled_gluing.glue(analog, photon)
     power, quality = result["power"].to_numpy(), result["quality"].to_numpy()
     assert (quality[np.isnan(power)] != 0).all()
-    assert (quality[:2] & int(Quality.NO_GLUING) != 0).all()
-    assert np.isnan(power[:2]).all()
+    # One record alone gives them.
+    assert (quality[:2] & int(Quality.SINGLE_RECORD) != 0).all()
+    assert np.isfinite(power[:2, 1000:]).all()
+    assert result["glue_top"].to_numpy()[0] == 0.0
+    assert result["glue_top"].to_numpy()[1] > distance[-1]
     assert (quality[2, -30:] == int(Quality.PILE_UP)).all()
     assert (quality[2, :30] & int(Quality.INCOMPLETE_OVERLAP) != 0).all()
     assert quality[3, 40] == int(Quality.INPUT_MISSING)
@@ -272,11 +429,11 @@ class TestLag:
         assert abs(float(wrong.mean() - right.mean())) > 0.01 * RATIO
 
 
-def test_a_sky_that_saturates_most_bins_of_the_tail_is_not_glued():
+def test_a_sky_that_saturates_most_bins_of_the_tail_leaves_analog_alone():
     analog, photon = recorded(truth())
     tail = distance > 0.9 * distance[-1]
     bits = np.where(tail & (np.arange(distance.size) % 3 > 0), np.int32(Quality.SATURATED), 0)
     photon["quality"] = photon["quality"] | xr.DataArray(bits.astype(np.int32), dims="range")
     glued = labeled_gluing.glue(analog, photon)
-    assert np.isnan(glued["power"].to_numpy()).all()
-    assert ((glued["quality"].to_numpy() & np.int32(Quality.NO_GLUING)) != 0).all()
+    assert ((glued["quality"].to_numpy() & np.int32(Quality.SINGLE_RECORD)) != 0).all()
+    assert (glued["glue_top"] > distance[-1]).all()
