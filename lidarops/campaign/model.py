@@ -290,9 +290,8 @@ class Instrument(SettingsModel):
     )
     header_pointing: Literal["stated", "elevation", "zenith_angle"] = Field(
         default="stated",
-        description="what the angle in headers is that do not state a scan: elevation (of either"
-        " sign), or zenith_angle (negative on the opposite side); stated: a zenith angle, -90"
-        " upwards, and files with another negative one are refused",
+        description="angle in headers that state no scan: elevation, of any sign; zenith_angle,"
+        " negative on the opposite side; stated: the latter, but -90 upwards, others refused",
     )
     position_tolerance: float = quantity(
         0.5,

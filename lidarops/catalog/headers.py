@@ -79,10 +79,6 @@ class _Place:
         eastward = (longitude - self.longitude + 180.0) % 360.0 - 180.0
         return max(abs(latitude - self.latitude), abs(eastward)) <= self.position_tolerance
 
-    def is_as_high(self, altitude: float) -> bool:
-        """Return whether an altitude is that of the station, within the tolerance."""
-        return abs(altitude - self.altitude) <= self.altitude_tolerance
-
 
 @dataclass(frozen=True, slots=True)
 class Headers:
@@ -213,7 +209,7 @@ def _contradictions(
             f" campaign {place.latitude:.1f} N {place.longitude:.1f} E ({remedy})"
         )
     altitude = header.altitude
-    if altitude is not None and not place.is_as_high(altitude):
+    if altitude is not None and abs(altitude - place.altitude) > place.altitude_tolerance:
         remedy = "correct the station, or set header_position: ignore or altitude_tolerance"
         if abs(altitude - 1e3 * place.altitude) <= place.altitude_tolerance:
             remedy = "that of the station looks like km: give m"
@@ -232,13 +228,12 @@ def _overridden(header: RawHeader, facts: _Facts, place: _Place) -> Iterator[str
         ):
             yield f"{name} {given:g} degree of the campaign overrides {stated:g} of the header"
     if header.doubt:
-        given = facts.zenith_angle
-        yield f"zenith_angle {given:g} degree of the campaign overrides the header: {header.doubt}"
+        yield f"zenith_angle {facts.zenith_angle:g} of the facts overrides header: {header.doubt}"
     if place.header_position == "ignore":
         pair, altitude = header.coordinates, header.altitude
         if pair is not None and not (place.is_near(*pair) or place.is_near(*pair[::-1])):
             yield f"header_position: ignore overrides {pair[0]:g}, {pair[1]:g} of the header"
-        if altitude is not None and not place.is_as_high(altitude):
+        if altitude is not None and abs(altitude - place.altitude) > place.altitude_tolerance:
             yield f"header_position: ignore overrides the altitude {altitude:g} m of the header"
 
 

@@ -202,9 +202,7 @@ def _instrument(
         yield f"    header_position: {site.order}  # ? order of {_pair(site.coordinates)}"
     pointing = headers.main.header_pointing
     if pointing != "stated":
-        other = "elevation" if pointing == "zenith_angle" else "zenith_angle"
-        doubts = [doubt for group in groups for doubt in group.doubts]
-        yield f"    header_pointing: {pointing}  # ? or {other}: {doubts[0]}"
+        yield f"    header_pointing: {pointing}  # ? elevation or zenith_angle: headers do not tell"
     yield from _facts(headers, estimates=estimates)
     yield from _products(headers)
 

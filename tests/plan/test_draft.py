@@ -145,13 +145,23 @@ def test_a_scan_whose_headers_do_not_tell_what_its_angles_are_is_a_question(
     assert lidar.facts[0].zenith_angle is None
     assert lidar.header_pointing == pointing
     (line,) = (line for line in text.splitlines() if "header_pointing" in line)
-    assert "# ? or " in line
-    assert "may be an elevation or a zenith angle" in line
+    assert "# ? elevation or zenith_angle" in line
     assert set(lidar.products.requested()) == {"signal", "multiangle"}
     known = granules(campaign)
     assert [granule.zenith_angle for granule in known] == zenith
     assert [granule.azimuth for granule in known] == azimuth
     assert all("header_pointing" in " ".join(granule.notes) for granule in known)
+
+
+def test_doubtful_angles_of_dark_files_alone_do_not_end_the_draft(tmp_path: Path) -> None:
+    for number, angle in enumerate((-90.0, -90.0)):
+        write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle))
+        dark = content(60 + number, zenith_angle=-15.0 - number)
+        write(tmp_path / f"raw/dark/h26{number}", dark)
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert lidar.facts[0].zenith_angle == 0.0
+    assert all(granule.status is Status.GOOD for granule in granules(campaign))
 
 
 def test_a_single_doubtful_angle_among_others_is_refused(tmp_path: Path) -> None:
