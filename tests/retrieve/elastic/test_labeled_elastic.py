@@ -713,7 +713,7 @@ def messy(seed=0):
 
     spoil((0, slice(None)), Quality.INPUT_MISSING)
     spoil((1, slice(0, 40)), Quality.SATURATED)
-    quality[2, :60] |= BITS[Quality.PILE_UP]
+    quality[2, :60] |= BITS[Quality.PILE_UP] | BITS[Quality.SINGLE_RECORD]
     quality[3, :50] |= BITS[Quality.INCOMPLETE_OVERLAP]
     spoil((4, slice(None)), Quality.NO_GLUING)
     spoil((5, slice(300, 310)), Quality.INPUT_MISSING)
