@@ -136,10 +136,8 @@ def test_means_join_no_recorders(archive: RecorderArchive) -> None:
     out = str(archive.folder / "out")
     words = ["aggregate", out, "--means", "month", "--json"]
     made = json.loads(CliRunner().invoke(app, words).output)
-    joined = {
-        (means["path"].split("signal_")[1][:13], means["products"]) for means in made["means"]
-    }
-    assert len(made["means"]) == 3, joined
+    # Each has a file of its own.
+    assert len({means["path"] for means in made["means"]}) == 3
     with pytest.raises(ProductError, match="BT0"):
         lidarops.open_products(out, kind="signal", channel="analog_532o")
     opened = lidarops.open_products(out, kind="signal", channel="analog_532o_2")
