@@ -571,6 +571,20 @@ class UnusableFile:
 
 
 @dataclass(frozen=True, slots=True)
+class LostFiles:
+    """Raw files that products were made from, and that have vanished or cannot be read."""
+
+    instrument: str
+    files: int
+    of: int
+    """Number of raw files that all products were made from."""
+    names: tuple[str, ...]
+    """The first of them."""
+    kept: int
+    """Number of products that are kept as they are; those of few lost files are made again."""
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
     """Where an archive is not what the campaign states, names and requests."""
 
@@ -583,12 +597,14 @@ class Findings:
     unmade: tuple[Unmade, ...] = ()
     idle_facts: tuple[FactsNote, ...] = ()
     incomplete_facts: tuple[FactsNote, ...] = ()
+    lost_files: tuple[LostFiles, ...] = ()
 
     @property
     def failed(self) -> bool:
-        """Whether channels, patterns or headers contradict the campaign, or a file is unusable."""
+        """Whether the archive contradicts the campaign, lost many files, or a file is unusable."""
         return (
             bool(self.idle_patterns or self.unusable_files)
+            or any(lost.kept for lost in self.lost_files)
             or any(request.nowhere for request in self.unmet)
             or any(note.contradicts for note in self.file_notes)
         )

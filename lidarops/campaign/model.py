@@ -30,6 +30,7 @@ from lidarops.campaign.yaml_errors import duplicate_keys, explain_yaml_error
 from lidarops.errors import CampaignError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.settings import (
+    NO_UNIT,
     ChannelProduct,
     Identifier,
     Inside,
@@ -452,6 +453,21 @@ class CampaignPeriod(SettingsModel):
         return self
 
 
+class Acknowledged(SettingsModel):
+    """What is missing and known to be, so that runs go on without it."""
+
+    what: Patterns = Field(
+        min_length=1, description="patterns of raw files below archive, as in files"
+    )
+    reason: str = Field(pattern=r"\S", description="why this is right, in words")
+    until: Instant | None = Field(default=None, description="end of the validity of the entry")
+
+    @property
+    def holds(self) -> bool:
+        """Whether the entry is valid now."""
+        return self.until is None or datetime.now(UTC) < self.until
+
+
 class Campaign(SettingsModel):
     """One campaign: stations, instruments, networks, raw files and requested products."""
 
@@ -473,6 +489,17 @@ class Campaign(SettingsModel):
     scenes: Scenes = Scenes()
     periods: list[CampaignPeriod] = Field(
         default=[], description="periods whose products can be frozen"
+    )
+    vanished_share: float = quantity(
+        0.05,
+        unit=NO_UNIT,
+        ge=0,
+        le=1,
+        description="products are kept as they are if more than one of their raw files and more"
+        " than this share has vanished or cannot be read: of a product, or of all products",
+    )
+    acknowledged: list[Acknowledged] = Field(
+        default=[], description="raw files that may vanish, as where old ones are moved away"
     )
     simulation: SimulationSettings | None = Field(
         default=None, description="what lidarops simulate makes the raw files of"

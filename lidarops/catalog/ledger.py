@@ -33,6 +33,7 @@ from lidarops.catalog.schema import (
 from lidarops.errors import CatalogError
 from lidarops.kinds import kinds
 from lidarops.records import (
+    UNREADABLE,
     Granule,
     InputRecord,
     ProductRecord,
@@ -475,6 +476,47 @@ class Ledger(Granules):
             return list(
                 self.decoded(InputRecord(path, Role(role), sha256) for path, role, sha256 in rows)
             )
+
+    def lost_inputs(self) -> list[tuple[str, str]]:
+        """Return set and path of raw inputs of products that the catalog lacks or could not read.
+
+        Without those whose content is known under another path.
+        """
+        listed = sa.exists().where(
+            GRANULE.c.campaign == self.campaign,
+            GRANULE.c.path == FILE_SET.c.path,
+            GRANULE.c.reason.not_like(f"{UNREADABLE}%"),
+        )
+        query = sa.select(FILE_SET).where(FILE_SET.c.id.in_(self._raw_sets()), ~listed)
+        with self.stream(query) as rows:
+            lost = [(name, path, sha256) for name, path, sha256 in rows]
+        if not lost:
+            return []
+        # In one pass, because digests have no index.
+        query = sa.select(GRANULE.c.sha256).where(GRANULE.c.campaign == self.campaign)
+        with self.stream(query) as rows:
+            moved = {sha256 for _, _, sha256 in lost}.intersection(sha256 for (sha256,) in rows)
+        return [(name, path) for name, path, sha256 in lost if sha256 not in moved]
+
+    def _raw_sets(self) -> sa.Select[tuple[str]]:
+        link = PRODUCT_INPUT.c
+        raw = link.role.in_([Role.SIGNAL.value, Role.DARK.value])
+        return sa.select(link.file_set).where(link.campaign == self.campaign, raw)
+
+    def raw_inputs(self) -> tuple[dict[str, tuple[list[str], int]], int]:
+        """Return the products and the size of each set of raw files, and the number of files."""
+        files, used = FILE_SET.c, FILE_SET.c.id.in_(self._raw_sets())
+        sizes = sa.select(files.id, sa.func.count()).where(used).group_by(files.id)
+        total = sa.select(sa.func.count(sa.distinct(files.path))).where(used)
+        with self.transaction() as connection:
+            sets: dict[str, tuple[list[str], int]] = {
+                name: ([], size) for name, size in connection.execute(sizes)
+            }
+            for name, product in connection.execute(
+                self._raw_sets().add_columns(PRODUCT_INPUT.c.product)
+            ):
+                sets[name][0].append(product)
+            return sets, connection.scalar(total) or 0
 
     @contextmanager
     def all_inputs(self) -> Iterator[Iterator[tuple[str, str, str]]]:

@@ -20,6 +20,7 @@ def findings_document(findings: Findings) -> dict[str, Any]:
         "unusable_files": [asdict(unusable) for unusable in findings.unusable_files],
         "incomplete_facts": [asdict(facts) for facts in findings.incomplete_facts],
         "unused_facts": [asdict(idle) for idle in findings.idle_facts],
+        "lost_files": [asdict(lost) for lost in findings.lost_files],
         "never_made": [asdict(unmade) for unmade in findings.unmade],
     }
 

@@ -122,7 +122,7 @@ def _plan(
             _show_all(judged, needs, plan=not stale)
         else:
             show_scene(judged, needs, plan=not stale)
-        _show_frozen(judged)
+        _show_kept(judged)
     no_scene = not count and selects_no_scene(settings, selection)
     if as_json:
         no_scene_found = {"no_scene_selected": no_scene}
@@ -232,21 +232,24 @@ def _show_stale(title: str, judged: Judgement) -> None:
     show_rows(f"{title}: to be made", ("product", "channels", "reason"), rows)
 
 
-def _show_frozen(judged: Judgement) -> None:
-    rows = ((product.kind, product.channel, product.reason) for product in judged.frozen)
-    title = f"{judged.scene.id}: frozen, would be replaced with --thaw"
-    show_rows(title, ("product", "channel", "reason"), rows)
+def _show_kept(judged: Judgement) -> None:
+    for title, products in (
+        ("frozen, would be replaced with --thaw", judged.frozen),
+        ("kept, because raw files are lost", judged.kept),
+    ):
+        rows = ((product.kind, product.channel, product.reason) for product in products)
+        show_rows(f"{judged.scene.id}: {title}", ("product", "channel", "reason"), rows)
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
     from lidarops.steps.reading import idle_window
 
-    stale, frozen = (
+    stale, frozen, kept = (
         [
             {"kind": product.kind, "channel": product.channel, "reason": product.reason}
             for product in products
         ]
-        for products in (judged.stale, judged.frozen)
+        for products in (judged.stale, judged.frozen, judged.kept)
     )
     plan = judged.requested
     idle = [idle_window(step, plan.steps) for step in plan.steps]
@@ -260,6 +263,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         "steps": steps,
         "stale": stale,
         "frozen": frozen,
+        "kept": kept,
         "fresh": judged.fresh,
         "failure": asdict(judged.failure) if judged.failure else None,
         "held": judged.held,

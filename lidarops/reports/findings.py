@@ -70,6 +70,18 @@ def lacking(unmet: Unmet) -> str:
 
 
 def _rows(findings: Findings) -> Iterator[FindingRow]:
+    for lost in findings.lost_files:
+        fate = "products are made again of the files that are left"
+        if lost.kept:
+            fate = (
+                f"{counted(lost.kept, 'product')} that they belong to stay as they are: bring the"
+                " files back, or name them under acknowledged in the campaign file"
+            )
+        more = lost.files - len(lost.names)
+        names = ", ".join(lost.names) + (f" and {more:,} more" if more else "")
+        problem = f"have vanished or cannot be read, though products were made from them; {fate}"
+        subject = f"{lost.files:,} of {counted(lost.of, 'raw file')}: {names}"
+        yield FindingRow(lost.instrument, subject, problem, fails=bool(lost.kept))
     for idle in findings.idle_patterns:
         near = f"; unclaimed files with similar names: {', '.join(idle.near)}" if idle.near else ""
         problem = f"matches no file of the archive{near}"

@@ -18,7 +18,7 @@ FILE_NAME: Final = "run.json"
 INDEX: Final = "index.html"
 """Name of the page beside it."""
 _FORMAT: Final = "lidarops run record"
-_VERSION: Final = 5
+_VERSION: Final = 6
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
 
 

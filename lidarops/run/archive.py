@@ -22,7 +22,7 @@ from lidarops.catalog.ledger import RunStatus, Verdict
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.errors import LidarOpsError
 from lidarops.plan.outlying_headers import joined_notes
 from lidarops.process.job import Job
 from lidarops.records import FileNote, Findings, Granule, RunRecord
@@ -186,7 +186,7 @@ def assess(
         days = _days_to_judge(judge, store, selection, force=everything)
         for batch in judge.batches(days):
             for judged in judge.days(batch).judgements:
-                if everything or judged.due or judged.held or judged.frozen:
+                if everything or judged.due or judged.held or judged.frozen or judged.kept:
                     yield judge.explained(judged)
 
 
@@ -334,7 +334,14 @@ class _Pass:
             self._settle(signatures)
         self._clear_up()
         orphans = {orphan.path for orphan in self.gathered.orphans}
-        findings = find(self.judge, self.store, self.selection, summary.idle_patterns, orphans)
+        findings = find(
+            self.judge,
+            self.store,
+            self.selection,
+            summary.idle_patterns,
+            orphans,
+            settled=not days,
+        )
         gathered = self.gathered
         file_notes = (*findings.file_notes, *joined_notes(gathered.file_notes))
         findings = replace(findings, file_notes=file_notes)
@@ -641,7 +648,7 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
     """Remove products that the campaign no longer requests: files and ledger rows.
 
     Products stay if another run has made them again since, or if the campaign still requests them
-    although the present files of their scene do not allow them.
+    although the present files of their scene do not allow them, or many raw files are lost.
 
     Parameters
     ----------
@@ -659,7 +666,7 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
     Raises
     ------
     CatalogError
-        If the archive holds no file at all (is it mounted?), or another run holds the catalog.
+        If another run holds the catalog.
     """
     # A requested product is kept, unless its file was removed by hand.
     removable = [
@@ -669,13 +676,6 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
     ]
     if not removable:
         return 0
-    if not result.summary.files:
-        raise CatalogError(
-            f"holds no raw file, so that {len(removable)} products would be removed",
-            file=campaign.archive,
-            field="archive",
-            remedy="check that it is mounted; if it is to be empty, remove the products by hand",
-        )
     removed = 0
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         lock.acquire()

@@ -9,6 +9,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan import availability
 from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, Unmet, UnusableFile
+from lidarops.run.lost_files import Lost
 from lidarops.run.selection import Selection, station_of
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.steps import dependence
@@ -28,6 +29,8 @@ def find(
     selection: Selection,
     idle_patterns: Iterable[IdlePattern],
     orphans: Collection[str] = (),
+    *,
+    settled: bool = False,
 ) -> Findings:
     """Return the findings on the selected instruments and networks.
 
@@ -42,6 +45,8 @@ def find(
         Of the scan.
     orphans : collection of str
         Paths of products that would not be made again.
+    settled : bool
+        Whether no day was judged, so that no raw file is lost but those that are acknowledged.
     """
     campaign = judge.campaign
     owners = [
@@ -51,6 +56,7 @@ def find(
     ]
     instruments = {member for name in owners for member in _members(campaign, name)}
     exchanged = availability.exchanged_recorders(judge.names.holdings)
+    lost = Lost() if settled and not campaign.acknowledged else judge.lost
     return Findings(
         unmet=_unmet(judge, selection, instruments),
         file_notes=(*store.file_notes(instruments), *judge.names.notes(instruments)),
@@ -61,7 +67,8 @@ def find(
             *_incomplete_facts(campaign, store, sorted(instruments)),
             *(note for note in exchanged if note.instrument in instruments),
         ),
-        idle_facts=tuple(_idle_facts(campaign, store, sorted(instruments))),
+        idle_facts=(*_idle_facts(campaign, store, sorted(instruments)), *lost.idle),
+        lost_files=tuple(found for found in lost.findings if found.instrument in instruments),
     )
 
 

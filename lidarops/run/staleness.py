@@ -50,6 +50,7 @@ from lidarops.records import (
 )
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
+from lidarops.run.lost_files import Lost, find_lost
 from lidarops.run.selection import Selection, requested_kinds
 from lidarops.steps import dependence
 from lidarops.steps.dependence import OPERATION, ProductKey, ancillary_files
@@ -111,6 +112,8 @@ class Judgement:
     fresh: int = 0
     frozen: tuple[Stale, ...] = ()
     """Products of a frozen period that would be replaced."""
+    kept: tuple[Stale, ...] = ()
+    """Products that would be replaced, but for the raw files that are lost."""
     key: str = ""
     """Digest of everything that may change the outcome."""
     failure: Failure | None = None
@@ -254,6 +257,7 @@ class Judge:
         return dependence.digest(
             [
                 {key: value for key, value in settings.items() if key not in OPERATION},
+                [entry.what for entry in self.campaign.acknowledged if entry.holds],
                 joint_code_version(requested_kinds(self.campaign), *_PLANNING),
                 sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
             ]
@@ -316,10 +320,15 @@ class Judge:
             planned, made.values(), self.campaign, self._other_files, fates.of
         )
         unplanned = {judged.scene.id for judged in judgements if not judged.planned}
-        orphans = [orphan for orphan in orphans if orphan[0].scene not in unplanned]
+        orphans = [
+            (product, self._kept_orphan(orphan))
+            for product, orphan in orphans
+            # What the archive lost on purpose is no finding.
+            if product.scene not in unplanned and not (orphan.lost and self._is_excused(product))
+        ]
         unsettled = {product.day for product, _ in orphans}
-        # A frozen product is reported by every run.
-        unsettled |= {judged.day for judged in judgements if judged.frozen}
+        # A product that is not replaced is reported by every run.
+        unsettled |= {judged.day for judged in judgements if judged.frozen or judged.kept}
         # The signature of a day does not hold all that may end an internal error.
         unsettled |= {
             judged.day
@@ -334,6 +343,15 @@ class Judge:
             for scene, last_try in tried.items()
             if last_try.day in judged_days and scene not in present
         }
+        orphans += [
+            (
+                stale.before,
+                Orphan(stale.before.path, stale.reason, stale.before.run, requested=True),
+            )
+            for judged in judgements
+            for stale in judged.kept
+            if stale.before
+        ]
         return DaysJudged(
             judgements=tuple(judged for judged in judgements if judged.scene.id in selected),
             orphans=tuple(
@@ -357,6 +375,19 @@ class Judge:
             touched=touched,
             digests=digests,
         )
+
+    @cached_property
+    def lost(self) -> Lost:
+        """The raw files of products that are lost, when first asked for."""
+        return find_lost(self.campaign, self._store)
+
+    def _is_excused(self, made: RecordedProduct) -> bool:
+        return made.path in self.lost.excused - self.lost.protected
+
+    def _kept_orphan(self, orphan: Orphan) -> Orphan:
+        """Return an orphan that is not removed if its raw files may come back."""
+        stays = orphan.path in self.lost.protected and self.lost.many
+        return replace(orphan, requested=True, lost=False) if stays else orphan
 
     def _healed(self, judged: Judgement, tried: Mapping[str, LastTry]) -> bool:
         """Return whether a failed scene is complete again, e.g. because a file came back."""
@@ -449,6 +480,7 @@ class Judge:
         judged = replace(self.judgement(scene, whole), ancillaries=self._ancillary_records(planned))
         stale: list[Stale] = []
         frozen: list[Stale] = []
+        kept: list[Stale] = []
         requested = dependence.plan_of_kinds(whole, self._selection.kinds)
         products = dependence.planned_products(requested)
         for kind, channel in products:
@@ -456,7 +488,9 @@ class Judge:
             reason, restored = self._reason(judged, (kind, channel), known, touched)
             if reason:
                 one = Stale(kind, channel, reason, known, restored)
-                if self._stays_frozen(scene, one):
+                if known and known.path in self.lost.protected:
+                    kept.append(one)
+                elif self._stays_frozen(scene, one):
                     frozen.append(self._with_remedy(one))
                 else:
                     stale.append(one)
@@ -465,7 +499,8 @@ class Judge:
             requested=requested,
             stale=tuple(stale),
             frozen=tuple(frozen),
-            fresh=len(products) - len(stale) - len(frozen),
+            kept=tuple(kept),
+            fresh=len(products) - len(stale) - len(frozen) - len(kept),
         )
 
     def _stays_frozen(self, scene: Scene, stale: Stale) -> bool:
@@ -537,11 +572,11 @@ class Judge:
 
         Reads the products of which some did, which takes a few ms each.
         """
-        stale, frozen = (
+        stale, frozen, kept = (
             tuple(self._explained(judged, product) for product in products)
-            for products in (judged.stale, judged.frozen)
+            for products in (judged.stale, judged.frozen, judged.kept)
         )
-        return replace(judged, stale=stale, frozen=frozen)
+        return replace(judged, stale=stale, frozen=frozen, kept=kept)
 
     def _explained(self, judged: Judgement, stale: Stale) -> Stale:
         scene, product, made = judged.scene, (stale.kind, stale.channel), stale.before

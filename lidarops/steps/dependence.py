@@ -42,8 +42,9 @@ ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
 OPERATION: Final = frozenset(
-    {"archive", "output", "catalog", "superseded", "simulation", "periods"}
-)
+    {"archive", "output", "catalog", "superseded", "simulation", "periods", "vanished_share",
+     "acknowledged"}
+)  # fmt: skip
 """Settings of a campaign that change neither the scenes nor the content of a product."""
 _OF_CAMPAIGN: Final = OPERATION | {"all_steps", "scenes", "stations", "instruments", "networks"}
 _OF_INSTRUMENT: Final = frozenset(

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -58,6 +59,7 @@ _DRIVER_ERRORS: Final = (
     ("aiohttp", "ClientError"),
     ("botocore.exceptions", "BotoCoreError"),
     ("botocore.exceptions", "ClientError"),
+    ("botocore.parsers", "ResponseParserError"),
     ("google.auth.exceptions", "GoogleAuthError"),
     ("gcsfs.retry", "HttpError"),
     ("ftplib", "Error"),
@@ -159,6 +161,8 @@ class RemoteStore:
                 wrong_use=isinstance(error, ValueError),
             ) from error
         self._prefix = prefix.rstrip("/")
+        if self._scheme in _READ_ONLY:
+            self._fs.client_kwargs = {**self._fs.client_kwargs, "response_class": _whole_page()}
 
     def files(self, is_used: Callable[[str], bool] = lambda _: True) -> Iterator[Stored]:
         """List all objects below the URL, sorted by path.
@@ -219,20 +223,34 @@ class RemoteStore:
         return name.removeprefix(self._prefix).removeprefix("/")
 
     def _find(self) -> dict[str, Any]:
-        # By default, drivers that walk through folders skip what they cannot list.
-        strict = {} if self._scheme in _ATOMIC else {"on_error": "raise"}
         try:
-            listing: dict[str, Any] = self._fs.find(self._prefix, detail=True, **strict)
-        except RecursionError as error:
+            listing: dict[str, Any] = (
+                self._fs.find(self._prefix, detail=True)
+                if self._scheme in _ATOMIC
+                else dict(self._walk(self._prefix))
+            )
+        except KeyError as error:
             raise CatalogError(
-                "cannot be listed: the index of a folder lists the folder itself",
+                "cannot be listed: a page says that more follow, and not where",
                 file=self.url,
-                remedy="take the link out of the index",
+                remedy="try again, or ask who runs the store",
             ) from error
         if not listing:
             # Raises an error if the place does not exist.
             self._fs.ls(self._prefix, detail=False)
         return listing
+
+    def _walk(self, folder: str) -> Iterator[tuple[str, Any]]:
+        """Yield the files below a folder; `find` would leave out folders that cannot be listed."""
+        for info in self._fs.ls(folder, detail=True):
+            inner = info["name"].rstrip("/")
+            is_folder = info["type"] == "directory"
+            if is_folder and inner == folder:
+                continue
+            if is_folder and is_confined(self._path(inner)):
+                yield from self._walk(inner)
+            else:
+                yield info["name"], info
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file.
@@ -425,6 +443,22 @@ class RemoteStore:
                 file=self.url,
                 remedy="check address, network and keys",
             ) from error
+
+
+@cache
+def _whole_page() -> type:
+    """Return the class of answers of a web server that raise an error for a page that is cut."""
+    import aiohttp  # noqa: PLC0415 - the driver of http and https, which may be missing
+
+    class WholePage(aiohttp.ClientResponse):
+        async def text(self, encoding: str | None = None, errors: str = "strict") -> str:
+            page = await super().text(encoding, errors)
+            unclosed = re.search("<html", page, re.I) and not re.search("</html", page, re.I)
+            if unclosed or page.rfind("<") > page.rfind(">"):
+                raise aiohttp.ClientPayloadError(f"the index {self.url} ends before its end")
+            return page
+
+    return WholePage
 
 
 @contextmanager

@@ -85,7 +85,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
         ("station: coast", "station: cost", "known stations: coast"),
         ('files: "h*"', 'files: "../h*"', "must be a relative path"),
         ('files: "h*"', 'files: "/h*"', "must be a relative path"),
-        ("archive: raw", "archve: raw", "line 3: archve: .* keys here are archive, all_steps, "),
+        ("archive: raw", "archve: raw", "line 3: archve: .* keys here are archive, acknowledged, "),
         (
             "station: coast",
             "products: {elastik: {}}",

@@ -87,12 +87,11 @@ def lidarops(*arguments: str) -> None:
 
 def harbour() -> str:
     """Return the campaign file of the page on campaigns."""
-    (text,) = [
+    return next(
         block.text
         for block in OURS
         if block.page == "docs/howto/campaign.md" and block.language == "yaml"
-    ]
-    return text
+    )
 
 
 @pytest.fixture(scope="module")

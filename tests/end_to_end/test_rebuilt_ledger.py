@@ -109,6 +109,7 @@ def test_products_whose_raw_files_are_gone_are_known(archive: Archive) -> None:
         file.unlink()
     shown = CliRunner().invoke(app, ["catalog", str(archive.file), "--rebuild", "--json"])
     assert json.loads(shown.stdout)["rebuilt"]["without_scene"] == 2
+    archive.tree["vanished_share"] = 1
     result = bring_up_to_date(archive.write())
     assert {Path(path).name for path in result.lost} == {
         f"coast_poor_signal_{channel}_20260302T000000.nc"

@@ -37,6 +37,7 @@ from lidarops.records import (
     Findings,
     IdlePattern,
     LeftOut,
+    LostFiles,
     Plan,
     PlannedStep,
     ProductRecord,
@@ -531,6 +532,7 @@ def nasty_run(nasty: str, archive):
             idle_patterns=(IdlePattern(nasty, nasty, nasty, (nasty,)),),
             unusable_files=(UnusableFile(nasty, nasty, nasty, nasty),),
             unmade=(Unmade(nasty, nasty, nasty, nasty),),
+            lost_files=(LostFiles(nasty, 5, 9, (nasty, nasty), 2),),
         ),
     )  # fmt: skip
 

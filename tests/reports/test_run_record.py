@@ -24,6 +24,7 @@ from lidarops.records import (
     IdlePattern,
     InputRecord,
     LeftOut,
+    LostFiles,
     Plan,
     PlannedStep,
     ProductRecord,
@@ -125,6 +126,7 @@ findings = st.builds(
     idle_patterns=some(st.builds(IdlePattern, text, text, text, some(text))),
     unusable_files=some(st.builds(UnusableFile, text, text, text, text)),
     unmade=some(st.builds(Unmade, text, text, text, text)),
+    lost_files=some(st.builds(LostFiles, text, whole, whole, some(text), whole)),
 )
 records = st.builds(
     RunRecord,

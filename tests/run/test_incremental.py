@@ -207,6 +207,7 @@ def test_products_of_vanished_inputs_are_listed_and_kept_until_removal_is_reques
 ) -> None:
     for path in (archive.folder / "raw/poor").glob("h1*"):
         path.unlink()
+    archive.tree["vanished_share"] = 1
     campaign = archive.write()
     before = archive.contents("out/products")
     for _ in range(2):

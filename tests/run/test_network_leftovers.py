@@ -181,6 +181,8 @@ def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
     net.raw("other/h0", 9)
     assert reprocess(net.write())
     net.lose(*PLACES)
+    net.tree["vanished_share"] = 1
+    net.write()
     _, summary = net.command("--remove-orphans")
     assert list(summary["orphans"].values()) == ["no raw file of its scene is left"]
     assert (summary["kept_products"], summary["removed"]) == ({}, 1)

@@ -221,14 +221,17 @@ def test_a_file_that_no_instrument_claims_may_fail(
         assert scan_archive(campaign, store).files == 2
 
 
-def test_an_index_that_lists_its_own_folder_is_refused(campaign: Campaign, tmp_path: Path) -> None:
-    (tmp_path / "raw" / "index.html").write_text('<a href="./">x</a><a href="coast/h0">y</a>')
+def test_an_index_that_lists_its_own_folder_costs_no_file(
+    campaign: Campaign, tmp_path: Path
+) -> None:
+    (tmp_path / "raw" / "index.html").write_text(
+        '<a href="./">x</a><a href="/">z</a><a href="coast/h0">y</a>'
+    )
     everything = _campaign_of_everything(campaign, campaign.archive)
-    with (
-        Store(campaign.catalog_url, campaign.name) as store,
-        pytest.raises(CatalogError, match="lists the folder itself"),
-    ):
+    with Store(campaign.catalog_url, campaign.name) as store:
         scan_archive(everything, store)
+        granules = {granule.path: granule.status for granule in store.granules()}
+    assert granules == {"coast/h0": Status.GOOD, "./": Status.REFUSED}
 
 
 @pytest.fixture(params=["http", "s3", "memory", "file"])

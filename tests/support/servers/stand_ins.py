@@ -36,6 +36,10 @@ class StandIn:
     """What becomes of a page of a listing on its way."""
     page: int = 1000
     """Objects in a page of a listing of S3."""
+    promises_more: bool = False
+    """Whether the last page of S3 says that more follow."""
+    ends_after: int = 1000
+    """Pages of S3 that are sent; the last one of them says that no other follows."""
     states_length: bool = False
     """Whether an answer states its length, also where it is cut."""
 
@@ -104,6 +108,7 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
         prefix, first = query.get("prefix", ""), int(query.get("continuation-token", "0"))
         names = [name for name in self._stand_in.names() if name.startswith(prefix)]
         last = first + self._stand_in.page
+        names = names[: self._stand_in.ends_after * self._stand_in.page]
         rows = []
         for name in names[first:last]:
             status = (self._stand_in.folder / name).stat()
@@ -111,8 +116,9 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
                 f"<Contents><Key>{escape(name)}</Key><Size>{status.st_size}</Size>"
                 f"<ETag>&quot;{status.st_mtime_ns}&quot;</ETag></Contents>"
             )
-        more = last < len(names)
-        token = f"<NextContinuationToken>{last}</NextContinuationToken>" if more else ""
+        more = last < len(names) or self._stand_in.promises_more
+        token = f"<NextContinuationToken>{last}</NextContinuationToken>"
+        token = token if last < len(names) else ""
         return (
             '<?xml version="1.0" encoding="UTF-8"?>'
             '<ListBucketResult xmlns="http://s3.amazonaws.com/doc/2006-03-01/">'

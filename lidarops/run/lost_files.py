@@ -1,0 +1,98 @@
+"""Raw files that products were made from, and that the archive no longer gives.
+
+A product is not replaced by one of fewer files where more than a few are lost: the listing may be
+incomplete, or a disk not mounted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from lidarops.campaign.model import Campaign
+from lidarops.catalog.sources import path_pattern
+from lidarops.catalog.store import Store
+from lidarops.records import FactsNote, LostFiles
+
+_NAMES_SHOWN: Final = 3
+_IDLE: Final = "matches no raw file that has vanished: take the entry out, or correct it"
+_OVER: Final = "has expired: its files count as lost again; take the entry out, or set until later"
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The lost raw files of a campaign."""
+
+    findings: tuple[LostFiles, ...] = ()
+    """What a report says of those that the campaign does not acknowledge, by instrument."""
+    protected: frozenset[str] = frozenset()
+    """Products that are not replaced."""
+    many: bool = False
+    """Whether more than a few of all files are lost, so that nothing is removed either."""
+    excused: frozenset[str] = frozenset()
+    """Products of which the campaign acknowledges lost files."""
+    idle: tuple[FactsNote, ...] = ()
+    """Entries of `acknowledged` that match no lost file, or have expired."""
+
+
+def find_lost(campaign: Campaign, store: Store) -> Lost:
+    """Return the raw files that products were made from and the archive does not give.
+
+    Files whose content is found under another path, and those that no instrument of the campaign
+    claims any more, are not lost.
+    """
+    claims = {
+        name: _matcher((*instrument.files, *instrument.dark_files))
+        for name, instrument in campaign.instruments.items()
+    }
+    inputs = store.lost_inputs()
+    owners = {path: name for _, path in inputs for name, has in claims.items() if has(path)}
+    known: set[str] = set()
+    idle = []
+    for entry in campaign.acknowledged:
+        matched = set(filter(_matcher(entry.what), owners)) if entry.holds else set()
+        known |= matched
+        if not matched:
+            reason = _IDLE if entry.holds else _OVER
+            idle.append(FactsNote("all", f"acknowledged: {', '.join(entry.what)}", reason))
+    if not owners:
+        return Lost(idle=tuple(idle))
+    sets, total = store.raw_inputs()
+    size, lost = Counter[str](), Counter[str]()
+    excused, products_of = set[str](), defaultdict[str, set[str]](set)
+    for products, files in sets.values():
+        size.update(dict.fromkeys(products, files))
+    for name, path in inputs:
+        products, _ = sets[name]
+        if path in known:
+            excused.update(products)
+        elif path in owners:
+            lost.update(products)
+            products_of[owners[path]].update(products)
+    unknown = sorted(owners.keys() - known)
+    total -= len(known)
+
+    def too_many(files: int, of: int) -> bool:
+        return files > 1 and files > campaign.vanished_share * of
+
+    many = too_many(len(unknown), total)
+    protected = frozenset(
+        product
+        for product, files in lost.items()
+        # Of a product without any file left, no other is made.
+        if many or (files < size[product] and too_many(files, size[product]))
+    )
+    findings = []
+    for owner, products_with in sorted(products_of.items()):
+        paths = tuple(path for path in unknown if owners[path] == owner)
+        kept = len(products_with & protected)
+        findings.append(LostFiles(owner, len(paths), total, paths[:_NAMES_SHOWN], kept))
+    return Lost(tuple(findings), protected, many, frozenset(excused), tuple(idle))
+
+
+def _matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
+    """Return a function that tells whether a path matches one of some patterns."""
+    expressions = [path_pattern(pattern) for pattern in patterns]
+    return lambda path: any(expression.match(path) for expression in expressions)
