@@ -110,6 +110,14 @@ class ChannelFacts(SettingsModel):
         allow_inf_nan=False,
         description="analog noise variance of one profile",
     )
+    baseline_uncertainty: float | None = quantity(
+        None,
+        unit="mV",
+        ge=0,
+        le=10,
+        description="standard error of the analog baseline; if none, as dark files or blocked"
+        " beams show it, or 0.01 mV and 0.075 % of the largest voltage",
+    )
     lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = quantity(
         None,
         unit="1",

@@ -342,6 +342,9 @@ class NoiseSettings(SettingsModel):
     noise_variance: float | None = quantity(
         None, unit="mV2", description="with the method ``given``"
     )
+    baseline_uncertainty: float | None = quantity(
+        None, unit="mV", description="of an analog channel, where the campaign gives it"
+    )
 
 
 class Noise(Step[ChannelCase, NoiseSettings]):
@@ -355,17 +358,20 @@ class Noise(Step[ChannelCase, NoiseSettings]):
     def decide(self, case: ChannelCase) -> Decisions:
         """Run always: the noise is Poisson, given, or estimated."""
         variance = case.facts_of_channel.noise_variance
+        baseline = case.facts_of_channel.baseline_uncertainty
         if case.channel.mode is DetectionMode.PHOTON:
             reason = "photon counts are Poisson distributed"
             yield Run(reason, NoiseSettings(method="poisson"))
         elif variance is not None:
-            settings = NoiseSettings(method="given", noise_variance=variance)
+            settings = NoiseSettings(
+                method="given", noise_variance=variance, baseline_uncertainty=baseline
+            )
             yield Run("given by the campaign", settings, number=variance)
         else:
             reason = (
                 "the campaign gives no noise_variance; estimated from third differences over range"
             )
-            yield Run(reason, NoiseSettings(method="differences"))
+            yield Run(reason, NoiseSettings(method="differences", baseline_uncertainty=baseline))
 
     def carry_out(self, settings: NoiseSettings, data: Data) -> None:
         """Give the profiles of the channel."""
@@ -380,6 +386,7 @@ class Noise(Step[ChannelCase, NoiseSettings]):
                 if uncertainty is None
                 else uncertainty,
                 "noise_variance": settings.noise_variance,
+                "baseline_uncertainty": settings.baseline_uncertainty,
                 "dark": data.get(DARK),
                 "range_offset": data.get(RANGE_OFFSET) or 0.0,
                 "full_overlap_range": data.get(FULL_OVERLAP_RANGE) or 0.0,

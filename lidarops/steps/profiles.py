@@ -26,6 +26,7 @@ class Conditioning(TypedDict):
     dead_time: float | None
     dead_time_uncertainty: float
     noise_variance: float | None
+    baseline_uncertainty: float | None
     dark: DarkSignals | None
     range_offset: float
     full_overlap_range: float

@@ -14,7 +14,9 @@ from lidarops.kinds import flags_of
 
 Floats = NDArray[np.float64]
 
-CAUSES: Final = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
+CAUSES: Final = (
+    "noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline",
+)  # fmt: skip
 """Causes of backscatter errors, as in the names of variables."""
 
 _ALONG_TIME: Final = ("time", "reference_bottom", "reference_top")

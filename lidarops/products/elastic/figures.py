@@ -35,6 +35,7 @@ _CAUSES: Final = {
     "lidar_ratio": "lidar ratio",
     "molecular": "molecules",
     "dead_time": "dead time",
+    "baseline": "baseline",
 }
 _UNIT: Final = "Mm⁻¹ sr⁻¹"
 _MEGA: Final = 1e6

@@ -70,6 +70,11 @@ _BUDGET: Final = {
         ErrorKind.SYSTEMATIC,
         "Systematic: from the dead time of photon counting; 0 for analog signals.",
     ),
+    "baseline": (
+        "the baseline",
+        ErrorKind.SYSTEMATIC,
+        "Systematic: from the baseline of analog signals; 0 for photon counting.",
+    ),
 }
 """Source of error -> its name in texts, its kind and a comment, in the order of
 `lidarops.retrieve.elastic.inversion.ErrorBudget`."""

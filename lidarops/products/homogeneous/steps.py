@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -29,7 +30,12 @@ from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, channel_unit, counts_per_power
+from lidarops.retrieve.signal.labeled import (
+    CORRELATION_LENGTH,
+    baseline_error,
+    channel_unit,
+    counts_per_power,
+)
 from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
 from lidarops.steps.case import ProductCase
 from lidarops.steps.conditioning import OVERLAP, PROFILES, RELATIVE_VARIANCE
@@ -383,8 +389,8 @@ class _Sections(WholeProduct):
         estimated = self._data[RELATIVE_VARIANCE]
         counts = None if estimated else counts_per_power(conditioned, shots, glued=True)
         far = self._settings.background_range
-        return labeled.fit_homogeneous_path(
-            conditioned["power"],
+        fit = partial(
+            labeled.fit_homogeneous_path,
             sections=self._kept,
             background_range=far,
             background=self._settings.background,
@@ -397,6 +403,14 @@ class _Sections(WholeProduct):
             noise_correlation_length=conditioned[CORRELATION_LENGTH],
             exposure=None if counts is None else xr.DataArray(counts, dims="time"),
         )
+        fitted = fit(conditioned["power"])
+        error = baseline_error(conditioned, decaying=True)
+        if error is None:
+            return fitted
+        power = conditioned["power"]
+        moved = fit((power + error).assign_attrs(power.attrs))
+        name = "total_extinction"
+        return fitted.assign({f"{name}_baseline_error": np.abs(moved[name] - fitted[name])})
 
     def _joined(self) -> xr.Dataset:
         joined: xr.Dataset = xr.concat(
@@ -435,10 +449,14 @@ def _in_order(
 
 
 def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:
+    systematic = sections["total_extinction_model_error"]
+    if "total_extinction_baseline_error" in sections:
+        of_baseline = sections["total_extinction_baseline_error"].fillna(0.0)
+        systematic = (systematic**2 + of_baseline**2) ** 0.5
     visibility = labeled_visibility.visibility_of_extinction(
         sections["total_extinction"],
         sections["total_extinction_standard_error"],
-        sections["total_extinction_model_error"],
+        systematic,
         definition,
     )
     return sections.assign(visibility.data_vars).assign_attrs(steps=definition.words)

@@ -96,6 +96,19 @@ LAYOUT: Final = Layout(
             f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED}"
             f" {by_class('extinction', _DEPARTURES)}. {NO_STANDARD_NAME}",
         ),
+        Row(
+            name="total_extinction_baseline_error",
+            dims=_SECTIONS,
+            dtype="f4",
+            units="m-1",
+            long_name="change of extinction with one standard error of the analog baseline",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            optional=True,
+            error_kind=ErrorKind.SYSTEMATIC,
+            comment="Separate from the other errors. Of analog and glued channels, for a baseline"
+            f" that decays with range. {NO_STANDARD_NAME}",
+        ),
         *visibility_rows(
             _SECTIONS, place="along the section", ancillaries=_OF_EXTINCTION, optional=True
         ),

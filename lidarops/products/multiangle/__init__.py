@@ -16,7 +16,10 @@ KIND: Final = Kind(
     common=CommonQuantity(
         "vertical_optical_depth",
         "altitude",
-        errors_of_channel=("vertical_optical_depth_dead_time_error",),
+        errors_of_channel=(
+            "vertical_optical_depth_dead_time_error",
+            "vertical_optical_depth_baseline_error",
+        ),
         errors_of_air=("vertical_optical_depth_gradient_error",),
     ),
 )

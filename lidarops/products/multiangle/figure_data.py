@@ -28,11 +28,13 @@ _ALONG_BOTH: Final = (
     *(f"{name}{error}" for name in QUANTITIES for error in _ERRORS),
     "quality_flag",
 )
-_OF_DEAD_TIME: Final = tuple(f"{name}_dead_time_error" for name in QUANTITIES)
+_OF_CHANNEL: Final = tuple(
+    f"{name}_{cause}_error" for name in QUANTITIES for cause in ("dead_time", "baseline")
+)
 """Optional variables."""
 _PROFILES: Final = ("time", "altitude", "reach", *_ALONG_BOTH)
 CYCLE_VARIABLES: Final = (
-    *_PROFILES, *_OF_DEAD_TIME, "time_bnds", "station_altitude", "wavelength"
+    *_PROFILES, *_OF_CHANNEL, "time_bnds", "station_altitude", "wavelength"
 )  # fmt: skip
 """Variables that `clearest_cycle` reads."""
 EXTINCTION_VARIABLES: Final = (*_PROFILES, TIME_BOUNDS)
@@ -76,6 +78,7 @@ class ProfileEstimate:
     standard_error: Floats
     """Of noise and smoothing."""
     dead_time_error: Floats
+    baseline_error: Floats
     """Standard error from the dead time; NaN where the product has none."""
     gradient_error: Floats
     """Largest systematic error from a horizontal gradient."""
@@ -208,7 +211,7 @@ def _estimate(cycle: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileE
 
     def kept(suffix: str) -> Floats:
         variable = f"{name}_{suffix}"
-        if variable in _OF_DEAD_TIME and variable not in cycle.variables:
+        if variable in _OF_CHANNEL and variable not in cycle.variables:
             return np.full(value.shape, np.nan)
         return np.where(rejected, np.nan, cycle[variable].values.astype(np.float64))
 
@@ -217,6 +220,7 @@ def _estimate(cycle: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileE
         rejected=np.where(rejected, value, np.nan),
         standard_error=kept("standard_error"),
         dead_time_error=kept("dead_time_error"),
+        baseline_error=kept("baseline_error"),
         gradient_error=kept("gradient_error"),
     )
 

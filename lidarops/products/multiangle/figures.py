@@ -104,10 +104,15 @@ def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
     """Return a quantity of one cycle with its errors, flags, reach and truth."""
     scale, label = _SCALES[quantity]
     estimate, z = profile.estimates[quantity], profile.altitude / 1e3
-    of_dead_time = np.nan_to_num(estimate.dead_time_error)
+    of_channel = {
+        "dead time": np.nan_to_num(estimate.dead_time_error),
+        "baseline": np.nan_to_num(estimate.baseline_error),
+    }
     value = scale * estimate.value
-    error = scale * np.hypot(estimate.standard_error, of_dead_time)
-    words = "standard error, with the dead time" if of_dead_time.any() else "standard error"
+    error = scale * np.sqrt(
+        estimate.standard_error**2 + sum(part**2 for part in of_channel.values())
+    )
+    words = ", with the ".join(["standard error", *(n for n, v in of_channel.items() if v.any())])
     whole = error + scale * np.nan_to_num(estimate.gradient_error)
     truth = _truth(profile, quantity, scale)
     # A truth beyond the reach, such as a cloud, does not set the axis.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final, get_args
 
@@ -168,15 +169,17 @@ def _gradient_error(quantity: str, words: str, units: str) -> Row:
     )
 
 
-def _dead_time_error(quantity: str, words: str, units: str) -> Row:
-    return replace(
-        _gradient_error(quantity, words, units),
-        name=f"{quantity}_dead_time_error",
-        long_name=f"calibration (systematic) uncertainty of {words} from the dead time",
-        optional=True,
-        comment=f"Separate from {quantity}_standard_error. Change with one standard error of the"
-        f" dead time, without smoothing. Missing for analog signals. {NO_STANDARD_NAME}",
-    )
+def _signal_errors(quantity: str, words: str, units: str) -> Iterator[Row]:
+    """Yield the rows of the errors by dead time and analog baseline."""
+    for cause, missing in (("dead time", "analog signals"), ("baseline", "photon counting")):
+        yield replace(
+            _gradient_error(quantity, words, units),
+            name=f"{quantity}_{cause.replace(' ', '_')}_error",
+            long_name=f"calibration (systematic) uncertainty of {words} from the {cause}",
+            optional=True,
+            comment=f"Separate from {quantity}_standard_error. Change with one standard error of"
+            f" the {cause}, without smoothing. Missing for {missing}. {NO_STANDARD_NAME}",
+        )
 
 
 LAYOUT: Final = Layout(
@@ -240,7 +243,7 @@ LAYOUT: Final = Layout(
             comment=f"Along the vertical, at the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         _gradient_error("vertical_optical_depth", "optical depth", "1"),
-        _dead_time_error("vertical_optical_depth", "optical depth", "1"),
+        *_signal_errors("vertical_optical_depth", "optical depth", "1"),
         Row(
             name="monotone_vertical_optical_depth",
             dims=_LEVELS,
@@ -286,7 +289,7 @@ LAYOUT: Final = Layout(
             f" {NO_STANDARD_NAME}",
         ),
         _gradient_error("total_extinction", "extinction", "m-1"),
-        _dead_time_error("total_extinction", "extinction", "m-1"),
+        *_signal_errors("total_extinction", "extinction", "m-1"),
         Row(
             name="log_intercept",
             dims=_LEVELS,

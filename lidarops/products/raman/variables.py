@@ -47,6 +47,7 @@ _WORDS: Final = {
     " vertical_resolution",
     "background": "the backgrounds",
     "dead_time": "the dead times",
+    "baseline": "the analog baselines",
     "reference": "the scattering ratio in the reference window",
     "angstrom": "the Angstrom exponent",
     "molecular": "the density of the air",

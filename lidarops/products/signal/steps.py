@@ -106,7 +106,7 @@ def _without_overlap(signals: xr.Dataset, overlap: npt.NDArray[np.float64]) -> x
     """Return signals divided by the overlap, and flagged where it is not known."""
     along = xr.DataArray(overlap.astype(np.float32), dims="range")
     lost = along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
-    divided = ("signal", "signal_standard_error", "signal_dead_time_error")
+    divided = ("signal", "signal_standard_error", "signal_dead_time_error", "signal_baseline_error")
     return signals.assign(
         {name: signals[name] / along for name in divided if name in signals}
     ).assign(quality_flag=signals["quality_flag"] | lost)

@@ -65,6 +65,20 @@ LAYOUT: Final = Layout(
             comment="Of channels with photon counting. All ranges and profiles share it. Not part"
             f" of signal_standard_error. {NO_STANDARD_NAME}",
         ),
+        Row(
+            name="signal_baseline_error",
+            dims=("time", "range"),
+            dtype="f4",
+            units="{signal} m2",
+            long_name="change of the signal with one standard error of the analog baseline",
+            coverage=Coverage.QUALITY,
+            significant_bits=8,
+            optional=True,
+            error_kind=ErrorKind.SYSTEMATIC,
+            comment="Of analog and glued channels: a voltage without light that varies slowly with"
+            " range. All ranges and profiles share it, with a shape that is not known. Not part of"
+            f" signal_standard_error. {NO_STANDARD_NAME}",
+        ),
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         Row(

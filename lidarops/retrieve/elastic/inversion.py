@@ -7,7 +7,7 @@ window towards the lidar and away from it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -45,20 +45,15 @@ class ErrorBudget:
     """Error by the density of the air."""
     dead_time: Array
     """Error by the dead time of photon counting."""
+    baseline: Array
+    """Error by the baseline of analog signals, without sign."""
 
     @property
     def total(self) -> Array:
         """Standard error by all causes, which are independent; NaN where one is unknown."""
         variance = np.zeros_like(self.noise)
-        for error in (
-            self.noise,
-            self.background,
-            self.reference,
-            self.lidar_ratio,
-            self.molecular,
-            self.dead_time,
-        ):
-            variance += error * error
+        for cause in fields(self):
+            variance += getattr(self, cause.name) ** 2
         return np.asarray(np.sqrt(variance))
 
 
@@ -111,6 +106,7 @@ class ElasticResult:
             ratio * budget.lidar_ratio + self.lidar_ratio_standard_error * self.backscatter,
             ratio * budget.molecular,
             ratio * budget.dead_time,
+            ratio * budget.baseline,
         )
 
     @property
@@ -129,6 +125,7 @@ class ElasticResult:
             inverse * budget.lidar_ratio,
             inverse * (budget.molecular - self.molecular_relative_error * self.backscatter),
             inverse * budget.dead_time,
+            inverse * budget.baseline,
         )
 
     def _inverse_molecular(self) -> Array:
@@ -150,6 +147,7 @@ def invert_elastic(
     reference_relative_error: npt.ArrayLike = 0.0,
     molecular_relative_error: npt.ArrayLike = 0.0,
     dead_time_error: npt.ArrayLike = 0.0,
+    baseline_error: npt.ArrayLike = 0.0,
     noise_correlation_length: npt.ArrayLike = 1.0,
 ) -> ElasticResult:
     r"""Return particle backscatter and extinction of elastic profiles, without iteration.
@@ -202,6 +200,9 @@ def invert_elastic(
     dead_time_error : float or (..., range) float
         In the unit of `power`: its change with one standard error of the dead time, common to all
         bins; broadcast against `power`. The inversion is repeated with it.
+    baseline_error : float or (..., range) float
+        The same with one standard error of the baseline of analog signals; that of the reference
+        window and that of all other bins are independent.
     noise_correlation_length : float or (...) float
         Bins; the integral correlation length of the noise, 1 where bins are independent
         (`lidarops.retrieve.signal.noise_correlation`).
@@ -266,19 +267,28 @@ def invert_elastic(
 
     rows = rows.astype(np.float64, copy=False)
     out, scalars, state = solved(rows)
-    dead_time = np.zeros((2, *rows.shape))
-    if np.any(dead_time_error):
-        change = inputs.noise_rows(dead_time_error, "dead_time_error", grid, leading)
-        both = [_fernald.BACKSCATTER, _fernald.ATTENUATED]
+    both = [_fernald.BACKSCATTER, _fernald.ATTENUATED]
+
+    def shifted(change: Array) -> Array:
+        """Return the change of the backscatter, and add those of others to their errors."""
+        if not change.any():
+            return np.zeros_like(rows)
         moved, moved_scalars, _ = solved(rows + change)
-        dead_time = moved[both] - out[both]
+        shift = moved[both] - out[both]
         # Where the changed signal has no solution, the value itself is uncertain.
-        dead_time = np.where(np.isfinite(dead_time), dead_time, out[both])
-        out[_fernald.ATTENUATED_ERROR] = np.hypot(out[_fernald.ATTENUATED_ERROR], dead_time[1])
+        shift = np.where(np.isfinite(shift), shift, out[both])
+        out[_fernald.ATTENUATED_ERROR] = np.hypot(out[_fernald.ATTENUATED_ERROR], shift[1])
         scalars[:, _fernald.CONSTANT_ERROR] = np.hypot(
             scalars[:, _fernald.CONSTANT_ERROR],
             moved_scalars[:, _fernald.CONSTANT] - scalars[:, _fernald.CONSTANT],
         )
+        return np.asarray(shift[0])
+
+    dead_time = shifted(inputs.noise_rows(dead_time_error, "dead_time_error", grid, leading))
+    change = inputs.noise_rows(baseline_error, "baseline_error", grid, leading)
+    # Its shape is not known: that of the window and that of the other bins would cancel.
+    parts = [shifted(np.where(inside, change, 0.0)) for inside in (window, ~window)]
+    baseline = np.hypot(*parts)
     if variance is None:
         out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
         scalars[:, _fernald.CONSTANT_ERROR] = np.nan
@@ -288,14 +298,17 @@ def invert_elastic(
         values = rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
         return grid.turn(values)
 
-    fields = [profiles(rows) for rows in out]
+    values = [profiles(rows) for rows in out]
     return ElasticResult(
-        backscatter=fields[_fernald.BACKSCATTER],
+        backscatter=values[_fernald.BACKSCATTER],
         budget=ErrorBudget(
-            *(*fields[_fernald.NOISE : _fernald.MOLECULAR + 1], profiles(dead_time[0]))
+            *(
+                *values[_fernald.NOISE : _fernald.MOLECULAR + 1],
+                *map(profiles, (dead_time, baseline)),
+            )
         ),
-        attenuated_backscatter=fields[_fernald.ATTENUATED],
-        attenuated_backscatter_standard_error=fields[_fernald.ATTENUATED_ERROR],
+        attenuated_backscatter=values[_fernald.ATTENUATED],
+        attenuated_backscatter_standard_error=values[_fernald.ATTENUATED_ERROR],
         lidar_constant=scalars[:, _fernald.CONSTANT].reshape(leading),
         lidar_constant_standard_error=scalars[:, _fernald.CONSTANT_ERROR].reshape(leading),
         molecular_backscatter=profiles(air[0]),

@@ -29,7 +29,7 @@ from lidarops.retrieve.clouds.labeled import (
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import dead_time_error, without_analog_background
+from lidarops.retrieve.signal.labeled import systematic_changes, without_analog_background
 from lidarops.retrieve.signal.screening import cloud_contrast
 
 Array = npt.NDArray[np.float64]
@@ -70,8 +70,8 @@ def invert_elastic(
         time, with the scalar coordinate ``zenith_angle`` (degree), from
         `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. With the signals of
         their parts, from `lidarops.retrieve.signal.labeled_screening.ScreenedAverage`, clouds are
-        sought in these too, else in the mean only. For the error of the
-        dead time, see `lidarops.retrieve.signal.labeled.dead_time_error`.
+        sought in these too, else in the mean only. For the errors of
+        dead time and baseline, see `lidarops.retrieve.signal.labeled.systematic_changes`.
     molecules : MolecularProfile
     wavelength : float
         m.
@@ -130,7 +130,7 @@ def invert_elastic(
         lidar_ratio_standard_error=ratio_error,
         reference_relative_error=_reference_error(window, reference),
         molecular_relative_error=molecular_relative_error,
-        dead_time_error=_dead_time_error(averages, means, signal),
+        **_systematic_errors(averages, means, signal),
         noise_correlation_length=means.correlation_length,
     )
     quality = means.quality
@@ -187,14 +187,17 @@ def invert_elastic(
     return without_analog_background(product, averages)
 
 
-def _dead_time_error(averages: xr.Dataset, means: MeanProfiles, signal: MeanSignal) -> Array:
-    """Return the change of the signal with one standard error of the dead time."""
+def _systematic_errors(
+    averages: xr.Dataset, means: MeanProfiles, signal: MeanSignal
+) -> dict[str, Any]:
+    """Return the changes of the signal with one standard error of dead time and baseline."""
     bridged = averages.assign(power=averages["power"].copy(data=means.raw))
-    change = dead_time_error(bridged, xr.DataArray(signal.background, dims="time"))
-    if change is None:
-        return np.zeros(1)
-    array = change.transpose("time", "range").to_numpy() / means.overlap
-    return np.nan_to_num(array, posinf=0.0, neginf=0.0)
+    changes = systematic_changes(bridged, xr.DataArray(signal.background, dims="time"))
+    errors = {}
+    for cause, change in changes.items():
+        array = change.transpose("time", "range").to_numpy() / means.overlap
+        errors[f"{cause}_error"] = np.nan_to_num(array, posinf=0.0, neginf=0.0)
+    return errors
 
 
 def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
@@ -258,6 +261,7 @@ def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
                 "lidar_ratio",
                 "molecular",
                 "dead_time",
+                "baseline",
             )
         },
         "aerosol_extinction": solution.extinction,

@@ -52,12 +52,6 @@ class AnalogBaseline:
         nearer = np.maximum(first - distance, 0.0) * rise / (second - first)
         return np.asarray(np.hypot(np.interp(distance, self.range, self.standard_error), nearer))
 
-    def error_within(self, distance: Array) -> float:
-        """Return the root mean square of the standard error over ranges in m."""
-        if distance.size == 0:
-            return 0.0
-        return float(np.sqrt((self.error_at(distance) ** 2).mean()))
-
 
 class _Profile(NamedTuple):
     """Means of one profile over blocks; NaN where bins are missing."""

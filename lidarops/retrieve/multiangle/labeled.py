@@ -155,7 +155,7 @@ def retrieve_optical_depth(
         attrs={"steps": _step_texts(retrieval), "method": _method_of(retrieval)},
     )
     product = product.assign(_plane_variables(signals, beams, settings))
-    product = product.assign(_dead_time_variables(retrieval, signals, beams, station_altitude))
+    product = product.assign(_systematic_variables(retrieval, signals, beams, station_altitude))
     if not layers:
         return product
     return product.assign(_layer_variables(retrieval, quality, levels, bounds))
@@ -235,24 +235,26 @@ def _plane_variables(
     }
 
 
-def _dead_time_variables(
+def _systematic_variables(
     retrieval: MultiAngleResult, signals: ScanSignals, beams: xr.Dataset, station_altitude: float
 ) -> dict[str, xr.Variable]:
-    """Return the errors by the dead time; none for analog signals."""
-    if signals.dead_time_change is None:
-        return {}
-    shift = signals.shift_by(retrieval, signals.dead_time_change)
+    """Return the errors by dead time and baseline, as far as the signals have them."""
     thickness = np.diff(beams["altitude"].to_numpy(), prepend=station_altitude)
-    errors = {
-        "optical_depth": np.abs(shift),
-        "extinction": np.abs(np.diff(shift, axis=1, prepend=0.0)) / thickness,
-    }
-    return {
-        f"{_variable(name)}_dead_time_error": xr.Variable(
-            ("time", "altitude"), np.where(np.isfinite(getattr(retrieval, name)), error, np.nan)
-        )
-        for name, error in errors.items()
-    }
+    variables = {}
+    for cause in ("dead_time_error", "baseline_error"):
+        if cause not in beams:
+            continue
+        shift = signals.shift_by(retrieval, beams[cause].to_numpy())
+        errors = {
+            "optical_depth": np.abs(shift),
+            "extinction": np.abs(np.diff(shift, axis=1, prepend=0.0)) / thickness,
+        }
+        for name, error in errors.items():
+            known = np.isfinite(getattr(retrieval, name))
+            variables[f"{_variable(name)}_{cause}"] = xr.Variable(
+                ("time", "altitude"), np.where(known, error, np.nan)
+            )
+    return variables
 
 
 def _planes_with_leverage(

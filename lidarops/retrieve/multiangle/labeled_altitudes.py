@@ -19,7 +19,7 @@ from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_ce
 from lidarops.retrieve.multiangle._obstructions import obstruction_range
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
 from lidarops.retrieve.signal.averaging import RunningMean
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, dead_time_change
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error, dead_time_change
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -36,6 +36,7 @@ _DIMENSIONS: Final = {
     "left": ("time", "beam"),
     "obstruction": ("time", "beam"),
     "dead_time_error": _CUBE,
+    "baseline_error": _CUBE,
 }
 """Of the arrays of cycles; see `AltitudeCycles.result`."""
 _OF_CELLS: Final = {name for name, dims in _DIMENSIONS.items() if dims == _CUBE}
@@ -82,7 +83,7 @@ class AltitudeCycles:
     overlap : (range,) float, optional
         The signal is divided by it; NaN where it is not known.
     baseline : AnalogBaseline, optional
-        Subtracted from the power of all profiles; its error is part of that of the background.
+        Subtracted from the power of all profiles, whose baseline error is then that of it.
     shapes : dict, optional
         Keeps the signals of clean air along the beams, for other channels of the scan.
 
@@ -133,7 +134,6 @@ class AltitudeCycles:
             altitude=levels,
             slant_edges=slant_edges,
             baseline=baseline,
-            baseline_error=_baseline_error(baseline, distance, slant_edges),
         )
         self._weights = np.asarray(shots, dtype=np.float64)
         self._bounds = np.asarray(time_bnds)
@@ -166,7 +166,7 @@ class AltitudeCycles:
             conditioned[name].to_numpy()
             for name in ("power", "variance", "quality", CORRELATION_LENGTH)
         )
-        change = dead_time_change(conditioned)
+        changes = dead_time_change(conditioned), self._baseline_error(conditioned)
         while len(self._pieces) < len(self._batches):
             batch = self._batches[len(self._pieces)]
             members = self._order.profile[batch]
@@ -176,7 +176,7 @@ class AltitudeCycles:
             self._pieces.append(
                 _batch_on_altitudes(
                     profiles,
-                    change,
+                    changes,
                     members - first,
                     self._weights[members],
                     cycle,
@@ -184,6 +184,16 @@ class AltitudeCycles:
                     self._settings,
                 )
             )
+
+    def _baseline_error(self, conditioned: xr.Dataset) -> Array | None:
+        """Return the error of the baseline of analog profiles, (time, range covered)."""
+        error, settings = baseline_error(conditioned), self._settings
+        if error is None:
+            return None
+        if settings.baseline is None:
+            return error.transpose("time", "range").to_numpy()[:, settings.covered]
+        measured = settings.baseline.error_at(settings.distance[settings.covered])
+        return np.broadcast_to(measured, (error.sizes["time"], measured.size))
 
     def result(self, obstructions: Mapping[int, float] | None = None) -> xr.Dataset:
         """Return the cycles of all profiles.
@@ -203,7 +213,8 @@ class AltitudeCycles:
             ``left`` (the standard error of the background by signal in the far range) and
             ``obstruction`` (m, the range from which a beam is blocked; NaN if none) over (time,
             beam); for photon counting ``dead_time_error`` (the change of ``signal`` with one
-            standard error of the dead time) over (time, beam, altitude); ``response`` (the mean of
+            standard error of the dead time), for analog ``baseline_error`` (the same of the
+            baseline) over (time, beam, altitude); ``response`` (the mean of
             the square of range over overlap, m2) over (beam, altitude); and ``shots`` over time.
             ``time`` is the middle of ``time_bnds``, which span the profiles of a cycle.
         """
@@ -274,8 +285,6 @@ class _Settings:
     slant_edges: Array
     """(beam, altitude + 1) m: the range at which a beam crosses the edges of the cells."""
     baseline: AnalogBaseline | None
-    baseline_error: Array
-    """(beam,) mV: standard error of the baseline within the cells of a beam."""
 
     @property
     def in_front(self) -> slice:
@@ -310,14 +319,6 @@ class _Settings:
                 for edges in self.slant_edges
             ]
         )
-
-
-def _baseline_error(baseline: AnalogBaseline | None, distance: Array, slant_edges: Array) -> Array:
-    """Return the standard error of the baseline within the cells of each beam, mV."""
-    if baseline is None:
-        return np.zeros(len(slant_edges))
-    inside = (distance[(distance >= edges[0]) & (distance <= edges[-1])] for edges in slant_edges)
-    return np.array([baseline.error_within(part) for part in inside])
 
 
 def _slant_edges(zenith_angle: Array, height: Array) -> Array:
@@ -369,7 +370,7 @@ def _batches(order: _Order) -> Iterator[slice]:
 
 def _batch_on_altitudes(
     profiles: tuple[_Block, ...],
-    dead_time: tuple[_Block, float] | None,
+    systematic: tuple[tuple[_Block, float] | None, Array | None],
     rows: Integers,
     shots: Array,
     cycle: Integers,
@@ -378,9 +379,9 @@ def _batch_on_altitudes(
 ) -> dict[str, _Block]:
     """Return the arrays of the cycles of a batch by name.
 
-    `dead_time` holds the change of the power by the dead time, and that of the background over its
-    square; None for analog. `rows` are those of the batch in the profiles, sorted by cycle and
-    beam, as `shots`, `cycle` and `beam` are.
+    `systematic` holds the change of the power by the dead time with that of the background over its
+    square, and that by the baseline; None where a channel has none. `rows` are those of the batch
+    in the profiles, sorted by cycle and beam, as `shots`, `cycle` and `beam` are.
     """
     beams = len(settings.slant_edges)
     shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
@@ -391,16 +392,24 @@ def _batch_on_altitudes(
         "left": np.full(shape[:2], np.nan),
         "obstruction": np.full(shape[:2], np.nan),
     }
-    if dead_time is not None:
-        cycles["dead_time_error"] = np.full(shape, np.nan)
+    dead_time, baseline = systematic
+    for name, change in (("dead_time_error", dead_time), ("baseline_error", baseline)):
+        if change is not None:
+            cycles[name] = np.full(shape, np.nan)
     first = np.flatnonzero(np.diff(cycle * beams + beam, prepend=-1))
     for few, visits in _few_visits(first, rows.size):
         power, variance, quality, length = (values[rows[few]] for values in profiles)
         bins = _net_bins(power, variance, quality, length, beam[few], settings)
+        changes = {}
         if dead_time is not None:
             of_sky = dead_time[1] * bins.background**2
-            change = dead_time[0][rows[few], settings.covered] - of_sky[:, np.newaxis]
-            bins = bins._replace(change=np.where(np.isfinite(bins.power), change, np.nan))
+            changes["dead_time_error"] = dead_time[0][rows[few], settings.covered] - of_sky[:, None]
+        if baseline is not None:
+            changes["baseline_error"] = baseline[rows[few]]
+        known = np.isfinite(bins.power)
+        bins = bins._replace(
+            changes={name: np.where(known, change, np.nan) for name, change in changes.items()}
+        )
         if visits.size < bins.left.size:
             bins = _visit_means(bins, shots[few], visits - few.start)
         _fill_cells(cycles, bins, cycle[visits], beam[visits], settings)
@@ -436,9 +445,8 @@ def _fill_cells(
         visits = cycle[rows], number
         cycles["signal"][visits], cycles["variance"][visits] = at_centres(means.signal, variance)
         cycles["quality"][cycle[rows]] |= means.quality
-        if bins.change is not None:
-            change = average_over_cells(bins.change[rows], *noise, *cells).signal
-            cycles["dead_time_error"][visits] = change
+        for name, change in bins.changes.items():
+            cycles[name][visits] = average_over_cells(change[rows], *noise, *cells).signal
 
 
 class _Bins(NamedTuple):
@@ -458,8 +466,8 @@ class _Bins(NamedTuple):
     """(profile,): m, range from which the beam is blocked; inf for a free beam."""
     background: Array
     """(profile,)."""
-    change: Array | None = None
-    """(profile, range): of the power, with one standard error of the dead time."""
+    changes: Mapping[str, Array] = {}
+    """(profile, range): of the power, with one standard error of dead time or baseline."""
 
 
 def _net_bins(
@@ -497,7 +505,6 @@ def _net_bins(
     unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
     left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
-    left = np.hypot(left, settings.baseline_error[beam])
     distance = settings.distance[near]
     blocked = obstruction_range(net, of_means[:, near], distance)
     net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)
@@ -562,7 +569,7 @@ def _visit_means(bins: _Bins, shots: Array, first: npt.NDArray[np.intp]) -> _Bin
         left / count,
         np.minimum.reduceat(bins.obstruction, first),
         bins.background[first],
-        None if bins.change is None else _mean_change(bins.change, bins.variance, group, shots),
+        {name: _mean_change(c, bins.variance, group, shots) for name, c in bins.changes.items()},
     )
 
 

@@ -21,7 +21,7 @@ from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -109,6 +109,8 @@ class _Signals:
     """(interval, beam) warning bits of the bins between the crossings, and of the background."""
     overlap: Array
     """(beam, bin)."""
+    baseline: Array
+    """(interval, beam, bin) standard error of the analog baseline."""
 
 
 def retrieve_network(
@@ -190,7 +192,7 @@ def _gather_signals(
 ) -> _Signals:
     bins = max(beam.averages.sizes["range"] for beam in beams)
     shape = (intervals.size, len(beams), bins)
-    power, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+    power, variance, baseline = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape)
     grid, overlap = np.full(shape[1:], np.nan), np.ones(shape[1:])
     error, tail_signal = np.full(shape[:2], np.nan), np.zeros(shape[:2])
     warnings = np.zeros(shape[:2], dtype=np.int32)
@@ -209,6 +211,9 @@ def _gather_signals(
         if beam.overlap is not None:
             # Bins nearer than the first known overlap are not used anyway.
             overlap[index, beam_bins] = np.nan_to_num(beam.overlap)
+        off = baseline_error(data)
+        if off is not None:
+            baseline[rows, index, beam_bins] = off.transpose("time", "range").to_numpy()
         error[rows, index] = sky.standard_error
         tail_signal[rows, index] = sky.left.detected
         ranges = network.on_beam(index)[1]
@@ -225,6 +230,7 @@ def _gather_signals(
         tail_signal,
         warnings,
         overlap[:, used_bins],
+        np.ascontiguousarray(baseline[..., used_bins]),
     )
 
 
@@ -357,6 +363,7 @@ class _Errors:
             by_exponent,
             by_lidar_ratio,
             tail_signal,
+            *solver.extinction_changes(result, signals.baseline),
             condition * result.extinction * settings.overlap_relative_error,
             result.multiplier_error,
         ]

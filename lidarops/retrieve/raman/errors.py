@@ -20,10 +20,11 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 EXTINCTION_CAUSES: Final = (
-    "noise", "resolution", "background", "dead_time", "angstrom", "molecular", "overlap",
+    "noise", "resolution", "background", "dead_time", "baseline", "angstrom", "molecular",
+    "overlap",
 )  # fmt: skip
 BACKSCATTER_CAUSES: Final = (
-    "noise", "background", "dead_time", "reference", "angstrom", "molecular", "overlap",
+    "noise", "background", "dead_time", "baseline", "reference", "angstrom", "molecular", "overlap",
 )  # fmt: skip
 RANDOM: Final = frozenset({"noise", "resolution", "background"})
 """Causes whose errors change from profile to profile; those of all others are systematic."""
@@ -125,10 +126,10 @@ class Effects:
         return self.calibrated.total
 
     def _instrument(self) -> Iterator[_Change]:
-        """Yield the changes by backgrounds and dead times, which are subtracted."""
+        """Yield the changes by backgrounds, dead times and baselines, which are subtracted."""
         raman, elastic = self.profile.raman, self.profile.elastic
         level, none = np.exp(-self.profile.fit.depth), self._none
-        for name in ("background", "dead_time"):
+        for name in ("background", "dead_time", "baseline"):
             of_raman = raman.relative(-getattr(raman, name), level)
             of_elastic = elastic.relative(-getattr(elastic, name), elastic.value)
             yield _Change(name, of_raman, none, none)

@@ -33,7 +33,7 @@ from lidarops.retrieve.signal.labeled import (
     actual_noise,
     analog_alone,
     counts_per_power,
-    dead_time_error,
+    systematic_changes,
     without_analog_background,
 )
 from lidarops.retrieve.signal.screening import cloud_contrast
@@ -126,26 +126,30 @@ class _Channel:
         else:
             sky = estimate.from_tail(self._power, r, self._variance)
         background = sky.background
-        change = dead_time_error(self.averages, xr.DataArray(background, dims="time"))
-        error = np.zeros((1, r.size))
-        if change is not None:
-            error = np.nan_to_num(change.transpose("time", "range").to_numpy())
-        values: tuple[Array, ...] = (self._power - background[:, np.newaxis], self._variance, error)
+        changes = systematic_changes(self.averages, xr.DataArray(background, dims="time"))
+        errors = [
+            np.nan_to_num(changes[cause].transpose("time", "range").to_numpy())
+            if cause in changes
+            else np.zeros((1, r.size))
+            for cause in ("dead_time", "baseline")
+        ]
+        values = (self._power - background[:, np.newaxis], self._variance, *errors)
         if self._share:
             # Noise of neighbours is common to them then. That of a smooth fit is as without.
-            factors = (own, shape), (own**2, shape**2), (own, shape)
+            factors = (own, shape), (own**2, shape**2), (own, shape), (own, shape)
             values = tuple(
                 self._at_common(part / of_bins) * of_common
                 for part, (of_bins, of_common) in zip(values, factors, strict=True)
             )
-        power, variance, error = values
+        power, variance, dead_time, baseline = values
         signal = ChannelSignal(
             power,
             variance,
             np.nan_to_num(background),
             sky.standard_error,
-            error,
+            dead_time,
             self._counts,
+            baseline,
         )
         return signal, sky.uncertain
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,10 @@ from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
+
+
+def _nothing() -> Array:
+    return np.zeros((1, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,8 @@ class ChannelSignal:
     """(profile or 1, bin): change with one standard error of the dead time."""
     counts_per_power: Array | None = None
     """(profile,): for photon counting, whose variance then follows from the fitted counts."""
+    baseline_error: Array = field(default_factory=_nothing)
+    """(profile or 1, bin): change with one standard error of the analog baseline."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +86,8 @@ class CellSignal:
     """(cell,): change of the value with one standard error of the background."""
     dead_time: Array
     """(cell,): change of the value with one standard error of the dead time."""
+    baseline: Array = field(default_factory=lambda: _nothing()[0])
+    """(cell,): change of the value with one standard error of the analog baseline."""
 
     def relative(self, change: Array, level: Array) -> Array:
         """Return a change relative to a level, 0 where there are no data."""
@@ -113,10 +121,11 @@ def cell_signals(signal: ChannelSignal, shape: Array, cells: Cells) -> list[Cell
         per_signal = np.where(missing, 0.0, per_signal * excess)
         fixed = np.where(missing, np.inf, fixed * excess)
     background = level * np.nan_to_num(signal.background_standard_error)[:, np.newaxis]
-    dead_time = cells.mean(signal.dead_time_error * inverse)
+    dead_time, baseline = (
+        cells.mean(error * inverse) for error in (signal.dead_time_error, signal.baseline_error)
+    )
+    columns = value, variance, per_signal, fixed, background, dead_time, baseline
     return [
-        CellSignal(v, s, SignalNoise(p, f), b, d)
-        for v, s, p, f, b, d in zip(
-            value, variance, per_signal, fixed, background, dead_time, strict=True
-        )
+        CellSignal(v, s, SignalNoise(p, f), *changes)
+        for v, s, p, f, *changes in zip(*columns, strict=True)
     ]

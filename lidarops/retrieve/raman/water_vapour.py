@@ -95,12 +95,13 @@ def mixing_ratio(
     factor = constant * inverse_mean(level, square)
     factor *= np.exp(particles.exponent * beyond)
     value = factor * water.value
-    background, dead_time = (
-        nitrogen.relative(change, level) for change in (nitrogen.background, nitrogen.dead_time)
+    background, dead_time, baseline = (
+        nitrogen.relative(change, level)
+        for change in (nitrogen.background, nitrogen.dead_time, nitrogen.baseline)
     )
     noise = factor**2 * (water.variance + water.background**2)
     noise += value**2 * (square + background**2)
-    shared = dead_time**2 + (particles.standard_error * beyond) ** 2
+    shared = dead_time**2 + baseline**2 + (particles.standard_error * beyond) ** 2
     shared += sum(np.square(relative) for relative in relative_errors)
-    systematic = np.sqrt(value**2 * shared + (factor * water.dead_time) ** 2)
+    systematic = np.sqrt(value**2 * shared + factor**2 * (water.dead_time**2 + water.baseline**2))
     return MixingRatio(value, np.sqrt(noise), systematic)

@@ -19,6 +19,10 @@ _SECOND_DIFFERENCE_VARIANCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
 
 
+_DRIFT_PARTS: Final = 16
+"""Parts of the range over which dark files are averaged for `DarkSignals.drift`."""
+
+
 class _DarkMethod(StrEnum):
     """How the dark signal of a profile follows from the dark sessions."""
 
@@ -80,6 +84,9 @@ class DarkSignals:
             )
         self._sessions = _sessions(dark_seconds)
         self._means, self._variances = _means(signals, self._sessions)
+        self.drift = _drift(signals)
+        """Standard deviation of the shape of dark files, in their unit: that of means over 16ths of
+        the range, without the level of the file. NaN for one file, or of several channels."""
 
     def at(self, times: npt.ArrayLike) -> DarkProfile:
         """Return the dark signal of each profile.
@@ -186,6 +193,19 @@ def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array,
     variance = _ratio(file_variance, np.stack(counts, axis=-2))
     stacked = np.stack(means, axis=-2)
     return stacked, np.where(np.isfinite(stacked), variance, np.nan)
+
+
+def _drift(signals: Array) -> float:
+    """Return the standard deviation over files of means over parts of the range."""
+    if signals.ndim != 2 or len(signals) < 2 or signals.shape[-1] < _DRIFT_PARTS:
+        return float("nan")
+    edges = np.linspace(0, signals.shape[-1], _DRIFT_PARTS, endpoint=False).astype(np.intp)
+    finite = np.isfinite(signals)
+    total = np.add.reduceat(np.where(finite, signals, 0.0), edges, axis=-1)
+    parts = _ratio(total, np.add.reduceat(finite, edges, axis=-1))
+    parts -= parts[:, -1:]
+    parts = parts[:, np.isfinite(parts).all(axis=0)][:, :-1]
+    return float(np.sqrt(np.var(parts, axis=0, ddof=1).mean())) if parts.size else float("nan")
 
 
 def _far_variance(signals: Array) -> Array:

@@ -21,11 +21,14 @@ from lidarops.retrieve.common import inputs
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _Block = npt.NDArray[Any]
 
 DEAD_TIME_ERROR: Final = "dead_time_standard_error"
 """Attribute of the power of photon counting, s."""
+BASELINE_ERROR: Final = "baseline_standard_error"
+"""Attribute of the power of analog, mV and the share of the largest power."""
 
 CORRELATION_LENGTH: Final = "noise_correlation_length"
 """Name of the integral correlation length of noise along range, bins."""
@@ -62,6 +65,7 @@ def condition(
     dead_time: float | None = None,
     dead_time_uncertainty: float = DEAD_TIME_UNCERTAINTY,
     noise_variance: float | None = None,
+    baseline_uncertainty: float | None = None,
     dark: DarkSignals | None = None,
     range_offset: float = 0.0,
     full_overlap_range: float = 0.0,
@@ -80,6 +84,9 @@ def condition(
         Relative standard error of the dead time; photon counting only.
     noise_variance : float, optional
         mV^2; analog only.
+    baseline_uncertainty : float, optional
+        mV, standard error of the baseline, in place of the default or of what dark files show;
+        analog only.
     dark : DarkSignals, optional
         From `read_dark`; analog only.
     range_offset : float
@@ -92,8 +99,8 @@ def condition(
     xr.Dataset
         ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), and
         ``noise_correlation_length`` (bins) over time, as lazy as the input. The attribute
-        ``dead_time_standard_error`` (s) of the power of photon counting is the input of
-        `dead_time_error`.
+        ``dead_time_standard_error`` (s) of the power of photon counting, and
+        ``baseline_standard_error`` of analog, are the inputs of `systematic_changes`.
     """
     counts = _with_range(archive[channel], range_offset)
     unit = channel_unit(archive, channel)
@@ -131,10 +138,79 @@ def condition(
         result["power"].attrs[DEAD_TIME_ERROR] = counts_to_signal.dead_time_standard_error(
             dead_time, dead_time_uncertainty
         )
+    else:
+        result["power"].attrs[BASELINE_ERROR] = _baseline(baseline_uncertainty, dark)
     result["variance"].attrs = {"units": f"{unit}2"}
     result[CORRELATION_LENGTH].attrs = {"units": "1"}
     result["range"].attrs = counts["range"].attrs
     return result
+
+
+def _baseline(given: float | None, dark: DarkSignals | None) -> tuple[float, float]:
+    """Return the standard error of the baseline, mV, and its share of the largest power.
+
+    Dark files show that of the electronics, but no undershoot after light.
+    """
+    if given is not None:
+        return given, 0.0
+    shown = np.nan if dark is None else dark.drift
+    return (shown if np.isfinite(shown) else THRESHOLDS.baseline), THRESHOLDS.baseline_share
+
+
+def baseline_error(profiles: xr.Dataset, *, decaying: bool = False) -> xr.DataArray | None:
+    """Return the standard error of the baseline of analog signals.
+
+    A baseline is a voltage without light that varies slowly with range, so that the background is
+    not that of nearer bins. Its shape is not known: bins in front of the far range are taken to be
+    off together, which changes results more than a baseline that decays, and by the undershoot
+    after the largest power.
+
+    Parameters
+    ----------
+    profiles : xr.Dataset
+        From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
+    decaying : bool
+        Whether all of it decays as undershoot does, for what does not depend on a constant.
+
+    Returns
+    -------
+    xr.DataArray or None
+        In the unit of the power, over its dimensions; of glued profiles 0 where they are photon
+        counting. None for photon counting.
+    """
+    power = profiles["power"]
+    decay = np.exp(-np.maximum(profiles["range"], 0.0) / THRESHOLDS.baseline_decay)
+    if BASELINE_ERROR in profiles:
+        return profiles[BASELINE_ERROR] * (decay if decaying else 1.0)
+    if BASELINE_ERROR not in power.attrs:
+        return None
+    fixed, share = power.attrs[BASELINE_ERROR]
+    undershoot = share * (power.max("range") - power.min("range")).fillna(0.0)
+    error: xr.DataArray = np.hypot(fixed * (decay if decaying else 1.0), undershoot * decay)
+    return error
+
+
+def systematic_changes(profiles: xr.Dataset, background: xr.DataArray) -> dict[str, xr.DataArray]:
+    """Return the changes of signals without background with one standard error of each cause.
+
+    Parameters
+    ----------
+    profiles : xr.Dataset
+        From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
+    background : xr.DataArray, (...)
+        In the unit of the power.
+
+    Returns
+    -------
+    dict of str to xr.DataArray
+        In the unit of the power, over its dimensions: ``dead_time`` (`dead_time_error`) of photon
+        counting, ``baseline`` (`baseline_error`) of analog, both of glued signals.
+    """
+    dead_time, baseline = dead_time_error(profiles, background), baseline_error(profiles)
+    changes = {} if dead_time is None else {"dead_time": dead_time}
+    if baseline is not None:
+        changes["baseline"] = baseline
+    return changes
 
 
 def dead_time_error(profiles: xr.Dataset, background: xr.DataArray) -> xr.DataArray | None:
@@ -218,10 +294,9 @@ def correct_for_range(
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
         over (time, range), ``background``, ``background_standard_error`` and
         ``noise_correlation_length`` over time, NaN where it is not known; the attribute ``steps``
-        states the method of the background. For photon counting,
-        ``signal_dead_time_error`` over (time, range), the change of the signal with one standard
-        error of the dead time (`dead_time_error`), which is not part of
-        ``signal_standard_error``.
+        states the method of the background. ``signal_dead_time_error`` and
+        ``signal_baseline_error`` over (time, range) are the changes of the signal with one standard
+        error of these (`systematic_changes`), which are not part of ``signal_standard_error``.
         INPUT_MISSING without a background, or NO_REAL_SOLUTION where the cubic has no admissible
         root. BACKGROUND_UNCERTAIN where the background may contain signal.
 
@@ -253,10 +328,10 @@ def correct_for_range(
     )
     words = background_words(method, background_range)
     result = xr.Dataset(dict(zip(_CORRECTED, arrays, strict=True)), attrs={"steps": words})
-    error = dead_time_error(conditioned, result["background"])
-    if error is not None:
-        error *= conditioned["range"].astype(np.float64) ** 2
-        result["signal_dead_time_error"] = error.astype(np.float32)
+    square = conditioned["range"].astype(np.float64) ** 2
+    changes = systematic_changes(conditioned, result["background"])
+    errors = {f"signal_{cause}_error": change * square for cause, change in changes.items()}
+    result = result.assign({name: error.astype(np.float32) for name, error in errors.items()})
     return without_analog_background(result, conditioned)
 
 

@@ -15,7 +15,13 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, DEAD_TIME_ERROR, analog_alone
+from lidarops.retrieve.signal.labeled import (
+    BASELINE_ERROR,
+    CORRELATION_LENGTH,
+    DEAD_TIME_ERROR,
+    analog_alone,
+    baseline_error,
+)
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -117,10 +123,11 @@ def glue(
         ``power`` (MHz), ``variance`` (MHz2, with the error of the line) and ``quality`` over
         (time, range); ``noise_correlation_length`` of the analog channel over time;
         ``dead_time_error`` (MHz), the change of the power with one standard error of the dead
-        time, where the power of photon counting states that; ``glue_lag`` and ``glue_slope`` with
-        their standard errors, and the ends of the window, ``glue_bottom`` and ``glue_top``, over
-        time: both the end of the bins for analog alone, and 0 for photon counting alone. NO_GLUING
-        where no record serves.
+        time, where the power of photon counting states that; ``baseline_standard_error`` (MHz) of
+        the analog part (`lidarops.retrieve.signal.labeled.baseline_error`); ``glue_lag`` and
+        ``glue_slope`` with their standard errors, and the ends of the window, ``glue_bottom`` and
+        ``glue_top``, over time: both the end of the bins for analog alone, and 0 for photon
+        counting alone. NO_GLUING where no record serves.
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
@@ -153,6 +160,16 @@ def glue(
     result[CORRELATION_LENGTH] = length.assign_attrs(units="1")
     for name, unit in {**units, **_LAG}.items():
         result[name].attrs = {"units": unit} if unit else {}
+    baseline = baseline_error(analog)
+    if baseline is not None:
+        middle = 0.5 * (result["glue_bottom"] + result["glue_top"])
+        result[BASELINE_ERROR] = (
+            (baseline * result["glue_slope"])
+            .where(result["range"] <= middle, 0.0)
+            .fillna(0.0)
+            .transpose(*result["power"].dims)
+            .assign_attrs(units="MHz")
+        )
     if dead_time_error is None:
         return result.drop_vars("dead_time_error")
     result["power"].attrs[DEAD_TIME_ERROR] = dead_time_error
