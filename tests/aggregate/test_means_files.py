@@ -221,7 +221,7 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
 
     shared = sum(
         (data[f"aerosol_backscatter_error_{cause}"].where(used).sum("time") / count) ** 2
-        for cause in ("reference", "lidar_ratio", "molecular", "dead_time")
+        for cause in ("reference", "lidar_ratio", "molecular", "dead_time", "baseline")
     )
     expected = np.sqrt(random(1.0).sum("time") / count**2 + shared)
     some = count.to_numpy() > 0

@@ -233,7 +233,7 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
         part["vertical_optical_depth"].values[:, rows] for part in (products["photon_355s"], found)
     )
     by_dead_time = products["photon_355s"]["vertical_optical_depth_dead_time_error"]
-    errors = [by_dead_time] + [
+    errors = [by_dead_time, found["vertical_optical_depth_baseline_error"]] + [
         part["vertical_optical_depth_standard_error"] for part in (products["photon_355s"], found)
     ]
     spread = np.sqrt(sum(error.values[:, rows] ** 2 for error in errors))

@@ -205,6 +205,7 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
         "lidar_ratio",
         "molecular",
         "dead_time",
+        "baseline",
     ):
         retrieved[f"aerosol_backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
     window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
