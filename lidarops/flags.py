@@ -114,6 +114,22 @@ class Quality(FlagBit):
         ),
     )
     NEGATIVE_AMPLITUDE = 8, Severity.REJECT, "the fitted amplitude is not positive"
+    CONTRADICTED = (
+        9,
+        Severity.REJECT,
+        (
+            "the value differs by more than stated errors from another channel that measures the"
+            " same, and further channels tell that this one is wrong"
+        ),
+    )
+    DISAGREES = (
+        10,
+        Severity.CARE,
+        (
+            "another channel that measures the same disagrees by more than stated errors, here or"
+            " elsewhere in the profile"
+        ),
+    )
     NOT_HOMOGENEOUS = (
         11,
         Severity.REJECT,
@@ -164,6 +180,8 @@ WITHHELD: Final = int(
     Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
 )
 """Bits of bins that retrievals of profiles do not use."""
+COMPARED_BITS: Final = (Quality.CONTRADICTED, Quality.DISAGREES)
+"""Bits of kinds of product that state a quantity which channels have in common."""
 
 
 def rejecting(bits: Iterable[FlagBit]) -> int:

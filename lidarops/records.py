@@ -211,7 +211,7 @@ class PlannedStep:
     """Kind of product to which the step belongs; empty where all kinds share it."""
     needs: tuple[str, ...] = ()
     """Steps whose outputs it takes, run or left out: ``name``, or ``channel/name`` of another
-    channel."""
+    channel; for a product, also those of the same kind with which it is compared."""
     warning: str = ""
     """Why its results may be of no use; empty where nothing is known against them."""
 
@@ -445,6 +445,19 @@ class Disagreement:
     """Coordinate along the profile where they disagree most, m."""
     deviation: float
     """Difference there over its error, of all stated errors that differ between the channels."""
+
+    @property
+    def words(self) -> str:
+        """The disagreement as a sentence without the scene."""
+        wrong = (
+            f"{self.outlier} is wrong, as other channels contradict it too"
+            if self.outlier
+            else "one of the two is wrong"
+        )
+        return (
+            f"{' and '.join(self.channels)} differ by {self.deviation:.1f} stated errors at"
+            f" {self.place:g} m, though both measure the same: {wrong}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

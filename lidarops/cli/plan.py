@@ -183,15 +183,22 @@ def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
 
 
 def _needs(plan: Plan) -> Iterator[str]:
-    """Yield, for each step, the steps whose outputs it takes, with the channel if it is another."""
-    from lidarops.steps.dependence import needed_places
+    """Yield, for each step, the steps whose outputs it takes, with the channel if it is another.
+
+    For a product, also the channels with which it is compared.
+    """
+    from lidarops.steps.dependence import is_product, needed_places
 
     for step, places in zip(plan.steps, needed_places(plan), strict=True):
+        others = [plan.steps[place] for place in places]
         names = [
             other.name if other.channel in ("", step.channel) else f"{other.channel}/{other.name}"
-            for other in (plan.steps[place] for place in places)
+            for other in others
+            if not is_product(other)
         ]
-        yield f"after {', '.join(names)}" if names else ""
+        compared = [other.channel for other in others if is_product(other)]
+        words = {"after": names, "compared with": compared}
+        yield "; ".join(f"{word} {', '.join(those)}" for word, those in words.items() if those)
 
 
 def _effect(step: PlannedStep, plan: Plan) -> str:

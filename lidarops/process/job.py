@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
-from lidarops.records import Plan, PlannedStep, Scene, Stamp
+from lidarops.records import Plan, Scene, Stamp
 from lidarops.steps.dependence import ProductKey, is_product, scene_facts
 from lidarops.steps.step import REQUEST
 
@@ -31,20 +31,18 @@ class Job:
     scene: Scene
     plan: Plan
     profiles_per_chunk: int | None = None
-    only: str | None = None
-    """The channel whose products are made; all channels where None."""
+    products: tuple[ProductKey, ...] | None = None
+    """Those to write; all of the plan where None. The others are only compared with them."""
     places: Mapping[ProductKey, Place] = field(default_factory=dict)
     """Of products that were made before."""
-    requested: tuple[ProductKey, ...] = ()
-    """Products of the scene, also those that are not made now. Channels are compared among them."""
 
     def place(self, kind: str, channel: str) -> Place:
         """Return what stands at the place of a product."""
         return self.places.get((kind, channel), Place(Stamp()))
 
-    def concerns(self, step: PlannedStep) -> bool:
-        """Whether the products of the step's channel are made."""
-        return self.only in (None, step.channel)
+    def writes(self, kind: str, channel: str) -> bool:
+        """Whether a product is written."""
+        return self.products is None or (kind, channel) in self.products
 
     @property
     def facts(self) -> InstrumentFacts:

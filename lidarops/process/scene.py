@@ -18,9 +18,11 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import RawFormatError
+from lidarops.kinds import kind_of
 from lidarops.netcdf.context import Context, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.process import execution
+from lidarops.process.agreement import Retrieved, compare_channels
 from lidarops.process.context import product_context
 from lidarops.process.guard import Failure, guarded
 from lidarops.process.input_files import check_files, local_files, open_granules
@@ -28,6 +30,7 @@ from lidarops.process.job import Job, nothing_to_do
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
+    Disagreement,
     Grade,
     Granule,
     InputRecord,
@@ -121,6 +124,7 @@ def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutc
         refused=work.refused,
         seconds=clock.laps,
         notes=tuple(work.notes),
+        disagreements=work.disagreements,
         bytes_read=read + tally.bytes,
     )
     if isinstance(products, Failure):
@@ -161,6 +165,7 @@ class _Work:
         """Products that are written, in the order in which they were complete."""
         self.notes: dict[str, None] = {}
         """What the data did not give, each once."""
+        self.disagreements: tuple[Disagreement, ...] = ()
         self.refused: tuple[Granule, ...] = ()
         """Files of the scene that cannot be used, of which one turned out when steps read it."""
 
@@ -260,15 +265,25 @@ class _Instrument(_Work):
     def products(self) -> Iterator[ProductRecord]:
         """Make the products of all channels, and yield their records."""
         steps = self.job.plan.steps
-        channels = dict.fromkeys(
-            step.channel for step in steps if is_product(step) and self.job.concerns(step)
-        )
+        channels = dict.fromkeys(step.channel for step in steps if is_product(step))
         source = self._source(self._scene, steps, read_windows(steps))
         plan = execution.refined_plan(self.job.plan, self._scene, self._sample)
         self.job = replace(self.job, plan=plan)
         self._clock.lap("look")
+        compared: list[Retrieved] = []
         for channel in channels:
-            yield from self._channel_products(source, channel)
+            yield from self._channel_products(source, channel, compared)
+        judged, pairs = compare_channels(compared) if compared else ([], ())
+        self._clock.lap("retrieve")
+        # Pairs of two products that stand were reported when these were made.
+        self.disagreements = tuple(
+            pair
+            for pair in pairs
+            if any(self.job.writes(pair.kind, name) for name in pair.channels)
+        )
+        for product in judged:
+            if self.job.writes(product.context.kind, product.context.channel):
+                yield self._written(product.context, iter([product.frame, *product.batches]))
 
     def _sample(self, channel: str, granules: Sequence[Granule]) -> Iterator[xr.Dataset]:
         """Yield power, variance and quality of a channel in some granules."""
@@ -280,12 +295,16 @@ class _Instrument(_Work):
         profiles = self._chunk_profiles(source, file_channels(channel))
         return execution.profiles_of(source, steps, channel, profiles)
 
-    def _channel_products(self, source: Source, channel: str) -> Iterator[ProductRecord]:
+    def _channel_products(
+        self, source: Source, channel: str, compared: list[Retrieved]
+    ) -> Iterator[ProductRecord]:
+        """Write the products of a channel, but for those to be compared with other channels."""
         steps = self.job.plan.steps
         data = execution.channel_data(source, steps, channel)
-        for part in data[""].channels.values():
-            self.notes.update(dict.fromkeys(part.notes))
         streams = execution.streams_of(steps, data, channel)
+        if any(self.job.writes(kind, channel) for kind in streams):
+            for part in data[""].channels.values():
+                self.notes.update(dict.fromkeys(part.notes))
         layout = member_channel(self._scene.layout, channel)
         contexts = {
             kind: product_context(
@@ -312,8 +331,13 @@ class _Instrument(_Work):
             if isinstance(stream, WholeProduct):
                 results = stream.results()
                 frame = _with_words(next(results), words[kind])
-                self.notes.update(dict.fromkeys(data[kind].notes))
-                yield self._written(contexts[kind], itertools.chain([frame], results))
+                common = kind_of(kind).common
+                if self.job.writes(kind, channel):
+                    self.notes.update(dict.fromkeys(data[kind].notes))
+                if common:
+                    compared.append(Retrieved(common, contexts[kind], frame, tuple(results)))
+                else:
+                    yield self._written(contexts[kind], itertools.chain([frame], results))
 
 
 def _words(plan: Plan, product: str, data: Data) -> list[str]:

@@ -31,16 +31,8 @@ def disagreement_rows(scenes: Iterable[SceneOutcome]) -> Iterator[FindingRow]:
     """Yield a row for each two channels of a scene that disagree."""
     for scene in scenes:
         for pair in scene.disagreements:
-            wrong = (
-                f"{pair.outlier} is wrong, as other channels contradict it too"
-                if pair.outlier
-                else "one of the two is wrong"
-            )
-            problem = (
-                f"differ by {pair.deviation:.1f} stated errors at an altitude of {pair.place:g} m"
-                f" in {scene.scene}, though both measure the same: {wrong}"
-            )
-            subject = f"{pair.kind}: {pair.channels[0]}, {pair.channels[1]}"
+            subject = f"{pair.kind}: {', '.join(pair.channels)}"
+            problem = f"in {scene.scene}, {pair.words}"
             yield FindingRow(scene.instrument, subject, problem, fails=False)
 
 

@@ -41,7 +41,6 @@ from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session, sweep
 from lidarops.run.staleness import REACH, DaysJudged, Judge, Judgement, Signature
-from lidarops.steps.dependence import planned_products
 from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
 
@@ -481,8 +480,8 @@ class _Pass:
                     scene.scene,
                     scene.needed(),
                     self.options.profiles_per_chunk,
+                    products=tuple((made.kind, made.channel) for made in scene.stale),
                     places=scene.places,
-                    requested=planned_products(scene.plan),
                 )
                 for scene in due
                 if scene.stale

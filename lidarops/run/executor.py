@@ -255,19 +255,11 @@ def _process_here(
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
-    """Process a scene, and compare its channels; see `lidarops.process.scene.attempt`."""
-    # They load the libraries of arrays and files, which a run with nothing to do does not need.
+    """Process a scene; see `lidarops.process.scene.attempt`."""
+    # It loads the libraries of arrays and files, which a run with nothing to do does not need.
     from lidarops.process import scene  # noqa: PLC0415
-    from lidarops.run.agreement import find_disagreements  # noqa: PLC0415
 
-    outcome, final = scene.attempt(job)
-    products, root = outcome.products, job.campaign.products_root
-    compared = guarded(lambda: find_disagreements(products, job.scene, job.requested, root))
-    if isinstance(compared, Failure):
-        # The products are written and stay recorded.
-        failed = replace(outcome, error=compared.error, internal=compared.internal)
-        return failed, final and compared.final
-    return replace(outcome, disagreements=compared), final
+    return scene.attempt(job)
 
 
 def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:

@@ -304,8 +304,9 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
     """Yield the differences between a product and the one made from its inputs now."""
     campaign, scene = recipe.campaign(root, folder, out), recipe.scene(root)
     # Version and time of writing are those of the file, so that every byte can be compared.
-    places = {(recipe.kind, recipe.channel): Place(recipe.stamp)}
-    outcome = process_scene(Job(campaign, scene, recipe.plan, only=recipe.channel, places=places))
+    product = recipe.kind, recipe.channel
+    places = {product: Place(recipe.stamp)}
+    outcome = process_scene(Job(campaign, scene, recipe.plan, products=(product,), places=places))
     if outcome.internal:
         _LOG.error("scene %s: %s\n%s", outcome.scene, outcome.error, outcome.internal)
     record = next((made for made in outcome.products if made.kind == recipe.kind), None)

@@ -28,6 +28,12 @@ def file_channels(channel: str) -> tuple[str, ...]:
     return glued_parts(channel) if is_glued(channel) else (channel,)
 
 
+def sources(step: PlannedStep) -> tuple[str, ...]:
+    """Return the other channels from which a step takes data; not those it is compared with."""
+    parts = (need.rpartition("/") for need in step.needs)
+    return tuple(channel for channel, _, name in parts if channel and name != step.product)
+
+
 def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
     """Return the channels from which the products of a channel take data, each after its parts.
 
@@ -35,8 +41,7 @@ def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, 
     """
     needed: dict[str, list[str]] = {}
     for step in steps:
-        others = (need.rpartition("/")[0] for need in step.needs)
-        needed.setdefault(step.channel, []).extend(other for other in others if other)
+        needed.setdefault(step.channel, []).extend(sources(step))
     order: dict[str, None] = {}
 
     def visit(name: str) -> None:

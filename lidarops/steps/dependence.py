@@ -25,7 +25,7 @@ from lidarops.records import (
     Scene,
     UnusedFile,
 )
-from lidarops.steps.channels import READ_STEP
+from lidarops.steps.channels import READ_STEP, sources
 from lidarops.steps.conditioning import DARK, lacks_dark
 from lidarops.steps.reading import ARCHIVE, required_by
 from lidarops.steps.registry import definition, gives
@@ -161,8 +161,7 @@ def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> Planned
     if step.instrument or not gives(step, ARCHIVE):
         return step
     products = sorted(s.name for s in steps if is_product(s) and s.channel == step.channel)
-    of_part = f"{step.channel}/"
-    glued = sorted({s.channel for s in steps if any(n.startswith(of_part) for n in s.needs)})
+    glued = sorted({s.channel for s in steps if step.channel in sources(s)})
     return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
 
 

@@ -6,6 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import Final
 
+from lidarops.kinds import kind_of
 from lidarops.records import Plan, PlannedStep, Scene
 from lidarops.steps.channels import counted_channels, prepared_channels
 from lidarops.steps.data import CHUNK_BYTES
@@ -20,6 +21,9 @@ OF_A_COUNT: Final = 26.0
 less."""
 OF_A_FILE: Final = 5_000
 """Bytes of the facts about a raw file."""
+OF_A_RESULT: Final = 0.1
+"""Bytes of a product that waits for those with which it is compared, for each byte of its
+retrieval: 38 of 430 for an altitude of a beam."""
 _COUNT: Final = 4
 """Bytes of a raw count."""
 
@@ -74,11 +78,12 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
         together = max(together, known.together(settings, work))
     files = len(scene.granules) + len(scene.dark)
     products = [step for step in plan.steps if is_product(step)]
+    compared = [held[step.channel] for step in products if kind_of(step.product).common]
     # Channels are processed one after the other.
     channels = [prepared_channels(plan.steps, step.channel) for step in products]
     most = max((sum(held[name] for name in names) for names in channels), default=0.0)
     return SceneMemory(
-        held=OF_A_FILE * files + most,
+        held=OF_A_FILE * files + most + OF_A_RESULT * sum(compared),
         profile=float(_COUNT * _most_bins(scene, plan, products)),
         together=together,
         profiles=max((len(member.granules) for member in scene.members or (scene,)), default=0),

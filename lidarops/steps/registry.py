@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, Final
@@ -17,7 +18,7 @@ from lidarops.steps.data import Data
 from lidarops.steps.gluing import Glue, Lag
 from lidarops.steps.network import NetworkProductStep
 from lidarops.steps.preparation import Molecular
-from lidarops.steps.reading import READ
+from lidarops.steps.reading import READ, WAVELENGTH
 from lidarops.steps.step import Datum, Definition, MakingStep, ProductStep, Step
 
 SharedStep = Step[ChannelCase, Any]
@@ -118,15 +119,35 @@ def _takes(taker: Definition[Any], other: Definition[Any]) -> bool:
 
 
 def with_needs(entries: Iterable[PlannedStep | LeftOut]) -> list[PlannedStep | LeftOut]:
-    """Return the entries of a plan, of which each step names those whose outputs it takes."""
+    """Return the entries of a plan, of which each step names those whose outputs it takes.
+
+    The step that makes a product names the products with which its own is compared.
+    """
     entries = list(entries)
+    compared = _compared([entry for entry in entries if isinstance(entry, PlannedStep)])
     places = {(e.channel, e.instrument, e.product, e.name) for e in entries}
     # A step of a whole network takes from every member.
     places |= {(e.channel, "", e.product, e.name) for e in entries}
     return [
-        replace(entry, needs=_needs(entry, places)) if isinstance(entry, PlannedStep) else entry
+        replace(entry, needs=(*_needs(entry, places), *compared.get(id(entry), ())))
+        if isinstance(entry, PlannedStep)
+        else entry
         for entry in entries
     ]
+
+
+def _compared(steps: Sequence[PlannedStep]) -> dict[int, list[str]]:
+    """Return the products of other channels that measure the same, by the identity of a step."""
+    wavelengths = {s.channel: s.settings["wavelength"] for s in steps if gives(s, WAVELENGTH)}
+    alike: defaultdict[tuple[str, float], list[PlannedStep]] = defaultdict(list)
+    for step in steps:
+        if step.name == step.product and kind_of(step.product).common:
+            alike[step.product, wavelengths[step.channel]].append(step)
+    return {
+        id(step): [f"{other.channel}/{other.name}" for other in group if other is not step]
+        for group in alike.values()
+        for step in group
+    }
 
 
 def _needs(planned: PlannedStep, places: Collection[tuple[str, str, str, str]]) -> tuple[str, ...]:

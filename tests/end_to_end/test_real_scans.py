@@ -244,6 +244,35 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     assert found["vertical_optical_depth"].values[:, row] == pytest.approx([0.12, 0.12], abs=0.01)
 
 
+@pytest.mark.parametrize(("overlap", "method"), [(100, "auto"), (300, "kano_hamilton")])
+def test_what_a_run_knows_to_be_wrong_is_not_good(overlap, method, data_root, tmp_path):
+    """Analog signals nearer than their full overlap, and altitudes that are not smoothed."""
+    tree = yaml.safe_load(CAMPAIGN.read_text())
+    lidar = tree["instruments"]["savant"]
+    lidar["files"] = "*/R18*"
+    lidar["facts"][0]["full_overlap_range"] = overlap
+    lidar["products"]["multiangle"]["method"] = method
+    campaign = tmp_path / "near.yaml"
+    campaign.write_text(yaml.safe_dump(tree))
+    record = reprocess(
+        load_campaign(campaign, archive=data_root / "savant", output=tmp_path / "out")
+    )
+    assert record is not None
+    (scene,) = record.scenes
+    outliers = {pair.outlier for pair in scene.disagreements}
+    good = 0
+    for made in scene.products:
+        product = xr.load_dataset(Path(record.products) / made.path)
+        is_good = (product["usable"] == 0).values
+        assert not (is_good.any() and made.channel in outliers)
+        for name in ("vertical_optical_depth", "total_extinction"):
+            value, error = (product[f"{name}{of}"].values for of in ("", "_standard_error"))
+            # Rounding of both to a part of 4096.
+            assert not (value < -2.01 * error)[is_good].any()
+        good += np.count_nonzero(is_good)
+    assert good > 50
+
+
 @pytest.mark.parametrize("uncertainty", [0.05, 0.1, 0.15])
 def test_values_are_usable_where_the_stated_dead_time_explains_the_residuals(
     uncertainty, data_root, tmp_path

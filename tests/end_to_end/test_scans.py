@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 import yaml
 from support.archives.scan_campaign import ALTITUDE, TREE
+from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.constants import KNOWN_SHAPE_PAPERS
@@ -18,7 +19,10 @@ from lidarops.reports.findings import disagreement_rows
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
+from lidarops.run.reproduction import reproduce_product
 from lidarops.simulate.campaign import simulate_campaign
+from lidarops.steps.dependence import plan_closure, planned_products
+from lidarops.system.files import sha256_of
 
 
 def campaign(folder: Path, **simulation: Any) -> tuple[Campaign, xr.Dataset]:
@@ -134,8 +138,22 @@ def test_a_fixed_beam_is_not_a_scan(tmp_path):
     assert "does not scan" in reason
 
 
-def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
-    """The range offset of one channel is stated wrongly."""
+CHANNELS = ("photon_532p", "analog_532p", "photon_532s")
+AGREEMENT = int(Quality.CONTRADICTED | Quality.DISAGREES)
+
+
+@pytest.fixture(scope="module")
+def polarised(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of simulated scans of two polarisations, one of which has an analog record."""
+    folder = tmp_path_factory.mktemp("polarised")
+    simulate_campaign(of_channels(folder, "out"))
+    return folder
+
+
+def of_channels(
+    folder: Path, output: str, channels: tuple[str, ...] = CHANNELS, range_offset: float = 0.0
+) -> Campaign:
+    """Return a campaign that states the range offset of one channel, wrongly if not 0."""
     lidar, scanner = TREE["instruments"]["scanner"], TREE["simulation"]["instruments"]["scanner"]
     (detector,) = scanner["detectors"]
     analog = {"analog": {"gain": 0.5, "noise": 0.02, "dark_offset": 2.0}}
@@ -143,60 +161,114 @@ def test_channels_that_disagree_about_the_optical_depth_are_reported(tmp_path):
         detector | {"signal_rate": 60, "polarisation": name} | recorders
         for name, recorders in (("p", analog), ("s", {}))
     ]
-    names = ["photon_532p", "analog_532p", "photon_532s"]
-
-    def tree(range_offset: float) -> dict[str, Any]:
-        counting = {"dead_time": 3e-9, "dead_time_uncertainty": 0.01}
-        facts = {
-            "photon_532p": counting,
-            "photon_532s": counting | {"range_offset": range_offset},
-        }
-        products = {"multiangle": lidar["products"]["multiangle"] | {"channels": names}}
-        changed = lidar | {
-            "facts": [{"full_overlap_range": 300, "channels": facts}],
-            "products": products,
-        }
-        instruments = {"scanner": scanner | {"detectors": detectors}}
-        return TREE | {
-            "instruments": {"scanner": changed},
-            "simulation": TREE["simulation"] | {"duration": 600, "instruments": instruments},
-        }
-
-    path = tmp_path / "scans.yaml"
-    for range_offset, outliers in ((0.0, set()), (40.0, {"photon_532s"})):
-        path.write_text(yaml.safe_dump(tree(range_offset)), encoding="utf-8")
-        settings = load_campaign(path)
-        if not outliers:
-            simulate_campaign(settings)
-        else:
-            # What is no product is no witness.
-            (product,) = settings.products_root.rglob("*photon_532p*.nc")
-            product.with_name(product.name.replace("532p", "532o")).write_bytes(b"")
-        run = reprocess(settings)
-        pairs = run.scenes[0].disagreements
-        assert {pair.outlier for pair in pairs} == outliers
-        others = {name for pair in pairs for name in pair.channels} - {"photon_532s"}
-        assert others == ({"photon_532p", "analog_532p"} if outliers else set())
-        rows = list(disagreement_rows(run.scenes))
-        assert len(rows) == len(pairs)
-        assert all(
-            "photon_532s is wrong, as other channels contradict it too" in row.problem
-            for row in rows
-        )
-    # Only the channel of the changed fact was made again.
-    assert [product.channel for product in run.scenes[0].products] == ["photon_532s"]
+    counting = {"dead_time": 3e-9, "dead_time_uncertainty": 0.01}
+    facts = {"photon_532p": counting, "photon_532s": counting | {"range_offset": range_offset}}
+    layers = [[0, 1200], [2000, 3000]]
+    request = lidar["products"]["multiangle"] | {"channels": list(channels), "layers": layers}
+    changed = lidar | {
+        "facts": [{"full_overlap_range": 300, "channels": facts}],
+        "products": {"multiangle": request},
+    }
+    tree = TREE | {
+        "output": output,
+        "instruments": {"scanner": changed},
+        "simulation": TREE["simulation"]
+        | {"duration": 600, "instruments": {"scanner": scanner | {"detectors": detectors}}},
+    }
+    path = folder / f"{output}.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return load_campaign(path)
 
 
-def test_products_stay_recorded_where_their_comparison_fails(tmp_path, monkeypatch):
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError
+def opened(settings: Campaign) -> dict[str, xr.Dataset]:
+    """Return the products of a campaign by channel."""
+    products = map(xr.load_dataset, settings.products_root.rglob("*.nc"))
+    return {product.attrs["lidarops_channel"]: product for product in products}
 
-    monkeypatch.setattr("lidarops.run.agreement.find_disagreements", fail)
-    settings, _ = campaign(tmp_path, duration=400)
-    (outcome,) = reprocess(settings).scenes
-    assert "ZeroDivisionError" in outcome.internal
-    (product,) = outcome.products
-    assert (settings.products_root / product.path).is_file()
+
+def digests(settings: Campaign) -> dict[str, str]:
+    """Return the SHA-256 of the products of a campaign, by name of the file."""
+    return {path.name: sha256_of(path) for path in settings.products_root.rglob("*.nc")}
+
+
+def test_values_of_a_channel_that_others_contradict_are_not_good(polarised):
+    settings = of_channels(polarised, "third")
+    assert reprocess(settings).scenes[0].disagreements == ()
+    agreeing = digests(settings)
+    for product in opened(settings).values():
+        assert not (product["quality_flag"] & AGREEMENT).any()
+    settings = of_channels(polarised, "third", range_offset=40.0)
+    run = reprocess(settings)
+    pairs = run.scenes[0].disagreements
+    assert {pair.outlier for pair in pairs} == {"photon_532s"}
+    assert {name for pair in pairs for name in pair.channels} == set(CHANNELS)
+    rows = list(disagreement_rows(run.scenes))
+    assert len(rows) == len(pairs)
+    words = "photon_532s is wrong, as other channels contradict it too"
+    assert all(words in row.problem for row in rows)
+    wrong = opened(settings)["photon_532s"]
+    contradicted = (wrong["quality_flag"] & int(Quality.CONTRADICTED)) != 0
+    assert (wrong["usable"].values[contradicted.values] == 2).all()
+    assert contradicted.all("time").any()
+    assert not (wrong["usable"] == 0).any()
+    assert words in wrong.attrs["lidarops_steps"]
+    # A layer has no flags of its own.
+    top = wrong["layer_bnds"].values.max(axis=1)
+    for layer, altitude in enumerate(top):
+        rejected = wrong["usable"].sel(altitude=altitude).values == 2
+        values = wrong["layer_vertical_optical_depth"].values[rejected, layer]
+        assert np.isnan(values).all()
+    # The others are judged again, and nothing of them has changed.
+    assert {product.channel for product in run.scenes[0].products} == set(CHANNELS)
+    changed = {name for name, sha256 in digests(settings).items() if agreeing[name] != sha256}
+    assert {name.split("_")[3:5] == ["photon", "532s"] for name in changed} == {True}
+
+
+def test_a_product_depends_on_the_channels_of_its_wavelength(polarised):
+    (job,) = scene_jobs(of_channels(polarised, "plan"))
+    needed = {}
+    for channel in CHANNELS:
+        closure = plan_closure(job.plan, [("multiangle", channel)])
+        assert {step.channel for step in closure.steps} == set(CHANNELS)
+        assert planned_products(closure) == planned_products(job.plan)
+        needed[channel] = {n for step in closure.steps for n in step.needs if "/" in n}
+    assert needed["photon_532s"] == {f"{channel}/multiangle" for channel in CHANNELS}
+    (alone,) = scene_jobs(of_channels(polarised, "plan", CHANNELS[:1]))
+    assert not any("/" in need for step in alone.plan.steps for need in step.needs)
+
+
+def test_two_channels_that_disagree_are_both_to_be_used_with_care(polarised):
+    pair = ("photon_532p", "photon_532s")
+    settings = of_channels(polarised, "two", pair, 40.0)
+    (found,) = reprocess(settings).scenes[0].disagreements
+    assert (found.channels, found.outlier) == (pair, "")
+    for product in opened(settings).values():
+        flags = product["quality_flag"]
+        assert ((flags & AGREEMENT) == int(Quality.DISAGREES)).all()
+        assert (product["usable"] == 1).any()
+        assert "one of the two is wrong" in product.attrs["lidarops_steps"]
+
+
+def test_verdicts_on_channels_are_the_same_whatever_is_made_with_them(polarised):
+    settings = of_channels(polarised, "alone", range_offset=40.0)
+    reprocess(settings)
+    made = digests(settings)
+    for path in settings.products_root.rglob("*.nc"):
+        assert reproduce_product(path, archive=settings.archive).identical
+        path.unlink()
+        (scene,) = reprocess(settings).scenes
+        assert [settings.products_root / product.path for product in scene.products] == [path]
+        names = {name for pair in scene.disagreements for name in pair.channels}
+        assert scene.products[0].channel in names
+        assert digests(settings) == made
+    # Elsewhere: a file whose values do not change stays as it is.
+    other = settings.model_copy(update={"output": f"{settings.output}-by-2"})
+    reprocess(other, options=Options(workers=2, profiles_per_chunk=7))
+    assert digests(other) == made
+    # A channel that is no longer requested is no witness.
+    reprocess(of_channels(polarised, "alone", ("photon_532s", "analog_532p"), 40.0))
+    flags = opened(settings)["photon_532s"]["quality_flag"]
+    assert ((flags & AGREEMENT) == int(Quality.DISAGREES)).all()
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ SHARED = {
     "low_signal": 6,
     "single_record": 7,
     "negative_amplitude": 8,
+    "contradicted": 9,
+    "disagrees": 10,
     "not_homogeneous": 11,
     "outlier": 12,
     "no_real_solution": 13,
@@ -64,6 +66,7 @@ OWN = {
         "doubtful_water_vapour": 23,
     },
     "multiangle": {
+        "negative_optical_depth": 19,
         "no_leverage": 20,
         "poor_stratification": 21,
         "prior_dominated": 22,
@@ -95,12 +98,12 @@ RETIRED = {"multiangle": {25, 30}}
 """Places of bits of former versions: one_sided and horizontal_gradient."""
 
 LEFT = {
-    "shared": 2,
+    "shared": 0,
     "signal": 14,
     "homogeneous": 9,
     "elastic": 8,
     "raman": 7,
-    "multiangle": 3,
+    "multiangle": 2,
     "visibility": 10,
 }
 """Places left for new bits."""
@@ -128,6 +131,10 @@ SCENES = {
     "test_values_below_their_error_are_used_with_care",
     "Quality.BACKGROUND_UNCERTAIN": "test_labeled_elastic::"
     "test_aerosol_in_the_far_range_makes_the_background_uncertain",
+    "Quality.CONTRADICTED": "test_scans::"
+    "test_values_of_a_channel_that_others_contradict_are_not_good",
+    "Quality.DISAGREES": "test_scans::"
+    "test_two_channels_that_disagree_are_both_to_be_used_with_care",
     "Quality.SINGLE_RECORD": "test_labeled_gluing::test_each_record_alone_has_the_bit",
     "Quality.NO_GLUING": "test_labeled_gluing::test_no_gluing_where_neither_record_shows_light",
     "ElasticQuality.CLOUD": "test_labeled_elastic::"
@@ -154,6 +161,8 @@ SCENES = {
     "RamanQuality.CLOUD": "test_raman_clouds::test_a_cloud_in_all_profiles_is_no_partial_one",
     "RamanQuality.DOUBTFUL_WATER_VAPOUR": "test_raman_channels::"
     "test_a_broken_channel_of_water_vapour_concerns_water_vapour_alone",
+    "MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH": "test_labeled_multiangle::"
+    "test_an_optical_depth_below_zero_or_falling_is_flagged",
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
     "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"

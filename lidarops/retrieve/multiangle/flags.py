@@ -11,6 +11,14 @@ from lidarops.flags import FIRST_OWN, FlagBit, Quality, Severity, rejecting
 class MultiAngleQuality(FlagBit):
     """Own bits. A place is never given to another bit."""
 
+    NEGATIVE_OPTICAL_DEPTH = (
+        FIRST_OWN + 2,
+        Severity.CARE,
+        (
+            "the optical depth is below zero, or falls with altitude, by more than 2 standard"
+            " errors: keep it in means, which would be biased without such values"
+        ),
+    )
     NO_LEVERAGE = (
         FIRST_OWN + 3,
         Severity.REJECT,

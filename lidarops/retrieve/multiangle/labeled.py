@@ -362,6 +362,11 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     )
     reasons = np.where(reasons == 0, np.int32(MultiAngleQuality.NO_LEVERAGE), reasons)
     bits |= np.where(lost, reasons, np.int32(0))
+    negative = np.zeros(lost.shape, dtype=np.bool_)
+    for name in ("optical_depth", "extinction"):
+        error = getattr(retrieval, f"{name}_standard_error")
+        negative |= getattr(retrieval, name) < -THRESHOLDS.negative * error
+    bits |= np.where(negative, np.int32(MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH), np.int32(0))
     # The layer that ends at a valid altitude may begin in a gap.
     gapped = np.zeros(lost.shape, dtype=bool)
     for name in _PER_ALTITUDE:

@@ -103,6 +103,11 @@ class Thresholds:
     it, 0.4 percent deviated by more than 4 errors, not 0.07, where beams were not averaged over
     cells (`docs/algorithms/multiangle.md`)."""
 
+    # Values (`labeled`).
+    negative: float = 2.0
+    """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
+    alone in 2.3 percent of the altitudes where the air is clear."""
+
     # Outlying beams (`_block`, `robust_weights`).
     outlying_residual: float = 4.5
     """Least limit in standard errors beyond which a residual starts the robust passes; assumed."""

@@ -213,6 +213,26 @@ def test_optical_depths_of_layers_lie_within_their_errors(method):
     assert "layer_vertical_optical_depth" not in solve(*scan(3), method=method)
 
 
+@pytest.mark.parametrize("base", [0.0, 1500.0])
+def test_an_optical_depth_below_zero_or_falling_is_flagged(base):
+    """A gain that increases with the path through the air above the base."""
+    conditioned, pointing = scan(12)
+    cosine = np.cos(np.radians(pointing["zenith_angle"]))[:, np.newaxis]
+    added = 5e-4 * np.maximum(RANGE * cosine - base, 0.0)
+    light = power(pointing["zenith_angle"])
+    conditioned["power"] += light * np.expm1(2.0 * np.minimum(added, 1.0) / cosine)
+    product = solve(conditioned, pointing)
+    flagged = has(product, MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH)
+    depth = product["vertical_optical_depth"].to_numpy()
+    below_zero = depth < -2.0 * product["vertical_optical_depth_standard_error"].to_numpy()
+    assert below_zero.any()
+    assert flagged[below_zero].all()
+    height = product["altitude"].to_numpy() - STATION
+    assert flagged[:, (base + 200.0 < height) & (height < base + 1800.0)].all()
+    assert not flagged[:, height < base - 200.0].any()
+    assert not has(solve(*scan(12)), MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH).any()
+
+
 def test_product_has_monotone_profiles_and_chi_square():
     product = solve(*scan(16), **FAR)
     depth, risen = (
