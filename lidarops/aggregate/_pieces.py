@@ -10,6 +10,7 @@ import xarray as xr
 from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, refuse_changed
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
+from lidarops.netcdf.read import reading
 from lidarops.netcdf.variables import attributes
 
 
@@ -35,12 +36,10 @@ def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
         If the file cannot be read, or has changed since its facts were read.
     """
     chunks: dict[str, int] | None = {} if dask else None
-    try:
+    with reading(file):
         opened = xr.open_dataset(
             file, engine="netcdf4", chunks=chunks, drop_variables=list(UNSHARED), decode_cf=False
         )
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ProductError(f"cannot be read: {error}", file=file) from error
     try:
         refuse_changed(opened, facts)
     except ProductError:

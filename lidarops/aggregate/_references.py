@@ -30,6 +30,7 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
+from lidarops.netcdf.read import reading
 from lidarops.netcdf.variables import attributes
 from lidarops.netcdf.write import is_chunked
 from lidarops.records import DetectionMode
@@ -152,14 +153,11 @@ def _refuse_foreign_encoding(variable: xr.Variable, name: str, facts: Facts) -> 
 
 def _chunk_locations(file: Path, names: Iterable[str]) -> dict[str, ChunkLocations]:
     locations = {}
-    try:
-        with h5py.File(file, "r") as stored:
-            for name in names:
-                locations[name] = ChunkLocations(
-                    stored[name].chunks, dict(_places(file, name, stored[name]))
-                )
-    except (OSError, KeyError, RuntimeError) as error:
-        raise ProductError(f"cannot be read: {error}", file=file) from error
+    with reading(file), h5py.File(file, "r") as stored:
+        for name in names:
+            locations[name] = ChunkLocations(
+                stored[name].chunks, dict(_places(file, name, stored[name]))
+            )
     return locations
 
 

@@ -18,6 +18,7 @@ from lidarops.aggregate._pieces import open_piece
 from lidarops.aggregate.facts import Facts, opened, plain, refuse_changed, refuse_duplicates
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
+from lidarops.netcdf.read import reading
 from lidarops.system.files import within
 
 _ROWS: Final = 256
@@ -247,9 +248,10 @@ def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:
 
 def _values(variable: xr.Variable, facts: Facts) -> NDArray[Any]:
     try:
-        return variable.values
-    except (OSError, RuntimeError) as error:
-        raise UnreadableProductError(facts, f"cannot be read: {error}") from error
+        with reading(facts.path):
+            return variable.values
+    except ProductError as error:
+        raise UnreadableProductError(facts, error.problem) from error
 
 
 def _piece(root: Path, facts: Facts) -> xr.Dataset:

@@ -18,7 +18,7 @@ from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.global_attributes import RECORDERS
-from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf.read import opened_product
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import DetectionMode, Verdicts, is_glued
@@ -294,15 +294,12 @@ def opened(file: Path) -> Iterator[xr.Dataset]:
     ProductError
         If the file cannot be read, or lacks what every product has.
     """
-    try:
-        check_sizes(file)
-        with xr.open_dataset(file, engine="netcdf4", decode_cf=False, cache=False) as product:
+    with opened_product(file, decode_cf=False) as product:
+        try:
             yield product
-    except KeyError as error:
-        raise ProductError(f"is not a product of lidarops: it has no {error}", file=file) from error
-    # Reading a damaged file raises OSError or RuntimeError.
-    except (OSError, RuntimeError, ValueError, MemoryError) as error:
-        raise ProductError(f"cannot be read: {error}", file=file) from error
+        except KeyError as error:
+            problem = f"is not a product of lidarops: it has no {error}"
+            raise ProductError(problem, file=file) from error
 
 
 def refuse_changed(product: xr.Dataset, facts: Facts) -> None:

@@ -28,6 +28,7 @@ from lidarops.aggregate.selection import parse_selection
 from lidarops.aggregate.usable import CARE, masked
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
+from lidarops.netcdf.read import reading
 from lidarops.system.files import within
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -165,7 +166,11 @@ def _from_index(indexed: IndexedPaths) -> tuple[Path, list[Facts]]:
 def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
     pieces = [open_piece(within(root, facts.path), facts, dask=True) for facts in products]
     owners = [facts.path for facts in products for _ in range(facts.profiles)]
-    refuse_duplicates(np.concatenate([piece["time"].values for piece in pieces]), owners)
+    times = []
+    for facts, piece in zip(products, pieces, strict=True):
+        with reading(facts.path):
+            times.append(piece["time"].values)
+    refuse_duplicates(np.concatenate(times), owners)
     joined = join(pieces)
     joined.attrs = shared_attributes([piece.attrs for piece in pieces])
     # Decoded once, which is much faster than decoding each piece.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import Severity
 from lidarops.netcdf.provenance import read_provenance
+from lidarops.netcdf.read import opened_product
 from lidarops.netcdf.variables import PROVENANCE, USABLE
 from lidarops.records import Change, Grade, Measure, Plan
 
@@ -93,17 +95,18 @@ def compare_products(old: Path, new: Path) -> Change:
     """
     causes = tuple(_causes(_making(old), _making(new)))
     try:
-        with (
-            xr.open_dataset(old, engine="netcdf4", decode_cf=False, cache=False) as before,
-            xr.open_dataset(new, engine="netcdf4", decode_cf=False, cache=False) as after,
-        ):
+        with _opened(old) as before, _opened(new) as after:
             _refuse_another(before, after, new)
             differences = [d for d in _differences(before, after) if d.count or d.lost or d.moved]
             same_texts = _texts(before) == _texts(after)
             sizes = {name: part[name].size for part in (before, after) for name in _measured(part)}
-    # The type of HDF5's error depends on the place of the damage.
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ProductError(f"cannot be compared with {old}: {error}", file=new) from error
+    except ProductError:
+        # It names the new one, also where values of the old one cannot be read.
+        with _opened(old) as before:
+            for variable in before.variables.values():
+                for part in _parts(variable):
+                    _ = variable[part].values
+        raise
     most = max(differences, key=lambda d: d.largest, default=_Difference("", 0))
     lost = sum(d.lost for d in differences)
     first_lost = next((d.variable for d in differences if d.lost), "")
@@ -122,6 +125,10 @@ def compare_products(old: Path, new: Path) -> Change:
         flags=sum(d.flags for d in differences),
         moved=moved,
     )
+
+
+def _opened(file: Path) -> AbstractContextManager[xr.Dataset]:
+    return opened_product(file, in_parts=True, decode_cf=False)
 
 
 def _refuse_another(before: xr.Dataset, after: xr.Dataset, new: Path) -> None:

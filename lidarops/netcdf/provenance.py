@@ -15,10 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 from uuid import NAMESPACE_URL, uuid5
 
-import xarray as xr
-
 from lidarops.errors import NO_FILE, ProductError
-from lidarops.netcdf.sizes import check_contents
+from lidarops.netcdf.read import opened_product
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
@@ -183,22 +181,15 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
 
 def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read the PROV-JSON document of a product and its global attributes; see `read_provenance`."""
-    try:
-        check_contents(path)
-        with xr.open_dataset(path, engine="netcdf4", decode_times=False) as product:
-            if "provenance" not in product:
-                raise ProductError(
-                    "has no such variable", file=path, field="provenance", wrong_use=True
-                )
-            text, attributes = str(product["provenance"].item()), dict(product.attrs)
-    # The type of HDF5's error depends on the place of the damage.
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ProductError(
-            f"cannot be read: {error}",
-            file=path,
-            remedy="give the path of a product of lidarops",
-            wrong_use=not _is_netcdf(Path(path)),
-        ) from error
+    if not _is_netcdf(Path(path)):
+        problem = "is no NetCDF file" if Path(path).is_file() else "is no file"
+        remedy = "give the path of a product of lidarops"
+        raise ProductError(problem, file=path, remedy=remedy, wrong_use=True)
+    with opened_product(path, in_parts=True, decode_times=False) as product:
+        if "provenance" not in product:
+            problem = "has no such variable"
+            raise ProductError(problem, file=path, field="provenance", wrong_use=True)
+        text, attributes = str(product["provenance"].item()), dict(product.attrs)
     try:
         document: dict[str, Any] = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -1,7 +1,9 @@
-"""Read some variables of a product fast: a report reads a few variables of thousands of products.
+"""Open and read products: whole ones through xarray, and some variables fast.
 
-xarray reads these files with the same result, but inspects the whole file first. Only files of
-`lidarops.netcdf.write` are read faster; other NetCDF-4 files are read through HDF5.
+A report reads a few variables of thousands of products. xarray reads these with the same result,
+but inspects the whole file first. Only files of `lidarops.netcdf.write` are read faster; other
+NetCDF-4 files are read through HDF5. Whatever a library raises for a damaged file is raised as
+`ProductError`, which names the file.
 """
 
 from __future__ import annotations
@@ -21,9 +23,9 @@ from xarray.backends import BackendArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from xarray.core import indexing
 
-from lidarops.errors import ProductError
+from lidarops.errors import LidarOpsError, ProductError
 from lidarops.netcdf._deflate import inflate_chunk
-from lidarops.netcdf.sizes import is_bare_dimension
+from lidarops.netcdf.sizes import check_contents, check_sizes, is_bare_dimension
 from lidarops.netcdf.stored_flags import Recoding, recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.netcdf.write import OTHER_DIMENSION
@@ -42,7 +44,78 @@ _ATTRIBUTES: Final = (
 """Attributes needed to decode values. Reading all attributes takes longer than the values."""
 LAZY_BYTES: Final = 1 << 14
 """Smallest variable that is not read at once."""
+_OF_LIBRARIES: Final = (
+    OSError,
+    EOFError,
+    RuntimeError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    MemoryError,
+)
+"""Families of errors of HDF5, netCDF4, xarray and numpy; the type depends on the place of the
+damage."""
+UNREADABLE: Final = (*_OF_LIBRARIES, LidarOpsError)
+"""What is raised where a part of a damaged or foreign product is read and drawn."""
+_MOST_WORDS: Final = 300
+"""Characters of the message of a library that are shown."""
 _FILTERS: Final = [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
+
+
+@contextmanager
+def reading(path: str | Path, field: str | None = None) -> Iterator[None]:
+    """Raise whatever a library raises for a damaged product as `ProductError`.
+
+    Parameters
+    ----------
+    path : path or str
+    field : str, optional
+        The variable that is read.
+    """
+    try:
+        yield
+    except LidarOpsError:
+        raise
+    except _OF_LIBRARIES as error:
+        words = " ".join(str(error).replace(str(path), Path(path).name).split())
+        raise ProductError(
+            f"cannot be read: {words[:_MOST_WORDS] or type(error).__name__}",
+            file=path,
+            field=field,
+            remedy="restore it from a copy, or make it again with lidarops reprocess",
+        ) from error
+
+
+@contextmanager
+def opened_product(
+    path: str | Path, *, in_parts: bool = False, **decoding: Any
+) -> Iterator[xr.Dataset]:
+    """Open a whole product; what is raised while it is open names it.
+
+    Parameters
+    ----------
+    path : path or str
+    in_parts : bool
+        Whether the product may be larger than memory, because no variable is read as a whole.
+    **decoding
+        As for `xarray.open_dataset`.
+
+    Yields
+    ------
+    xr.Dataset
+        Lazy.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be read, or states more than it can hold (`lidarops.netcdf.sizes`).
+    """
+    with reading(path):
+        (check_contents if in_parts else check_sizes)(path)
+        with xr.open_dataset(path, engine="netcdf4", cache=False, **decoding) as product:
+            yield product
 
 
 def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:
@@ -106,7 +179,7 @@ class _File:
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise ProductError("the file is missing", file=path)
-        self._path = path
+        self.path = path
         with self.access():
             self._file = h5py.File(path, "r")
 
@@ -116,16 +189,9 @@ class _File:
 
     @contextmanager
     def access(self) -> Iterator[None]:
-        try:
-            # netCDF4 may use the same HDF5 library, which is not thread-safe.
-            with NETCDF4_PYTHON_LOCK:
-                yield
-        # The type of HDF5's error depends on the place of the damage.
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise self.damaged(error) from error
-
-    def damaged(self, error: object) -> ProductError:
-        return ProductError(f"cannot be read: {error}", file=self._path)
+        # netCDF4 may use the same HDF5 library, which is not thread-safe.
+        with reading(self.path), NETCDF4_PYTHON_LOCK:
+            yield
 
     def length(self, dimension: str) -> int:
         with self.access():
@@ -175,13 +241,9 @@ class _File:
     def _decoded(self, name: str, stored: xr.Variable) -> xr.Variable:
         if _is_plain(stored):
             return stored
-        try:
+        with reading(self.path, name):
             decoded = xr.conventions.decode_cf_variable(name, stored, decode_timedelta=False)
             return decoded if stored.nbytes >= LAZY_BYTES else decoded.load()
-        except (ValueError, TypeError, OverflowError) as error:
-            raise ProductError(
-                f"cannot be decoded: {error}", file=self._path, field=name
-            ) from error
 
 
 class _Stored(BackendArray):
@@ -239,10 +301,8 @@ class _Stored(BackendArray):
                 # HDF5 may store a chunk without some of the filters.
                 inside = (slice(at, at + step) for at, step in zip(corner, chunk, strict=True))
                 return np.asarray(self._dataset[tuple(inside)])
-        try:
+        with reading(self._file.path):
             return inflate_chunk(data, chunk, self.dtype)
-        except ValueError as error:
-            raise self._file.damaged(error) from error
 
 
 def _shared(span: range, corner: int, step: int) -> tuple[slice, slice]:

@@ -75,12 +75,8 @@ def check_contents(path: str | Path) -> dict[str, int]:
         if stream.read(len(_HDF5)) != _HDF5:
             return {}
         size = os.fstat(stream.fileno()).st_size
-    try:
-        with h5py.File(file, "r") as opened:
-            stated = {name: _stated_bytes(opened, name, file) for name in opened}
-    # The type of HDF5's error depends on the place of the damage.
-    except (RuntimeError, KeyError, ValueError) as error:
-        raise ProductError(f"cannot be read: {error}", file=file) from error
+    with h5py.File(file, "r") as opened:
+        stated = {name: _stated_bytes(opened, name, file) for name in opened}
     most = _DEFLATE_LIMIT * size + _UNWRITTEN
     _refuse_more(sum(stated.values()), most, file, _largest(stated), "hold")
     return stated

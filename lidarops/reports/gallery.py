@@ -22,8 +22,9 @@ from lidarops.figures.panels import Figure
 from lidarops.figures.wording import counted
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
+from lidarops.netcdf.read import UNREADABLE, opened_product
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
-from lidarops.reports.reading import UNREADABLE, Readers, reason
+from lidarops.reports.reading import Readers, reason
 from lidarops.reports.sources import Compared, Group, Problem, Sources
 from lidarops.system.files import write_atomically
 
@@ -184,7 +185,7 @@ def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
     try:
         if not path.is_file():
             raise ProductError("the file is missing")
-        with xr.open_dataset(path, engine="netcdf4", decode_timedelta=False) as opened:
+        with opened_product(path, decode_timedelta=False) as opened:
             truth = opened.load()
         for name in ("path", "instrument", "time", "total_extinction"):
             if name not in truth.variables or truth[name].dims != ("granule",):

@@ -20,11 +20,11 @@ from rich.table import Table
 from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
-from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
+from lidarops.errors import NO_FILE, LidarOpsError, RawFormatError
 from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
 from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
-from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf.read import opened_product
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import raw_formats, read_raw_header
@@ -184,12 +184,7 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
 
 
 def _product(file: Path) -> dict[str, Any]:
-    try:
-        check_sizes(file)
-        dataset = xr.open_dataset(file, decode_times=False)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise ProductError(f"cannot be opened: {error}", file=file) from error
-    with dataset:
+    with opened_product(file, decode_times=False) as dataset:
         return {
             "type": "netcdf",
             "file": str(file),

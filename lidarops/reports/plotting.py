@@ -15,8 +15,7 @@ from lidarops.figures.any_kind import views_of
 from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.netcdf.provenance import NETCDF_MAGIC
-from lidarops.netcdf.read import open_product
-from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf.read import open_product, opened_product, reading
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
 
@@ -58,19 +57,15 @@ def _of_product(path: Path) -> Iterator[Figure]:
             "is no product of lidarops", file=path, remedy="plot draws raw files and products"
         )
     for view in views_of(kind):
-        with open_product(path, view.variables) as product:
+        with reading(path), open_product(path, view.variables) as product:
             content = view.read(product, ProductSource())
         if content is not None:
             yield from view.draw([content])
 
 
 def _kind(path: Path) -> str:
-    try:
-        check_sizes(path)
-        with xr.open_dataset(path, decode_times=False) as opened:
-            return str(opened.attrs.get("lidarops_kind", ""))
-    except (OSError, ValueError, RuntimeError) as error:
-        raise ProductError(f"cannot be opened: {error}", file=path) from error
+    with opened_product(path, decode_times=False) as opened:
+        return str(opened.attrs.get("lidarops_kind", ""))
 
 
 def _of_raw(path: Path) -> Iterator[Figure]:

@@ -20,8 +20,15 @@ from lidarops.system.processes import Processes
 
 FEWEST: Final = 50
 """Fewest products per process for which starting the process pays."""
-UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
-"""Exceptions observed when damaged or foreign files are opened and read."""
+_UNREADABLE: Final = (
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+    ValueError,
+    ProductError,
+)
+"""What values of a damaged product may raise; other errors are those of the program."""
 _AT_A_TIME: Final = 8
 """Products sent to a process together, so that it waits less."""
 _LENGTHS_AT_A_TIME: Final = 32
@@ -75,13 +82,13 @@ class Readers:
     def __exit__(self, *error: object) -> None:
         self._processes.__exit__(*error)
 
-    def read(self, reading: ReadTask[Content]) -> Content | ReadFailure:
+    def read(self, task: ReadTask[Content]) -> Content | ReadFailure:
         """Read one product, in this process."""
-        return _read(self._truth, reading)
+        return _read(self._truth, task)
 
-    def read_all(self, readings: Iterable[ReadTask[Content]]) -> Iterator[Content | ReadFailure]:
+    def read_all(self, tasks: Iterable[ReadTask[Content]]) -> Iterator[Content | ReadFailure]:
         """Yield the content of each product, in their order."""
-        for _, content in self._processes.map_items(_read, readings, at_a_time=_AT_A_TIME):
+        for _, content in self._processes.map_items(_read, tasks, at_a_time=_AT_A_TIME):
             yield content
 
     def lengths(self, paths: Iterable[Path]) -> Iterator[int | ReadFailure]:
@@ -90,18 +97,18 @@ class Readers:
             yield length
 
 
-def _read(truth: xr.Dataset | None, reading: ReadTask[Content]) -> Content | ReadFailure:
+def _read(truth: xr.Dataset | None, task: ReadTask[Content]) -> Content | ReadFailure:
     try:
-        with open_product(reading.path, reading.names) as product:
-            return reading.read(product, replace(reading.source, truth=truth))
-    except UNREADABLE as error:
-        return ReadFailure(reason(reading.path, error))
+        with open_product(task.path, task.names) as product:
+            return task.read(product, replace(task.source, truth=truth))
+    except _UNREADABLE as error:
+        return ReadFailure(reason(task.path, error))
 
 
 def _length(_: object, path: Path) -> int | ReadFailure:
     try:
         return profiles_in(path)
-    except UNREADABLE as error:
+    except ProductError as error:
         return ReadFailure(reason(path, error))
 
 

@@ -12,24 +12,23 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
-import xarray as xr
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import Dependence, NewProduct, Run, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.store import Store
-from lidarops.errors import ProductError
+from lidarops.errors import LidarOpsError, ProductError
 from lidarops.figures.series_data import blocks
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.context import path_of_product
+from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.plan.scenes import parse_scene_id
 from lidarops.process.context import recorded_settings
 from lidarops.process.job import Job
 from lidarops.records import Plan, ProductRecord, Role, SceneOutcome
-from lidarops.reports.reading import UNREADABLE
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, Judgement
@@ -37,7 +36,6 @@ from lidarops.steps import dependence
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
 
-_UNREADABLE: Final = (*UNREADABLE, TypeError)
 """Also what foreign settings raise."""
 _BLOCK: Final = 1 << 24
 """Quality flags that are read at a time."""
@@ -151,7 +149,7 @@ class _Rebuilding:
             self.progress(1)
             try:
                 products.append(_read_product(self.campaign, path))
-            except _UNREADABLE as error:
+            except LidarOpsError as error:
                 root = f"{self.campaign.products_root}/"
                 self.rebuilt.problems[path] = str(error).removeprefix(root)
         return products
@@ -181,6 +179,11 @@ def _order(product: _ProductFile) -> tuple[str, str]:
 
 def _read_product(campaign: Campaign, path: str) -> _ProductFile:
     file = campaign.products_root / path
+    with reading(file):
+        return _read_file(campaign, path, file)
+
+
+def _read_file(campaign: Campaign, path: str, file: Path) -> _ProductFile:
     recipe = Recipe.of(file)
     if recipe.campaign_name != campaign.name:
         raise ProductError(f"is a product of campaign {recipe.campaign_name!r}", file=file)
@@ -212,7 +215,7 @@ def _counts(file: Path, kind: str) -> tuple[int, int, int]:
     """
     rejecting = np.int32(flags_of(kind).rejecting)
     unflagged = usable = 0
-    with xr.open_dataset(file, decode_cf=False, cache=False) as product:
+    with opened_product(file, in_parts=True, decode_cf=False) as product:
         flags = product[QUALITY_FLAG]
         recode = recoding(flags.attrs, kind)
         for block in blocks(flags, _BLOCK):

@@ -18,8 +18,9 @@ import xarray as xr
 from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.ledger import Run
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError, LidarOpsError, ProductError
+from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.provenance import package_versions
+from lidarops.netcdf.read import opened_product
 from lidarops.process.job import Job, Place
 from lidarops.process.scene import process_scene
 from lidarops.records import InputRecord
@@ -321,14 +322,9 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
 
 def _compared(before: Path, after: Path) -> list[Difference]:
     """Return the differences between two NetCDF files whose bytes differ."""
-    try:
-        with (
-            xr.open_dataset(before, decode_cf=False) as old,
-            xr.open_dataset(after, decode_cf=False) as new,
-        ):
-            differences = [*_attributes("", old.attrs, new.attrs), *_variables(old, new)]
-    except (OSError, ValueError) as error:
-        raise LidarOpsError(f"cannot be read: {error}", file=before) from error
+    whole = [opened_product(file, decode_cf=False) for file in (after, before)]
+    with whole[0] as new, whole[1] as old:
+        differences = [*_attributes("", old.attrs, new.attrs), *_variables(old, new)]
     same = Difference("bytes", before.name, "the same content, stored in other bytes")
     return differences or [same]
 

@@ -19,15 +19,14 @@ from typing import Any, Final, TypeVar
 import xarray as xr
 
 from lidarops import __version__
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, ProductError
 from lidarops.figures import any_kind, svg
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.quality_panel import quality_figure, read_quality
-from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.reports.reading import UNREADABLE
 from lidarops.site import pages, product_contents
 from lidarops.site.links import BESIDE, Links
 from lidarops.site.neighbours import with_neighbours
@@ -49,10 +48,6 @@ _FORMAT: Final = "lidarops site"
 _EMPTY: Final = "no figure of the product"
 _OURS: Final = ("product", "station", COPIES)
 """Folders that only the site writes to."""
-_UNREADABLE: Final = (*UNREADABLE, TypeError, ArithmeticError, MemoryError)
-"""Exceptions observed when damaged or foreign files are read and drawn."""
-
-
 Part = TypeVar("Part")
 
 
@@ -199,11 +194,12 @@ def _page(task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
     try:
         file = within(task.products, task.path)
-        sha256 = sha256_of(file)
+        with reading(file):
+            sha256 = sha256_of(file)
         if task.known is not None and _is_kept(task.known, sha256, task.site):
             return task.known, False
         return _make(task, file, sha256), True
-    except _UNREADABLE as error:
+    except ProductError as error:
         return Problem(task.path, _reason(task, error)), True
 
 
@@ -224,8 +220,7 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
 
 
 def _make(task: _Task, file: Path, sha256: str) -> Entry:
-    check_sizes(file)
-    with xr.open_dataset(file, engine="netcdf4", decode_timedelta=False) as opened:
+    with opened_product(file, decode_timedelta=False) as opened:
         quality = product_contents.count_quality(opened)
         origin = product_contents.origin(opened)
         span = product_contents.span(opened)
@@ -289,7 +284,7 @@ def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
     """Return a part of a page, or why there is none."""
     try:
         return make(), ""
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         return None, f"{failure}: {error}"
 
 
@@ -311,11 +306,11 @@ def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:
     try:
         if figures is not None:
             return _figures(with_current_flags(opened), figures.views), ""
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
         return _figures(opened, [any_kind.view_of(kind)]), problem
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         return [], problem or f"it cannot be drawn: {error}"
 
 

@@ -181,7 +181,7 @@ class TestOfOtherWriters:
         path = tmp_path / "times.nc"
         units = {"units": "fortnights since the flood"}
         xr.Dataset({"time": ("time", np.arange(3.0), units)}).to_netcdf(path)
-        with pytest.raises(ProductError, match="time: cannot be decoded"):
+        with pytest.raises(ProductError, match="time: cannot be read"):
             open_product(path, ["time"])
 
 
