@@ -188,3 +188,21 @@ def test_a_file_that_was_damaged_without_a_trace_is_refused_when_it_is_read(tmp_
     assert not bring_up_to_date(campaign).has_failures
     assert _is_same(campaign, other)
     assert reprocess(campaign) is None
+
+
+@pytest.mark.slow
+def test_products_of_a_damaged_archive_do_not_depend_on_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1772323200")
+    archive = _archive(tmp_path, days=5)
+    _damaged_at_random(archive, days=5)
+    contents = []
+    for workers in (1, 2):
+        archive.tree["output"] = f"out{workers}"
+        campaign = archive.write()
+        bring_up_to_date(campaign, options=Options(workers=workers))
+        contents.append(archive.contents(f"out{workers}/products"))
+        assert reprocess(campaign) is None
+    assert len(contents[0]) == 10
+    assert contents[0] == contents[1]
