@@ -681,6 +681,19 @@ REFERENCE_WINDOW: Final = (
         comment="Set by the campaign, as its standard error is: the value by which profiles are"
         f" calibrated. {NO_STANDARD_NAME}",
     ),
+    Row(
+        name="reference_detection_limit",
+        dims=("time",),
+        dtype="f4",
+        units="1",
+        long_name="least ratio of backscatter of particles to that of molecules that is"
+        " detected in the reference window with a probability of 0.95",
+        coverage=Coverage.AUXILIARY,
+        comment="By comparison with other windows. Fewer particles may remain undetected:"
+        " aerosol_backscatter_error_reference includes the ratio of the window to air in excess of"
+        " the lowest ratio beyond their noise. Missing where no window passed the tests, or none"
+        f" beside it is comparable. {NO_STANDARD_NAME}",
+    ),
 )
 """Where a profile was compared with clean air, and how clean the air is taken to be."""
 

@@ -364,7 +364,7 @@ def invert(
         clouds = find_clouds(power, noise, sky).mask
         window = choose_window(power, noise, sky, clouds, background_error=estimates.standard_error)
         edges = window.edges
-        hidden = np.nan_to_num(window.undetected_particles) if chain.carried else 0.0
+        hidden = window.undetected_particles if chain.carried else 0.0
     return invert_particles(
         power,
         sky,

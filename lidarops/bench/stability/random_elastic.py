@@ -205,9 +205,8 @@ def _input_errors(
     fit: known_shape.KnownShapeResult, window: reference_window.ReferenceWindow
 ) -> Array:
     """Return standard errors of the background and relative ones of the reference."""
-    undetected = np.nan_to_num(window.undetected_particles)
     background = np.nan_to_num(fit.background_standard_error)
-    return np.stack([background, np.hypot(_REFERENCE.relative_error, undetected)])
+    return np.stack([background, window.relative_error(_REFERENCE.relative_error)])
 
 
 def _solve(

@@ -252,19 +252,6 @@ LAYOUT: Final = Layout(
             " ranges are one error.",
         ),
         *REFERENCE_WINDOW,
-        Row(
-            name="reference_detection_limit",
-            dims=("time",),
-            dtype="f4",
-            units="1",
-            long_name="least ratio of backscatter of particles to that of molecules that is"
-            " detected in the reference window with a probability of 0.95",
-            coverage=Coverage.AUXILIARY,
-            comment="By comparison with other windows. Fewer particles may remain undetected:"
-            " aerosol_backscatter_error_reference states 1.5 standard errors of the comparison for"
-            " them. Missing where no window passed"
-            f" the tests, or none beside it is comparable. {NO_STANDARD_NAME}",
-        ),
         reference_rejections(
             "too_few_bins: data in less than half of the bins; excluded: a cloud; low_signal: the"
             " signal does not exceed zero by 3 standard errors; slope, curvature, scatter: it"

@@ -75,6 +75,8 @@ class ReferenceWindow:
     comparison_standard_error: Array
     """Error of the anchor's scale, and of the background in the difference of both; in the unit of
     the scale, 0 where the anchor itself is chosen."""
+    excess: Array
+    """Scale less that of the anchor; 0 where the anchor itself is chosen."""
     detection_limit: Array
     """Scattering ratio minus 1 of particles in the window that the comparison with other windows
     shows with a probability of 0.95. Infinite where no other window is comparable."""
@@ -90,10 +92,28 @@ class ReferenceWindow:
     def undetected_particles(self) -> Array:
         """Relative standard error of the scattering ratio by particles that noise hides.
 
-        It is `Thresholds.undetected_particles` standard errors of the comparison with the anchor.
+        It is the excess over the anchor beyond noise: the root of the square of the difference,
+        where positive, less the variance of that difference, which noise adds on average.
         """
-        error = np.hypot(self.scale_standard_error, self.comparison_standard_error)
-        return np.asarray(THRESHOLDS.undetected_particles * error / self.scale)
+        noise = np.hypot(self.scale_standard_error, self.comparison_standard_error)
+        square = np.maximum(self.excess, 0.0) ** 2 - noise**2
+        return np.asarray(np.nan_to_num(np.sqrt(np.maximum(square, 0.0)) / self.scale))
+
+    def relative_error(self, stated: float) -> Array:
+        """Return the relative error of the scattering ratio: stated, and by hidden particles."""
+        return np.hypot(stated, self.undetected_particles)
+
+    @property
+    def variables(self) -> dict[str, tuple[str, npt.NDArray[np.generic]]]:
+        """What products state of the windows of their profiles, over time."""
+        limit = np.where(np.isinf(self.detection_limit), np.nan, self.detection_limit)
+        rejections = np.bitwise_or.reduce(self.rejections, axis=-1).astype(np.int32)
+        return {
+            "reference_bottom": ("time", self.bottom),
+            "reference_top": ("time", self.top),
+            "reference_detection_limit": ("time", limit),
+            "reference_rejections": ("time", rejections),
+        }
 
 
 def candidate_windows(lowest: float, highest: float, width: float, step: float) -> Array:
@@ -143,7 +163,7 @@ def choose_reference(
     background_standard_error: npt.ArrayLike = 0.0,
     exclude: npt.NDArray[np.bool_] | None = None,
 ) -> ReferenceWindow:
-    r"""Return the cleanest window; of equally clean ones, the best determined.
+    r"""Return the cleanest window; of equally clean ones, the highest that is well determined.
 
     In each candidate the power is fitted with the molecular shape :math:`\phi` by weighted
     least squares: :math:`P = \phi (a_0 + a_1 p_1(R) + a_2 p_2(R))`, with polynomials that are
@@ -158,8 +178,9 @@ def choose_reference(
     The anchor is the window with the lowest upper bound of :math:`a_0`, at k standard errors, of
     those that pass all tests but that of :math:`a_0`: a noisy window can show that a less noisy one
     holds particles. Windows whose :math:`a_0` exceeds that of the anchor by more than k standard
-    errors of the difference are rejected. The rest counts as equally clean. Of these, the passing
-    one with the smallest standard error of :math:`a_0` is chosen, the nearest one in a tie. That
+    errors of the difference are rejected. The rest counts as equally clean. Of these, the last
+    passing candidate whose standard error of :math:`a_0` is below `Thresholds.most_noise` times the
+    smallest one is chosen, because particles decrease with height. That
     error follows from the variances and not from the power, so the choice favours no
     fluctuation. The tests favour one slightly, because they keep windows whose noise looks flat.
     In differences and upper bounds, the error :math:`\sigma_b` of the background is common to all
@@ -219,7 +240,7 @@ def choose_reference(
     rejections = _rejections(statistics, np.diff(edges)[:, 0])
     level_error = inputs.real_array(background_standard_error, "background_standard_error")
     level_error = np.broadcast_to(level_error.astype(np.float64), leading).reshape(-1, 1)
-    index, comparison_error = _pick(statistics, rejections, level_error)
+    index, comparison_error, excess = _pick(statistics, rejections, level_error)
     chosen = index >= 0
     profile = np.arange(index.size)
 
@@ -233,6 +254,7 @@ def choose_reference(
         scale=of_chosen(statistics[profile, index, SCALE]),
         scale_standard_error=of_chosen(statistics[profile, index, SCALE_ERROR]),
         comparison_standard_error=of_chosen(comparison_error),
+        excess=of_chosen(excess),
         detection_limit=of_chosen(
             _detection_limit(statistics, rejections, level_error, windows, index)
         ),
@@ -301,10 +323,11 @@ def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
 
 def _pick(
     statistics: Array, rejections: Codes, level_error: Array
-) -> tuple[npt.NDArray[np.int64], Array]:
-    """Return the index of the chosen window or -1, and the error of its comparison with the anchor.
+) -> tuple[npt.NDArray[np.int64], Array, Array]:
+    """Return the index of the chosen window or -1, its comparison with the anchor, and its excess.
 
-    Windows with more particles than the anchor are marked as rejected.
+    The comparison is a standard error. Windows with more particles than the anchor are marked as
+    rejected.
 
     Parameters
     ----------
@@ -328,9 +351,12 @@ def _pick(
     has_more_particles = comparable & (scale - lowest > most_above)
     rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
     passed = rejections == 0
-    best = np.argmin(np.where(passed, error, np.inf), axis=-1)
-    index = np.where(np.any(passed, axis=-1), best, -1).astype(np.int64)
-    return index, comparison_error[np.arange(index.size), index]
+    least = np.min(np.where(passed, error, np.inf), axis=-1, keepdims=True)
+    certain = passed & (error <= THRESHOLDS.most_noise * least)
+    highest = certain.shape[-1] - 1 - np.argmax(certain[:, ::-1], axis=-1)
+    index = np.where(np.any(passed, axis=-1), highest, -1).astype(np.int64)
+    chosen = np.arange(index.size), index
+    return index, comparison_error[chosen], (scale - lowest)[chosen]
 
 
 def _detection_limit(

@@ -128,7 +128,7 @@ def invert_elastic(
         variance=means.variance,
         background_standard_error=signal.background_standard_error,
         lidar_ratio_standard_error=ratio_error,
-        reference_relative_error=_reference_error(window, reference),
+        reference_relative_error=window.relative_error(reference.relative_error),
         molecular_relative_error=molecular_relative_error,
         **_systematic_errors(averages, means, signal),
         noise_correlation_length=means.correlation_length,
@@ -156,21 +156,12 @@ def invert_elastic(
             "lidar_ratio": ("range", ratio),
             "lidar_ratio_standard_error": ("range", ratio_error),
             "vertical_resolution": float(np.median(np.diff(distance))),
-            "reference_bottom": ("time", window.bottom),
-            "reference_top": ("time", window.top),
+            **window.variables,
             "reference_bottom_altitude": ("time", station_altitude + climb * window.bottom),
             "reference_top_altitude": ("time", station_altitude + climb * window.top),
             "reference_scattering_ratio": reference.scattering_ratio,
             "reference_scattering_ratio_standard_error": (
                 reference.scattering_ratio * reference.relative_error
-            ),
-            "reference_detection_limit": (
-                "time",
-                np.where(np.isinf(window.detection_limit), np.nan, window.detection_limit),
-            ),
-            "reference_rejections": (
-                "time",
-                np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32),
             ),
             "cloud_mask": (("time", "range"), clouds.state),
             "cloud_fraction": (("time", "range"), clouds.fraction),
@@ -198,11 +189,6 @@ def _systematic_errors(
         array = change.transpose("time", "range").to_numpy() / means.overlap
         errors[f"{cause}_error"] = np.nan_to_num(array, posinf=0.0, neginf=0.0)
     return errors
-
-
-def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
-    """Return the relative error of the scattering ratio: assumed, and by undetected particles."""
-    return np.hypot(reference.relative_error, np.nan_to_num(window.undetected_particles))
 
 
 def _solution_flags(

@@ -438,11 +438,9 @@ def _reference_variables(result: RamanResult, settings: RamanSettings, sky: _Sky
     """Return the reference windows, and what is assumed in them."""
     ratio = settings.scattering_ratio
     return {
-        "reference_bottom": ("time", result.reference_bottom),
-        "reference_top": ("time", result.reference_top),
-        "reference_rejections": ("time", result.reference_rejections),
-        "reference_bottom_altitude": ("time", sky.altitude(result.reference_bottom)),
-        "reference_top_altitude": ("time", sky.altitude(result.reference_top)),
+        **result.reference.variables,
+        "reference_bottom_altitude": ("time", sky.altitude(result.reference.bottom)),
+        "reference_top_altitude": ("time", sky.altitude(result.reference.top)),
         "reference_scattering_ratio": ratio,
         "reference_scattering_ratio_standard_error": ratio * settings.reference_relative_error,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -62,12 +62,8 @@ class RamanResult:
     """Fitted optical depth of particles at both wavelengths, up to a constant."""
     raman_depth_error: Array
     """Its standard error by noise."""
-    reference_bottom: Array
-    """(profile,): m; NaN without reference."""
-    reference_top: Array
-    """(profile,): m."""
-    reference_rejections: Flags
-    """(profile,): bits of `Rejection` of all candidates together."""
+    reference: reference_window.ReferenceWindow
+    """(profile,): NaN without reference."""
     quality: Flags
 
     @property
@@ -135,14 +131,15 @@ def retrieve_raman(
     fitted = [None if row is None else (row.raman, row.fit) for row in rows]
     window = choose_window(elastic, fitted, air, cells, settings)
     edges = np.stack(window.edges, axis=-1)
+    errors = window.relative_error(settings.reference_relative_error)
+    assumed = [replace(settings, reference_relative_error=float(error)) for error in errors]
     in_cells = AirCells.of(air, cells)
     solved = [
-        _Solution.of(row, in_cells, cells, settings, partial[number], edges[number], number)
+        _Solution.of(row, in_cells, cells, assumed[number], partial[number], edges[number], number)
         for number, row in enumerate(rows)
         if row is not None
     ]
-    rejections = np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32)
-    return _joined(solved, quality, window, rejections)
+    return _joined(solved, quality, window)
 
 
 def _profile(
@@ -245,7 +242,6 @@ def _joined(
     solved: Sequence[_Solution],
     quality: Flags,
     window: reference_window.ReferenceWindow,
-    rejections: Flags,
 ) -> RamanResult:
     """Return the profiles together, NaN where a bit rejects them."""
     numbers = [one.number for one in solved]
@@ -286,9 +282,7 @@ def _joined(
         lidar_ratio_systematic=slopes(one.lidar_ratio.systematic for one in solved),
         raman_depth=values(one.profile.fit.depth for one in solved),
         raman_depth_error=values(one.profile.fit.standard_error for one in solved),
-        reference_bottom=window.bottom,
-        reference_top=window.top,
-        reference_rejections=rejections,
+        reference=window,
         quality=_flags(solved, quality, weak, np.isnan(lidar_ratio), window.chosen),
     )
 

@@ -380,7 +380,7 @@ def test_noisy_windows_state_what_they_cannot_see(sky, background):
     assert np.mean(window.chosen) > 0.95
     result = elastic_cases.invert_particles(
         power, sky, window.edges, noise=noise, background_error=error,
-        reference_error=np.nan_to_num(window.undetected_particles),
+        reference_error=window.undetected_particles,
     )  # fmt: skip
     compared = result.valid & sky.compared
     score = (result.backscatter - sky.backscatter) / result.backscatter_standard_error

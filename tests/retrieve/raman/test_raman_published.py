@@ -17,6 +17,7 @@ import xarray as xr
 from support.raman_signals import along, mean_over
 
 from lidarops.flags import Quality
+from lidarops.products.raman.settings import RamanProductSettings, RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.cells import make_cells
@@ -46,6 +47,9 @@ FIGURES = {
         "line": (1.1, -10.5),
     },
 }
+# With the reference and air of products by default: deviations in percent, and coverage.
+DEFAULT_AWAY = {"355": (-14.7, -31.4), "532": (-5.8, -4.8)}
+DEFAULT_COVERED = {"355": 0.977, "532": 0.9411}
 COVERED = {"355": (0.938, 0.967, 1.0), "532": (0.961, 0.922, 0.946)}
 
 
@@ -135,13 +139,26 @@ def expected(case, air):
     ]
 
 
-def retrieved(case, raman=None, elastic=None, air=None):
+def retrieved(case, raman=None, elastic=None, air=None, settings=None):
     near = np.where(case.cells.range < 375.0, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
     raman = channel(case.raman) if raman is None else raman
     elastic = channel(case.elastic) if elastic is None else elastic
     quality = np.tile(near, (len(raman.power), 1))
     air = case.air if air is None else air
-    return retrieve_raman(raman, elastic, air, case.cells, case.settings, quality=quality)
+    settings = case.settings if settings is None else settings
+    return retrieve_raman(raman, elastic, air, case.cells, settings, quality=quality)
+
+
+def by_default(case, *signals):
+    """Return values with the reference and air that products have without settings of their own."""
+    window, of_product = RamanReferenceSettings(), RamanProductSettings.model_fields
+    settings = RamanSettings(
+        case.settings.wavelength, case.settings.raman_wavelength,
+        of_product["angstrom_exponent"].default, of_product["angstrom_standard_error"].default,
+        window.lowest, window.highest, window.width, window.scattering_ratio,
+        window.relative_error, of_product["molecular_relative_error"].default,
+    )  # fmt: skip
+    return retrieved(case, *signals, air=case.own_air, settings=settings)
 
 
 def resolved(case, profile, found):
@@ -286,6 +303,31 @@ def test_cross_sections_of_lidarops_leave_their_difference(case):
         "355": ("extinction", (-1.7, -9.1)), "532": ("backscatter", (-4.4, -3.4)),
     }[case.name]  # fmt: skip
     np.testing.assert_allclose(found[name], away, atol=0.06)
+
+
+def test_default_windows_hold_particles_that_their_error_covers(case):
+    found = by_default(case)
+    truth = case.cells.mean(case.backscatter)
+    away = [
+        100.0 * np.mean((found.backscatter - truth)[:, part]) / truth[part].mean()
+        for part in between(case)
+    ]
+    np.testing.assert_allclose(away, DEFAULT_AWAY[case.name], atol=0.06)
+    z = dict(normalised(case, found))["backscatter"]
+    assert np.mean(np.abs(z) < 1.96) == pytest.approx(DEFAULT_COVERED[case.name], abs=1e-3)
+    assert np.mean(np.abs(z) > 4.0) <= 1e-3
+
+
+def test_other_realisations_are_covered_with_default_windows(case):
+    found = by_default(case, *other(case, 90, seed=8))
+    z = dict(normalised(case, found))["backscatter"]
+    # 15 realisations scatter by 2.5 %. With the window and error of noise alone: 91 and 60 %.
+    assert 0.93 < np.mean(np.abs(z) < 1.96) < 0.98
+    assert np.mean(np.abs(z) > 4.0) <= 1e-3
+    # In the nearest windows, particles make values of 532 nm too small by a quarter.
+    truth = case.cells.mean(case.backscatter)
+    near = between(case)[0]
+    assert abs(np.mean((found.backscatter - truth)[:, near]) / truth[near].mean()) < 0.15
 
 
 def other(case, profiles, seed, light=1):

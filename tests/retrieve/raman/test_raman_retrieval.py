@@ -65,7 +65,7 @@ def test_particles_everywhere_leave_no_reference():
     assumed = 1.0 + 1e-4 / 50.0 / sky.air.backscatter
     middle = (R > 9000.0) & (R < 11_000.0)
     found = retrieved(sky, scattering_ratio=float(assumed[middle].mean()))
-    assert np.isnan(found.reference_bottom).all()  # no shape of air anywhere
+    assert np.isnan(found.reference.bottom).all()  # no shape of air anywhere
     assert np.all(found.quality & RamanQuality.NO_REFERENCE)
     np.testing.assert_allclose(found.extinction[0, 20:300], 1e-4, rtol=1e-6)
 
@@ -120,7 +120,7 @@ def test_errors_of_the_overlap_are_the_change_by_it(sky):
 def test_errors_of_the_slope_of_air_are_the_change_by_it(sky):
     before = retrieved(sky, molecular_slope_error=1e-6)
     steeper, molecular = np.exp(1e-6 * R), sky.air.backscatter
-    window = (before.reference_bottom < R) & (before.reference_top > R)
+    window = (before.reference.bottom < R) & (before.reference.top > R)
     # The density in the reference window stays.
     steeper *= molecular[window].sum() / (steeper * molecular)[window].sum()
     air = replace(sky.air, density=sky.air.density * steeper, backscatter=molecular * steeper)

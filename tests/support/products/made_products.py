@@ -303,6 +303,7 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             "reference_scattering_ratio_standard_error": 0.01,
             "molecular_source": 0,
             "background_method": 2,
+            "reference_detection_limit": ("time", np.where(np.isnan(window), np.nan, 0.1)),
             "reference_rejections": ("time", np.zeros(profiles, np.int32)),
             "cloud_mask": (dims, np.zeros(shape, np.int8)),
             "cloud_fraction": (dims, np.zeros(shape)),
