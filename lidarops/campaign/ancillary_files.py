@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
@@ -21,6 +21,7 @@ import xarray as xr
 from lidarops.errors import AncillaryError, RetrievalInputError
 from lidarops.records import InputRecord, Role
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
 from lidarops.retrieve.raman.flags import RamanQuality
 
 Array = npt.NDArray[np.float64]
@@ -42,8 +43,17 @@ _LIDAR_RATIOS: Final = (1.0, 200.0)
 """sr; as for the fact ``lidar_ratio``."""
 _MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_systematic", "usable"})
 """Variables of a product with measured lidar ratios and overlap."""
-_LIDAR_RATIO_NEEDS: Final = frozenset({"altitude", "lidar_ratio", "quality_flag", "shots"})
+_LIDAR_RATIO_NEEDS: Final = frozenset(
+    {"altitude", "quality_flag", "shots", "aerosol_extinction", "aerosol_backscatter"}
+    | {"vertical_resolution"}
+    | {f"aerosol_extinction_error_{cause}" for cause in EXTINCTION_CAUSES}
+    | {f"aerosol_backscatter_error_{cause}" for cause in BACKSCATTER_CAUSES}
+)
 """What else a product with measured lidar ratios holds."""
+_SEVERAL: Final = 2
+"""Profiles with values at a height that has a lidar ratio, where there are as many."""
+_CERTAIN: Final = 3.0
+"""Standard errors by which mean backscatter exceeds zero; that of a lidar ratio is symmetrical."""
 _REJECTED: Final = 2
 """``usable`` of a value that is not to be used."""
 _CLOUDS: Final = int(RamanQuality.CLOUD | RamanQuality.PARTLY_CLOUDY)
@@ -328,12 +338,13 @@ def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -
 
 
 def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:
-    """Return the mean over time of the lidar ratios of a product outside of clouds.
+    """Return the mean extinction of a product outside of clouds over its mean backscatter.
 
-    Heights whose mean is below its standard error have none. Values are weighted by laser shots.
-    Their errors, and limits of values, would follow the noise of backscatter: low values have small
-    errors, and by them 60 sr become 49 (`tests/campaign/test_ancillary_files.py`). Systematic
-    errors are those of all times.
+    Means over time are weighted by laser shots, of all values that are usable. Lidar ratios of
+    single profiles exist where noise makes backscatter high or the ratio uncertain, and their
+    errors follow that noise (`tests/campaign/test_ancillary_files.py`). Heights with values of few
+    profiles, or an uncertain mean backscatter, have none. Random errors decrease with the number of
+    profiles; systematic ones, that of the reference among them, are those of all times.
     """
     missing = sorted(_LIDAR_RATIO_NEEDS - raw.keys())
     if missing:
@@ -342,24 +353,35 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
             file=name,
             remedy="give the product with all its variables",
         )
-    ratio, random, systematic = (
-        raw[f"lidar_ratio{error}"][1] for error in ("", "_error_random", "_error_systematic")
-    )
+    altitude = raw["altitude"][1]
+    extinction, backscatter = raw["aerosol_extinction"][1], _as_resolved(raw)
     cloudy = (raw["quality_flag"][1].astype(np.int32) & np.int32(_CLOUDS)) != 0
-    known = np.isfinite(ratio) & (random > 0.0) & (raw["usable"][1] < _REJECTED) & ~cloudy
+    known = np.isfinite(extinction * backscatter) & (raw["usable"][1] < _REJECTED) & ~cloudy
     weight = np.where(known, raw["shots"][1][:, np.newaxis], 0.0)
     weight /= np.maximum(weight.sum(axis=0), 1.0)
 
     def mean(values: Array) -> Array:
         return np.asarray((weight * np.where(known, values, 0.0)).sum(axis=0))
 
-    together = mean(ratio)
+    def square_error(quantity: str, causes: Sequence[str]) -> Array:
+        total = np.zeros(altitude.size)
+        for cause in causes:
+            error = np.where(known, raw[f"{quantity}_error_{cause}"][1], 0.0)
+            if cause in RANDOM:
+                total += ((weight * error) ** 2).sum(axis=0)
+            else:
+                total += mean(error) ** 2
+        return total
+
+    of_extinction = square_error("aerosol_extinction", EXTINCTION_CAUSES)
+    of_backscatter = square_error("aerosol_backscatter", BACKSCATTER_CAUSES)
+    scattered = mean(backscatter)
+    certain = scattered > _CERTAIN * np.sqrt(of_backscatter)
+    certain &= known.sum(axis=0) >= min(_SEVERAL, len(known))
+    ratio = mean(extinction) / np.where(certain, scattered, np.nan)
+    error = np.sqrt(of_extinction + ratio**2 * of_backscatter) / scattered
     least, largest = _LIDAR_RATIOS
-    # Values that noise makes too large have the relative error of the mean.
-    excess = np.maximum(np.where(known, ratio, 0.0) / np.maximum(together, least), 1.0)
-    by_noise = np.sqrt(((weight * np.where(known, random, 0.0) / excess) ** 2).sum(axis=0))
-    error = np.hypot(by_noise, mean(systematic))
-    measured = (together >= least) & (together <= largest) & (together >= error)
+    measured = (ratio >= least) & (ratio <= largest) & (ratio >= error)
     if not measured.any():
         raise AncillaryError(
             "holds no usable value outside of clouds that exceeds its error",
@@ -367,7 +389,25 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
             field="lidar_ratio",
             remedy="choose another night",
         )
-    return LidarRatio(raw["altitude"][1][measured], together[measured], error[measured])
+    return LidarRatio(altitude[measured], ratio[measured], error[measured])
+
+
+def _as_resolved(raw: Mapping[str, tuple[str, Array]]) -> Array:
+    """Return backscatter over the resolution of extinction, m-1 sr-1, NaN where it has none."""
+    ranges = raw["range"][1]
+    step = float(np.median(np.diff(ranges)))
+    edges = np.append(ranges - 0.5 * step, ranges[-1] + 0.5 * step)
+    resolved = np.full(raw["aerosol_backscatter"][1].shape, np.nan)
+    for row, (values, length) in enumerate(
+        zip(raw["aerosol_backscatter"][1], raw["vertical_resolution"][1], strict=True)
+    ):
+        there = np.isfinite(values)
+        sums = np.append(0.0, np.cumsum(np.where(there, values, 0.0)))
+        counts = np.append(0.0, np.cumsum(there))
+        low, high = ranges - 0.5 * length, ranges + 0.5 * length
+        total, bins = (np.interp(high, edges, c) - np.interp(low, edges, c) for c in (sums, counts))
+        resolved[row] = np.where(there & (bins > 0.0), total, np.nan) / np.where(bins > 0, bins, 1)
+    return resolved
 
 
 def _read(folder: Path, name: str) -> bytes:

@@ -23,7 +23,7 @@ from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
-from lidarops.retrieve.raman.backscatter import inverse_of_weak
+from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.steps.dependence import ancillary_files
 
@@ -152,21 +152,36 @@ def test_lidar_ratios_are_linear_between_their_altitudes(tmp_path: Path) -> None
 
 
 def _product(
-    folder: Path, ratio: object, random: object, usable: object, quality: object = 0
+    folder: Path,
+    ratio: object,
+    random: object,
+    usable: object,
+    quality: object = 0,
+    backscatter: object = 1.0,
+    **errors: object,
 ) -> None:
-    """Write the variables of a product with measured lidar ratios over times and heights."""
+    """Write the variables of a product with lidar ratios over times and heights, 1 km apart.
+
+    Errors are by their cause, of extinction in sr and of backscatter relative to 1.
+    """
     plane, values = ("time", "range"), np.asarray(ratio, float)
     times, heights = values.shape
+    stated = {f"aerosol_extinction_error_{cause}": 0.0 for cause in EXTINCTION_CAUSES}
+    stated |= {f"aerosol_backscatter_error_{cause}": 0.0 for cause in BACKSCATTER_CAUSES}
+    stated |= {"aerosol_extinction_error_noise": random, "aerosol_extinction_error_molecular": 2.0}
+    stated |= {f"aerosol_backscatter_error_{cause}": error for cause, error in errors.items()}
+    stated |= {"aerosol_extinction": values, "aerosol_backscatter": backscatter}
+    stated |= {"lidar_ratio_error_random": 0.0, "lidar_ratio_error_systematic": 0.0}
+    altitude = 1000.0 * np.arange(1, heights + 1)
     xr.Dataset(
-        {
-            "lidar_ratio": (plane, values),
-            "lidar_ratio_error_random": (plane, np.broadcast_to(random, values.shape)),
-            "lidar_ratio_error_systematic": (plane, np.full(values.shape, 2.0)),
+        {name: (plane, np.broadcast_to(array, values.shape)) for name, array in stated.items()}
+        | {
+            "vertical_resolution": (plane, np.full(values.shape, 1000.0)),
             "usable": (plane, np.broadcast_to(np.asarray(usable, np.int8), values.shape)),
             "quality_flag": (plane, np.broadcast_to(np.asarray(quality, np.int32), values.shape)),
             "shots": ("time", np.where(np.arange(times) == 1, 500, 1000)),
         },
-        coords={"altitude": ("range", 1000.0 * np.arange(1, heights + 1))},
+        coords={"altitude": ("range", altitude), "range": altitude},
     ).to_netcdf(folder / "night.nc")
 
 
@@ -178,7 +193,7 @@ def test_measured_lidar_ratios_are_averaged_by_shots(tmp_path: Path) -> None:
     assert profile.altitude.tolist() == [1000.0]
     mean = (2 * 50.0 + 60.0) / 3
     assert profile.ratio[0] == pytest.approx(mean)
-    by_noise = np.hypot(2 * 3.0, 6.0 * mean / 60.0) / 3
+    by_noise = np.hypot(2 * 3.0, 6.0) / 3
     assert profile.standard_error[0] == pytest.approx(np.hypot(by_noise, 2.0))
     _product(tmp_path, ratio, random, 2)
     with pytest.raises(AncillaryError, match="usable"):
@@ -186,9 +201,9 @@ def test_measured_lidar_ratios_are_averaged_by_shots(tmp_path: Path) -> None:
 
 
 def test_measured_lidar_ratios_of_clouds_are_left_out(tmp_path: Path) -> None:
-    ratio = [[70.0, 18.0, 70.0], [20.0, 18.0, 70.0]]
+    ratio = [[70.0, 18.0, 70.0], [20.0, 18.0, 70.0], [70.0, 18.0, 70.0]]
     cloud, partly = RamanQuality.CLOUD, RamanQuality.PARTLY_CLOUDY
-    _product(tmp_path, ratio, 5.0, 1, [[0, cloud, 0], [partly, cloud, 0]])
+    _product(tmp_path, ratio, 5.0, 1, [[0, cloud, 0], [partly, cloud, 0], [0, cloud, 0]])
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
     assert profile.altitude.tolist() == [1000.0, 3000.0]
     assert profile.ratio.tolist() == [70.0, 70.0]
@@ -222,18 +237,31 @@ def test_means_of_measured_lidar_ratios_have_no_bias(
     rng, shape = np.random.default_rng(1), (times, 3000)
     backscatter = 1.0 + of_backscatter * rng.standard_normal(shape)
     extinction = 60.0 * (1.0 + of_extinction * rng.standard_normal(shape))
-    # Values and errors as the Raman retrieval has them.
-    inverse = inverse_of_weak(backscatter, np.full(shape, of_backscatter))
-    ratio = extinction * inverse
-    square = (60.0 * of_extinction) ** 2 + (ratio * of_backscatter) ** 2
-    square *= inverse**2 * (1.0 + 8.0 * (of_backscatter / backscatter) ** 2)
-    _product(tmp_path, ratio, np.sqrt(square), 0)
+    errors = {"backscatter": backscatter, "noise": of_backscatter}
+    _product(tmp_path, extinction, 60.0 * of_extinction, 0, **errors)
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
-    # With weights by the errors, 49 and 58 sr in the first and the last case.
     assert profile.ratio.mean() == pytest.approx(60.0, abs=0.5)
     by_noise = np.sqrt(profile.standard_error**2 - 2.0**2)
     away = np.abs(profile.ratio - 60.0) / by_noise
     assert 0.92 < np.mean(away < 1.96) < 0.985
+
+
+def test_the_error_of_the_reference_does_not_decrease_with_the_number_of_profiles(
+    tmp_path: Path,
+) -> None:
+    _product(tmp_path, np.full((100, 2), 60.0), 0.0, 0, reference=0.1)
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    np.testing.assert_allclose(profile.standard_error, np.hypot(6.0, 2.0))
+
+
+def test_the_value_of_a_single_profile_is_not_held_to_the_top(tmp_path: Path) -> None:
+    ratio = np.full((15, 4), 60.0)
+    ratio[:, 3] = np.nan
+    ratio[4, 3] = 158.0
+    _product(tmp_path, ratio, 5.0, 0)
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    assert profile.altitude.tolist() == [1000.0, 2000.0, 3000.0]
+    assert profile.at(np.array([9000.0]))[0] == 60.0
 
 
 @pytest.mark.parametrize(
