@@ -17,7 +17,7 @@ from typing import Any, Final
 from lidarops.records import FEWEST_ALIKE, ChannelLayout
 
 POLARISATIONS: Final = {
-    "o": "no", "p": "parallel", "s": "perpendicular", "r": "right circular", "l": "left circular"
+    "o": "none", "p": "parallel", "s": "perpendicular", "r": "right circular", "l": "left circular"
 }  # fmt: skip
 _NUMBERED: Final = re.compile(r"([a-z]+_\d+[a-z])_\d+")
 

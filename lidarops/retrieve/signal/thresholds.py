@@ -43,13 +43,12 @@ class Thresholds:
     # Analog
     baseline: float = 0.01
     """mV, standard error of the baseline where nothing shows it. Blocked beams of a real lidar show
-    1 to 10 uV (Champaign, 2018), dark files of another 1 to 2 uV (Sao Paulo, 2017)."""
+    0.1 to 10 uV (Champaign, 2018), dark files of another 0.1 to 2 uV (Sao Paulo, 2017)."""
     baseline_share: float = 7.5e-4
     """Share of the largest power of the profile by which the baseline may be off after it:
     undershoot after a peak reaches 0.3 %, four times this."""
     baseline_decay: float = 3000.0
-    """m, range in which that falls to 1/e. Assumed; undershoot of 0.3 % that lasts longer leaves no
-    reference window (`test_analog_baselines.py`)."""
+    """m, range in which that falls to 1/e; assumed."""
     near_full_scale: float = 0.5
     """Share of full scale above which a bin is tested for clipped shots. Assumed."""
     clipping: float = 3.5
