@@ -28,7 +28,6 @@ lint: .venv/.dev
 
 # The products and the picture that tests compare with; look at the difference before you commit it.
 golden: .venv/.dev
-	$(BIN)/python docs/_extensions/measured_shares.py
 	PYTHONPATH=tests $(BIN)/python -m golden.regenerate
 	$(BIN)/python docs/architecture_picture.py
 

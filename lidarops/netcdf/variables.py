@@ -22,7 +22,6 @@ from lidarops import __version__
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.flags import Flags, Severity
 from lidarops.kinds import flags_of, kind_of, kinds
-from lidarops.netcdf.false_shares import percent
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.reference_window import Rejection
 
@@ -38,6 +37,9 @@ _SIGNAL_UNITS: Final = {DetectionMode.ANALOG: "mV", DetectionMode.PHOTON: "MHz"}
 _ERROR_BITS: Final = 8
 """Significant bits of the standard error of a rounded quantity: 0.2 percent at worst."""
 NO_STANDARD_NAME: Final = f"The {STANDARD_NAME_TABLE} has no name for this quantity."
+MEASURED_SHARES: Final = (
+    "The results in the documentation state the share of such values in simulated scenes."
+)
 AEROSOL_EXTINCTION: Final = (
     "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient_aerosol_particles"
 )
@@ -727,9 +729,8 @@ BACKGROUND_METHOD: Final = _coded(
     "tail_mean: mean of the far range. cubic: from the cubic of a homogeneous section."
     " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
     " the far range where the fit fails. Haze that falls with height nearly as air does leaves no"
-    " trace in that fit: with simulated haze of 0.6 to 3 times the backscatter of air at the ground"
-    f" and a scale height of 3 km, {percent('background, known shape', 'shape of hazy air')} of the"
-    " backgrounds deviated by more than 4 standard errors.",
+    " trace in that fit: backgrounds in simulated haze with a scale height of 3 km deviate by more"
+    f" than 4 standard errors. {MEASURED_SHARES}",
 )
 
 AVERAGED_PROFILES: Final = Row(

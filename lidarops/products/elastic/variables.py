@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Final
 
 from lidarops.netcdf.cloud_rows import CLOUDS
-from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -16,6 +15,7 @@ from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
     GLUING,
     LEFT_OUT_PROFILES,
+    MEASURED_SHARES,
     MOLECULAR_BACKSCATTER,
     MOLECULAR_SOURCE,
     NO_STANDARD_NAME,
@@ -136,9 +136,9 @@ LAYOUT: Final = Layout(
     " the reference window that decrease with height nearly as molecules do look like aerosol-free"
     " air, and no test of the signal detects them: only the error of the scattering ratio declared"
     " in the settings covers them. Declare a larger error where the air is hazy at all heights:"
-    f" where simulated haze exceeded it, {percent('backscatter', 'more haze than stated')} of the"
-    " values without a flag deviated by more than 4 of their standard errors. An"
-    " elastic signal does not determine the lidar ratio either; its declared error has to cover"
+    " where simulated haze exceeds it, values without a flag deviate by more than 4 of their"
+    f" standard errors. {MEASURED_SHARES} An elastic"
+    " signal does not determine the lidar ratio either; its declared error has to cover"
     " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
     " bin deviates from theirs by more than noise explains.",
     sampled="range",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final, get_args
 
-from lidarops.netcdf.false_shares import by_class, percent
 from lidarops.netcdf.variables import (
+    MEASURED_SHARES,
     NO_STANDARD_NAME,
     SECTION,
     SECTION_RANGE,
@@ -31,23 +31,12 @@ _CURVED_SIGNAL = (
     "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
     " section, and by the opposite amount at the other"
 )
-_DEPARTURES: Final = {
-    "slope of the backscatter along the section": "with backscatter that changes exponentially"
-    " along the section with a scale of 1 to 100 km",
-    "bent backscatter": "where backscatter is curved",
-    "plume": "with a plume",
-    "overlap error": "with an error of the overlap",
-    "eddies": "with eddies",
-    "afterpulse": "with an afterpulse",
-    "saturated": "where the top of the signal is clipped",
-    "detector not linear": "with a detector that is not linear",
-    "outliers": "with outliers",
-}
-"""Words for the classes of random departures from the model."""
 _UNDETECTED = (
     "This is not an upper bound: departures from the model that its parameters absorb leave no"
-    " trace in the residuals. In simulated random departures, this share of the values without a"
-    " rejecting flag deviated by more than 4 combined standard errors:"
+    " trace in the residuals. With simulated backscatter that changes along the section or is"
+    " curved, a plume, an afterpulse, or where the top of the signal is clipped, some values"
+    " without a rejecting flag deviate by more than 4 combined standard errors."
+    f" {MEASURED_SHARES}"
 )
 
 LAYOUT: Final = Layout(
@@ -93,8 +82,7 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Separate from the random error in total_extinction_standard_error. Root of the"
             " sum of squares of 5 percent of (extinction + 1 / mean range), and of the extinction"
-            f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED}"
-            f" {by_class('extinction', _DEPARTURES)}. {NO_STANDARD_NAME}",
+            f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED} {NO_STANDARD_NAME}",
         ),
         Row(
             name="total_extinction_baseline_error",
@@ -136,8 +124,8 @@ LAYOUT: Final = Layout(
             ancillaries=("background_model_error", *_OF_FIT),
             uncertain=True,
             comment="Not calibrated. Where extinction plus 1 / mean range is known to 10 to 15"
-            f" percent only, {percent('background', 'near the cut')} of such simulated backgrounds"
-            f" deviated by more than 4 of their standard errors. {NO_STANDARD_NAME}",
+            " percent only, some simulated backgrounds deviate by more than 4 of their standard"
+            f" errors. {NO_STANDARD_NAME}",
         ),
         Row(
             name="background_model_error",
@@ -150,7 +138,7 @@ LAYOUT: Final = Layout(
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Separate from the random error in background_standard_error. Background error"
             f" caused by a signal {_CURVED_SIGNAL}, as with backscatter that is curved along the"
-            f" path. {_UNDETECTED} {by_class('background', _DEPARTURES)}. {NO_STANDARD_NAME}",
+            f" path. {_UNDETECTED} {NO_STANDARD_NAME}",
         ),
         Row(
             name="reduced_chi2",

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final, get_args
 
-from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
+    MEASURED_SHARES,
     NO_STANDARD_NAME,
     PLACE,
     TIME,
@@ -281,12 +281,9 @@ LAYOUT: Final = Layout(
             # Noise, and smoothing error that profiles share, are not stated separately.
             error_kind=ErrorKind.BOTH,
             comment="Mean over the layer in altitude_bnds, at the wavelength of the channel. The"
-            " error by smoothing is a mean over altitudes, too small in thin layers. Simulated:"
-            " of all extinctions of scenes with a layer of a few altitudes,"
-            f" {percent('scans', 'layer')} differ by more than 4 standard errors where 8 scans are"
-            f" solved together, {percent('scans', 'layer, blocks of 2')} where two are; nearly all"
-            " within the layer."
-            f" {NO_STANDARD_NAME}",
+            " error by smoothing is a mean over altitudes, too small in thin layers: within"
+            " simulated layers of a few altitudes, some values differ by more than 4 standard"
+            f" errors. {MEASURED_SHARES} {NO_STANDARD_NAME}",
         ),
         _gradient_error("total_extinction", "extinction", "m-1"),
         *_signal_errors("total_extinction", "extinction", "m-1"),

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Final
 
 from lidarops.netcdf.cloud_rows import CLOUDS
-from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     AEROSOL_BACKSCATTER,
     AEROSOL_EXTINCTION,
@@ -218,9 +217,7 @@ LAYOUT: Final = Layout(
             comment="Measured: extinction over backscatter, which is smoothed as extinction is."
             " Missing where backscatter exceeds zero by too few standard errors. The error allows"
             " for noise that made the value too small; of uncertain values, it expects most lidar"
-            f" ratios within a factor of {_FACTOR:.1f} of {THRESHOLDS.typical_lidar_ratio:g} sr."
-            f" Simulated: {percent('lidar ratio', 'model holds')} of the values without a flag"
-            " differ by more than 4 errors.",
+            f" ratios within a factor of {_FACTOR:.1f} of {THRESHOLDS.typical_lidar_ratio:g} sr.",
         ),
         _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.RANDOM),
         _part("lidar_ratio", "sr", "lidar_ratio", ErrorKind.SYSTEMATIC),

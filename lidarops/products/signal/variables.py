@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
     GLUING,
+    MEASURED_SHARES,
     NO_STANDARD_NAME,
     RANGE,
     SUBTRACTED_BACKGROUND,
@@ -33,8 +33,7 @@ LAYOUT: Final = Layout(
     " background, which is common to them. lidarops_steps states the method of the background."
     " Where the noise of an analog record is below half a step of the digitizer, its bins share"
     " their rounding error: the standard error of a bin covers it, that of a mean over bins does"
-    f" not ({percent('voltage', 'analog noise below half a step')} of such simulated means"
-    " deviated by more than 4 of them).",
+    f" not. {MEASURED_SHARES}",
     sampled="range",
     weighed=("signal",),
     coordinates=coordinates((RANGE,), altitude("range")),

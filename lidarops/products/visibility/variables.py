@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Final
 
 from lidarops.constants import MULTIPOSITION_PAPER
-from lidarops.netcdf.false_shares import percent
 from lidarops.netcdf.variables import (
+    MEASURED_SHARES,
     NO_STANDARD_NAME,
     PLACE,
     TIME,
@@ -127,16 +127,14 @@ LAYOUT: Final = Layout(
     " over the whole network mimics attenuation where the air is optically thin or the noise is"
     " high, and no test detects it there: total_extinction_standard_error allows for twice the"
     " typical gradient. More profiles in a block and more beams constrain the field better. In"
-    " blocks of one profile, the share of simulated values without a flag that deviated by more"
-    f" than 4 standard errors was {percent('network', 'plume, blocks of 1')} with a plume, and"
-    f" {percent('network', 'layered, blocks of 1')} where extinction changes with height by"
-    " a factor of e in 300 to 3000 m; most are of few networks, where noise hides"
-    " the field. The error that the prior leaves is common to all profiles, so that a mean over"
+    " blocks of one profile, some simulated values without a flag deviate by more than 4 standard"
+    " errors with a plume, or where extinction changes with height by a factor of e in 300 to"
+    f" 3000 m: noise hides the field. {MEASURED_SHARES}"
+    " The error that the prior leaves is common to all profiles, so that a mean over"
     " time does not reduce it. total_extinction_systematic_error includes a lidar ratio that varies"
-    " over the network as declared, by 2 percent if not stated: where it varied by 10 percent"
-    f" (rms), {percent('network', 'lidar ratio, 2 % declared')} of simulated values deviated by"
-    " more than 4 standard errors with 2 percent declared, and"
-    f" {percent('network', 'lidar ratio, 10 % declared')} with 10 percent.",
+    " over the network as declared, by 2 percent if not stated: where it varies by 10 percent"
+    " (rms), values without a flag deviate by more than 4 standard errors unless 10 percent are"
+    " declared.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=(
