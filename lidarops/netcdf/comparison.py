@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
 from lidarops.flags import Severity
-from lidarops.netcdf.provenance import read_provenance
-from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.read import opened_product, read_provenance
 from lidarops.netcdf.variables import PROVENANCE, USABLE
 from lidarops.records import Change, Grade, Measure, Plan
 

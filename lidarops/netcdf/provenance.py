@@ -11,18 +11,14 @@ from functools import cache
 from importlib.metadata import version
 from itertools import groupby
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, Final
 from uuid import NAMESPACE_URL, uuid5
 
-from lidarops.errors import NO_FILE, ProductError
-from lidarops.netcdf.read import opened_product
+from lidarops.errors import ProductError
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
-NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
-"""First bytes of NetCDF files."""
 
 _quoted: Final = json.JSONEncoder().encode
 
@@ -161,51 +157,6 @@ def product_id(provenance: Provenance) -> str:
     members = {key: _canonical(value) for key, value in content.items()}
     text = _object({**members, "inputs": f"[{','.join(inputs)}]"})
     return str(uuid5(NAMESPACE_URL, NAMESPACE + text))
-
-
-def read_provenance(path: str | Path) -> dict[str, Any]:
-    """Read the PROV-JSON document of a product.
-
-    Parameters
-    ----------
-    path : path or str
-        A product file.
-
-    Raises
-    ------
-    ProductError
-        If the file cannot be read or holds no provenance.
-    """
-    return read_origin(path)[0]
-
-
-def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read the PROV-JSON document of a product and its global attributes; see `read_provenance`."""
-    if not _is_netcdf(Path(path)):
-        problem = "is no NetCDF file" if Path(path).is_file() else "is no file"
-        remedy = "give the path of a product of lidarops"
-        raise ProductError(problem, file=path, remedy=remedy, wrong_use=True)
-    with opened_product(path, in_parts=True, decode_times=False) as product:
-        if "provenance" not in product:
-            problem = "has no such variable"
-            raise ProductError(problem, file=path, field="provenance", wrong_use=True)
-        text, attributes = str(product["provenance"].item()), dict(product.attrs)
-    try:
-        document: dict[str, Any] = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
-    return document, attributes
-
-
-def _is_netcdf(path: Path) -> bool:
-    """Return whether a file is NetCDF by its first bytes, or exists but cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(4) in NETCDF_MAGIC
-    except NO_FILE:
-        return False
-    except OSError:
-        return True
 
 
 @cache

@@ -9,6 +9,7 @@ NetCDF-4 files are read through HDF5. Whatever a library raises for a damaged fi
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -23,13 +24,19 @@ from xarray.backends import BackendArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from xarray.core import indexing
 
-from lidarops.errors import LidarOpsError, ProductError
+from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.netcdf._deflate import inflate_chunk
-from lidarops.netcdf.sizes import check_contents, check_sizes, is_bare_dimension
+from lidarops.netcdf.sizes import (
+    OTHER_DIMENSION,
+    check_contents,
+    check_sizes,
+    is_bare_dimension,
+)
 from lidarops.netcdf.stored_flags import Recoding, recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.netcdf.write import OTHER_DIMENSION
 
+NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
+"""First bytes of NetCDF files."""
 _ATTRIBUTES: Final = (
     "units",
     "calendar",
@@ -116,6 +123,51 @@ def opened_product(
         (check_contents if in_parts else check_sizes)(path)
         with xr.open_dataset(path, engine="netcdf4", cache=False, **decoding) as product:
             yield product
+
+
+def read_provenance(path: str | Path) -> dict[str, Any]:
+    """Read the PROV-JSON document of a product.
+
+    Parameters
+    ----------
+    path : path or str
+        A product file.
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be read or holds no provenance.
+    """
+    return read_origin(path)[0]
+
+
+def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read the PROV-JSON document of a product and its global attributes; see `read_provenance`."""
+    if not _is_netcdf(Path(path)):
+        problem = "is no NetCDF file" if Path(path).is_file() else "is no file"
+        remedy = "give the path of a product of lidarops"
+        raise ProductError(problem, file=path, remedy=remedy, wrong_use=True)
+    with opened_product(path, in_parts=True, decode_times=False) as product:
+        if "provenance" not in product:
+            problem = "has no such variable"
+            raise ProductError(problem, file=path, field="provenance", wrong_use=True)
+        text, attributes = str(product["provenance"].item()), dict(product.attrs)
+    try:
+        document: dict[str, Any] = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
+    return document, attributes
+
+
+def _is_netcdf(path: Path) -> bool:
+    """Return whether a file is NetCDF by its first bytes, or exists but cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4) in NETCDF_MAGIC
+    except NO_FILE:
+        return False
+    except OSError:
+        return True
 
 
 def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:

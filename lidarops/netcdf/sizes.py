@@ -15,6 +15,9 @@ import h5py
 
 from lidarops.errors import ProductError
 
+OTHER_DIMENSION: Final = "_nc4_non_coord_"
+"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
+
 _HDF5: Final = b"\x89HDF"
 _DEFLATE_LIMIT: Final = 1032
 """Largest factor by which deflate, the only compression of our products, shrinks data (zlib)."""

@@ -28,17 +28,15 @@ from lidarops.errors import ProductError
 from lidarops.netcdf._deflate import deflate_chunks
 from lidarops.netcdf._quiet_file import QuietFile
 from lidarops.netcdf._row_blocks import Block, RowBlocks
+from lidarops.netcdf.sizes import OTHER_DIMENSION
 from lidarops.netcdf.skeleton import Skeleton
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
+"""Largest chunk: a chunk is the whole variable, or as many whole rows as fit."""
 CONTIGUOUS_BYTES: Final = 2048
 """Up to this size, a variable without rows is stored as it is: the index of a chunk takes 2.1 kB.
 """
-"""Largest chunk: a chunk is the whole variable, or as many whole rows as fit."""
-
-OTHER_DIMENSION: Final = "_nc4_non_coord_"
-"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 
 _TYPES: Final = {"S1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"}
 _Array = NDArray[Any]

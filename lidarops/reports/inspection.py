@@ -23,8 +23,7 @@ from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import NO_FILE, LidarOpsError, RawFormatError
 from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
-from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
-from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.read import NETCDF_MAGIC, opened_product, read_provenance
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import raw_formats, read_raw_header

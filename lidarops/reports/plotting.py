@@ -14,8 +14,7 @@ from lidarops.errors import LidarOpsError, ProductError
 from lidarops.figures.any_kind import views_of
 from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
-from lidarops.netcdf.provenance import NETCDF_MAGIC
-from lidarops.netcdf.read import open_product, opened_product, reading
+from lidarops.netcdf.read import NETCDF_MAGIC, open_product, opened_product, reading
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from lidarops.campaign.model import Campaign
 from lidarops.errors import ProductError
-from lidarops.netcdf.provenance import read_origin
+from lidarops.netcdf.read import read_origin
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
 from lidarops.raw.recorders import named_layout, recorder_names

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
-from lidarops.netcdf.provenance import read_origin, read_provenance
+from lidarops.netcdf.read import read_origin, read_provenance
 from lidarops.netcdf.write import write_product
 from lidarops.run.archive import Selection, reprocess
 from lidarops.run.reproduction import Reproduction, explain_difference, reproduce_product

@@ -132,7 +132,15 @@ class TestErrorBudget:
         np.testing.assert_allclose(air.x, MEGA * profile.molecular)
         (total,) = labelled(right, "total")
         np.testing.assert_allclose(total.x, MEGA * profile.standard_error)
-        names = ("noise", "background", "reference", "lidar ratio", "molecules", "dead time")
+        names = (
+            "noise",
+            "background",
+            "reference",
+            "lidar ratio",
+            "molecules",
+            "dead time",
+            "baseline",
+        )
         for cause, label in zip(CAUSES, names, strict=True):
             (curve,) = labelled(right, label)
             np.testing.assert_allclose(curve.x, MEGA * profile.budget[cause])

@@ -73,7 +73,7 @@ def test_every_unit_is_valid_and_no_placeholder_is_left(kind: str, row: Row, mod
         Unit(found["units"].split(" since ")[0])
 
 
-_CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time")
+_CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline")
 
 
 def test_variables_without_standard_name():
@@ -98,6 +98,7 @@ def test_variables_without_standard_name():
             "signal",
             "signal_standard_error",
             "signal_dead_time_error",
+            "signal_baseline_error",
             "background",
             "background_standard_error",
             "noise_correlation_length",
@@ -166,6 +167,8 @@ def test_variables_without_standard_name():
             "beam_obstruction",
             "vertical_optical_depth_dead_time_error",
             "total_extinction_dead_time_error",
+            "vertical_optical_depth_baseline_error",
+            "total_extinction_baseline_error",
             "analog_baseline",
             "analog_baseline_standard_error",
             "blocked_range",
@@ -195,6 +198,7 @@ def test_variables_without_standard_name():
             "total_extinction",
             "total_extinction_standard_error",
             "total_extinction_model_error",
+            "total_extinction_baseline_error",
             "amplitude",
             "amplitude_standard_error",
             "background",

@@ -16,7 +16,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.global_attributes import UNUSED_INPUTS
-from lidarops.netcdf.provenance import read_provenance
+from lidarops.netcdf.read import read_provenance
 from lidarops.records import Grade
 from lidarops.reports import run_tables
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
