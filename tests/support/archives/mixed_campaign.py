@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,7 @@ def tree(*, profiles: int = 60, bins: int = 4000) -> dict[str, Any]:
             "acquisition": shooting,
             "detectors": [_detector(_PHOTON, 4.0)],
         }
-    return {
+    whole = {
         "name": "mixed",
         "title": "Scenes of many kinds",
         "archive": "raw",
@@ -179,6 +180,8 @@ def tree(*, profiles: int = 60, bins: int = 4000) -> dict[str, Any]:
             "instruments": simulated,
         },
     }
+    # Tests change what they are given.
+    return copy.deepcopy(whole)
 
 
 def write(folder: Path, **size: int) -> Campaign:
