@@ -100,9 +100,11 @@ class Glue(Step[ChannelCase, GlueSettings]):
         # Parts of a glued channel are channels of the files.
         of_analog, of_photon = (cast("FileProfiles", part[PROFILES]) for part in (analog, photon))
 
+        archives = analog[ARCHIVE], photon[ARCHIVE]
+
         @functools.cache
         def slope() -> labeled_gluing.Slope:
-            return labeled_gluing.scene_slope(_samples(analog, photon), lag)
+            return labeled_gluing.scene_slope(_samples(archives, (of_analog, of_photon)), lag)
 
         data[PROFILES] = GluedProfiles(of_analog, of_photon, lag, slope)
 
@@ -119,13 +121,16 @@ def _groups(analog: Data, photon: Data) -> Iterator[tuple[_Power, _Power]]:
         yield _power(analog, rows), _power(photon, rows)
 
 
-def _samples(analog: Data, photon: Data) -> Iterator[tuple[xr.Dataset, xr.Dataset]]:
+def _samples(
+    archives: tuple[xr.Dataset, xr.Dataset], profiles: tuple[FileProfiles, FileProfiles]
+) -> Iterator[tuple[xr.Dataset, xr.Dataset]]:
     """Yield profiles of both channels from all over a scene, some at a time."""
-    number, together = analog[ARCHIVE].sizes["time"], PROFILES_AT_ONCE // 4
+    number, together = archives[0].sizes["time"], PROFILES_AT_ONCE // 4
     rows = np.unique(np.linspace(0, number - 1, labeled_gluing.SLOPE_PROFILES).astype(int))
     for first in range(0, rows.size, together):
         some = rows[first : first + together]
-        one, other = (part[PROFILES].of(part[ARCHIVE].isel(time=some)) for part in (analog, photon))
+        both = zip(archives, profiles, strict=True)
+        one, other = (of_channel.of(counts.isel(time=some)) for counts, of_channel in both)
         yield one, other
 
 
