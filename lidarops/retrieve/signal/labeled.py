@@ -170,7 +170,8 @@ def baseline_error(profiles: xr.Dataset, *, decaying: bool = False) -> xr.DataAr
     profiles : xr.Dataset
         From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
     decaying : bool
-        Whether all of it decays as undershoot does, for what does not depend on a constant.
+        Whether all of it decays as undershoot does, for what does not depend on a constant; not of
+        glued profiles.
 
     Returns
     -------
@@ -179,12 +180,12 @@ def baseline_error(profiles: xr.Dataset, *, decaying: bool = False) -> xr.DataAr
         counting. None for photon counting.
     """
     power = profiles["power"]
-    decay = np.exp(-np.maximum(profiles["range"], 0.0) / THRESHOLDS.baseline_decay)
     if BASELINE_ERROR in profiles:
-        return profiles[BASELINE_ERROR] * (decay if decaying else 1.0)
+        return profiles[BASELINE_ERROR]
     if BASELINE_ERROR not in power.attrs:
         return None
     fixed, share = power.attrs[BASELINE_ERROR]
+    decay = np.exp(-np.maximum(profiles["range"], 0.0) / THRESHOLDS.baseline_decay)
     undershoot = share * (power.max("range") - power.min("range")).fillna(0.0)
     error: xr.DataArray = np.hypot(fixed * (decay if decaying else 1.0), undershoot * decay)
     return error

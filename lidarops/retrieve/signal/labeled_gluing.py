@@ -160,11 +160,11 @@ def glue(
     result[CORRELATION_LENGTH] = length.assign_attrs(units="1")
     for name, unit in {**units, **_LAG}.items():
         result[name].attrs = {"units": unit} if unit else {}
-    baseline = baseline_error(analog)
+    baseline = baseline_error(analog.assign_coords(range=photon["range"]))
     if baseline is not None:
         middle = 0.5 * (result["glue_bottom"] + result["glue_top"])
         result[BASELINE_ERROR] = (
-            (baseline * result["glue_slope"])
+            (baseline * result["glue_slope"].fillna(1.0))
             .where(result["range"] <= middle, 0.0)
             .fillna(0.0)
             .transpose(*result["power"].dims)
@@ -245,7 +245,8 @@ def _glue(
     change *= dead_time_error
     change -= (sky_change := sky**2 * dead_time_error)[..., np.newaxis]
     x, y = (analog - dark[..., np.newaxis])[..., ahead], (photon - sky[..., np.newaxis])[..., ahead]
-    xv, yv = (np.nan_to_num(v[..., ahead]) for v in (analog_variance, photon_variance))
+    # Without power there is no variance, and without shots it is infinite.
+    xv, yv = (np.nan_to_num(v[..., ahead], posinf=0.0) for v in (analog_variance, photon_variance))
     glued = gluing.glue(
         x,
         y,

@@ -8,7 +8,12 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.signal import labeled_gluing
-from lidarops.retrieve.signal.labeled import actual_noise, correct_for_range, counts_per_power
+from lidarops.retrieve.signal.labeled import (
+    actual_noise,
+    baseline_error,
+    correct_for_range,
+    counts_per_power,
+)
 from lidarops.retrieve.signal.labeled_gluing import ChannelLag
 
 DIMS = ("time", "range")
@@ -192,6 +197,36 @@ def test_where_the_counter_cannot_be_used_analog_alone_is_the_signal(sky, counte
 
 def with_dead_time(record, error=4e-9):
     return record.assign(power=record["power"].assign_attrs(dead_time_standard_error=error))
+
+
+@pytest.mark.parametrize("lag", [0.0, 6.0])
+def test_the_baseline_of_analog_is_an_error_of_its_part(lag):
+    known = (RATIO, 0.0)
+    for sky, slope in ((0.2, None), (60.0, None), (60.0, known)):
+        analog, photon = recorded(truth(sky=sky), lag=lag)
+        analog["power"].attrs["baseline_standard_error"] = (0.01, 7.5e-4)
+        own = baseline_error(analog).to_numpy()
+        # Ranges of files may state the lag.
+        analog = analog.assign_coords(range=photon["range"] - lag * BIN)
+        result = labeled_gluing.glue(analog, photon, ChannelLag(lag), slope)
+        middle = 0.5 * (result["glue_bottom"] + result["glue_top"])
+        used = result["glue_slope"].fillna(1.0).to_numpy()[:, np.newaxis]
+        expected = np.where(distance <= middle.to_numpy()[:, np.newaxis], own * used, 0.0)
+        np.testing.assert_allclose(baseline_error(result), expected, rtol=1e-12)
+        assert (baseline_error(result)[:, :100] > 0.0).all()
+
+
+def test_profiles_without_shots_have_no_light():
+    analog, photon = recorded(truth(), profiles=4)
+    for record in (analog, photon):
+        record["power"][2:], record["variance"][2:] = np.nan, np.inf
+        record["quality"][2:] = int(Quality.INPUT_MISSING)
+    result = labeled_gluing.glue(analog, photon, slope=(RATIO, 0.1))
+    assert np.isnan(result["power"][2:]).all()
+    assert (result["quality"][2:].to_numpy() & int(Quality.NO_GLUING) != 0).all()
+    some = {"time": slice(2)}
+    others = labeled_gluing.glue(analog.isel(some), photon.isel(some), slope=(RATIO, 0.1))
+    xr.testing.assert_identical(result.isel(some), others)
 
 
 def test_each_record_alone_has_the_bit():
