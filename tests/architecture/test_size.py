@@ -23,7 +23,7 @@ MOST = {
     "dataclasses": 425,
     "lines of dataclasses": 10_700,
     "tuning numbers": 260,
-    "tuning numbers that are assumed": 86,
+    "tuning numbers that are assumed": 87,
     "copied thresholds": 55,
     "most parameters": 24,
     "lines of the largest package": 9_900,
