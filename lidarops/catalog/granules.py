@@ -15,7 +15,8 @@ import sqlalchemy as sa
 
 from lidarops.catalog.database import BATCH, Database
 from lidarops.catalog.rows import NO_NOTES, GranuleRow, day_of, naive
-from lidarops.catalog.schema import GRANULE, LAYOUT
+from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
+from lidarops.raw.recorders import Names, recorder_names
 from lidarops.records import ChannelLayout, DetectionMode, FileNote, Granule, Holding, Role, Status
 
 _C = GRANULE.c
@@ -274,6 +275,31 @@ class Granules(Database):
                     for name, k, _, files, first, text in rows
                 )
             )
+
+    def channel_names(self) -> Mapping[str, Names]:
+        """Return the names that recorders have for good, by instrument."""
+        query = sa.select(CHANNEL_NAME).where(CHANNEL_NAME.c.campaign == self.campaign)
+        names: dict[str, dict[Any, str]] = defaultdict(dict)
+        with self.transaction() as connection:
+            rows = connection.execute(query)
+            for row, recorder in self.decoded((row, json.loads(row.recorder)) for row in rows):
+                names[row.instrument][tuple(recorder)] = row.name
+        return names
+
+    def bind_channel_names(self) -> None:
+        """Enter names for recorders without one; they stay when files are forgotten."""
+        held: dict[str, list[Any]] = defaultdict(list)
+        for holding in self.holdings(()):
+            held[holding.instrument].append((holding.layout, holding.files, holding.first))
+        bound, ours = self.channel_names(), {"campaign": self.campaign}
+        rows = [
+            {**ours, "instrument": instrument, "name": name, "recorder": json.dumps(recorder)}
+            for instrument, files in held.items()
+            for recorder, name in recorder_names(files, bound=bound.get(instrument)).items()
+        ]
+        if rows:
+            with self.transaction() as connection:
+                connection.execute(self.insert_new(CHANNEL_NAME), rows)
 
     def days_of_instruments(
         self, first: int | None = None, last: int | None = None

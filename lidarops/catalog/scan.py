@@ -292,6 +292,8 @@ class _Scan:
                 remedy="check the keys and permissions with which lidarops reads it",
             )
         self._flush()
+        if self._added or self._changed:
+            self._store.bind_channel_names()
         moved = self._moved()
         if moved:
             self._write()

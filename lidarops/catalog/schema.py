@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 10
+SCHEMA_VERSION: Final = 11
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
@@ -59,6 +59,17 @@ GRANULE = sa.Table(
     sa.Column("stamp_low", sa.BigInteger, nullable=False),
     sa.Column("stamp_high", sa.BigInteger, nullable=False),
     sa.Index("granule_by_day", "campaign", "day", "role", "status", "stamp_low", "stamp_high"),
+    sqlite_with_rowid=False,
+)
+
+CHANNEL_NAME = sa.Table(
+    "channel_name",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("instrument", _NAME, primary_key=True),
+    sa.Column("name", sa.Text, primary_key=True),
+    # JSON of the recorder that has this name for good.
+    sa.Column("recorder", sa.Text, nullable=False),
     sqlite_with_rowid=False,
 )
 

@@ -36,6 +36,7 @@ class ChannelNames:
     def __init__(self, campaign: Campaign, store: Store) -> None:
         self._instruments = campaign.instruments
         self._stored = store.holdings(validity_edges(campaign))
+        self._bound = store.channel_names()
         self._layouts: dict[tuple[object, Layout], Layout] = {}
         self.holdings = [
             replace(held, layout=self._layout(held.instrument, held.layout, held.since))
@@ -70,5 +71,6 @@ class ChannelNames:
         if (key, layout) not in self._layouts:
             own = (held for held in self._stored if held.instrument == instrument)
             files = ((held.layout, held.files, held.first) for held in own)
-            self._layouts[key, layout] = named_layout(layout, recorder_names(files, stated))
+            names = recorder_names(files, stated, self._bound.get(instrument))
+            self._layouts[key, layout] = named_layout(layout, names)
         return self._layouts[key, layout]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -21,6 +22,7 @@ from lidarops.catalog.folder import (
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder
+from lidarops.raw.recorders import label_of
 from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.steps.channels import file_channels
@@ -219,13 +221,18 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield "        channels:"
     # Without dead times, all values of a scan are rejected where rates are high (SAVANT).
     estimated = {name for pair in headers.pairs if estimates for name in file_channels(pair)}
+    several = Counter(map(label_of, {c.name for group in headers.signal for c in group.layout}))
+    alike = Counter((label_of(c.name), c.recorder) for c in headers.layout)
     for channel in headers.layout:
         photon = channel.mode is DetectionMode.PHOTON
-        facts = "{dead_time: estimate}" if photon and channel.name in estimated else "{}"
+        facts = ["dead_time: estimate"] if photon and channel.name in estimated else []
+        own = label_of(channel.name), channel.recorder
+        if channel.recorder and several[own[0]] > 1 == alike[own]:
+            facts.insert(0, f"recorder: {_text(channel.recorder)}")
         recorder = f", {channel.recorder}" if channel.recorder else ""
         grid = f"{channel.bins} bins of {channel.bin_width:g} m{recorder}"
         question = _unknown(channel, estimated=channel.name in estimated)
-        yield f"          {channel.name}: {facts}  # {grid}{question}"
+        yield f"          {channel.name}: {{{', '.join(facts)}}}  # {grid}{question}"
 
 
 def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:

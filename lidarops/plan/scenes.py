@@ -15,7 +15,7 @@ import hashlib
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
@@ -140,6 +140,13 @@ def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
 def _grids_key(members: Sequence[Scene]) -> str:
     text = " ".join(_layout_key(member.granules[0]) for member in members)
     return hashlib.sha256(text.encode()).hexdigest()[:6]
+
+
+def as_recorded(scene: Scene, recorded: Collection[str]) -> Scene:
+    """Return a scene with its suffix if a recorded one has it, whose window held others then."""
+    members = tuple(as_recorded(member, recorded) for member in scene.members)
+    whole = f"{scene.id}-{_grids_key(members) if members else _layout_key(scene.granules[0])}"
+    return replace(scene, id=whole if whole in recorded else scene.id, members=members)
 
 
 def parse_scene_id(scene: str) -> tuple[str, datetime]:

@@ -45,14 +45,16 @@ def _recorders(layout: Layout) -> list[Recorder]:
 
 
 def recorder_names(
-    files: Iterable[tuple[Layout, int, datetime]], stated: Mapping[str, str] | None = None
+    files: Iterable[tuple[Layout, int, datetime]],
+    stated: Mapping[str, str] | None = None,
+    bound: Names | None = None,
 ) -> Names:
     """Return the name of each recorder of an instrument, whatever the order of its files.
 
     Of the files with most recorders of a label, those that start first count. One file that
     differs from many may be damaged, so that it counts last. `files` are channels as files name
     them, the number of these files, and the start of the first one; `stated` are names that a
-    person gave, with their recorders. No other recorder has such a name.
+    person gave, with their recorders, and `bound` earlier ones. No other recorder has such a name.
     """
     counts: Counter[Any] = Counter()
     starts: dict[Any, datetime] = {}
@@ -68,6 +70,9 @@ def recorder_names(
             place = (many and counts[key] == 1, -held[recorder[0]], start, key, name)
             first[recorder] = min(first.get(recorder, place), place)
     names = {(label_of(name), recorder, 0): name for name, recorder in (stated or {}).items()}
+    # Before all others, and first those whose names no person gave to others.
+    given = set(names.values())
+    first |= {recorder: (-1, name in given, name) for recorder, name in (bound or {}).items()}
     for recorder in sorted(first.keys() - names.keys(), key=first.__getitem__):
         *_, name = first[recorder]
         number = 2

@@ -30,7 +30,7 @@ from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.channel_names import ChannelNames
 from lidarops.plan.outlying_headers import new_notes, without_outlying
 from lidarops.plan.scene_plan import plan_scene
-from lidarops.plan.scenes import DARK_REACH, Cut, cut_scenes
+from lidarops.plan.scenes import DARK_REACH, Cut, as_recorded, cut_scenes
 from lidarops.plan.surroundings import NEAR_DAYS
 from lidarops.plan.unused_files import Refused, dated, name_unused
 from lidarops.process.context import recorded_settings
@@ -297,9 +297,9 @@ class Judge:
             Ascending; from `batches`.
         """
         first, last, judged_days = days[0], days[-1], set(days)
-        cut = self._cut(first, last, judged_days)
         tried = self._store.last_tries(first, last)
         products = self._store.products_of_days(first, last)
+        cut = self._cut(first, last, judged_days, {product.scene for product in products})
         made = {product.key: product for product in products if product.day in judged_days}
         touched: dict[str, int] = {}
         judgements = [
@@ -395,7 +395,7 @@ class Judge:
         complete = not (judged.stale or judged.failure or self._selection.kinds)
         return last is not None and bool(last.error) and complete
 
-    def _cut(self, first: int, last: int, days: set[int]) -> Cut:
+    def _cut(self, first: int, last: int, days: set[int], recorded: set[str]) -> Cut:
         stored = self._store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
@@ -410,7 +410,7 @@ class Judge:
             ],
         )
         unused = [*self._refused, *(Refused(granule, _moment(granule)) for granule in refused)]
-        scenes = name_unused(cut.scenes, unused)
+        scenes = name_unused([as_recorded(scene, recorded) for scene in cut.scenes], unused)
         return replace(
             cut,
             scenes=scenes,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
 from pathlib import Path
 from typing import Any
 
 import pytest
 import xarray as xr
 import yaml
+from support import damage
 from support.archives.recorder_archive import BOTH, DAY, NEAR, RecorderArchive, periods
 from typer.testing import CliRunner, Result
 
@@ -64,6 +66,21 @@ def partly_off(archive: RecorderArchive) -> None:
     archive.products["signal"] = {"channels": ["analog_532o", "analog_532o_2"]}
 
 
+def taken_away(archive: RecorderArchive, pattern: str) -> dict[Path, bytes]:
+    """Remove raw files and return their contents."""
+    files = sorted((archive.folder / "raw").glob(pattern))
+    kept = {file: file.read_bytes() for file in files}
+    for file in files:
+        file.unlink()
+    return kept
+
+
+def contents(archive: RecorderArchive) -> dict[str, bytes]:
+    """Return the content of each product, by its name."""
+    root = archive.folder / "out/products"
+    return {path.name: path.read_bytes() for path in root.rglob("*.nc")}
+
+
 def test_a_telescope_that_is_off_leaves_its_name_free(archive: RecorderArchive) -> None:
     partly_off(archive)
     archive.facts[0]["channels"] = {"analog_532o": {"wavelength": 530e-9}}
@@ -84,14 +101,11 @@ def test_a_telescope_that_is_off_leaves_its_name_free(archive: RecorderArchive) 
 
 def test_names_do_not_depend_on_the_order_in_which_files_come(tmp_path: Path) -> None:
     contents = []
-    for number, late in enumerate(("h0", "h1", "")):
+    for number, late in enumerate(("h0", "h11", "")):
         archive = RecorderArchive(tmp_path / str(number))
         partly_off(archive)
-        files = sorted((archive.folder / "raw").glob(f"{late}?*")) if late else []
-        kept = {file: file.read_bytes() for file in files}
+        kept = taken_away(archive, f"{late}*") if late else {}
         if late:
-            for file in files:
-                file.unlink()
             invoke(archive, "reprocess")
         for file, data in kept.items():
             file.write_bytes(data)
@@ -113,11 +127,57 @@ def test_a_product_is_made_again_when_its_name_comes_to_mean_another_recorder(
         archive.raw(f"h0{minute}", minute, ("BT1", "BT2"))
     invoke(archive, "reprocess")
     assert recorders(archive) == {"analog_532o": {"BT1"}, "analog_532o_2": {"BT2"}}
+    archive.facts[0]["channels"] = {"analog_532o": {"recorder": "BT2"}}
+    invoke(archive, "reprocess")
+    assert recorders(archive) == {"analog_532o": {"BT2"}, "analog_532o_2": {"BT1"}}
+
+
+def test_names_stay_when_a_recorder_comes(archive: RecorderArchive) -> None:
     for minute in range(3):
-        archive.raw(f"h1{minute}", DAY + minute, ("BT2", "BT0", "BT1"))
-    invoke(archive, "reprocess", "--remove-orphans")
-    # On the first day, too, whose products of BT2 had the name analog_532o_2.
-    assert recorders(archive) == {"analog_532o": {"BT2"}, "analog_532o_2": {"BT0"}}
+        archive.raw(f"h0{minute}", minute, NEAR)
+    invoke(archive, "reprocess")
+    before = contents(archive)
+    for minute in range(3):
+        archive.raw(f"h1{minute}", DAY + minute, BOTH)
+    shown = invoke(archive, "reprocess", "--json")
+    assert shown.exit_code == 0
+    assert not json.loads(shown.stdout)["orphans"]
+    assert before.items() <= contents(archive).items()
+    assert recorders(archive) == {
+        "analog_532o": {"BT12"},
+        "photon_532o": {"BC12"},
+        "analog_532o_2": {"BT5"},
+        "photon_532o_2": {"BC5"},
+    }
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+@pytest.mark.parametrize("recorder", ["BT5", None])
+def test_files_that_are_lost_for_a_time_change_nothing(
+    archive: RecorderArchive, recorder: str | None, damaged: bool
+) -> None:
+    pytest.importorskip("pyarrow")
+    partly_off(archive)
+    archive.facts[0]["channels"] = {"analog_532o": {"wavelength": 530e-9, "recorder": recorder}}
+    invoke(archive, "reprocess")
+    before = contents(archive)
+    kept = taken_away(archive, "h1*")
+    for file, data in kept.items() if damaged else ():
+        file.write_bytes(damage.flip_line_end(data, random.Random(file.name)))
+    invoke(archive, "reprocess")
+    assert recorders(archive) == {"analog_532o": {"BT5"}, "analog_532o_2": {"BT12"}}
+    # Products tell of damaged files.
+    assert contents(archive).keys() == before.keys() if damaged else contents(archive) == before
+    for file, data in kept.items():
+        file.write_bytes(data)
+    shown = invoke(archive, "reprocess", "--json")
+    assert shown.exit_code == 0
+    assert not json.loads(shown.stdout)["orphans"]
+    assert contents(archive).keys() == before.keys()
+    words = ["aggregate", str(archive.folder / "out"), "--means", "month", "--json"]
+    means = CliRunner().invoke(app, words)
+    assert means.exit_code == 0
+    assert len(json.loads(means.stdout)["means"]) == 2
 
 
 def test_means_join_no_recorders(archive: RecorderArchive) -> None:
@@ -235,7 +295,12 @@ def test_files_are_opened_and_described_by_the_same_names(archive: RecorderArchi
     words = ["init", str(archive.folder / "raw"), str(draft)]
     assert CliRunner().invoke(app, words).exit_code == 0
     (lidar,) = yaml.safe_load(draft.read_text())["instruments"].values()
-    assert len(lidar["facts"][0]["channels"]) == 4
+    assert {name: facts["recorder"] for name, facts in lidar["facts"][0]["channels"].items()} == {
+        "analog_532o": "BT5",
+        "photon_532o": "BC5",
+        "analog_532o_2": "BT12",
+        "photon_532o_2": "BC12",
+    }
 
 
 def test_a_real_lidar_whose_far_telescope_is_off(data_root: Path, tmp_path: Path) -> None:
