@@ -92,12 +92,17 @@ class ReferenceWindow:
     def undetected_particles(self) -> Array:
         """Relative standard error of the scattering ratio by particles that noise hides.
 
-        It is the excess over the anchor beyond noise: the root of the square of the difference,
-        where positive, less the variance of that difference, which noise adds on average.
+        `Thresholds.undetected_particles` standard errors of the comparison with the anchor, for
+        those that it could not have shown, and the excess over the anchor beyond noise: the root
+        of the square of the difference, where positive, less the variance of that difference.
+        It is 0 with a single candidate, which is compared with none: its stated error is all.
         """
+        if self.rejections.shape[-1] == 1:
+            return np.zeros(self.chosen.shape)
         noise = np.hypot(self.scale_standard_error, self.comparison_standard_error)
-        square = np.maximum(self.excess, 0.0) ** 2 - noise**2
-        return np.asarray(np.nan_to_num(np.sqrt(np.maximum(square, 0.0)) / self.scale))
+        square = np.maximum(np.maximum(self.excess, 0.0) ** 2 - noise**2, 0.0)
+        unseen = THRESHOLDS.undetected_particles * noise
+        return np.asarray(np.nan_to_num(np.hypot(unseen, np.sqrt(square)) / self.scale))
 
     def relative_error(self, stated: float) -> Array:
         """Return the relative error of the scattering ratio: stated, and by hidden particles."""

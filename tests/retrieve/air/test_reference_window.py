@@ -161,6 +161,16 @@ def test_of_equally_clean_windows_the_highest_certain_one_is_taken():
     assert np.mean(window.bottom == expected) > 0.8
 
 
+def test_a_single_candidate_states_no_particles_that_a_comparison_may_miss():
+    power = 1e17 * SHAPE
+    several = choose_reference(power, RANGE, power, **CLEAN)
+    noise = np.hypot(several.scale_standard_error, several.comparison_standard_error)
+    assert several.excess == pytest.approx(0.0, abs=1e-9 * several.scale)
+    assert several.undetected_particles == pytest.approx(1.5 * noise / several.scale)
+    one = choose_reference(power, RANGE, power, **{**CLEAN, "candidates": WINDOWS[:1]})
+    assert one.undetected_particles == 0.0
+
+
 def test_cleaner_air_is_preferred_to_a_uniform_layer():
     # Backscatter of air times 1.2 from 3 to 6 km has the shape of air but for its extinction.
     particles = np.where((RANGE > 3e3) & (RANGE < 6e3), 0.2 * BACKSCATTER, 0.0)
