@@ -44,14 +44,17 @@ _LIDAR_RATIOS: Final = (1.0, 200.0)
 _MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_systematic", "usable"})
 """Variables of a product with measured lidar ratios and overlap."""
 _LIDAR_RATIO_NEEDS: Final = frozenset(
-    {"altitude", "quality_flag", "shots", "aerosol_extinction", "aerosol_backscatter"}
-    | {"vertical_resolution"}
-    | {f"aerosol_extinction_error_{cause}" for cause in EXTINCTION_CAUSES}
-    | {f"aerosol_backscatter_error_{cause}" for cause in BACKSCATTER_CAUSES}
+    {"altitude", "quality_flag", "aerosol_extinction", "aerosol_backscatter", "vertical_resolution"}
+    | {"molecular_backscatter", "reference_scattering_ratio"}
+    | {"reference_scattering_ratio_standard_error"}
+    | {f"aerosol_extinction_error_{cause}" for cause in EXTINCTION_CAUSES if cause != "baseline"}
+    | {f"aerosol_backscatter_error_{cause}" for cause in BACKSCATTER_CAUSES if cause != "baseline"}
 )
-"""What else a product with measured lidar ratios holds."""
-_SEVERAL: Final = 2
-"""Profiles with values at a height that has a lidar ratio, where there are as many."""
+"""What else a product with measured lidar ratios holds. Former products state no baseline error."""
+_SEVERAL: Final = 0.5
+"""Share of the profiles of the most frequent height that a height with a lidar ratio exceeds."""
+_LEAST_NOISE: Final = 1e-3
+"""Relative noise of a profile, below which its weight does not grow."""
 _CERTAIN: Final = 3.0
 """Standard errors by which mean backscatter exceeds zero; that of a lidar ratio is symmetrical."""
 _REJECTED: Final = 2
@@ -93,11 +96,21 @@ class LidarRatio:
     """sr."""
     standard_error: Array
     """sr; one error of this shape, common to all altitudes."""
+    top: float = np.inf
+    """m above mean sea level, up to which it holds."""
 
-    def at(self, altitude: Array) -> tuple[Array, Array]:
-        """Return ratio and standard error at altitudes in m: linear, constant beyond the ends."""
-        ratio = np.interp(altitude, self.altitude, self.ratio)
-        return ratio, np.interp(altitude, self.altitude, self.standard_error)
+    def at(self, altitude: Array, beyond: tuple[float, float]) -> tuple[Array, Array]:
+        """Return ratio and standard error at altitudes in m: linear, constant beyond the ends.
+
+        Above `top` they are those of `beyond`.
+        """
+        known = altitude <= self.top
+        parts = zip((self.ratio, self.standard_error), beyond, strict=True)
+        ratio, error = (
+            np.where(known, np.interp(altitude, self.altitude, values), other)
+            for values, other in parts
+        )
+        return ratio, error
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,11 +353,12 @@ def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -
 def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:
     """Return the mean extinction of a product outside of clouds over its mean backscatter.
 
-    Means over time are weighted by laser shots, of all values that are usable. Lidar ratios of
-    single profiles exist where noise makes backscatter high or the ratio uncertain, and their
-    errors follow that noise (`tests/campaign/test_ancillary_files.py`). Heights with values of few
-    profiles, or an uncertain mean backscatter, have none. Random errors decrease with the number of
-    profiles; systematic ones, that of the reference among them, are those of all times.
+    Means over time are of all values that are usable, weighted by the noise of whole profiles
+    relative to total backscatter, which no single value changes. Lidar ratios of single profiles
+    exist where noise makes backscatter high or the ratio uncertain, and their errors follow that
+    noise (`tests/campaign/test_ancillary_files.py`). Heights with values of few profiles, or an
+    uncertain mean backscatter, have none. Random errors, with that of each calibration, decrease
+    with the number of profiles; systematic ones are those of all times.
     """
     missing = sorted(_LIDAR_RATIO_NEEDS - raw.keys())
     if missing:
@@ -357,28 +371,37 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
     extinction, backscatter = raw["aerosol_extinction"][1], _as_resolved(raw)
     cloudy = (raw["quality_flag"][1].astype(np.int32) & np.int32(_CLOUDS)) != 0
     known = np.isfinite(extinction * backscatter) & (raw["usable"][1] < _REJECTED) & ~cloudy
-    weight = np.where(known, raw["shots"][1][:, np.newaxis], 0.0)
-    weight /= np.maximum(weight.sum(axis=0), 1.0)
+    total = raw["aerosol_backscatter"][1] + raw["molecular_backscatter"][1]
+    weight = _profile_weights(raw, np.where(known, total, np.nan))[:, np.newaxis] * known
+    weight /= np.where(known.any(axis=0), weight.sum(axis=0), 1.0)
 
     def mean(values: Array) -> Array:
         return np.asarray((weight * np.where(known, values, 0.0)).sum(axis=0))
 
     def square_error(quantity: str, causes: Sequence[str]) -> Array:
-        total = np.zeros(altitude.size)
+        square = np.zeros(altitude.size)
         for cause in causes:
-            error = np.where(known, raw[f"{quantity}_error_{cause}"][1], 0.0)
-            if cause in RANDOM:
-                total += ((weight * error) ** 2).sum(axis=0)
-            else:
-                total += mean(error) ** 2
-        return total
+            error = np.where(known, raw.get(f"{quantity}_error_{cause}", ("", total * 0.0))[1], 0.0)
+            # What a reference window may hide beside the stated error follows its noise.
+            stated = mean(stated_ratio * total) if cause == "reference" else mean(error)
+            if cause in RANDOM or cause == "reference":
+                square += ((weight * error) ** 2).sum(axis=0)
+            if cause not in RANDOM:
+                square += stated**2
+        return square
 
+    stated_ratio = raw["reference_scattering_ratio_standard_error"][1]
+    stated_ratio = stated_ratio / raw["reference_scattering_ratio"][1]
     of_extinction = square_error("aerosol_extinction", EXTINCTION_CAUSES)
-    of_backscatter = square_error("aerosol_backscatter", BACKSCATTER_CAUSES)
+    # Particles that windows may hide do not make the denominator fluctuate.
+    fluctuating = [cause for cause in BACKSCATTER_CAUSES if cause != "reference"]
+    of_backscatter = square_error("aerosol_backscatter", fluctuating)
     scattered = mean(backscatter)
     certain = scattered > _CERTAIN * np.sqrt(of_backscatter)
-    certain &= known.sum(axis=0) >= min(_SEVERAL, len(known))
+    count = known.sum(axis=0)
+    certain &= count > _SEVERAL * count.max()
     ratio = mean(extinction) / np.where(certain, scattered, np.nan)
+    of_backscatter += square_error("aerosol_backscatter", ["reference"])
     error = np.sqrt(of_extinction + ratio**2 * of_backscatter) / scattered
     least, largest = _LIDAR_RATIOS
     measured = (ratio >= least) & (ratio <= largest) & (ratio >= error)
@@ -389,7 +412,19 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
             field="lidar_ratio",
             remedy="choose another night",
         )
-    return LidarRatio(altitude[measured], ratio[measured], error[measured])
+    altitude, ratio, error = altitude[measured], ratio[measured], error[measured]
+    return LidarRatio(altitude, ratio, error, altitude[-1])
+
+
+def _profile_weights(raw: Mapping[str, tuple[str, Array]], total: Array) -> Array:
+    """Return the inverse square of the noise of each profile relative to total backscatter."""
+    names = [f"aerosol_backscatter_error_{cause}" for cause in ("noise", "background")]
+    noise = np.hypot(*(raw[name][1] for name in names)) / np.abs(total)
+    weights = np.zeros(len(noise))
+    for number, row in enumerate(noise):
+        if np.any(finite := np.isfinite(row)):
+            weights[number] = max(float(np.median(row[finite])), _LEAST_NOISE) ** -2
+    return weights
 
 
 def _as_resolved(raw: Mapping[str, tuple[str, Array]]) -> Array:

@@ -692,9 +692,9 @@ REFERENCE_WINDOW: Final = (
         " detected in the reference window with a probability of 0.95",
         coverage=Coverage.AUXILIARY,
         comment="By comparison with other windows. Fewer particles may remain undetected:"
-        " aerosol_backscatter_error_reference includes the noise of this comparison, and the ratio of"
-        " the window to air in excess of the lowest ratio. Missing where no window passed the tests, or none"
-        f" beside it is comparable. {NO_STANDARD_NAME}",
+        " aerosol_backscatter_error_reference includes the noise of this comparison, and the ratio"
+        " of the window to air in excess of the lowest ratio. Missing where no window passed the"
+        f" tests, or none beside it is comparable. {NO_STANDARD_NAME}",
     ),
 )
 """Where a profile was compared with clean air, and how clean the air is taken to be."""

@@ -145,7 +145,7 @@ RATIOS = "altitude [km],lidar_ratio [sr],lidar_ratio_standard_error\n1,40,4\n3,6
 def test_lidar_ratios_are_linear_between_their_altitudes(tmp_path: Path) -> None:
     (tmp_path / "s.csv").write_text(RATIOS)
     profile, digest = lidar_ratio_profile(tmp_path, "s.csv")
-    ratio, error = profile.at(np.array([0.0, 1000.0, 2000.0, 3000.0, 9000.0]))
+    ratio, error = profile.at(np.array([0.0, 1000.0, 2000.0, 3000.0, 9000.0]), (50.0, 10.0))
     np.testing.assert_array_equal(ratio, [40.0, 40.0, 50.0, 60.0, 60.0])
     np.testing.assert_array_equal(error, [4.0, 4.0, 8.0, 12.0, 12.0])
     assert digest == hashlib.sha256((tmp_path / "s.csv").read_bytes()).hexdigest()
@@ -165,13 +165,14 @@ def _product(
     Errors are by their cause, of extinction in sr and of backscatter relative to 1.
     """
     plane, values = ("time", "range"), np.asarray(ratio, float)
-    times, heights = values.shape
+    heights = values.shape[1]
     stated = {f"aerosol_extinction_error_{cause}": 0.0 for cause in EXTINCTION_CAUSES}
     stated |= {f"aerosol_backscatter_error_{cause}": 0.0 for cause in BACKSCATTER_CAUSES}
     stated |= {"aerosol_extinction_error_noise": random, "aerosol_extinction_error_molecular": 2.0}
     stated |= {f"aerosol_backscatter_error_{cause}": error for cause, error in errors.items()}
     stated |= {"aerosol_extinction": values, "aerosol_backscatter": backscatter}
     stated |= {"lidar_ratio_error_random": 0.0, "lidar_ratio_error_systematic": 0.0}
+    stated |= {"molecular_backscatter": 0.0}
     altitude = 1000.0 * np.arange(1, heights + 1)
     xr.Dataset(
         {name: (plane, np.broadcast_to(array, values.shape)) for name, array in stated.items()}
@@ -179,25 +180,49 @@ def _product(
             "vertical_resolution": (plane, np.full(values.shape, 1000.0)),
             "usable": (plane, np.broadcast_to(np.asarray(usable, np.int8), values.shape)),
             "quality_flag": (plane, np.broadcast_to(np.asarray(quality, np.int32), values.shape)),
-            "shots": ("time", np.where(np.arange(times) == 1, 500, 1000)),
+            "reference_scattering_ratio": 1.0,
+            "reference_scattering_ratio_standard_error": 0.02,
         },
         coords={"altitude": ("range", altitude), "range": altitude},
     ).to_netcdf(folder / "night.nc")
 
 
-def test_measured_lidar_ratios_are_averaged_by_shots(tmp_path: Path) -> None:
+def test_measured_lidar_ratios_are_averaged_by_the_noise_of_profiles(tmp_path: Path) -> None:
     ratio = np.array([[50.0, 40.0], [60.0, 40.0], [np.nan, 40.0]])
     random = np.array([[3.0, 3.0], [6.0, 3.0], [3.0, 3.0]])
-    _product(tmp_path, ratio, random, [[0, 2], [1, 2], [0, 2]])
+    noise = 0.01 * np.array([[1.0], [np.sqrt(2.0)], [1.0]])
+    _product(tmp_path, ratio, random, [[0, 2], [1, 2], [0, 2]], noise=noise)
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
     assert profile.altitude.tolist() == [1000.0]
     mean = (2 * 50.0 + 60.0) / 3
     assert profile.ratio[0] == pytest.approx(mean)
     by_noise = np.hypot(2 * 3.0, 6.0) / 3
-    assert profile.standard_error[0] == pytest.approx(np.hypot(by_noise, 2.0))
+    of_backscatter = mean * np.hypot(0.02, np.sqrt(2**2 + 2) / 3 * 0.01)
+    error = np.sqrt(by_noise**2 + 2.0**2 + of_backscatter**2)
+    assert profile.standard_error[0] == pytest.approx(error)
     _product(tmp_path, ratio, random, 2)
     with pytest.raises(AncillaryError, match="usable"):
         lidar_ratio_profile(tmp_path, "night.nc")
+
+
+def test_profiles_of_uncertain_background_hardly_count(tmp_path: Path) -> None:
+    background, ratio = np.full((47, 1), 0.05), np.full((47, 2), 60.0)
+    background[4], ratio[4] = 3.0, 500.0
+    _product(tmp_path, ratio, 0.0, 0, background=background)
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    np.testing.assert_allclose(profile.ratio, 60.0, rtol=0.01)
+    assert np.all(profile.standard_error < 3.0)
+
+
+def test_products_without_errors_by_the_baseline_are_used(tmp_path: Path) -> None:
+    _product(tmp_path, [[60.0, 60.0]], 5.0, 0)
+    whole, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    with xr.open_dataset(tmp_path / "night.nc") as product:
+        names = [f"aerosol_{of}_error_baseline" for of in ("extinction", "backscatter")]
+        product.drop_vars(names).to_netcdf(tmp_path / "former.nc")
+    former, _ = lidar_ratio_profile(tmp_path, "former.nc")
+    assert former.ratio.tolist() == whole.ratio.tolist()
+    assert former.standard_error.tolist() == whole.standard_error.tolist()
 
 
 def test_measured_lidar_ratios_of_clouds_are_left_out(tmp_path: Path) -> None:
@@ -218,11 +243,11 @@ def test_means_of_lidar_ratios_below_their_error_are_left_out(tmp_path: Path) ->
     assert profile.ratio.tolist() == [60.0]
 
 
-def test_products_without_shots_are_refused_by_name(tmp_path: Path) -> None:
+def test_products_without_resolution_are_refused_by_name(tmp_path: Path) -> None:
     _product(tmp_path, [[60.0]], 5.0, 0)
     with xr.open_dataset(tmp_path / "night.nc") as product:
-        product.drop_vars("shots").to_netcdf(tmp_path / "cut.nc")
-    with pytest.raises(AncillaryError, match="without shots") as caught:
+        product.drop_vars("vertical_resolution").to_netcdf(tmp_path / "cut.nc")
+    with pytest.raises(AncillaryError, match="without vertical_resolution") as caught:
         lidar_ratio_profile(tmp_path, "cut.nc")
     assert caught.value.file == "cut.nc"
     assert caught.value.remedy
@@ -241,27 +266,31 @@ def test_means_of_measured_lidar_ratios_have_no_bias(
     _product(tmp_path, extinction, 60.0 * of_extinction, 0, **errors)
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
     assert profile.ratio.mean() == pytest.approx(60.0, abs=0.5)
-    by_noise = np.sqrt(profile.standard_error**2 - 2.0**2)
+    by_noise = np.sqrt(profile.standard_error**2 - 2.0**2 - (0.02 * profile.ratio) ** 2)
     away = np.abs(profile.ratio - 60.0) / by_noise
     assert 0.92 < np.mean(away < 1.96) < 0.985
 
 
-def test_the_error_of_the_reference_does_not_decrease_with_the_number_of_profiles(
-    tmp_path: Path,
-) -> None:
-    _product(tmp_path, np.full((100, 2), 60.0), 0.0, 0, reference=0.1)
+def test_only_the_stated_error_of_the_reference_remains_for_many_profiles(tmp_path: Path) -> None:
+    _product(tmp_path, np.full((100, 2), 60.0), 0.0, 0, reference=np.hypot(0.3, 0.02))
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
-    np.testing.assert_allclose(profile.standard_error, np.hypot(6.0, 2.0))
+    by_reference = np.hypot(0.02, np.hypot(0.3, 0.02) / 10.0)
+    np.testing.assert_allclose(profile.standard_error, np.hypot(60.0 * by_reference, 2.0))
 
 
-def test_the_value_of_a_single_profile_is_not_held_to_the_top(tmp_path: Path) -> None:
-    ratio = np.full((15, 4), 60.0)
-    ratio[:, 3] = np.nan
-    ratio[4, 3] = 158.0
+@pytest.mark.parametrize("few", [1, 2])
+def test_values_of_few_profiles_and_those_beyond_the_last_height_are_not_held(
+    tmp_path: Path, few: int
+) -> None:
+    ratio = np.full((47, 4), 60.0)
+    ratio[few:, 3] = np.nan
+    ratio[:few, 3] = 26.0
     _product(tmp_path, ratio, 5.0, 0)
     profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
     assert profile.altitude.tolist() == [1000.0, 2000.0, 3000.0]
-    assert profile.at(np.array([9000.0]))[0] == 60.0
+    found, error = profile.at(np.array([3000.0, 3100.0, 9000.0]), (50.0, 10.0))
+    assert found.tolist() == pytest.approx([60.0, 50.0, 50.0])
+    assert error.tolist()[1:] == [10.0, 10.0]
 
 
 @pytest.mark.parametrize(

@@ -294,7 +294,8 @@ def test_a_channel_may_have_a_profile_of_the_lidar_ratio() -> None:
     facts = {"zenith_angle": 0.0, "channels": {"photon_532o": of_photon}}
     steps = _steps(_elastic(facts=facts), "photon_532o")["elastic"]
     assert steps["lidar_ratio_profile"] == "ratio.csv"
-    assert "lidar_ratio" not in steps
+    # Above a measured profile.
+    assert (steps["lidar_ratio"], steps["lidar_ratio_standard_error"]) == (50.0, 10.0)
     for other in ({"lidar_ratio": 50}, {"lidar_ratio_standard_error": 5}):
         facts["channels"] = {"photon_532o": of_photon | other}
         with pytest.raises(ValidationError, match="lidar_ratio_profile is given together with"):

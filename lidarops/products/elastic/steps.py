@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, Self, cast
+from functools import partial
+from typing import Any, Final
 
 import xarray as xr
-from pydantic import model_validator
 
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
@@ -132,11 +132,9 @@ class ReferenceWindow(Step[Case, ReferenceWindowSettings]):
 def _lidar_ratio(case: Case) -> dict[str, Any]:
     """Return the settings of the lidar ratio: facts of the channel, or the settings of the kind."""
     facts = channel_facts(case.facts, range_channel(case.channel.name))
-    if facts.lidar_ratio_profile is not None:
-        return {"lidar_ratio_profile": facts.lidar_ratio_profile}
     names = ("lidar_ratio", "lidar_ratio_standard_error")
     given = {name: getattr(facts, name) for name in names}
-    return {
+    return {"lidar_ratio_profile": facts.lidar_ratio_profile} | {
         name: getattr(case.request, name) if value is None else value
         for name, value in given.items()
     }
@@ -145,23 +143,14 @@ def _lidar_ratio(case: Case) -> dict[str, Any]:
 class InversionSettings(SettingsModel):
     """Settings of the step ``elastic``."""
 
-    lidar_ratio: float | None = quantity(
-        None, unit="sr", description="None where a profile is given"
+    lidar_ratio: float = quantity(
+        unit="sr", description="above a measured profile where one is given"
     )
-    lidar_ratio_standard_error: float | None = quantity(
-        None, unit="sr", description="None where a profile is given"
-    )
+    lidar_ratio_standard_error: float = quantity(unit="sr", description="of lidar_ratio")
     lidar_ratio_profile: str | None = None
     """Ancillary file of both over altitude."""
     molecular_relative_error: float
     least_signal_to_noise: float
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        numbers = (self.lidar_ratio, self.lidar_ratio_standard_error)
-        if self.lidar_ratio_profile is None and None in numbers:
-            raise ValueError("has neither lidar_ratio with its standard error nor a profile")
-        return self
 
 
 _AVERAGE: Final = Average("the noise of a single profile is too large for the inversion")
@@ -275,11 +264,11 @@ class _Inversion(RowProduct):
 
 def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:
     """Return the function of altitude that gives the lidar ratio and its standard error."""
-    if settings.lidar_ratio_profile is not None:
-        return source.ancillaries.lidar_ratios[settings.lidar_ratio_profile].at
-    # `InversionSettings` requires both.
-    ratio = cast("float", settings.lidar_ratio)
-    return labeled.constant_ratio(ratio, cast("float", settings.lidar_ratio_standard_error))
+    constant = settings.lidar_ratio, settings.lidar_ratio_standard_error
+    name = settings.lidar_ratio_profile
+    if name is None:
+        return labeled.constant_ratio(*constant)
+    return partial(source.ancillaries.lidar_ratios[name].at, beyond=constant)
 
 
 STEP: Final = Elastic()

@@ -24,7 +24,7 @@ class Thresholds:
     raise a window beside the measured excess. With a layer of scattering ratio 1.15 in all windows
     but the lowest, at least 92 % of backscatter is covered for 1.5, 77 % for 1 and 54 % for 0; the
     same signals without it are covered to 99 % or more, which misleads less than false values
-    (`tests/retrieve/raman/test_raman_published.py`)."""
+    (`test_a_layer_in_most_windows_gives_no_false_values`)."""
     most_noise: float = 1.3
     """Error of a window over the least one of equally clean windows, up to which a higher one is
     preferred, because particles decrease with height. In the published Raman simulation,
