@@ -42,6 +42,8 @@ class Role(StrEnum):
     MOLECULAR = "molecular"
     OVERLAP = "overlap"
     LIDAR_RATIO = "lidar_ratio"
+    UNUSED = "unused"
+    """Of a raw file that a product states as unused; only in the ledger."""
 
 
 class Status(StrEnum):
@@ -590,7 +592,7 @@ class LostFiles:
     instrument: str
     files: int
     of: int
-    """Number of raw files that all products were made from."""
+    """Number of raw files of the products of which some are lost."""
     names: tuple[str, ...]
     """The first of them."""
     kept: int

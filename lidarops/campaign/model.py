@@ -504,7 +504,7 @@ class Campaign(SettingsModel):
         ge=0,
         le=1,
         description="products are kept as they are if more than one of their raw files and more"
-        " than this share has vanished or cannot be read: of a product, or of all products",
+        " than this share has vanished or cannot be read: of a product, or of all with such files",
     )
     acknowledged: list[Acknowledged] = Field(
         default=[], description="raw files that may vanish, as where old ones are moved away"

@@ -113,6 +113,14 @@ class SceneEntry:
     """SHA-256 of raw files by path, as far as the catalog does not have them yet."""
 
 
+class RawSet(NamedTuple):
+    """Raw files of one role that belong to some products."""
+
+    role: Role
+    files: int
+    products: list[str]
+
+
 class LastTry(NamedTuple):
     """Result of the last try of a scene."""
 
@@ -469,6 +477,7 @@ class Ledger(Granules):
             sa.select(FILE_SET.c.path, link.role, FILE_SET.c.sha256)
             .join(PRODUCT_INPUT, link.file_set == FILE_SET.c.id)
             .where(link.campaign == self.campaign, link.product == product)
+            .where(link.role != Role.UNUSED.value)
             .order_by(link.role, FILE_SET.c.path)
         )
         with self.transaction() as connection:
@@ -480,12 +489,13 @@ class Ledger(Granules):
     def lost_inputs(self) -> list[tuple[str, str]]:
         """Return set and path of raw inputs of products that the catalog lacks or could not read.
 
-        Without those whose content is known under another path.
+        Also of files that products state as unused, and the catalog lacks. Without those whose
+        content is known under another path.
         """
         listed = sa.exists().where(
             GRANULE.c.campaign == self.campaign,
             GRANULE.c.path == FILE_SET.c.path,
-            GRANULE.c.reason.not_like(f"{UNREADABLE}%"),
+            GRANULE.c.reason.not_like(f"{UNREADABLE}%") | (FILE_SET.c.sha256 == ""),
         )
         query = sa.select(FILE_SET).where(FILE_SET.c.id.in_(self._raw_sets()), ~listed)
         with self.stream(query) as rows:
@@ -500,23 +510,30 @@ class Ledger(Granules):
 
     def _raw_sets(self) -> sa.Select[tuple[str]]:
         link = PRODUCT_INPUT.c
-        raw = link.role.in_([Role.SIGNAL.value, Role.DARK.value])
+        raw = link.role.in_([Role.SIGNAL.value, Role.DARK.value, Role.UNUSED.value])
         return sa.select(link.file_set).where(link.campaign == self.campaign, raw)
 
-    def raw_inputs(self) -> tuple[dict[str, tuple[list[str], int]], int]:
-        """Return the products and the size of each set of raw files, and the number of files."""
-        files, used = FILE_SET.c, FILE_SET.c.id.in_(self._raw_sets())
-        sizes = sa.select(files.id, sa.func.count()).where(used).group_by(files.id)
-        total = sa.select(sa.func.count(sa.distinct(files.path))).where(used)
+    def raw_sets(self) -> dict[str, RawSet]:
+        """Return the sets of raw files of products, by their ids."""
+        link, files = PRODUCT_INPUT.c, FILE_SET.c
+        sizes = sa.select(files.id, sa.func.count()).where(files.id.in_(self._raw_sets()))
         with self.transaction() as connection:
-            sets: dict[str, tuple[list[str], int]] = {
-                name: ([], size) for name, size in connection.execute(sizes)
-            }
-            for name, product in connection.execute(
-                self._raw_sets().add_columns(PRODUCT_INPUT.c.product)
-            ):
-                sets[name][0].append(product)
-            return sets, connection.scalar(total) or 0
+            size = dict(connection.execute(sizes.group_by(files.id)).tuples().all())
+            rows = list(connection.execute(self._raw_sets().add_columns(link.role, link.product)))
+        sets: dict[str, RawSet] = {}
+        for name, role, product in rows:
+            sets.setdefault(name, RawSet(Role(role), size[name], [])).products.append(product)
+        return sets
+
+    def count_raw(self, sets: Collection[str], without: Collection[str]) -> int:
+        """Return the number of different raw files in some sets, without some paths."""
+        query = sa.select(FILE_SET.c.path, FILE_SET.c.id).order_by(FILE_SET.c.path)
+        with self.stream(query.where(FILE_SET.c.id.in_(self._raw_sets()))) as rows:
+            return sum(
+                any(name in sets for _, name in same)
+                for path, same in groupby(rows, key=attrgetter("path"))
+                if path not in without
+            )
 
     @contextmanager
     def all_inputs(self) -> Iterator[Iterator[tuple[str, str, str]]]:
@@ -525,7 +542,7 @@ class Ledger(Granules):
         query = (
             sa.select(link.role, FILE_SET.c.path, FILE_SET.c.sha256)
             .join(PRODUCT_INPUT, link.file_set == FILE_SET.c.id)
-            .where(link.campaign == self.campaign)
+            .where(link.campaign == self.campaign, link.role != Role.UNUSED.value)
             .distinct()
             .order_by(FILE_SET.c.path, link.role, FILE_SET.c.sha256)
         )

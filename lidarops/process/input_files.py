@@ -23,7 +23,8 @@ from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
 from lidarops.steps.dependence import scene_facts
 from lidarops.system.stores import RemoteStore
 
-_VANISHED: Final = "vanished after it was catalogued (run lidarops catalog again)"
+# A file that a scan does not find either counts as lost, like one that cannot be read.
+_VANISHED: Final = f"{UNREADABLE}: vanished after it was catalogued (run lidarops catalog again)"
 
 
 @contextmanager
@@ -123,7 +124,7 @@ def _read(granule: Granule, root: Path) -> bytes:
     data = (root / granule.path).read_bytes()
     if len(data) != granule.size:
         raise SceneError(
-            f"holds {len(data)} bytes, {granule.size} according to the catalog",
+            f"{UNREADABLE}: holds {len(data)} bytes, {granule.size} according to the catalog",
             remedy="run lidarops catalog again",
         )
     return data

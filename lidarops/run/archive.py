@@ -265,16 +265,20 @@ def _days_to_judge(judge: Judge, store: Store, selection: Selection, *, force: b
 
 @dataclass(slots=True)
 class _Gathered:
-    """What a pass over the archive collects."""
+    """What a pass over the archive collects; of what is judged again, the last judgement."""
 
-    orphans: list[Orphan] = field(default_factory=list)
-    set_aside: list[Granule] = field(default_factory=list)
+    orphans: dict[str, Orphan] = field(default_factory=dict)
+    """By path."""
+    set_aside: dict[str, Granule] = field(default_factory=dict)
+    """By path."""
     file_notes: list[FileNote] = field(default_factory=list)
     """Notes on files of the days that were judged, which the catalog does not know."""
-    held: list[Judgement] = field(default_factory=list)
+    held: dict[str, Judgement] = field(default_factory=dict)
+    """By scene."""
     frozen: dict[str, str] = field(default_factory=dict)
     """Product of a frozen period that would be replaced -> why."""
-    empty_scenes: list[Judgement] = field(default_factory=list)
+    empty_scenes: dict[str, str] = field(default_factory=dict)
+    """Scene -> why it can give no product."""
     verdicts: dict[int, Verdict] = field(default_factory=dict)
     """Of days that are settled, without signature; of those in `open` only once all their scenes
     succeed."""
@@ -332,13 +336,12 @@ class _Pass:
                     self.lost_worker = True
             self._settle(signatures)
         self._clear_up()
-        orphans = {orphan.path for orphan in self.gathered.orphans}
         findings = find(
             self.judge,
             self.store,
             self.selection,
             summary.idle_patterns,
-            orphans,
+            self.gathered.orphans.keys(),
             settled=not days,
         )
         gathered = self.gathered
@@ -350,15 +353,13 @@ class _Pass:
             record=record,
             status=status,
             summary=summary,
-            orphans=tuple(gathered.orphans),
+            orphans=tuple(gathered.orphans.values()),
             failures=self.store.failures(),
             internal=self.store.internal_errors(),
             # Orphans are never made again, so they would be reported for ever.
-            unusable=tuple(
-                self.store.unusable_scenes(without={orphan.path for orphan in gathered.orphans})
-            ),
-            empty_scenes={judged.scene.id: judged.empty_reason for judged in gathered.empty_scenes},
-            set_aside={granule.path: granule.reason for granule in gathered.set_aside},
+            unusable=tuple(self.store.unusable_scenes(without=gathered.orphans.keys())),
+            empty_scenes=gathered.empty_scenes,
+            set_aside={path: granule.reason for path, granule in gathered.set_aside.items()},
             more_unused=sum(verdicts[day].unused for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
             frozen=gathered.frozen,
             findings=findings,
@@ -370,8 +371,8 @@ class _Pass:
         judge = Judge(self.campaign, self.store)
         for batch in judge.batches(days):
             judged = judge.days(batch)
-            self.gathered.set_aside += judged.set_aside
-            self.gathered.empty_scenes += _empty_scenes(judged)
+            self.gathered.set_aside |= {granule.path: granule for granule in judged.set_aside}
+            self.gathered.empty_scenes |= _empty_scenes(judged)
 
     def _new_judge(self, *, again: bool = False) -> Judge:
         force = self.options.force and not again
@@ -411,13 +412,12 @@ class _Pass:
         self, known: Collection[int], client: Client | None, stop: StopRequest
     ) -> None:
         """Process what is stale without the refused files: other scenes or plans may follow."""
-        stated = self.gathered
+        notes = list(self.gathered.file_notes)
         while self.reduced and not stop:
             days = self.selection.days(sorted(self.reduced.intersection(known)))
             self.judge, self.reduced, self.suspects = self._new_judge(again=True), set(), []
-            self.gathered = _Gathered(verdicts=stated.verdicts, open=stated.open)
             self._process(days, client, stop)
-        self.gathered = stated
+        self.gathered.file_notes = notes
 
     def _enter_suspects(self, client: Client, stop: StopRequest) -> None:
         for job in self.suspects:
@@ -510,12 +510,14 @@ class _Pass:
 
     def _note(self, judged: DaysJudged) -> None:
         gathered = self.gathered
-        gathered.orphans += judged.orphans
-        gathered.set_aside += judged.set_aside
+        gathered.orphans |= {orphan.path: orphan for orphan in judged.orphans}
+        gathered.set_aside |= {granule.path: granule for granule in judged.set_aside}
         gathered.file_notes += judged.file_notes
         gathered.verdicts.update(judged.verdicts)
-        gathered.empty_scenes += _empty_scenes(judged)
-        gathered.held += [scene for scene in judged.judgements if scene.held]
+        gathered.empty_scenes |= _empty_scenes(judged)
+        for scene in judged.judgements:
+            gathered.held.pop(scene.scene.id, None)
+        gathered.held |= {scene.scene.id: scene for scene in judged.judgements if scene.held}
         gathered.frozen |= {
             stale.before.path: stale.reason
             for scene in judged.judgements
@@ -602,19 +604,16 @@ class _Pass:
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:
             return None
-        for held in self.gathered.held:
+        for held in self.gathered.held.values():
             if held.failure:
                 error = f"{held.failure.error} (not tried again, because nothing has changed)"
                 outcome = held.failure.outcome(held.scene, held.plan)
                 self.session.add(replace(outcome, error=error))
-        empty_scenes = {
-            judged.scene.id: judged.empty_reason for judged in self.gathered.empty_scenes
-        }
         return self.session.finish(
             status,
-            self.gathered.set_aside,
+            tuple(self.gathered.set_aside.values()),
             findings,
-            empty_scenes=empty_scenes,
+            empty_scenes=self.gathered.empty_scenes,
             frozen=self.gathered.frozen,
             lost_worker=self.lost_worker,
         )
@@ -628,8 +627,8 @@ def _bytes(size: str | None) -> int | None:
     return int(parse_bytes(size))
 
 
-def _empty_scenes(judged: DaysJudged) -> list[Judgement]:
-    return [scene for scene in judged.judgements if scene.empty_reason]
+def _empty_scenes(judged: DaysJudged) -> dict[str, str]:
+    return {one.scene.id: one.empty_reason for one in judged.judgements if one.empty_reason}
 
 
 def _signed(
@@ -647,7 +646,7 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
     """Remove products that the campaign no longer requests: files and ledger rows.
 
     Products stay if another run has made them again since, or if the campaign still requests them
-    although the present files of their scene do not allow them, or many raw files are lost.
+    although the present files of their scene do not allow them, or their raw files are lost.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """Raw files that products were made from, and that the archive no longer gives.
 
-A product is not replaced by one of fewer files where more than a few are lost: the listing may be
+A product is neither removed nor replaced by one of fewer files where more than a few files are
+lost, of it or of all products with lost files, or all its dark files: the listing may be
 incomplete, or a disk not mounted.
 """
 
@@ -14,7 +15,7 @@ from typing import Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.sources import path_pattern
 from lidarops.catalog.store import Store
-from lidarops.records import FactsNote, LostFiles
+from lidarops.records import FactsNote, LostFiles, Role
 
 _NAMES_SHOWN: Final = 3
 _IDLE: Final = "matches no raw file that has vanished: take the entry out, or correct it"
@@ -28,9 +29,7 @@ class Lost:
     findings: tuple[LostFiles, ...] = ()
     """What a report says of those that the campaign does not acknowledge, by instrument."""
     protected: frozenset[str] = frozenset()
-    """Products that are not replaced."""
-    many: bool = False
-    """Whether more than a few of all files are lost, so that nothing is removed either."""
+    """Products that are neither replaced nor removed."""
     excused: frozenset[str] = frozenset()
     """Products of which the campaign acknowledges lost files."""
     idle: tuple[FactsNote, ...] = ()
@@ -59,37 +58,45 @@ def find_lost(campaign: Campaign, store: Store) -> Lost:
             idle.append(FactsNote("all", f"acknowledged: {', '.join(entry.what)}", reason))
     if not owners:
         return Lost(idle=tuple(idle))
-    sets, total = store.raw_inputs()
-    size, lost = Counter[str](), Counter[str]()
+    sets = store.raw_sets()
+    size, lost, gone = Counter[str](), Counter[str](), Counter[str]()
     excused, products_of = set[str](), defaultdict[str, set[str]](set)
-    for products, files in sets.values():
-        size.update(dict.fromkeys(products, files))
+    for raw in sets.values():
+        size.update(dict.fromkeys(raw.products, raw.files))
     for name, path in inputs:
-        products, _ = sets[name]
+        products = sets[name].products
+        gone[name] += path in owners
         if path in known:
             excused.update(products)
         elif path in owners:
             lost.update(products)
             products_of[owners[path]].update(products)
     unknown = sorted(owners.keys() - known)
-    total -= len(known)
+    concerned = {name for name, raw in sets.items() if not lost.keys().isdisjoint(raw.products)}
+    total = store.count_raw(concerned, known) if concerned else 0
 
     def too_many(files: int, of: int) -> bool:
         return files > 1 and files > campaign.vanished_share * of
 
     many = too_many(len(unknown), total)
+    without_dark = {
+        product
+        for name, files in gone.items()
+        if sets[name].role is Role.DARK and files == sets[name].files
+        for product in sets[name].products
+        if campaign.vanished_share < 1
+    }
     protected = frozenset(
         product
         for product, files in lost.items()
-        # Of a product without any file left, no other is made.
-        if many or (files < size[product] and too_many(files, size[product]))
+        if many or product in without_dark or too_many(files, size[product])
     )
     findings = []
     for owner, products_with in sorted(products_of.items()):
         paths = tuple(path for path in unknown if owners[path] == owner)
         kept = len(products_with & protected)
         findings.append(LostFiles(owner, len(paths), total, paths[:_NAMES_SHOWN], kept))
-    return Lost(tuple(findings), protected, many, frozenset(excused), tuple(idle))
+    return Lost(tuple(findings), protected, frozenset(excused), tuple(idle))
 
 
 def _matcher(patterns: Iterable[str]) -> Callable[[str], bool]:

@@ -36,7 +36,6 @@ from lidarops.steps import dependence
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
 
-"""Also what foreign settings raise."""
 _BLOCK: Final = 1 << 24
 """Quality flags that are read at a time."""
 
@@ -251,7 +250,7 @@ def _entry(
             product.record,
             product.mtime_ns,
             _dependence(judge, judged, product.recipe),
-            product.recipe.inputs,
+            (*product.recipe.inputs, *dependence.unused_inputs(product.recipe.unused)),
         )
         for product in products
     )

@@ -169,17 +169,18 @@ class Recipe:
             start=start,
             stop=stop,
             notes=tuple(self.settings["notes"]),
-            unused=_unused(self.settings),
+            unused=self.unused,
             granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
             dark=tuple(granule for granule in granules if granule.role is Role.DARK),
         )
 
-
-def _unused(settings: Mapping[str, Any]) -> tuple[UnusedFile, ...]:
-    return tuple(
-        UnusedFile(str(file["path"]), Role(file["role"]), str(file["reason"]))
-        for file in settings.get(UNUSED, ())
-    )
+    @property
+    def unused(self) -> tuple[UnusedFile, ...]:
+        """The raw files that the product states as unused."""
+        return tuple(
+            UnusedFile(str(file["path"]), Role(file["role"]), str(file["reason"]))
+            for file in self.settings.get(UNUSED, ())
+        )
 
 
 def stays_inside(path: str) -> bool:

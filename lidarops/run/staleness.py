@@ -386,7 +386,7 @@ class Judge:
 
     def _kept_orphan(self, orphan: Orphan) -> Orphan:
         """Return an orphan that is not removed if its raw files may come back."""
-        stays = orphan.path in self.lost.protected and self.lost.many
+        stays = orphan.path in self.lost.protected
         return replace(orphan, requested=True, lost=False) if stays else orphan
 
     def _healed(self, judged: Judgement, tried: Mapping[str, LastTry]) -> bool:
@@ -601,7 +601,7 @@ class Judge:
     def depends_on(
         self, scene: Scene, whole: Plan, product: ProductKey, files: Sequence[InputRecord]
     ) -> tuple[Dependence, tuple[InputRecord, ...]]:
-        """Return what a product depends on, and the files that it was made from."""
+        """Return what a product depends on, and its files: used ones, and those stated unused."""
         closure = dependence.plan_closure(whole, [product])
         used = dependence.product_inputs(closure, files)
         settings = self._settings.of(scene, closure, product)
@@ -611,7 +611,8 @@ class Judge:
             inputs_hash=dependence.inputs_digest(used),
             code_version=code_version(product[0]),
         )
-        return depends_on, used
+        unused = dependence.product_unused(scene, closure)
+        return depends_on, (*used, *dependence.unused_inputs(unused))
 
     def settles(
         self, judged: Judgement, files: Sequence[InputRecord], made: Mapping[ProductKey, Dependence]

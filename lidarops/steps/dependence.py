@@ -280,6 +280,12 @@ def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
 
 
+def unused_inputs(unused: Iterable[UnusedFile]) -> tuple[InputRecord, ...]:
+    """Return the unused files of a product as the ledger knows them, by whose loss it is kept."""
+    # Of a name that is stated with escapes, the file is not found.
+    return tuple(InputRecord(f.path, Role.UNUSED, "") for f in unused if "\\" not in f.path)
+
+
 def unused_settings(scene: Scene, plan: Plan) -> dict[str, Any]:
     """Return the unused files of a product as plain JSON types; no key where there are none.
 

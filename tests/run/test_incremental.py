@@ -609,6 +609,7 @@ def _joined(archive: Archive) -> None:
 def test_a_change_during_processing_leaves_the_day_unsettled(
     archive: Archive, change: Callable[[Archive], None]
 ) -> None:
+    archive.tree["vanished_share"] = 1
     _title(archive)
 
     def once(outcome: SceneOutcome) -> None:

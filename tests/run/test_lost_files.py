@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import random
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support import damage
 from support.archives.small_archive import Archive, made
 from support.servers.stand_ins import SCHEMES, StandIn, served
 from typer.testing import CliRunner
 
+from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.cli import app
+from lidarops.run import archive as run_archive
 from lidarops.run.archive import bring_up_to_date, reprocess
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -117,6 +120,104 @@ def test_files_that_cannot_be_read_count_as_lost(archive: Archive) -> None:
         path.symlink_to("nowhere")
     assert reprocess(archive.write()) is None
     assert archive.contents("out/products") == before
+
+
+@pytest.mark.parametrize("fault", [Path.unlink, lambda path: path.write_bytes(b"")])
+def test_files_that_are_lost_after_the_scan_worsen_no_product(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, fault: Callable[[Path], object]
+) -> None:
+    before = archive.contents("out/products")
+    paths = [archive.folder / "raw" / name for name in THIRD]
+    content = {path: path.read_bytes() for path in paths}
+
+    def scan(*arguments: Any, **options: Any) -> ScanSummary:
+        summary = scan_archive(*arguments, **options)
+        for path in paths:
+            fault(path)
+        return summary
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_archive, "scan_archive", scan)
+        code, summary = _run(archive, "--force")
+    assert (code, len(summary["refused_files"])) == (1, len(THIRD))
+    assert summary["kept_products"].keys() == before.keys()
+    assert archive.contents("out/products") == before
+    for path in paths:
+        path.unlink(missing_ok=True)
+    assert _run(archive)[0] == 1
+    assert archive.contents("out/products") == before
+    for path, data in content.items():
+        path.write_bytes(data)
+    assert _run(archive)[0] == 0
+    assert archive.contents("out/products") == before
+
+
+@pytest.fixture
+def fortnight(tmp_path: Path) -> Archive:
+    """An archive of 14 days of signals, brought up to date."""
+    folder = tmp_path / "fortnight"
+    folder.mkdir()
+    archive = Archive(folder, days=14)
+    archive.tree["instruments"]["rich"]["products"] = {"signal": {}}
+    reprocess(archive.write())
+    return archive
+
+
+def test_products_that_lost_all_their_few_files_are_not_removed(fortnight: Archive) -> None:
+    before = fortnight.contents("out/products")
+    _remove(fortnight, [f"rich/h1{k}" for k in range(3)])
+    for _ in range(2):
+        code, summary = _run(fortnight, "--remove-orphans")
+        (lost,) = summary["lost_files"]
+        assert (code, summary["removed"], lost["kept"]) == (1, 0, 2)
+        assert fortnight.contents("out/products") == before
+
+
+def test_a_few_files_of_the_archive_are_many_of_their_products(fortnight: Archive) -> None:
+    before = fortnight.contents("out/products")
+    _remove(fortnight, [f"rich/h{day}1" for day in range(1, 3)])
+    code, summary = _run(fortnight)
+    (lost,) = summary["lost_files"]
+    # Two days of three files, and the dark file.
+    assert (code, lost["files"], lost["of"], lost["kept"]) == (1, 2, 7, 4)
+    assert fortnight.contents("out/products") == before
+
+
+def test_products_stay_that_would_be_left_without_any_dark_file(fortnight: Archive) -> None:
+    fortnight.raw("rich/d1", 12 * 1440 + 700, seed=98)
+    reprocess(fortnight.write())
+    before = fortnight.contents("out/products")
+    _remove(fortnight, ["rich/d0"])
+    for options in ((), ("--force", "--remove-orphans")):
+        code, summary = _run(fortnight, *options)
+        (lost,) = summary["lost_files"]
+        assert code == 1
+        assert len(summary["kept_products"]) == lost["kept"] > 0
+        after = fortnight.contents("out/products")
+        assert {name: after[name] for name in summary["kept_products"]} == {
+            name: before[name] for name in summary["kept_products"]
+        }
+    fortnight.tree["acknowledged"] = [{"what": "rich/d0", "reason": "saturated"}]
+    code, summary = _run(fortnight)
+    assert (code, summary["kept_products"]) == (0, {})
+
+
+def test_files_that_are_damaged_and_then_lost_stay_stated(archive: Archive) -> None:
+    for name in THIRD:
+        path = archive.folder / "raw" / name
+        path.write_bytes(damage.flip_line_end(path.read_bytes(), random.Random(name)))
+    assert len(_run(archive)[1]["products"]) == 24
+    stated = archive.contents("out/products")
+    _remove(archive, THIRD)
+    for _ in range(2):
+        code, summary = _run(archive)
+        assert (code, summary["products"]) == (1, [])
+        assert sum(lost["files"] for lost in summary["lost_files"]) == len(THIRD)
+        assert archive.contents("out/products") == stated
+    archive.tree["acknowledged"] = [{"what": "*/h?1", "reason": "damaged"}]
+    code, summary = _run(archive)
+    assert (code, len(summary["products"])) == (0, 24)
+    assert _run(archive)[1]["run"] is None
 
 
 def test_files_that_move_or_are_no_longer_claimed_are_not_lost(archive: Archive) -> None:

@@ -24,6 +24,10 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     scene, inputs, refused, _ = check_files(
         job.scene, Path(job.campaign.archive), read_all=job.campaign.all_steps
     )
+    if refused:
+        error = "" if scene.granules else "no granule of the scene can be read"
+        failed = Failure(error).outcome(job.scene, job.plan)
+        return replace(failed, refused=refused, inputs=inputs), False
     files = dependence.ancillary_files(job.plan.steps)
     for name in files:
         if (job.campaign.folder / name).read_text().endswith(REFUSED):
@@ -51,7 +55,6 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         Failure("").outcome(job.scene, job.plan),
         products=tuple(products),
         inputs=inputs,
-        refused=refused,
         seconds={"digest": 0.5, "retrieve": 1.0, "write": 0.25},
     )
     return outcome, True

@@ -108,7 +108,7 @@ def test_a_store_that_gives_no_file_ends_the_scan(
 
 @pytest.mark.parametrize(
     ("status", "reason"),
-    [(403, "cannot be read: the server answers 403"), (404, "vanished after it was catalogued")],
+    [(403, "cannot be read: the server answers 403"), (404, "cannot be read: vanished")],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_file_that_is_denied_while_its_scene_is_processed_costs_this_file_alone(
