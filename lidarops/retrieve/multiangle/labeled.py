@@ -366,6 +366,8 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     for name in ("optical_depth", "extinction"):
         error = getattr(retrieval, f"{name}_standard_error")
         negative |= getattr(retrieval, name) < -THRESHOLDS.negative * error
+    depth, error = retrieval.optical_depth, retrieval.optical_depth_standard_error
+    negative |= _below_others(depth, error, (bits == 0) & ~negative)
     bits |= np.where(negative, np.int32(MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH), np.int32(0))
     # The layer that ends at a valid altitude may begin in a gap.
     gapped = np.zeros(lost.shape, dtype=bool)
@@ -374,6 +376,16 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     return bits | np.where(
         gapped & unflagged & ~lost, np.int32(MultiAngleQuality.INTERPOLATED), np.int32(0)
     )
+
+
+def _below_others(depth: Array, error: Array, good: npt.NDArray[np.bool_]) -> Any:
+    """Return the values below a good one under them, by the error of the difference."""
+    below = np.zeros(depth.shape, dtype=np.bool_)
+    for k in range(depth.shape[-1]):
+        own, of_own, known = (values[:, k, np.newaxis] for values in (depth, error, good & ~below))
+        most = THRESHOLDS.negative * np.hypot(error[:, k:], of_own)
+        below[:, k:] |= known & (own - depth[:, k:] > most)
+    return below
 
 
 def _with_background_errors(

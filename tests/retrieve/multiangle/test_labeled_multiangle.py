@@ -233,6 +233,25 @@ def test_an_optical_depth_below_zero_or_falling_is_flagged(base):
     assert not has(solve(*scan(12)), MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH).any()
 
 
+def test_no_good_optical_depth_lies_below_a_good_one_under_it():
+    """Optical depths that fall by less than the error of a step, over many steps."""
+    conditioned, pointing = scan(12)
+    cosine = np.cos(np.radians(pointing["zenith_angle"]))[:, np.newaxis]
+    added = 1.5e-4 * np.maximum(RANGE * cosine - 1200.0, 0.0)
+    light = power(pointing["zenith_angle"])
+    conditioned["power"] += light * np.expm1(2.0 * np.minimum(added, 1.0) / cosine)
+    product = solve(conditioned, pointing)
+    good = product["quality_flag"].to_numpy() == 0
+    depth, error = (
+        np.where(good, product[f"vertical_optical_depth{of}"], np.nan)
+        for of in ("", "_standard_error")
+    )
+    fall = depth[:, :, np.newaxis] - depth[:, np.newaxis]
+    most = 2.0 * np.hypot(error[:, :, np.newaxis], error[:, np.newaxis])
+    assert not np.triu(fall > most, 1).any()
+    assert np.isfinite(depth).sum() > 50
+
+
 def test_product_has_monotone_profiles_and_chi_square():
     product = solve(*scan(16), **FAR)
     depth, risen = (
