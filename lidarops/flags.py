@@ -141,8 +141,9 @@ class Quality(FlagBit):
         14,
         Severity.CARE,
         (
-            "the value is smaller than its standard error (or another multiple, by"
-            " least_signal_to_noise): keep it in means, which would be biased without such values"
+            "the value is smaller than its error by noise, dead time and baseline (or another"
+            " multiple, by least_signal_to_noise): keep it in means, which would be biased without"
+            " such values"
         ),
     )
     BACKGROUND_UNCERTAIN = (

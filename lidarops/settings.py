@@ -241,8 +241,8 @@ def signal_to_noise_limit() -> Any:
         unit=NO_UNIT,
         ge=0,
         le=100,
-        description="values smaller than this times their standard error have the bit"
-        " low_signal_to_noise, of severity care; 0 for none",
+        description="values smaller than this times their error by noise, dead time and baseline"
+        " have the bit low_signal_to_noise, of severity care; 0 for none",
     )
 
 

@@ -32,6 +32,7 @@ from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
 from lidarops.netcdf.global_attributes import UNUSED_INPUTS
 from lidarops.netcdf.variables import layout_of
 from lidarops.netcdf.write import write_product
+from lidarops.steps.signal_to_noise import whole_error
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
 
@@ -182,7 +183,7 @@ class _PeriodSums:
             variables[f"{name}_observations"] = mean.observations
             variables |= mean.systematic
             if name in weighed:
-                error = mean.standard_error
+                error = whole_error(variables, name)
                 flags = flags | np.where(np.abs(mean.mean) < error, _WEIGHED, np.int32(0))
             if mean.mean.shape == flags.shape:
                 # Usable values without an error for weighting give no mean: flag it as missing.

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
+
+_SYSTEMATIC: Final = ("dead_time_error", "baseline_error")
+"""Of the signal; those of other causes are limits, or part of the standard error."""
+
+
+def whole_error(rows: Mapping[Any, Any], name: str) -> Any:
+    """Return the standard error of a variable with its errors by dead time and baseline."""
+    square = rows[f"{name}_standard_error"] ** 2
+    for cause in _SYSTEMATIC:
+        if f"{name}_{cause}" in rows:
+            square = square + np.nan_to_num(rows[f"{name}_{cause}"]) ** 2
+    return square**0.5
 
 
 def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: float) -> xr.Dataset:
@@ -16,18 +29,17 @@ def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: floa
     Parameters
     ----------
     rows : xr.Dataset
-        With the variables, their standard errors and ``quality_flag``, of the same dimensions.
+        With the variables, their standard errors, the errors by dead time and baseline beside these
+        where there are some, and ``quality_flag``, of the same dimensions.
     names : sequence of str
         Variables, one of which is enough.
     least : float
-        Least ratio of a value to its standard error without the bit; 0 for no bit.
+        Least ratio of a value to its error without the bit; 0 for no bit.
     """
     dims, flags = rows["quality_flag"].dims, rows["quality_flag"].to_numpy()
     low = np.zeros(flags.shape, dtype=np.bool_)
     for name in names:
-        value, error = (
-            rows[of].transpose(*dims).to_numpy() for of in (name, f"{name}_standard_error")
-        )
-        low |= np.abs(value) < least * error
+        value = rows[name].transpose(*dims).to_numpy()
+        low |= np.abs(value) < least * whole_error(rows, name).transpose(*dims).to_numpy()
     bit = low * np.int32(Quality.LOW_SIGNAL_TO_NOISE)
     return rows.assign(quality_flag=rows["quality_flag"].copy(data=flags | bit))
