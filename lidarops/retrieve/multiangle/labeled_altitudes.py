@@ -19,7 +19,12 @@ from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_ce
 from lidarops.retrieve.multiangle._obstructions import obstruction_range
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
 from lidarops.retrieve.signal.averaging import RunningMean
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error, dead_time_change
+from lidarops.retrieve.signal.labeled import (
+    BASELINE_ERROR,
+    CORRELATION_LENGTH,
+    baseline_error,
+    dead_time_change,
+)
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -190,7 +195,9 @@ class AltitudeCycles:
         error, settings = baseline_error(conditioned), self._settings
         if error is None:
             return None
-        if settings.baseline is None:
+        # A stated value has no share of the light; it replaces what blocked beams show.
+        given = conditioned["power"].attrs.get(BASELINE_ERROR, (0.0, 1.0))[1] == 0.0
+        if settings.baseline is None or given:
             return error.transpose("time", "range").to_numpy()[:, settings.covered]
         measured = settings.baseline.error_at(settings.distance[settings.covered])
         return np.broadcast_to(measured, (error.sizes["time"], measured.size))
