@@ -30,9 +30,8 @@ from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
 from lidarops.netcdf.global_attributes import UNUSED_INPUTS
-from lidarops.netcdf.variables import layout_of
+from lidarops.netcdf.variables import layout_of, whole_error
 from lidarops.netcdf.write import write_product
-from lidarops.steps.signal_to_noise import whole_error
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
 

@@ -9,7 +9,7 @@ name, because none is better than a wrong one (`cf111`, section 3.3).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag, StrEnum
 from functools import cache, cached_property
@@ -821,3 +821,16 @@ def coordinates(along: tuple[Row, ...], altitude: Row) -> tuple[Row, ...]:
 def station(*, profiles: bool) -> Row:
     """Return the row of the station's name; with `profiles` it identifies the time series."""
     return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION
+
+
+_SYSTEMATIC: Final = ("dead_time_error", "baseline_error")
+"""Of the signal; those of other causes are limits, or part of the standard error."""
+
+
+def whole_error(rows: Mapping[Any, Any], name: str) -> Any:
+    """Return the standard error of a variable with its errors by dead time and baseline."""
+    square = rows[f"{name}_standard_error"] ** 2
+    for cause in _SYSTEMATIC:
+        if f"{name}_{cause}" in rows:
+            square = square + np.nan_to_num(rows[f"{name}_{cause}"]) ** 2
+    return square**0.5

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
-
-_SYSTEMATIC: Final = ("dead_time_error", "baseline_error")
-"""Of the signal; those of other causes are limits, or part of the standard error."""
-
-
-def whole_error(rows: Mapping[Any, Any], name: str) -> Any:
-    """Return the standard error of a variable with its errors by dead time and baseline."""
-    square = rows[f"{name}_standard_error"] ** 2
-    for cause in _SYSTEMATIC:
-        if f"{name}_{cause}" in rows:
-            square = square + np.nan_to_num(rows[f"{name}_{cause}"]) ** 2
-    return square**0.5
+from lidarops.netcdf.variables import whole_error
 
 
 def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: float) -> xr.Dataset:

@@ -378,13 +378,13 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     )
 
 
-def _below_others(depth: Array, error: Array, good: npt.NDArray[np.bool_]) -> Any:
+def _below_others(depth: Array, error: Array, good: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Return the values below a good one under them, by the error of the difference."""
     below = np.zeros(depth.shape, dtype=np.bool_)
     for k in range(depth.shape[-1]):
-        own, of_own, known = (values[:, k, np.newaxis] for values in (depth, error, good & ~below))
-        most = THRESHOLDS.negative * np.hypot(error[:, k:], of_own)
-        below[:, k:] |= known & (own - depth[:, k:] > most)
+        known = (good & ~below)[:, [k]]
+        most = THRESHOLDS.negative * np.hypot(error[:, k:], error[:, [k]])
+        below[:, k:] |= known & (depth[:, [k]] - depth[:, k:] > most)
     return below
 
 
