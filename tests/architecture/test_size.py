@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 93_100,
+    "lines": 92_900,
     "lines of code alone": 61_500,
-    "lines without bench": 83_200,
+    "lines without bench": 83_050,
     "modules": 470,
     "dataclasses": 425,
     "lines of dataclasses": 10_700,
@@ -29,8 +29,8 @@ MOST = {
     "lines of the largest package": 9_900,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 106, "functions": 910, "changes": 700},
-    "elastic": {"modules": 110, "functions": 1_010, "changes": 740},
+    "homogeneous": {"modules": 106, "functions": 945, "changes": 715},
+    "elastic": {"modules": 110, "functions": 1_030, "changes": 740},
 }
 
 
