@@ -161,6 +161,8 @@ class RemoteStore:
                 wrong_use=isinstance(error, ValueError),
             ) from error
         self._prefix = prefix.rstrip("/")
+        self._given = ""
+        """Name of the last object of which the store gave the begin."""
         if self._scheme in _READ_ONLY:
             self._fs.client_kwargs = {**self._fs.client_kwargs, "response_class": _whole_page()}
 
@@ -212,7 +214,7 @@ class RemoteStore:
                 # Drivers of the web raise this whatever the server answers.
                 if error.__cause__ is None or _status(error) in _ABSENT:
                     _LOG.warning("%s lists %r, which it does not have", self.url, path)
-                elif _is_of_one_object(error):
+                elif self._is_of_one_object(error, name):
                     # Whoever reads the file learns of it.
                     yield name, info
                 else:
@@ -269,6 +271,7 @@ class RemoteStore:
                 if _status(error) != _NO_SUCH_RANGE or self._fs.size(self._name(path)):
                     raise
                 return b""
+        self._given = self._name(path)
         return data
 
     def digest(self, path: str) -> str:
@@ -307,7 +310,7 @@ class RemoteStore:
             try:
                 self._fs.get(*_columns(pairs), batch_size=_BATCH)
             except _failures() as error:
-                if not _is_of_one_object(error):
+                if not self._is_of_one_object(error):
                     raise
                 # Rare, so existing files may be fetched twice.
                 for path, pair in zip(paths, pairs, strict=True):
@@ -423,13 +426,36 @@ class RemoteStore:
                 yield
         except CatalogError as error:
             cause = error.__cause__
-            if not (isinstance(cause, Exception) and _is_of_one_object(cause)):
+            if not (
+                isinstance(cause, Exception) and self._is_of_one_object(cause, self._name(path))
+            ):
                 raise
             status = _status(cause)
             if status is None:
                 raise cause from None
             kind = FileNotFoundError if status in _ABSENT else OSError
             raise kind(errno.EIO, f"the server answers {status}") from error
+
+    def _is_of_one_object(self, error: Exception, name: str = "") -> bool:
+        """Return whether an error concerns one object, so that the store gives others."""
+        status = _status(error)
+        if status is None:
+            # Drivers of the web raise FileNotFoundError for whatever happened, and state its cause.
+            lacking = isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
+            return lacking and error.__cause__ is None
+        code = _response(error).get("Error", {}).get("Code")
+        if 400 <= status < 500 and status not in _OF_STORE and code not in _CODES_OF_STORE:
+            return True
+        # Any other answer is one of the store if it gives neither the object read last nor a list.
+        try:
+            if self._given not in {"", name}:
+                self._fs.cat_file(self._given, start=0, end=1)
+            else:
+                self._fs.invalidate_cache()
+                self._fs.ls(self._prefix, detail=False)
+        except _failures():
+            return False
+        return True
 
     @contextmanager
     def _errors_as(self, kind: type[LidarOpsError], problem: str) -> Iterator[None]:
@@ -523,17 +549,6 @@ def _status(error: Exception) -> int | None:
     places = ((place, name) for place in (error, error.__cause__) for name in ("status", "code"))
     found = chain([stated], (getattr(place, name, None) for place, name in places))
     return next((status for status in found if isinstance(status, int)), None)
-
-
-def _is_of_one_object(error: Exception) -> bool:
-    """Return whether an error concerns one object, so that the store may give others."""
-    status = _status(error)
-    if status is not None:
-        code = _response(error).get("Error", {}).get("Code")
-        return 400 <= status < 500 and status not in _OF_STORE and code not in _CODES_OF_STORE
-    # Drivers of the web raise FileNotFoundError for whatever happened, and state it as the cause.
-    lacking = isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
-    return lacking and error.__cause__ is None
 
 
 def _stamp(info: dict[str, Any]) -> int:

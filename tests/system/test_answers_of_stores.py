@@ -17,6 +17,7 @@ from lidarops.errors import CatalogError
 from lidarops.plan.scenes import cut_scenes
 from lidarops.process.input_files import check_files, local_files
 from lidarops.records import Status
+from lidarops.system.stores import RemoteStore
 
 FILES = 4
 
@@ -58,7 +59,7 @@ def test_an_empty_file_is_refused_alone_and_says_so(
     assert not refused.reason.startswith("cannot be read")
 
 
-@pytest.mark.parametrize("status", [400, 401, 403, 404, 409, 410, 416])
+@pytest.mark.parametrize("status", [400, 401, 403, 404, 409, 410, 416, 429, 500, 503])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_an_answer_about_one_file_costs_this_file_alone(
     stand_in: StandIn, scheme: str, status: int, tmp_path: Path
@@ -88,10 +89,33 @@ def test_an_answer_about_the_store_ends_the_scan(
         scan_archive(campaign, store)
         before = store.granules()
         (stand_in.folder / "coast" / "h1").write_bytes(raw_archives.content(9))
-        stand_in.statuses["h1"] = status
-        with pytest.raises(CatalogError, match="coast/h1"):
+
+        def fail_after_listing(page: bytes) -> bytes:
+            if b"h1" in page:
+                stand_in.statuses[""] = status
+            return page
+
+        stand_in.damaged = fail_after_listing
+        with pytest.raises(CatalogError, match="coast/h"):
             scan_archive(campaign, store)
         assert store.granules() == before
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_failure_concerns_one_object_if_the_one_read_before_is_still_given(
+    stand_in: StandIn, scheme: str
+) -> None:
+    store = RemoteStore(stand_in.url(scheme))
+    for before in ("coast/h1", "coast/h0"):
+        stand_in.statuses.clear()
+        store.head(before, 100)
+        stand_in.statuses["h1"] = 500
+        with pytest.raises(OSError, match="the server answers 500"):
+            store.head("coast/h1", 100)
+    # The list is still given.
+    stand_in.statuses["h0"] = 500
+    with pytest.raises(CatalogError):
+        store.head("coast/h1", 100)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -108,7 +132,11 @@ def test_a_store_that_gives_no_file_ends_the_scan(
 
 @pytest.mark.parametrize(
     ("status", "reason"),
-    [(403, "cannot be read: the server answers 403"), (404, "cannot be read: vanished")],
+    [
+        (403, "cannot be read: the server answers 403"),
+        (500, "cannot be read: the server answers 500"),
+        (404, "cannot be read: vanished"),
+    ],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_file_that_is_denied_while_its_scene_is_processed_costs_this_file_alone(

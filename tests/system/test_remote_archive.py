@@ -179,21 +179,7 @@ def _failing_on(name: str, status: int, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(_Quiet, "send_head", failing)
 
 
-@pytest.mark.parametrize("status", [429, 500, 503])
-def test_a_server_that_answers_for_no_file_ends_the_scan(
-    campaign: Campaign, monkeypatch: pytest.MonkeyPatch, status: int
-) -> None:
-    """Otherwise a file that is there for the next run would be taken out of its scene."""
-    with Store(campaign.catalog_url, campaign.name) as store:
-        scan_archive(campaign, store)
-        before = store.granules()
-        _failing_on("h1", status, monkeypatch)
-        with pytest.raises(CatalogError, match=f"coast/h1.*{status}"):
-            scan_archive(campaign, store)
-        assert store.granules() == before
-
-
-@pytest.mark.parametrize("status", [401, 403])
+@pytest.mark.parametrize("status", [401, 403, 429, 500, 503])
 def test_a_file_that_a_server_denies_is_refused_until_it_gives_it(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch, status: int
 ) -> None:
