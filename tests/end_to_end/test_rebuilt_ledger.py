@@ -118,6 +118,23 @@ def test_products_whose_raw_files_are_gone_are_known(archive: Archive) -> None:
     assert CliRunner().invoke(app, ["verify", str(archive.file), "--products-only"]).exit_code == 0
 
 
+def test_files_that_products_state_as_unused_count_as_lost(archive: Archive) -> None:
+    damaged = [archive.folder / f"raw/poor/h{day}1" for day in (0, 1)]
+    for path in damaged:
+        path.write_bytes(path.read_bytes()[:-100])
+    assert len(made(reprocess(archive.write()))) == 4
+    for path in damaged:
+        path.unlink()
+    _lose(archive)
+    campaign = archive.write()
+    update_catalog(campaign)
+    rebuild_ledger(campaign)
+    result = bring_up_to_date(campaign)
+    assert made(result.record) == set()
+    (lost,) = result.findings.lost_files
+    assert (lost.files, lost.kept) == (2, 4)
+
+
 def test_files_that_are_not_products_of_the_campaign_are_named(archive: Archive) -> None:
     _lose(archive)
     products = archive.folder / "out/products"
