@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
@@ -148,7 +149,7 @@ class _Clock:
         self._last = now
 
 
-class _Work:
+class _Work(ABC):
     """What the processing of a scene of an instrument and of a network share."""
 
     def __init__(
@@ -178,9 +179,9 @@ class _Work:
             self.refused = check_files(self.job.scene, self._root, read_all=True)[2]
             raise
 
+    @abstractmethod
     def products(self) -> Iterator[ProductRecord]:
         """Make the products, and yield their records."""
-        raise NotImplementedError
 
     def _source(
         self,

@@ -378,7 +378,7 @@ class Judge:
 
     @cached_property
     def lost(self) -> Lost:
-        """The raw files of products that are lost, when first asked for."""
+        """Raw files of products that have vanished or cannot be read; looked up once."""
         return find_lost(self.campaign, self._store)
 
     def _is_excused(self, made: RecordedProduct) -> bool:
