@@ -116,7 +116,7 @@ class ChannelFacts(SettingsModel):
         ge=0,
         le=10,
         description="standard error of the analog baseline; if none, as dark files or blocked"
-        " beams show it, or 0.01 mV and 0.075 % of the largest voltage",
+        " beams show it, or 0.02 mV and 0.075 % of the largest voltage",
     )
     lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = quantity(
         None,

@@ -166,6 +166,7 @@ def choose_reference(
     molecular_attenuated: npt.ArrayLike,
     candidates: npt.ArrayLike,
     background_standard_error: npt.ArrayLike = 0.0,
+    baseline_standard_error: npt.ArrayLike = 0.0,
     exclude: npt.NDArray[np.bool_] | None = None,
 ) -> ReferenceWindow:
     r"""Return the cleanest window; of equally clean ones, the highest that is well determined.
@@ -209,6 +210,9 @@ def choose_reference(
         m, bottom and top of each window; see `candidate_windows`.
     background_standard_error : (...) float
         In the unit of the power.
+    baseline_standard_error : (..., range) float
+        In the unit of the power, of its baseline, whose shape is not known: a part of the errors of
+        :math:`a_0` that no two windows have in common.
     exclude : (..., range) bool, optional
         Bins that no window may contain, such as the mask of `layers.find_layers`.
 
@@ -245,6 +249,10 @@ def choose_reference(
     rejections = _rejections(statistics, np.diff(edges)[:, 0])
     level_error = inputs.real_array(background_standard_error, "background_standard_error")
     level_error = np.broadcast_to(level_error.astype(np.float64), leading).reshape(-1, 1)
+    baseline = inputs.noise_rows(baseline_standard_error, "baseline_standard_error", grid, leading)
+    middle = np.minimum(edges.sum(axis=1) // 2, grid.size - 1)
+    by_baseline = statistics[..., RESPONSE] * baseline[:, middle]
+    statistics[..., SCALE_ERROR] = np.hypot(statistics[..., SCALE_ERROR], by_baseline)
     index, comparison_error, excess = _pick(statistics, rejections, level_error)
     chosen = index >= 0
     profile = np.arange(index.size)

@@ -22,7 +22,7 @@ from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.clouds import layers as _layers
 from lidarops.retrieve.clouds import outlying_bins as _outlying_bins
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import actual_noise, counts_per_power
+from lidarops.retrieve.signal.labeled import actual_noise, baseline_error, counts_per_power
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -151,6 +151,9 @@ class MeanProfiles:
         self.quantum = _quantum(averages)
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
+        baseline = baseline_error(averages)
+        of_baseline = 0.0 if baseline is None else baseline.transpose("time", "range").to_numpy()
+        self.baseline_error = np.asarray(of_baseline / self.overlap)
         self.partly = np.zeros(self.raw.shape, dtype=np.bool_)
         """Bins in clouds of some profiles of a mean."""
         self.unknown_overlap = np.zeros(self.raw.shape, dtype=np.bool_)
@@ -450,5 +453,6 @@ def reference_window(
         molecular_attenuated=means.air.shape,
         candidates=candidates,
         background_standard_error=np.nan_to_num(signal.background_standard_error),
+        baseline_standard_error=np.nan_to_num(means.baseline_error),
         exclude=with_margin(clouds, means.distance),
     )

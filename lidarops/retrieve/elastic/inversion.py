@@ -7,6 +7,7 @@ window towards the lidar and away from it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -269,26 +270,35 @@ def invert_elastic(
     out, scalars, state = solved(rows)
     both = [_fernald.BACKSCATTER, _fernald.ATTENUATED]
 
-    def shifted(change: Array) -> Array:
-        """Return the change of the backscatter, and add those of others to their errors."""
-        if not change.any():
+    def shifted(*changes: Array) -> Array:
+        """Return the largest change of the backscatter, and add those of others to their errors."""
+        if not changes[0].any():
             return np.zeros_like(rows)
-        moved, moved_scalars, _ = solved(rows + change)
-        shift = moved[both] - out[both]
-        # Where the changed signal has no solution, the value itself is uncertain.
-        shift = np.where(np.isfinite(shift), shift, out[both])
-        out[_fernald.ATTENUATED_ERROR] = np.hypot(out[_fernald.ATTENUATED_ERROR], shift[1])
-        scalars[:, _fernald.CONSTANT_ERROR] = np.hypot(
-            scalars[:, _fernald.CONSTANT_ERROR],
-            moved_scalars[:, _fernald.CONSTANT] - scalars[:, _fernald.CONSTANT],
+
+        def largest(former: Array, moved: Sequence[Array]) -> Array:
+            # Where the changed signal has no solution, the value itself is uncertain.
+            shifts = [np.where(np.isfinite(new), new - former, former) for new in moved]
+            first, last = shifts[0], shifts[-1]
+            return np.where(np.abs(first) >= np.abs(last), first, last)
+
+        moved, moved_scalars, _ = zip(*(solved(rows + change) for change in changes), strict=True)
+        shift = largest(out[both], [new[both] for new in moved])
+        of_constant = largest(
+            scalars[:, _fernald.CONSTANT], [new[:, _fernald.CONSTANT] for new in moved_scalars]
         )
+        for errors, change in (
+            (out[_fernald.ATTENUATED_ERROR], shift[1]),
+            (scalars[:, _fernald.CONSTANT_ERROR], of_constant),
+        ):
+            errors[:] = np.hypot(errors, change)
         return np.asarray(shift[0])
 
     dead_time = shifted(inputs.noise_rows(dead_time_error, "dead_time_error", grid, leading))
     change = inputs.noise_rows(baseline_error, "baseline_error", grid, leading)
-    # Its shape is not known: that of the window and that of the other bins would cancel.
-    parts = [shifted(np.where(inside, change, 0.0)) for inside in (window, ~window)]
-    baseline = np.hypot(*parts)
+    # Its shape is not known: that of the window and that of the other bins would cancel. The
+    # inversion is not linear where it exceeds the signal of the window, so both signs are tried.
+    parts = [np.where(inside, change, 0.0) for inside in (window, ~window)]
+    baseline = np.hypot(*(shifted(part, -part) for part in parts))
     if variance is None:
         out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
         scalars[:, _fernald.CONSTANT_ERROR] = np.nan

@@ -60,6 +60,7 @@ def choose_window(
     variance = cells.mean(elastic.variance) / bins
     shape = np.tile(of_air, (len(raman), 1))
     background = np.nan_to_num(elastic.background_standard_error)
+    baseline = np.zeros(power.shape) + np.nan_to_num(cells.mean(elastic.baseline_error))
     inside = (cells.range >= candidates[:, :1]) & (cells.range <= candidates[:, 1:])
     for number, signal in enumerate(raman):
         if signal is None:
@@ -76,6 +77,8 @@ def choose_window(
         # Over air, both signals have nearly the same shape, so that backgrounds are alike too.
         shift = level * (pair.per_raman * of_raman.background)[inside.any(axis=0)].mean()
         background[number] = np.hypot(background[number], shift)
+        shift = np.nan_to_num(level * pair.per_raman * of_raman.baseline)
+        baseline[number] = np.hypot(baseline[number], shift)
     return reference_window.choose_reference(
         power,
         cells.range,
@@ -83,6 +86,7 @@ def choose_window(
         molecular_attenuated=shape,
         candidates=candidates,
         background_standard_error=background,
+        baseline_standard_error=baseline,
     )
 
 
