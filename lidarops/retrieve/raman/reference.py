@@ -60,7 +60,8 @@ def choose_window(
     variance = cells.mean(elastic.variance) / bins
     shape = np.tile(of_air, (len(raman), 1))
     background = np.nan_to_num(elastic.background_standard_error)
-    baseline = np.zeros(power.shape) + np.nan_to_num(cells.mean(elastic.baseline_error))
+    baseline = cells.mean(np.broadcast_to(elastic.baseline_error, elastic.power.shape))
+    baseline = np.nan_to_num(baseline)
     inside = (cells.range >= candidates[:, :1]) & (cells.range <= candidates[:, 1:])
     for number, signal in enumerate(raman):
         if signal is None:
