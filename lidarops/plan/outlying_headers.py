@@ -1,38 +1,50 @@
-"""Find files whose headers state what all files around them contradict: damaged digits.
+"""Find files whose headers state what no other file of these days does: damaged digits.
 
-Headers have no checksum. A header that is the only one of its kind, between files that agree with
-each other, is more likely damaged than true: a change of the lidar stays for more than one file.
+Headers have no checksum. A header that is the only one of its kind, where most files of its day and
+of the days beside it agree, is more likely damaged than true: a change of the lidar stays for more
+than one file.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from dataclasses import fields, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from lidarops.catalog.granules import by_wording
 from lidarops.catalog.rows import day_of
-from lidarops.plan.outlying_intervals import lone_intervals
-from lidarops.plan.outlying_pointings import lone_pointings
-from lidarops.plan.surroundings import Outlying, ReadHeader, granules_around
 from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import FEWEST_ALIKE, FileNote, Granule, Role, Status
 
+NEAR_DAYS: Final = 1
+"""Days before and after that of a file whose files are compared with it."""
 _OF_VALUES: Final = frozenset(
     {"wavelength_label", "bins", "bin_width", "adc_bits", "input_range", "device"}
 )
 """Properties of a channel by which its values, their ranges or its name would be wrong."""
 _FREE: Final = frozenset({"name", "shots", "scale", "places", "mode", "wavelength", "polarisation"})
 """Properties that vary from file to file, or that follow from others."""
-_COMPARED: Final = tuple(
-    item.name for item in fields(RawChannel) if item.name not in _FREE | _OF_VALUES
-)
+_COMPARED: Final = {
+    item.name: item.name in _OF_VALUES for item in fields(RawChannel) if item.name not in _FREE
+}
+_JITTER: Final = 2
+"""s; two times in whole seconds may make an interval so much longer than another one."""
 _REMEDY: Final = (
     "a damaged digit, or a change for this file only (leave it out, correct its header, or give"
     " such files an instrument of their own)"
 )
+
+ReadHeader = Callable[[Granule], RawHeader | None]
+"""Header of a file; None where it cannot be read."""
+
+
+class Outlying(NamedTuple):
+    """What the header of a file states otherwise than the files around it, in words."""
+
+    refused: str
+    """Why the file cannot be used; empty where values are right whatever is true."""
+    note: str
 
 
 def without_outlying(
@@ -88,7 +100,10 @@ def joined_notes(notes: Iterable[FileNote]) -> Iterator[FileNote]:
 def outlying_headers(
     granules: Sequence[Granule], days: Collection[int], read: ReadHeader
 ) -> dict[str, Outlying]:
-    """Return the files of some days whose headers differ from all around them.
+    """Return the files of some days whose headers differ from the mode of the files around them.
+
+    These are the files of the same instrument and role on this day and the days beside it. What
+    another one of them states too, or fewer than `FEWEST_ALIKE` agree on, is no damage.
 
     Parameters
     ----------
@@ -103,92 +118,111 @@ def outlying_headers(
     dict
         By path.
     """
-    outlying: dict[str, Outlying] = {}
-    ordered = sorted(granules, key=lambda g: (g.instrument, g.role.value, g.start, g.path))
-    for (_, role), alike in itertools.groupby(ordered, key=lambda g: (g.instrument, g.role)):
-        own = list(alike)
-        statements = [_lone_setups(own, days, read), lone_intervals(own, days, read)]
+    by_day: dict[tuple[str, Role, int], list[Granule]] = defaultdict(list)
+    for granule in sorted(granules, key=lambda g: (g.start, g.path)):
+        if granule.start:
+            by_day[granule.instrument, granule.role, day_of(granule.start)].append(granule)
+    found: dict[str, Outlying] = {}
+    for instrument, role, day in [key for key in by_day if key[2] in days]:
+        near = range(day - NEAR_DAYS, day + NEAR_DAYS + 1)
+        around = [g for other in near for g in by_day.get((instrument, role, other), ())]
+        statements = [*_setups(around, day, read), *_intervals(around, day, read)]
         if role is Role.SIGNAL:
-            statements.append(lone_pointings(own, days))
-        for granule, stated in itertools.chain(*statements):
-            before = outlying.get(granule.path)
-            outlying[granule.path] = stated if before is None else before.joined(stated)
-    return outlying
-
-
-def _lone_setups(
-    granules: Sequence[Granule], days: Collection[int], read: ReadHeader
-) -> Iterator[tuple[Granule, Outlying]]:
-    """Yield granules whose site or channels are recorded otherwise than those around them."""
-    lone = {index: near for key in (_setup, _layout) for index, near in _lone(granules, days, key)}
-    for index, near in lone.items():
-        stated = _compared(granules[index], [granules[other] for other in near], read)
-        if stated is not None:
-            yield granules[index], stated
-
-
-def _setup(granule: Granule) -> Hashable:
-    return granule.setup
-
-
-def _layout(granule: Granule) -> Hashable:
-    return granule.layout
+            statements += _pointings(around, day)
+        for place, stated in statements:
+            path = around[place].path
+            both = zip(found.get(path, ("", "")), stated, strict=True)
+            found[path] = Outlying(*("; ".join(filter(None, pair)) for pair in both))
+    return found
 
 
 def _lone(
-    granules: Sequence[Granule], days: Collection[int], key: Callable[[Granule], Hashable]
-) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Yield the places of files that no other is like, with those of the two nearest files.
-
-    These are like each other and like others.
-    """
-    for own, around in granules_around(granules, days):
-        counts = Counter(key(granules[index]) for index in around)
-        if len(counts) == 1:
-            continue
-        for place, index in enumerate(around):
-            if counts[key(granules[index])] > 1 or index not in own:
-                continue
-            first = min(max(place - 1, 0), len(around) - 3)
-            near = tuple(other for other in around[first : first + 3] if other != index)
-            stated = {key(granules[other]) for other in near}
-            if len(near) == 2 and len(stated) == 1 and counts[stated.pop()] >= FEWEST_ALIKE:
-                yield index, (near[0], near[1])
-
-
-def _compared(granule: Granule, near: Sequence[Granule], read: ReadHeader) -> Outlying | None:
-    """Return in what the header of a file differs from those of two that are alike."""
-    headers = [header for header in map(read, (granule, *near)) if header is not None]
-    if len(headers) <= len(near):
-        return None
-    refused: list[str] = []
-    noted: list[str] = []
-    for statement in _statements(headers):
-        own, *others = statement.stated
-        if len(set(others)) == 1 and own != others[0]:
-            text = f"{statement.subject} {own}, the files around it {others[0]}"
-            (refused if statement.of_values else noted).append(text)
-    if not (refused or noted):
-        return None
-    return Outlying("; ".join(refused), "; ".join(noted))
-
-
-class _Statement(NamedTuple):
-    """What each of some headers states of the same thing."""
-
-    subject: str
-    stated: tuple[Hashable, ...]
-    of_values: bool
-    """Whether values or their ranges follow from it."""
-
-
-def _statements(headers: Sequence[RawHeader]) -> Iterator[_Statement]:
-    names = tuple(", ".join(c.name for c in header.channels) for header in headers)
-    yield _Statement("channels", names, of_values=True)
-    yield _Statement("site", tuple(header.site for header in headers), of_values=False)
-    if len({len(header.channels) for header in headers}) > 1:
+    around: Sequence[Granule], day: int, stated: Sequence[Hashable]
+) -> Iterator[tuple[int, int]]:
+    """Yield places of files of a day that alone state a value, with that of a usual file."""
+    counts = Counter(stated)
+    mode, files = counts.most_common(1)[0]
+    if len(counts) == 1 or files < FEWEST_ALIKE:
         return
-    for channels in zip(*(header.channels for header in headers), strict=True):
-        for name in (*sorted(_OF_VALUES), *_COMPARED):
-            values = tuple(getattr(channel, name) for channel in channels)
-            yield _Statement(f"{channels[1].name} {name}", values, of_values=name in _OF_VALUES)
+    usual = stated.index(mode)
+    for place, granule in enumerate(around):
+        if counts[stated[place]] == 1 and granule.start and day_of(granule.start) == day:
+            yield place, usual
+
+
+def _setups(
+    around: Sequence[Granule], day: int, read: ReadHeader
+) -> Iterator[tuple[int, Outlying]]:
+    """Yield places of files whose site or channels are recorded as in no other file."""
+    lone = dict(_lone(around, day, [granule.layout for granule in around]))
+    lone |= _lone(around, day, [granule.setup for granule in around])
+    for place, usual in lone.items():
+        own, other = read(around[place]), read(around[usual])
+        if own and other:
+            texts: dict[bool, list[str]] = {True: [], False: []}
+            for text, of_values in _differences(own, other):
+                texts[of_values].append(text)
+            yield place, Outlying("; ".join(texts[True]), "; ".join(texts[False]))
+
+
+def _differences(own: RawHeader, usual: RawHeader) -> Iterator[tuple[str, bool]]:
+    """Yield in words what two headers state otherwise, and whether values follow from it."""
+    names = [", ".join(channel.name for channel in header.channels) for header in (own, usual)]
+    stated: list[tuple[Any, ...]] = [("channels", *names, True)]
+    stated.append(("site", own.site, usual.site, False))
+    if len(own.channels) == len(usual.channels):
+        stated += [
+            (f"{other.name} {name}", getattr(channel, name), getattr(other, name), of_values)
+            for channel, other in zip(own.channels, usual.channels, strict=True)
+            for name, of_values in _COMPARED.items()
+        ]
+    for subject, one, other, of_values in stated:
+        if one != other:
+            yield f"{subject} {one}, the files around it {other}", of_values
+
+
+def _intervals(
+    around: Sequence[Granule], day: int, read: ReadHeader
+) -> Iterator[tuple[int, Outlying]]:
+    """Yield places of files that lasted longer or shorter than the others for the same shots.
+
+    One that lasted while another one was recorded cannot be used: its start or stop is wrong.
+    """
+    ends = [(g.start.timestamp(), g.stop.timestamp()) for g in around if g.start and g.stop]
+    lengths = [round(stop - start) for start, stop in ends]
+    for place, usual in _lone(around, day, lengths):
+        length, other = lengths[place], lengths[usual]
+        if any(0 < abs(length - near) <= _JITTER for near in lengths):
+            continue
+        own, others = (_shots(read(around[index])) for index in (place, usual))
+        if not (own and others) or abs(length - other * own / others) <= _JITTER:
+            continue
+        text = f"an interval of {length} s for {own} shots,"
+        text += f" the files around it {other} s for {others}"
+        start, stop = ends[place]
+        beside = ends[max(place - 1, 0) : place] + ends[place + 1 : place + 2]
+        if any(min(stop, past) - max(start, first) > _JITTER for first, past in beside):
+            text += ", and one of them was recorded at the same time"
+            yield place, Outlying(text, "")
+        else:
+            yield place, Outlying("", text)
+
+
+def _shots(header: RawHeader | None) -> int:
+    return max((channel.shots for channel in header.channels), default=0) if header else 0
+
+
+def _pointings(around: Sequence[Granule], day: int) -> Iterator[tuple[int, Outlying]]:
+    """Yield the place of the file that alone has its pointing, if each other pointing has several.
+
+    Of a beam that is fixed otherwise it cannot be used: the whole scene would seem to move. In a
+    scan it is one of many pointings.
+    """
+    stated = [(granule.zenith_angle, granule.azimuth) for granule in around]
+    others = sorted(Counter(stated).values())[1:]
+    if others and others[0] >= FEWEST_ALIKE:
+        for place, _ in _lone(around, day, stated):
+            named = zip(("zenith angle", "azimuth"), stated[place], strict=True)
+            words = " and ".join(f"{name} {angle:g}" for name, angle in named if angle is not None)
+            text = f"the pointing {words} alone of all files around it"
+            yield place, Outlying("", text) if len(others) > 1 else Outlying(text, "")

@@ -28,10 +28,9 @@ from lidarops.errors import AncillaryError, ProductError, RawFormatError
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.channel_names import ChannelNames
-from lidarops.plan.outlying_headers import new_notes, without_outlying
+from lidarops.plan.outlying_headers import NEAR_DAYS, new_notes, without_outlying
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, as_recorded, cut_scenes
-from lidarops.plan.surroundings import NEAR_DAYS
 from lidarops.plan.unused_files import Refused, dated, name_unused
 from lidarops.process.context import recorded_settings
 from lidarops.process.guard import Failure, guarded
