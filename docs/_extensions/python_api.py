@@ -16,7 +16,6 @@ REPOSITORY: Final = Path(__file__).resolve().parents[2]
 
 MODULES: Final = (
     "lidarops",
-    "lidarops.aggregate.virtual_dataset",
     "lidarops.campaign.model",
     "lidarops.raw.licel",
     "lidarops.retrieve.air.molecular",

@@ -1,4 +1,4 @@
-"""Makes the aggregates of an output: index, views, means, stores, STAC catalog."""
+"""Makes the aggregates of an output: index, means, stores, STAC catalog."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from lidarops.aggregate.means import MeansFile, write_means
 from lidarops.aggregate.means_variables import Period, Weights
 from lidarops.aggregate.stac import write_stac
 from lidarops.aggregate.versioned_store import StoreUpdate, stored_kinds, update_store
-from lidarops.aggregate.virtual_dataset import View, write_view
 from lidarops.errors import ProductError
 
 Progress = Callable[[int], None]
@@ -30,7 +29,7 @@ Progress = Callable[[int], None]
 
 @dataclass(frozen=True, slots=True)
 class AggregateOptions:
-    """Which aggregates to make besides the views, which are always made."""
+    """Which aggregates to make besides the index, which is always made."""
 
     selection: ProductSelection = EVERYTHING
     period: Period | None = None
@@ -52,7 +51,6 @@ class AggregateResult:
     products: int = 0
     index: str | None = None
     stac: str | None = None
-    views: list[View] = field(default_factory=list)
     means: list[MeansFile] = field(default_factory=list)
     stores: list[StoreUpdate] = field(default_factory=list)
     refused: list[Refused] = field(default_factory=list)
@@ -103,9 +101,8 @@ def make_aggregates(
         made.index = write_index(root, products)
     else:
         made.notes.append("the index lists all products; run without a selection to update it")
-    for group_products in by_group.values():
-        _try(made, partial(_view, made, group_products))
-        if options.period is not None:
+    if options.period is not None:
+        for group_products in by_group.values():
             _try(made, partial(_means, made, group_products, options.period, options.weights))
     if options.store:
         _try(made, partial(_stores, made, products, options))
@@ -158,12 +155,6 @@ def _try(made: AggregateResult, step: Callable[[], None]) -> None:
         step()
     except ProductError as error:
         made.failed.append(str(error))
-
-
-def _view(made: AggregateResult, products: Sequence[Facts]) -> None:
-    view = write_view(made.root, products)
-    made.views.append(view)
-    made.refused += view.refused
 
 
 def _means(

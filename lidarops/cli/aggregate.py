@@ -69,7 +69,7 @@ def aggregate(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write an index of products, and one virtual dataset for each instrument, kind and channel.
+    """Write an index of products, by which they open as one dataset, and means, stores or STAC.
 
     Writes to the folder aggregates, which can be deleted and made again at any time. Stores are in
     the folder stores, and keep the values of products that were replaced.
@@ -121,8 +121,6 @@ def _root(out: Path, *, with_runs: bool) -> tuple[Path, dict[str, str]]:
 
 
 def _tell(made: AggregateResult) -> None:
-    views = ((view.path, view.products, view.profiles, view.parts) for view in made.views)
-    show_rows("Views", ("file", "products", "profiles", "parts"), views)
     means = ((file.path, file.products, file.periods) for file in made.means)
     show_rows("Means", ("file", "products", "periods"), means)
     stores = ((s.path, s.groups, s.added, s.dropped, s.snapshot) for s in made.stores)

@@ -33,9 +33,8 @@ def test_everything_is_made(tmp_path: Path):
     made = json.loads(output)
     assert code == 0
     assert made["products"] == 4
-    assert len(made["views"]) == len(made["means"]) == 2
-    files = [made["index"], made["stac"], *(view["path"] for view in made["views"])]
-    files += [means["path"] for means in made["means"]]
+    assert len(made["means"]) == 2
+    files = [made["index"], made["stac"], *(means["path"] for means in made["means"])]
     assert all((tmp_path / file).is_file() for file in files)
 
 
@@ -47,18 +46,20 @@ def test_a_damaged_product_is_listed_with_exit_code_1(tmp_path: Path):
     made = json.loads(output)
     assert code == 1
     assert [product["path"] for product in made["refused"]] == [damaged]
-    assert [view["products"] for view in made["views"]] == [1]
+    assert made["products"] == 1
 
 
 def test_a_selection_leaves_the_index_alone(tmp_path: Path):
     add_day(tmp_path, 0)
     add_day(tmp_path, 0, "signal")
-    code, output = run(tmp_path, "--kind", "signal", "--since", "2026-01-01", "--json")
+    code, output = run(
+        tmp_path, "--kind", "signal", "--since", "2026-01-01", "--means", "day", "--json"
+    )
     made = json.loads(output)
     assert code == 0
     assert made["index"] is None
-    assert len(made["views"]) == 1
-    assert "signal" in made["views"][0]["path"]
+    assert len(made["means"]) == 1
+    assert "signal" in made["means"][0]["path"]
     code, output = run(tmp_path, "--kind", "signal", "--stac")
     assert code == 1
     assert "lists all products" in output
@@ -90,7 +91,7 @@ def test_signals_of_a_scan_have_no_mean_and_the_others_are_made(tmp_path: Path):
     code, output = run(tmp_path, "--means", "day", "--json")
     made = json.loads(output)
     assert code == 0
-    assert len(made["views"]) == 2
+    assert made["products"] == 2
     assert len(made["means"]) == 1
     assert not made["failed"]
     assert "profiles of several directions" in made["notes"][0]
