@@ -642,8 +642,11 @@ def load_campaign(
             f"cannot be read: {error}", file=path, remedy="give the path of a campaign YAML file"
         ) from error
     try:
-        tree = yaml.compose(text, Loader=yaml.SafeLoader)
-        raw = yaml.safe_load(text)
+        loader = yaml.SafeLoader(text)
+        tree = loader.get_single_node()
+        duplicates = duplicate_keys(tree)
+        # Merges the mappings that `<<` names into the nodes.
+        raw = None if tree is None else loader.construct_document(tree)
     except yaml.YAMLError as error:
         raise CampaignError(f"is not valid YAML: {error}", file=path) from error
     # Impossible dates, and nesting that is too deep.
@@ -653,7 +656,7 @@ def load_campaign(
             file=path,
             remedy="look for an impossible date such as 2024-02-30, and quote texts like it",
         ) from error
-    if duplicates := duplicate_keys(tree):
+    if duplicates:
         raise CampaignError(_listed("is not a valid campaign:", duplicates), file=path)
     if not isinstance(raw, dict):
         raise CampaignError(
@@ -664,7 +667,8 @@ def load_campaign(
     try:
         campaign = Campaign.model_validate(raw)
     except ValidationError as error:
-        lines = explain_yaml_error(error, tree, campaign_schema())
+        nodes = yaml.compose(text, Loader=yaml.SafeLoader)
+        lines = explain_yaml_error(error, nodes, campaign_schema())
         raise CampaignError(_listed("is not a valid campaign:", lines), file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Final
 from lidarops.cli.app import say, wrapped
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
-from lidarops.steps.channels import READ_STEP
-from lidarops.steps.step import REQUEST
 
 if TYPE_CHECKING:
     from lidarops.records import Plan
@@ -55,6 +53,9 @@ def show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
 
 
 def _say_steps(plan: Plan) -> None:
+    from lidarops.steps.channels import READ_STEP
+    from lidarops.steps.step import REQUEST
+
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
         _say(f"steps: {', '.join(names)}", "  ")
@@ -81,6 +82,9 @@ def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
 
     Without those of which a product is shown as left out.
     """
+    from lidarops.steps.channels import READ_STEP
+    from lidarops.steps.step import REQUEST
+
     unread = (
         left
         for left in plan.left_out
